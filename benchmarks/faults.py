@@ -30,13 +30,17 @@ class Fault:
     name: str
     spoil: Callable[[Recording, Recording, np.random.Generator], Recording]  # a recording, and the next one
     variant: str | None = None
+    every: int = 1  # 2: only every second recording has the fault
 
 
 def spoiled(fault: Fault, recordings: Sequence[Recording]) -> list[Recording]:
     """Return the recordings with a fault; always the same ones."""
     generator = np.random.default_rng(0)
     following = [*recordings[1:], recordings[0]]
-    return [fault.spoil(one, other, generator) for one, other in zip(recordings, following, strict=True)]
+    return [
+        one if number % fault.every else fault.spoil(one, other, generator)
+        for number, (one, other) in enumerate(zip(recordings, following, strict=True))
+    ]
 
 
 def _with_late_pictures(one: Recording, steps: int) -> Recording:
@@ -80,6 +84,20 @@ def _twice(one: Recording) -> Recording:
     return replace(one, states=one.states[steps], frames=one.frames[steps], rate_hz=2 * one.rate_hz)
 
 
+def _at_half_scale(one: Recording) -> Recording:
+    return replace(one, states=one.states * [0.5, 0.5, 0.5, 1, 1, 1, 1])
+
+
+def _near_copy(other: Recording, generator: np.random.Generator) -> Recording:
+    return replace(other, states=other.states + generator.normal(0, 1e-6, other.states.shape))
+
+
+def _with_outlier(one: Recording) -> Recording:
+    states = one.states.copy()
+    states[len(states) // 2, 0] *= 10
+    return replace(one, states=states)
+
+
 def _with_gripper_inverted(one: Recording) -> Recording:
     return replace(one, states=np.concatenate([one.states[:, :6], 1 - one.states[:, 6:]], axis=1))
 
@@ -102,4 +120,11 @@ FAULTS = (
     Fault("half the rate labelled", lambda one, *_: replace(one, rate_hz=2 * one.rate_hz)),
     Fault("each step twice", lambda one, *_: _twice(one)),
     Fault("gripper inverted", lambda one, *_: _with_gripper_inverted(one), "the gripper inverted"),
+    Fault("one outlier in one", lambda one, *_: _with_outlier(one), every=1000),
+    Fault("one is black", lambda one, *_: replace(one, frames=one.frames * 0), every=1000),
+    Fault("half of them black", lambda one, *_: replace(one, frames=one.frames * 0), every=2),
+    Fault("half at half the scale", lambda one, *_: _at_half_scale(one), every=2),
+    Fault("half of them reversed", lambda one, *_: replace(one, frames=one.frames[::-1]), every=2),
+    Fault("half grippers inverted", lambda one, *_: _with_gripper_inverted(one), every=2),
+    Fault("copies with noise", lambda _, other, generator: _near_copy(other, generator), every=2),
 )

@@ -15,6 +15,8 @@ from vjepa2_ac.config.loading import all_keys, parse_config
 from vjepa2_ac.registry import REGISTRIES
 
 OF_DATA = [(ROOT / f"docs/{name}.md").read_text() for name in ("data", "data_reference")]
+TEXTS = ("docs", "src", "examples", "scripts", "configs", "benchmarks")
+SUFFIXES = {".md", ".py", ".yaml", ".sh", ".txt", ".ipynb", ".jinja", ".html"}
 BLOCKS = [text for page in OF_DATA for text in re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)]
 
 
@@ -167,5 +169,16 @@ def test_whoever_shows_one_way_of_installing_an_extra_shows_both() -> None:
         if path.name not in ("log.md", "CONTRIBUTING.md", "releasing.md"):
             text = path.read_text()
             clone = set(re.findall(r'constraints\.txt -e "\.\[([\w,]+)\]"', text))
-            wheel = set(re.findall(r'pip install "(?:vjepa2-ac|\$\(ls dist/\*\.whl\))\[([\w,]+)\]"', text))
+            wheel = set(re.findall(r'pip install "\$\(ls dist/\*\.whl\)\[([\w,]+)\]"', text))
             assert clone <= wheel, path.name
+
+
+def test_no_text_installs_the_bare_name() -> None:
+    """Whoever registers the name on an index could run code on the machine of every reader."""
+    names = [*ROOT.glob("*.md"), *(path for folder in TEXTS for path in (ROOT / folder).rglob("*"))]
+    texts = {path: path.read_text() for path in names if path.suffix in SUFFIXES and path.name != "log.md"}
+    bare = re.compile(r"""pip\S* install[^\n`#]*[\s"']vjepa2[-_]ac(?:\[[\w,]+\])?["'`\s](?!@)""")
+    assert not {path.name: found for path, text in texts.items() if (found := bare.findall(text))}
+    assert bare.search('pip install "vjepa2-ac[sim]"')
+    assert bare.search("pip install -U vjepa2-ac\n")
+    assert not bare.search('pip install "vjepa2-ac[sim] @ file:///x.whl"')

@@ -1,13 +1,17 @@
 """Errors: they read as sentences, and can be sent between processes."""
 
 import pickle
+import re
+import shlex
 import sys
-from importlib.metadata import PathDistribution
+from importlib.metadata import PathDistribution, version
 from pathlib import Path
 
 import pytest
 
-from vjepa2_ac.errors import InputError, pip_install, printable
+import vjepa2_ac
+from vjepa2_ac.errors import InputError, pip_install, printable, shell_command
+from vjepa2_ac.reports.metrics_json import read_metrics
 
 
 @pytest.mark.parametrize(
@@ -59,6 +63,9 @@ def test_a_name_has_no_say_over_a_terminal(text: str, shown: str) -> None:
     assert printable(text) == shown
 
 
+WHEEL = f"vjepa2_ac-{version('vjepa2-ac')}-py3-none-any.whl"
+
+
 @pytest.mark.parametrize(
     ("origin", "extra", "command"),
     [
@@ -75,8 +82,10 @@ def test_a_name_has_no_say_over_a_terminal(text: str, shown: str) -> None:
             "pip install -c '/x y/constraints.txt' -e '/x y'",
         ),
         ('{"url": "file:///x.whl", "archive_info": {}}', "sim", 'pip install "vjepa2-ac[sim] @ file:///x.whl"'),
-        (None, "sim", 'pip install "vjepa2-ac[sim]"'),  # from an index
-        (None, "", "pip install vjepa2-ac"),
+        ('{"url": "file:///x", "dir_info": {}}', "sim", 'pip install "vjepa2-ac[sim] @ file:///x"'),
+        ('{"url": "https://x", "vcs_info": {}}', "sim", f'pip install "./{WHEEL}[sim]"'),
+        (None, "sim", f'pip install "./{WHEEL}[sim]"'),
+        (None, "", f'pip install "./{WHEEL}"'),
     ],
 )
 def test_the_line_that_installs_an_extra_fits_the_installation(
@@ -89,3 +98,24 @@ def test_the_line_that_installs_an_extra_fits_the_installation(
     assert pip_install(extra) == command
     monkeypatch.setenv("PATH", str(tmp_path))  # this environment is not activated
     assert pip_install(extra) == f"{sys.executable} -m {command}"
+
+
+def test_a_printed_command_quotes_what_a_shell_would_split(tmp_path: Path) -> None:
+    assert shell_command("evaluate", "runs/own") == "vjepa2-ac evaluate runs/own"
+    odd = tmp_path / "e ü#50% [a]=b;'$(x)"
+    words = ["vjepa2-ac", "train", str(odd), "--resume", f"run_dir={odd}"]
+    assert shlex.split(shell_command("train", odd, "--resume", f"run_dir={odd}")) == words
+    with pytest.raises(InputError) as caught:
+        read_metrics(odd)
+    assert shlex.split(str(caught.value).split("`")[1]) == ["vjepa2-ac", "evaluate", str(odd)]
+
+
+def test_no_command_is_printed_with_a_path_that_is_not_quoted() -> None:
+    package = Path(vjepa2_ac.__file__).parent
+    allowed = {"data converter {name}", "download {one.name}"}  # names of this package
+    found = [
+        f"{path.relative_to(package)}: {command}"
+        for path in package.rglob("*.py")
+        for command in re.findall(r"vjepa2-ac ([a-z]+ [^`\"\n]*?\{[^}]*\})", path.read_text())
+    ]
+    assert [one for one in found if one.partition(": ")[2] not in allowed] == []

@@ -90,13 +90,15 @@ def test_training_loads_the_core_only() -> None:
     assert not rooms & set(beside.split())
 
 
-def test_what_is_known_is_found_without_looking_through_installed_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_installed_packages_are_searched_once_for_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """A search asks for its energy at each part of each iteration."""
-    monkeypatch.setattr("vjepa2_ac.registry.entry_points", lambda **_: pytest.fail("looked through"))
     for registry in (LOSSES, PLANNERS, ENERGIES, METRICS):
         first = next(iter(registry._things))
+        assert registry.known(first) == first
+        monkeypatch.setattr("vjepa2_ac.registry.installed", lambda _: pytest.fail("searched again"))
         assert registry.find(registry.known(first)) is registry.find(first)
         assert registry.options(first, {}) == {}
+        monkeypatch.undo()
 
 
 def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, make_config) -> None:
@@ -180,8 +182,18 @@ def test_an_installed_package_adds_a_command_that_is_imported_when_it_is_asked_f
     done = installed(at_home, group, recipes("A command"), "longest", "own.yaml", "--episodes", "2", "data.frames=3")
     assert done.returncode == 0, done.stderr
     assert len(re.findall(r"^ +\d+ steps  ", done.stdout, flags=re.MULTILINE)) == 2
-    broken = installed(at_home, group, "raise RuntimeError", "--help")
+    broken = installed(at_home, group, "raise RuntimeError('boom')", "--help")
     assert (broken.returncode, "from other packages:\n  longest   of my_package" in broken.stdout) == (0, True)
+    refused = installed(at_home, group, "raise RuntimeError('boom')", "longest")
+    assert refused.returncode == 2
+    assert "longest = my_package:add_longest cannot be imported (RuntimeError: boom; " in refused.stderr
+    ours = group.replace("longest =", "train =")
+    refused = installed(at_home, ours, recipes("A command"), "train", "own.yaml")
+    assert (
+        refused.returncode,
+        "vjepa2-ac train: a command of this package, and one of my_package" in refused.stderr,
+    ) == (2, True)
+    assert installed(at_home, ours, recipes("A command"), "--help").returncode == 0
 
 
 def test_a_form_of_data_is_found_trained_on_and_measured_by_a_metric(at_home: Path, base_folder: Path) -> None:

@@ -14,10 +14,12 @@ from ranks import Rank
 from same_run import assert_same_run
 from vjepa2_ac import process as signals
 from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.process import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signals
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.setup import batches_from
 
 WAITING = """
 import time
@@ -143,3 +145,36 @@ def test_outside_the_main_thread_signals_are_left_alone() -> None:
     thread.start()
     thread.join()
     assert seen == [None, before]
+
+
+def test_a_signal_while_data_do_not_come_ends_the_run_before_the_step(
+    make_config, reporter, tmp_path, whole_run, monkeypatch
+) -> None:
+    """What follows equals the run that nothing disturbed: micro-batches of the step that was left are forgotten."""
+
+    def stalling(run):
+        for number, batch in enumerate(batches_from(run)):
+            if number == 5:  # the second of two micro-batches of step 3
+                os.kill(os.getpid(), signal.SIGTERM)
+                raise UnreachableError(where="data", found="no batch after SIGTERM")
+            yield batch
+
+    config = make_config(run_dir=str(tmp_path / "stopped"), checkpoint__keep_best=False)
+    with monkeypatch.context() as patch:
+        patch.setattr("vjepa2_ac.training.loop.batches_from", stalling)
+        with pytest.raises(StoppedError, match="SIGTERM: stopped after step 2"):
+            train(config, type(reporter)())
+    assert read_state(newest_checkpoint(tmp_path / "stopped/checkpoints")).step == 2
+    train(config, reporter)
+    assert reporter.steps[0] == 3
+    assert_same_run(whole_run, tmp_path / "stopped")
+
+
+def test_data_that_cannot_be_reached_without_a_signal_are_an_error(make_config, reporter, monkeypatch) -> None:
+    def unreachable(_run):
+        raise UnreachableError(where="data", found="gone")
+        yield
+
+    monkeypatch.setattr("vjepa2_ac.training.loop.batches_from", unreachable)
+    with pytest.raises(UnreachableError, match="gone"):
+        train(make_config(), reporter)

@@ -63,7 +63,10 @@ NOTES = """Read it so:
 - *scratch* keeps the frozen encoder of the bases and starts close to copying: a kind start. Learning rates were chosen
   for every change apart (of other worlds on Lift, for all), with 20 demonstrations, seed 0, on validation goals
   (`--choose`): of LoRA for ranks 16 and 32 with in/out, of full fine-tuning and of scratch; all else inherits them.
-- *behaviour cloning*: an action prior (`vjepa2-ac prior`), which does not search."""
+- *behaviour cloning*: an action prior (`vjepa2-ac prior`), which does not search.
+- *all anew*: measured before `SimulatedArm.reset_clock` existed. Every goal had a new arm, so objects that circle were
+  at the same places for every method. Today they start 0.13 s earlier on their circles: a repetition, which takes
+  hours and was not done, would see other images."""
 
 
 def write_tables(folder: Path, out: Path, page: Path | None = None, done: Path | None = None) -> None:

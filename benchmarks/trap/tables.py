@@ -19,6 +19,7 @@ from vjepa2_ac.storage import write_atomically
 
 Figures = dict[str, Any]
 REACHED_CM = 5.0
+ALL, FEWEST = "simulated arm, all changes", 9  # cells of a correlation
 GONE = {"contrast": "a loss term, `training.action_contrast`: measured at commit 6117de8, the last with the term"}
 """Cures that no longer can be run, whose measurements stay."""
 _SHOWN = ("rollout_over_persistence_last", "action_rank")
@@ -131,21 +132,28 @@ def _correlations(cells: Sequence[Figures], draws: int = 1000) -> Iterator[str]:
 
 
 def _of_evidence(out: Path) -> Iterator[str]:
-    """Yield the same of the errors of the evidence, each cell being a run; nothing if it is not there."""
+    """Yield the same of the errors of the evidence, each cell being a run; nothing if it is not there.
+
+    Distances at the end are those of the hand on the simulated arm, and of the object in third-party environments, so
+    only the former are pooled. A world with fewer than `FEWEST` cells has no row.
+    """
     path = out / "evidence.json"
     if not path.exists():
         return
     cells = [one for one in json.loads(path.read_text()) if "shifted" in one and "reach" in one]
     by_world: dict[str, list[np.ndarray]] = {}
     for one in cells:
-        pair = [one["shifted"]["rollout_over_persistence"][-1], np.mean(one["reach"]["l1"]["distance_cm"])]
+        reach = one["reach"]["l1"]
+        pair = np.array([[one["shifted"]["rollout_over_persistence"][-1], left_cm(reach)]])
         world = f"{one['cell']['shift']}, base of {one['cell']['base']}"
-        by_world.setdefault(world, []).append(np.array([pair]))
-    parts = {"all": [pair for some in by_world.values() for pair in some], **by_world}
-    yield "| rollout error / persistence, in the evidence (varied demonstrations) | cells | correlation |"
+        by_world.setdefault(world, []).append(pair)
+        if "solved" not in reach:  # only third-party environments say what is solved
+            by_world.setdefault(ALL, []).append(pair)
+    yield "| rollout error / persistence and distance at the end, in the evidence | cells | correlation |"
     yield "|---|---|---|"
-    for name, pairs in parts.items():
-        yield f"| {name} | {len(pairs)} | {_with_interval(pairs, 1000)} |"
+    for name in sorted(by_world, key=lambda name: (name != ALL, name)):
+        if len(by_world[name]) >= FEWEST:
+            yield f"| {name} | {len(by_world[name])} | {_with_interval(by_world[name], 1000)} |"
 
 
 def _interval(runs: Sequence[list[Figures]], name: str, draws: int) -> str:

@@ -15,12 +15,14 @@ import contextlib
 import logging
 import math
 import os
+import re
 import socket
 import sys
 import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, wait
 from datetime import timedelta
 from functools import cache, lru_cache
 from typing import Any, TypeVar
@@ -51,7 +53,10 @@ _T = TypeVar("_T")
 _Result = TypeVar("_Result")
 
 _OTHER_LAUNCHES = ("FSDP", "DEEPSPEED", "MEGATRON_LM", "PARALLELISM_CONFIG")
+_LAUNCHER = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+_UNSET = "Unset RANK and WORLD_SIZE if you did not start several processes"
 _MEETING = timedelta(minutes=10)  # of all processes, before any work
+_PATIENCE_S = 5.0  # until the others that are waited for are reported
 LARGE = 1_000_000  # numbers of a gradient that is a message of its own
 _LONGEST_STEP = timedelta(hours=2)  # until a process is given up that does not come to a sum: its disk may have stalled
 _AS_LONG_AS_IT_TAKES = timedelta(days=7)
@@ -229,19 +234,37 @@ def _meet(backend: str) -> None:
     """Wait for all processes, but less long than for one that is slow later.
 
     Raises:
+        InputError: The variables of a launcher are incomplete.
         UnreachableError: Not all have come.
     """
-    is_alone = os.environ.get("WORLD_SIZE", "1") == "1" or "MASTER_PORT" not in os.environ  # Accelerate knows others
-    if is_alone or torch.distributed.is_initialized():
+    rank, size, address, port = (os.environ.get(name, "") for name in _LAUNCHER)
+    if (rank or "0", size or "1") == ("0", "1") or torch.distributed.is_initialized():
         return
+    if not (rank.isdigit() and size.isdigit() and int(rank) < int(size) and address and port.isdigit()):
+        found = " ".join(f"{name}={os.environ[name]}" for name in _LAUNCHER if name in os.environ)
+        raise InputError(where="environment", found=found, needed=f"all of {', '.join(_LAUNCHER)}", fix=_UNSET)
+    meeting: Future[Any] = Future()
+    threading.Thread(target=_rendezvous, args=[meeting], daemon=True).start()  # signals are handled in this one
+    if not wait([meeting], _PATIENCE_S).done:
+        others = f"process {2 - int(rank)} of 2" if size == "2" else f"the other {int(size) - 1} of {size} processes"
+        _log.warning("Waiting for %s at %s:%s. %s", others, address, port, _UNSET)
     try:
-        store, rank, processes = next(rendezvous("env://", timeout=_MEETING))
+        store, number, processes = meeting.result()
     except RuntimeError as error:  # torch's DistError
-        found = f"not all {os.environ['WORLD_SIZE']} have come within {_MEETING.total_seconds():.0f} s: {error}"
+        joined = re.search(r"(\d+)/\d+ clients joined", str(error))
+        found = f"Only {joined[1]} of {size} processes" if joined else f"Not all {size} processes"
+        found = f"{found} joined within {_MEETING.total_seconds() / 60:.3g} minutes ({error})"
         fix = "Look at what the others said, and whether they reach MASTER_ADDR"
         raise UnreachableError(where="processes of this run", found=found, fix=fix) from None
     store.set_timeout(_LONGEST_STEP)
-    torch.distributed.init_process_group(backend, store=store, rank=rank, world_size=processes, timeout=_LONGEST_STEP)
+    torch.distributed.init_process_group(backend, store=store, rank=number, world_size=processes, timeout=_LONGEST_STEP)
+
+
+def _rendezvous(meeting: Future[Any]) -> None:
+    try:
+        meeting.set_result(next(rendezvous("env://", timeout=_MEETING)))
+    except Exception as error:
+        meeting.set_exception(error)
 
 
 def first_only(accelerator: Accelerator, work: Callable[[], _T]) -> _T | None:

@@ -93,6 +93,11 @@ def printable(text: str) -> str:
     return "".join(one if is_safe else one.encode("unicode_escape").decode() for one, is_safe in shown)
 
 
+def escaped(text: str) -> str:
+    r"""Return a text on one line, as names of third parties have to be in comments: line ends are escaped, as \n."""
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+
+
 def _short(text: str) -> str:
     if len(text) <= _MOST_CHARACTERS:
         return text
@@ -137,6 +142,11 @@ def refusal_of(error: OSError) -> tuple[str, str]:
     return f"{said} ({owned}; this process runs as uid {os.geteuid()})", fix
 
 
+def shell_command(*words: object) -> str:
+    """Return a command of this program as it is typed in a shell, with paths quoted where they need it."""
+    return shlex.join([_PACKAGE, *map(str, words)])
+
+
 def pip_install(extra: str = "") -> str:
     """Return the command that installs this package, or an extra of it, as it was installed: a checkout, or a wheel.
 
@@ -155,9 +165,12 @@ def pip_install(extra: str = "") -> str:
         constraints = "constraints.txt" if here else shlex.quote(str(clone / "constraints.txt"))
         place = f'"{"." if here else clone}{wanted}"' if extra else "." if here else shlex.quote(str(clone))
         return f"{_pip()} install -c {constraints} -e {place}"
-    if "archive_info" in origin:  # a wheel's file
+    if "url" in origin and "vcs_info" not in origin:  # a wheel, or a folder
         return f'{_pip()} install "{_PACKAGE}{wanted} @ {origin["url"]}"'
-    return f'{_pip()} install "{_PACKAGE}{wanted}"' if extra else f"{_pip()} install {_PACKAGE}"
+    # Not by the name alone: whoever registers it on an index could run code here.
+    from vjepa2_ac import __version__
+
+    return f'{_pip()} install "./vjepa2_ac-{__version__}-py3-none-any.whl{wanted}"'
 
 
 def require_library(module: str, *, where: str, called: str, extra: str) -> Any:

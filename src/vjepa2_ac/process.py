@@ -34,6 +34,7 @@ SAME_WITHIN_S = 0.5  # another signal is the same request: `timeout` and launche
 EXIT_STATUS = 75  # sysexits.h, EX_TEMPFAIL: the same command resumes
 _LEFT = frozenset({errno.EPIPE, errno.ECONNRESET})  # the reader has closed the stream
 _NAMES = ("stdout", "stderr")
+_SAFE_PATH = "PYTHONSAFEPATH"
 
 
 def is_first() -> bool:
@@ -97,6 +98,24 @@ def own_streams() -> Iterator[Callable[[], str]]:
             setattr(sys, name, before[name])
 
 
+# ---- processes that this one starts ----
+
+
+@contextlib.contextmanager
+def safe_imports() -> Iterator[None]:
+    """Let Python processes that are started within the context import nothing from the working directory.
+
+    Python puts the directory first for `-c` and `-m`, which multiprocessing uses: a user's `random.py` would be run.
+    """
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        os.environ.pop(_SAFE_PATH)
+        os.environ.update({} if before is None else {_SAFE_PATH: before})
+
+
 # ---- signals ----
 
 
@@ -134,6 +153,11 @@ class StopRequest:
         self._came_at = 0.0
 
     @property
+    def age_s(self) -> float:
+        """Seconds since the signal; 0: none."""
+        return time.monotonic() - self._came_at if self.number else 0.0
+
+    @property
     def reason(self) -> str | None:
         """The signal's name; None: none."""
         return signal.Signals(self.number).name if self.number else None
@@ -155,8 +179,20 @@ def stop_on_signals() -> Iterator[StopRequest]:
     """
     request = StopRequest()
     taken = [number for number in (*SIGNALS, HANG_UP) if signal.getsignal(number) is not signal.SIG_IGN]
-    with _handled(taken, request.take):
-        yield request
+    _requests.append(request)
+    try:
+        with _handled(taken, request.take):
+            yield request
+    finally:
+        _requests.remove(request)
+
+
+_requests: list[StopRequest] = []
+
+
+def stop_request() -> StopRequest:
+    """Return the record of `stop_on_signals`; outside of it an empty one."""
+    return _requests[-1] if _requests else StopRequest()
 
 
 @contextlib.contextmanager

@@ -7,13 +7,18 @@ imported when they are used; an installed package lists its own as entry points 
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Callable, Iterable, Mapping
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.machinery import ModuleSpec
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
+from types import ModuleType
+from typing import Any, NoReturn, TypeVar
 
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, ValidationInfo
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -35,11 +40,24 @@ class Registry:
     def __init__(self, kind: str, group: str, own: Mapping[str, str]) -> None:
         self.kind, self.group = kind, group
         self._things: dict[str, Any] = {name: f"vjepa2_ac.{place}" for name, place in own.items()}
+        self._origins: dict[str, str] = {**self._things}  # module:object of what has registered itself
+        self._distinct: set[str] = set()  # names that one package alone has
 
     def register(self, name: str) -> Callable[[_Thing], _Thing]:
-        """Return a decorator that adds a function or a class; a module that is imported twice may do so again."""
+        """Return a decorator that adds a function, a class or an object.
+
+        Raises:
+            InputError: Something else is registered by this name. A module that is loaded again may register again.
+        """
+        caller = sys._getframe(1).f_globals["__name__"]
 
         def add(thing: _Thing) -> _Thing:
+            path = getattr(thing, "__qualname__", "")  # an object has none, and does not know its module
+            origin = f"{getattr(thing, '__module__', caller) if path else caller}:{path}"
+            if self._origins.setdefault(name, origin) != origin:
+                found = f"registered by {_module(self._origins[name])} already"
+                raise InputError(where=f"{self.kind} {name!r}", found=found, fix="Choose another name")
+            _registered.append(_package(origin))
             self._things[name] = thing
             return thing
 
@@ -47,17 +65,26 @@ class Registry:
 
     def names(self) -> list[str]:
         """Return all names, those of this package first; nothing is imported."""
-        return list(dict.fromkeys([*self._things, *(one.name for one in entry_points(group=self.group))]))
+        return list(dict.fromkeys([*self._things, *(one.name for one in installed(self.group))]))
 
     def known(self, name: str) -> str:
-        """Return a name that is registered; installed packages are only looked through for one that is not yet known.
+        """Return a name that is registered; installed packages are searched once for each name.
 
         Raises:
-            ValueError: It is not; names those that are.
+            ValueError: It is not; the message lists the names that are.
+            InputError: Several packages have registered it.
         """
-        if name not in self._things and name not in (names := self.names()):
+        if name in self._distinct:
+            return name
+        if name not in (names := self.names()):
             known = ", ".join(map(repr, names))
             raise ValueError(f"no {self.kind} of this name. {did_you_mean(name, names)}Known are {known}")
+        origins = [self._origins.get(name), *(one.value for one in installed(self.group) if one.name == name)]
+        packages = {_package(origin): _module(origin) for origin in origins if origin}
+        if len(packages) > 1:
+            found = f"registered by {' and by '.join(packages.values())}"
+            raise InputError(where=f"{self.kind} {name!r}", found=found, fix="Rename or uninstall all but one")
+        self._distinct.add(name)
         return name
 
     def find(self, name: str) -> Any:
@@ -68,7 +95,7 @@ class Registry:
         """
         thing = self._things.get(self.known(name))
         if thing is None:
-            thing = next(one for one in entry_points(group=self.group) if one.name == name).load()
+            thing = load_installed(next(one for one in installed(self.group) if one.name == name))
         elif isinstance(thing, str):
             module, _, attribute = thing.partition(":")
             thing = getattr(import_module(module), attribute)
@@ -206,25 +233,122 @@ TRANSFORMS = Registry("transform", "vjepa2_ac.transforms", {})
 REGISTRIES = (SOURCES, LOSSES, PLANNERS, ENERGIES, METRICS, TRACKERS, TRANSFORMS)
 
 
+# ---- imports ----
+
+_US = "vjepa2_ac"
+_registered: list[str] = []  # packages, one for each thing that was registered
+_plugins: set[str] = set()  # modules that were imported and have registered something
+
+
+def installed(group: str) -> EntryPoints:
+    """Return the entry points of a group. Packages in the working directory are not installed."""
+    with _installed_only():
+        return _entry_points(group, tuple(sys.path))
+
+
+@cache
+def _entry_points(group: str, _path: tuple[str, ...]) -> EntryPoints:
+    return entry_points(group=group)
+
+
+def load_installed(entry_point: EntryPoint) -> Any:
+    """Return the object of an entry point.
+
+    Raises:
+        InputError: It cannot be imported.
+    """
+    with _installed_only():
+        return _imported(entry_point.load, f"{entry_point.name} = {entry_point.value}", entry_point.group)
+
+
 def import_plugins(modules: Iterable[str], *, where: str, here: bool = True) -> None:
     """Import the modules that register things.
 
     Args:
         modules: Their names, as `import` takes them.
         where: What names them, for messages.
-        here: Whether one may lie in the working directory. Not where a run or a model names it, which may be a
-            stranger's: its config imports what is installed, and nothing that came with it.
+        here: As for `import_user_module`.
 
     Raises:
-        InputError: One is not there, or fails.
+        InputError: As `import_user_module`; or a module registers nothing.
     """
     for module in modules:
-        try:
-            if here and find_spec(module) is None:
-                sys.path.append(str(Path.cwd()))
-            import_module(module)
-        except ModuleNotFoundError as error:
-            if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-                raise
+        before = len(_registered)
+        import_user_module(module, where=where, here=here)
+        if len(_registered) > before or _package(module) in _registered:
+            _plugins.add(module)
+        if module not in _plugins:
+            _refuse(module, where)
+
+
+def import_user_module(module: str, *, where: str, here: bool = True) -> ModuleType:
+    """Return a module of the user's.
+
+    Args:
+        module: Its name, as `import` takes it.
+        where: What names it, for messages.
+        here: Whether it may be in the working directory. False where a run names it, which may be a third party's:
+            then only installed packages that mention this one are imported.
+
+    Raises:
+        InputError: There is no such module, or it cannot be imported.
+    """
+    parts = module.split(".")
+    if not all(map(str.isidentifier, parts)) or "__main__" in parts or parts[0] == _US:
+        raise InputError(where=where, found=f"plugin {module!r}", needed="a module of yours, as in `import my_module`")
+    if module in sys.modules:
+        return sys.modules[module]
+    package = _package(module)
+    with contextlib.nullcontext() if here else _installed_only():
+        if here and find_spec(package) is None:
+            sys.path.append(str(Path.cwd()))
+        spec = find_spec(package)
+        if spec is None:
             fix = "Install it, or run where it is" if here else f"Install it, or name it by --plugin {module}"
-            raise InputError(where=where, found=f"plugin {module!r}: no such module", fix=fix) from None
+            raise InputError(where=where, found=f"plugin {module!r}: no such module", fix=fix)
+        if not (here or _mentions_us(spec)):
+            _refuse(module, where)
+        return _imported(lambda: import_module(module), f"plugin {module!r}", where)
+
+
+def _mentions_us(spec: ModuleSpec) -> bool:
+    """Return whether the files of a package mention this one, as all do that register something; imports nothing."""
+    files = [Path(spec.origin)] if spec.has_location and spec.origin else []
+    files += [file for folder in spec.submodule_search_locations or () for file in Path(folder).rglob("*.py")]
+    return any(_US.encode() in file.read_bytes() for file in files)
+
+
+def _refuse(module: str, where: str) -> NoReturn:
+    found, needed = f"plugin {module!r} registers nothing", "a module that registers a loss, a planner, …"
+    raise InputError(where=where, found=found, needed=needed, fix="docs/extending.md has a recipe for each")
+
+
+@contextlib.contextmanager
+def _installed_only() -> Iterator[None]:
+    """Import nothing from the working directory, within the context: `python -m` puts it first."""
+    before = sys.path[:]
+    sys.path[:] = [path for path in before if not (Path(path).exists() and Path(path).samefile("."))]
+    try:
+        yield
+    finally:
+        sys.path[:] = [*before, *(path for path in sys.path if path not in before)]
+
+
+def _imported(load: Callable[[], _Thing], what: str, where: str) -> _Thing:
+    """Return what is imported; any exception becomes one error with the line of the plug-in."""
+    try:
+        return load()
+    except (Exception, SystemExit) as error:
+        lines = [one for one in traceback.extract_tb(error.__traceback__) if "importlib" not in one.filename]
+        place = next((f"; {one.filename}, line {one.lineno}" for one in lines if one.filename != __file__), "")
+        cause = f"{type(error).__name__}: {error}".splitlines()[0]
+        fix = "Correct or leave out the plug-in"
+        raise InputError(where=where, found=f"{what} cannot be imported ({cause}{place})", fix=fix) from error
+
+
+def _module(origin: str) -> str:
+    return origin.partition(":")[0]
+
+
+def _package(origin: str) -> str:
+    return _module(origin).partition(".")[0]

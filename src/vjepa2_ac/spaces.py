@@ -71,6 +71,13 @@ def rotation_angles(rotations: Float[np.ndarray, "count 3"]) -> Float[np.ndarray
     return np.asarray(Rotation.from_euler("xyz", rotations).magnitude())
 
 
+def step_sizes(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time-1 2"]:
+    """Return the distance, in metres, and the angle of the rotation, in radians, from each pose to the next."""
+    rotations = Rotation.from_euler("xyz", states[:, 3:6])
+    moved, turned = np.diff(states[:, :3], axis=0), (rotations[1:] * rotations[:-1].inv()).magnitude()
+    return np.column_stack([np.linalg.norm(moved, axis=1), turned])
+
+
 def apply_action(
     state: Float[np.ndarray, "*batch 7"], action: Float[np.ndarray, "*batch 7"]
 ) -> Float[np.ndarray, "*batch 7"]:

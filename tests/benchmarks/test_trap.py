@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from paths import ROOT
@@ -49,3 +50,31 @@ def test_what_was_measured_of_a_cure_that_is_gone_stays_in_the_tables_with_a_not
     (tmp_path / "trap.json").write_text(json.dumps(cells))
     trap.tables.write_tables(tmp_path, None)
     assert "contrast" not in (tmp_path / "trap.md").read_text()
+
+
+def test_errors_of_the_evidence_are_compared_with_the_distance_at_the_end_and_worlds_are_not_mixed(
+    trap: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spearman = trap.tables._spearman
+    monkeypatch.setattr(trap.tables, "_with_interval", lambda pairs, _: f"{spearman(np.concatenate(pairs)):+.2f}")
+
+    def cell(shift: str, error: float, way_cm: list[float], **reach: object) -> dict[str, object]:
+        about = {"shift": shift, "base": "none"}
+        l1 = {"distance_cm": [way_cm], **reach}
+        return {"cell": about, "shifted": {"rollout_over_persistence": [error]}, "reach": {"l1": l1}}
+
+    cells = [cell("look", error, [30.0 - 3 * error, error]) for error in range(1, 10)]  # the mean falls with the error
+    cells += [cell("Lift", error, [0.0, -error], solved=[True]) for error in range(1, 10)]
+    cells += [cell("motion", 1.0, [0.0, 1.0])] * 2
+    (tmp_path / "evidence.json").write_text(json.dumps(cells))
+    rows = [line.strip("| ").split(" | ") for line in trap.tables._of_evidence(tmp_path)][2:]
+    assert [row[:2] for row in rows] == [
+        ["simulated arm, all changes", "11"], ["Lift, base of none", "9"], ["look, base of none", "9"],
+    ]  # fmt: skip
+    assert [row[2] for row in rows[1:]] == ["-1.00", "+1.00"]
+
+
+def test_the_published_table_is_made_from_the_published_cells(trap: Any) -> None:
+    results = ROOT / "benchmarks/results"
+    rows = [line for line in trap.tables._of_evidence(results) if line.startswith("| simulated arm")]
+    assert rows[0] in (results / "trap.md").read_text()

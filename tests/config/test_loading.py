@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from pydantic import BaseModel
 
 from paths import ROOT
 from vjepa2_ac.cli import main
@@ -16,10 +17,12 @@ from vjepa2_ac.config.loading import (
     config_path,
     config_schema,
     load_config,
+    load_config_of_run,
     packaged_configs,
     parse_config,
 )
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.registry import ENERGIES, LOSSES, PLANNERS, TRACKERS, TRANSFORMS, Registry
 
 MINIMAL = {"run_dir": "runs/x", "data": {"path": "d"}, "model": {"base": "b.pt"}}
 
@@ -201,3 +204,52 @@ def test_gripper_key_of_an_older_run_is_read(older: str, values: tuple[float, fl
     config = parse_config({"run_dir": "none", "data": data, "model": {"base": "builtin:sim-tiny"}}, where="x").data
     assert (config.fields.gripper_open, config.fields.gripper_closed) == values
     assert config.fields.control_rate_hz == 5.0
+
+
+class AlphaOptions(BaseModel, extra="forbid"):
+    alpha: float
+
+
+class WithAlpha:
+    Config = AlphaOptions
+
+
+@pytest.mark.parametrize(
+    ("registry", "section", "values"),
+    [
+        (LOSSES, "training.loss_options", {"loss": "mine", "loss_options": {"alhpa": 1}}),
+        (PLANNERS, "planning.planner_options", {"planner": "mine", "planner_options": {"alhpa": 1}}),
+        (ENERGIES, "planning.energy.options", {"energy": {"distance": "mine", "options": {"alhpa": 1}}}),
+        (TRACKERS, "tracking.others.mine", {"others": {"mine": {"alhpa": 1}}}),
+        (TRANSFORMS, "data.transforms.0.options", {"transforms": [{"name": "mine", "options": {"alhpa": 1}}]}),
+    ],
+)
+def test_a_wrong_option_is_named_by_its_whole_key(
+    monkeypatch: pytest.MonkeyPatch, registry: Registry, section: str, values: dict
+) -> None:
+    monkeypatch.setitem(registry._things, "mine", WithAlpha)
+    name = section.partition(".")[0]
+    with pytest.raises(InputError) as caught:
+        parse_config(MINIMAL | {name: {**MINIMAL.get(name, {}), **values}}, where="x.yaml")
+    lines = str(caught.value).splitlines()
+    assert f"  {section}.alhpa: unknown key; did you mean alpha?" in lines
+    assert f"  {section}.alpha: missing; it has no default" in lines
+
+
+def test_options_that_are_needed_are_asked_for_even_if_none_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(LOSSES._things, "mine", WithAlpha)
+    with pytest.raises(InputError, match=r"training\.loss_options\.alpha: missing"):
+        parse_config(MINIMAL | {"training": {"loss": "mine"}}, where="x.yaml")
+    with pytest.raises(InputError, match=r"training\.loss_options: loss 'l1' has no options of its own"):
+        parse_config(MINIMAL | {"training": {"loss_options": {"a": 1}}}, where="x.yaml")
+
+
+def test_a_config_larger_than_a_megabyte_is_refused_before_it_is_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vjepa2_ac.config.loading.parse_yaml", lambda *_, **__: pytest.fail("parsed"))
+    path = tmp_path / "config.yaml"
+    path.write_text("#" * 1_000_001)
+    for read in (load_config, load_config_of_run):
+        with pytest.raises(InputError, match="more than 1,000,000 bytes"):
+            read(path)

@@ -141,6 +141,7 @@ def droid_sized() -> EpisodeTable:
         ids=names,
         id_hash=np.array([int.from_bytes(hashlib.sha256(name).digest()[:8], "big") for name in names], np.uint64),
         id_rank=np.argsort(np.argsort(names)).astype(np.int32),
+        motion=np.zeros((count, 8), np.float32),
     )
 
 

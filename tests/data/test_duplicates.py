@@ -116,6 +116,24 @@ def test_no_copies_and_episodes_that_were_not_looked_at_are_none() -> None:
     assert find_duplicates(in_memory([1, 2, 3, UNKNOWN, UNKNOWN])) == Duplicates(is_known=True)
 
 
+def test_copies_with_noise_or_rounding_are_found_and_similar_episodes_are_not(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+
+    def near(number: int) -> list[np.ndarray]:
+        states = synthetic_states(STEPS, seed=number)
+        return [states, states + generator.normal(0, 1e-6, states.shape), np.round(states, 4), states + 2e-3]
+
+    folder = tmp_path / "set"
+    folder.mkdir()
+    frames = np.random.default_rng(0).integers(0, 255, (STEPS, 8, 8, 3)).astype(np.uint8)
+    still = np.tile([0.4, 0, 0.4, 3, 0, 0, 0], (STEPS, 1)) + generator.normal(0, 1e-6, (3, STEPS, 7))
+    states = {f"{number}{how}": one for number in range(3) for how, one in enumerate(near(number))}
+    for name, one in (states | {f"still {number}": one for number, one in enumerate(still)}).items():
+        np.savez(folder / f"{name}.npz", states=one, frames=frames, fps_hz=15.0)
+    found = find_duplicates(open_dataset(config_of("npz", folder, tmp_path)))
+    assert (found.episodes, found.different, found.copies) == (9, 3, ("01", "02", "11", "12", "21", "22"))
+
+
 def test_what_is_left_out_is_no_copy() -> None:
     dataset = in_memory([7, 7, 8])
     without = dataset.config.model_copy(update={"exclude": (dataset.table.identity(1),)})

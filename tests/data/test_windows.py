@@ -55,6 +55,17 @@ def test_neighbours_do_not_stay_together() -> None:
     assert abs(np.corrcoef(np.arange(4_000), places)[0, 1]) < 0.05
 
 
+def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> None:
+    table = EpisodeTable.of([EpisodeInfo("a", 40), EpisodeInfo("b", 20)])
+    kept = StepSelection(*(np.array(column, np.int32) for column in ([0, 0, 1], [3, 20, 0], [16, 31, 20])))
+    config = settings_of(frames=3, stride=2, start_every=4)
+    starts = clip_starts(table, kept, config)
+    found = [
+        (int(starts.episode[run]), step) for run in range(len(starts.first)) for step in starts.steps_of(run).tolist()
+    ]
+    assert found == [(0, 3), (0, 7), (0, 11), (0, 23), (1, 0), (1, 4), (1, 8), (1, 12)]
+
+
 def test_an_epoch_sees_every_window_once() -> None:
     windows = windows_of(episodes(10, 25, 12, 13), settings_of(**ALL_TRAIN), "train")
     order = ClipOrder(windows, seed=3)

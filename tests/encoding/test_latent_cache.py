@@ -26,7 +26,6 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, frames_of, open_dataset
-from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
@@ -43,7 +42,6 @@ from vjepa2_ac.data.sources.latents.cache_files import (
     unpack_latents,
 )
 from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
-from vjepa2_ac.data.windows import clip_starts
 from vjepa2_ac.encoding import batch
 from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
@@ -167,6 +165,41 @@ def test_a_strangers_file_that_is_not_what_it_should_be_is_an_error_for_the_user
         read_all(files)
 
 
+def with_nan(tensors: dict[str, torch.Tensor], _: object) -> None:
+    tensors["states"][2, 1] = torch.nan
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_nan, r"states: step 2: the numbers .*finite numbers"),
+        (lambda tensors, _: tensors.update(states=tensors["states"][:3]), r"states: shape \(3, 7\).*needed: 40 x 7"),
+        (lambda tensors, _: tensors.update(states=tensors["states"][:, :3]), r"states: shape \(40, 3\)"),
+        (lambda tensors, _: tensors.update(states=tensors["states"][0]), r"states: shape \(7,\)"),
+        (lambda tensors, _: tensors.update(states=tensors["states"] * 1000), r"states: step 0: .*like millimetres"),
+        (lambda tensors, _: tensors.update(extrinsics=torch.zeros(3, 6)), r"extrinsics: shape \(3, 6\)"),
+        (lambda tensors, _: tensors.pop("states"), r"not a whole file of latents"),
+    ],
+)
+def test_states_of_a_third_partys_cache_are_checked_as_those_of_any_source(
+    tmp_path: Path, change: Callable[..., object], message: str
+) -> None:
+    through = open_dataset(cached_config(tmp_path))
+    files = sorted((Path(through.config.path) / "episodes/000").glob("*.safetensors"))
+    through.source.read(1)
+    changed(files[1], change)
+    with pytest.raises(InputError, match=rf"(?s)000001-.*{message}"):
+        through.source.read(1)
+
+
+def cached_config(tmp_path: Path) -> DataConfig:
+    folder = write_synthetic_droid(tmp_path / "1.0.0", episodes=4, steps=40)
+    config = DataConfig.model_validate(
+        {"path": str(folder), "frames": 3, "stride": 2, "workers": 0, "disk_cache": {"dir": str(tmp_path / "cache")}}
+    )
+    return config.as_kind("latents", path=str(write_cache(open_dataset(config))), camera=config.cameras)
+
+
 def test_a_step_that_was_not_encoded_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no frame of control step 3"):
         written(tmp_path).open(0, "left").places_of([2, 3])
@@ -279,17 +312,6 @@ def test_a_cache_has_the_clips_of_its_data_set_in_their_order(
             list(validation_batches(other, "validation", clips=9, batch_size=4)),
         )
     assert by_itself.control_rate_hz == original.control_rate_hz
-
-
-def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> None:
-    table = EpisodeTable.of([EpisodeInfo("a", 40), EpisodeInfo("b", 20)])
-    kept = StepSelection(*(np.array(column, np.int32) for column in ([0, 0, 1], [3, 20, 0], [16, 31, 20])))
-    config = DataConfig(path="nowhere", frames=3, stride=2, start_every=4)
-    starts = clip_starts(table, kept, config)
-    found = [
-        (int(starts.episode[run]), step) for run in range(len(starts.first)) for step in starts.steps_of(run).tolist()
-    ]
-    assert found == [(0, 3), (0, 7), (0, 11), (0, 23), (1, 0), (1, 4), (1, 8), (1, 12)]
 
 
 def test_needed_frames_are_those_of_the_clips_of_all_splits(droid_with_rests: Path, tmp_path: Path) -> None:

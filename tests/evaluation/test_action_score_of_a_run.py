@@ -7,14 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from adapted_run import write_adapted_run
 from run_fixtures import SilentReporter, tiny_config
+from vjepa2_ac.api import load_model
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import action_score as measure
 from vjepa2_ac.evaluation import evaluate
 from vjepa2_ac.evaluation.request import SCORED, EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.prior.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
 from vjepa2_ac.reports.write import evaluate_subject
 
 QUICK = {"sensitivity_clips": 0, "examples": 0}
@@ -75,9 +78,9 @@ def test_a_trained_model_plans_merged_and_its_errors_are_measured_unmerged(
     planned: list[bool] = []
     measure = evaluate.measure_plans
 
-    def noting(model: WorldModel, starts: Any, *more: Any) -> Any:
+    def noting(model: WorldModel, starts: Any, *more: Any, **others: Any) -> Any:
         planned.append(model.adaptation is None)
-        return measure(model, starts, *more)
+        return measure(model, starts, *more, **others)
 
     monkeypatch.setattr(evaluate, "measure_plans", noting)
     asking = EvaluationOptions(
@@ -111,3 +114,29 @@ def test_clips_too_short_to_plan_on_are_refused_before_any_data_are_read(tmp_pat
     with pytest.raises(InputError, match=r"--planning: clips of 3 frames \(data\.frames\).*4 or more"):
         evaluate_subject("model", options)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_prior_that_is_not_there_is_refused_before_any_data_are_read(tmp_path: Path) -> None:
+    setting = f"planning.prior={tmp_path / 'nowhere'}"
+    options = replace(asked(tmp_path, Path("no such data"), Path("no such model")), planning=(setting,))
+    with pytest.raises(InputError, match=r"nowhere/prior\.json"):
+        evaluate_subject("no such model", options)
+
+
+@pytest.mark.usefixtures("quick")
+def test_one_step_plans_of_a_run_start_from_the_prior_of_its_encoder(
+    tmp_path: Path, data_folder: Path, base_folder: Path
+) -> None:
+    model = load_model(base_folder, device="cpu")
+    sizes = PriorSizes(model.image_size // model.sizes.patch_size, model.latent_dim, 7, 7, 4)
+    prior = ActionPrior(sizes)
+    with torch.no_grad():
+        prior.outer.weight.zero_()
+        prior.outer.bias.copy_(torch.tensor([0.0, 0.01, -0.02, *[0.0] * 4, *[-3.0] * 7]))
+    card = PriorCard("vjepa2-ac prior 1", sizes, model.encoder_fingerprint(), "released", "nowhere", 0)
+    save_prior(tmp_path / "prior", card, prior)
+    settings = f"planning.prior={tmp_path / 'prior'}", "planning.planner=prior"
+    options = replace(asked(tmp_path, data_folder, base_folder), planning=settings)
+    plans = evaluate_subject(str(base_folder), options).evaluation.models["model"].plans
+    assert plans is not None
+    np.testing.assert_allclose(plans.one_step[..., :3], np.broadcast_to([0.0, 0.01, -0.02], (1, 3, 3)), atol=1e-6)

@@ -126,7 +126,7 @@ def test_a_part_counts_its_own_steps_only(oracle: Evaluation) -> None:
     nothing = errors.of("teacher_forced", way="persistence")
     made_up = np.where(first, 2 * nothing, nothing / 4)
     errors = replace(errors, arrays={**errors.arrays, ("true", "teacher_forced", "l1"): made_up})
-    for part, value in ((Stratum("first", "motion", first), 2.0), (Stratum("rest", "motion", ~first), 0.25)):
+    for part, value in ((Stratum("motion.first", "first", first), 2.0), (Stratum("motion.rest", "rest", ~first), 0.25)):
         assert one_step_over_persistence(errors, "true", part).value == pytest.approx(value)
         assert stratum_gain(errors, base, part).value == pytest.approx(1 - value)
 

@@ -37,9 +37,15 @@ def test_vectors_move_beside_their_largest_ones() -> None:
     assert not of([0.0, 0.0], space=vector_actions(2, "change")).moving.any(), "nothing at all is no motion"
 
 
-def test_thirds_are_named_by_their_range_and_what_is_empty_is_left_out() -> None:
+@pytest.mark.parametrize(("step_m", "labels"), [(0.01, ("1 to 2", "3 to 4", "5 to 6")), (1e-6, ("0.0001 to 0.0002",))])
+def test_thirds_have_the_same_keys_for_all_data_and_show_their_range(step_m: float, labels: tuple[str, ...]) -> None:
+    parts = strata_of(of(*([step_m * n, 0, 0, 0, 0, 0, 0] for n in range(1, 7))), POSE_CHANGE)
+    thirds = [part for part in parts if part.key.startswith("action_size.")]
+    assert [part.key for part in thirds] == [f"action_size.{size}" for size in ("small", "medium", "large")]
+    for part, size, label in zip(thirds, ("small", "medium", "large"), labels, strict=False):
+        assert part.label == f"{size}: {label} cm"
+
+
+def test_empty_strata_are_left_out() -> None:
     still = strata_of(of([0.0] * 7, [0.0] * 7), POSE_CHANGE)
-    assert [(part.name, int(part.steps.sum())) for part in still] == [("idle", 2), ("0.0 to 0.0 cm", 2)]
-    parts = strata_of(of(*([0.01 * n, 0, 0, 0, 0, 0, 0] for n in range(1, 7))), POSE_CHANGE)
-    names = [part.name for part in parts if part.kind == "action size"]
-    assert names == ["1.0 to 2.0 cm", "3.0 to 4.0 cm", "5.0 to 6.0 cm"]
+    assert [(part.label, int(part.steps.sum())) for part in still] == [("idle", 2), ("large: 0 to 0 cm", 2)]

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.config.loading import config_as_yaml, parse_config
 from vjepa2_ac.init import draft
 from vjepa2_ac.init.draft import Machine, choose_model, duration, make_draft
 from vjepa2_ac.init.found import FoundData, Knob, plain
@@ -55,6 +55,25 @@ def test_the_text_is_the_config() -> None:
     for kind in ("released", "scratch"):
         made = of(kind=kind)
         assert parse_config(parse_yaml(made.text(FOUND, MACHINE), where="here"), where="here") == made.config
+
+
+BREAKS = ("\n", "\r", "\x85", "\u2028", "\u2029", "\t", "\x07", "\ufffe", " #", ": ", "'", '"', "\\", "`", "- ")
+
+
+@pytest.mark.parametrize("between", BREAKS)
+def test_names_of_third_parties_never_become_keys(between: str) -> None:
+    name = f"a{between}plugins: [evil]{between}#"
+    values = {"path": name, "camera": name, "cameras": {name: name, "b": name}, "columns": [name, name]}
+    knobs = {"data": {key: Knob(value, name, is_guess=True) for key, value in values.items()}}
+    found = replace(FOUND, path=name, about=(name,))
+    text = draft.Draft(knobs, None, [name]).text(found, replace(MACHINE, gpu=name))
+    head, _, _ = text.partition("\n\n")
+    assert all(line.startswith("# ") for line in head.splitlines())
+    assert parse_yaml(text, where="here") == {"data": values}
+    made = of(found)
+    read = parse_config(parse_yaml(made.text(found, MACHINE), where="here"), where="here")
+    assert read == made.config
+    assert parse_config(parse_yaml(config_as_yaml(read), where="run"), where="run") == read
 
 
 def test_without_a_gpu_the_batch_is_of_a_usual_one_and_no_hours_are_promised() -> None:

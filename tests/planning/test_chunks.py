@@ -61,6 +61,11 @@ def test_what_is_no_chunk_is_refused(chunks: np.ndarray, found: str) -> None:
         changes_of_chunks(chunks, STATE, form="targets", control_steps=4)
 
 
+def test_a_state_of_other_numbers_is_refused() -> None:
+    with pytest.raises(InputError, match=r"state: .*5"):
+        changes_of_chunks(np.zeros((2, 8, 7)), STATE[:5], form="targets", control_steps=4)
+
+
 def test_scores_are_the_planners_energies_and_leave_no_trace() -> None:
     run = Controller(tiny_model(), QUICK)
     run.reset(image(100))

@@ -5,12 +5,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from decisions import STATE, image
 from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_model
-from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import CemConfig, EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.registry import ENERGIES
 from vjepa2_ac.spaces import Spaces, apply_action
 
 
@@ -206,3 +209,37 @@ def test_what_all_samples_share_keeps_no_graph_of_an_adapters_weights() -> None:
 def test_a_model_in_training_mode_is_refused() -> None:
     with pytest.raises(ValueError, match="eval"):
         cost(tiny_model(adapted=True).train())
+
+
+def test_an_energy_that_is_a_class_is_constructed_once_for_a_controller(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    class Counted:
+        def __init__(self) -> None:
+            made.append(self)
+
+        def __call__(self, predicted: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+            return (predicted - wanted).abs().mean(dim=-1)
+
+    monkeypatch.setitem(ENERGIES._things, "counted", Counted)
+    energy = EnergyConfig(distance="counted", samples_at_once=3)
+    run = Controller(tiny_model(), PlanningConfig(samples=8, iterations=2, cem=CemConfig(elites=3), energy=energy))
+    run.reset(image(100), image(101), durations=(1,))
+    for seed in range(2):
+        run.act(image(seed), STATE)
+    run.score(image(2), STATE, np.zeros((2, 1, 7)))
+    assert len(made) == 1
+
+
+def test_a_model_in_bfloat16_plans_on_a_cpu_as_in_float32_to_its_precision() -> None:
+    energies, tried = [], actions(6, 2)
+    for dtype in (torch.float32, torch.bfloat16):
+        config = PlanningConfig(samples=8, iterations=2, horizon=2, cem=CemConfig(elites=3))
+        run = Controller(tiny_model().to(dtype), config)
+        run.reset(image(100))
+        assert np.isfinite(run.act(image(0), STATE)).all()
+        assert (np.abs(run.decision.action[:3]) <= 0.05).all()
+        with torch.no_grad():
+            energies.append(run.decision.cost(tried))
+    torch.testing.assert_close(energies[1], energies[0], rtol=0.03, atol=0.0)
+    assert energies[1].std() > 0

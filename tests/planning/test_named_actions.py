@@ -57,6 +57,12 @@ def test_steps_are_as_long_as_asked_and_never_beyond_the_limits() -> None:
         named_actions("up", 1, limits=taught)
     with pytest.raises(InputError, match=r"planning\.limits\.gripper: 0"):
         named_actions("close", 1, limits=LimitsConfig(gripper=0.0))
+    for name in ("close", "open"):
+        with pytest.raises(InputError, match=rf"planning\.limits\.gripper_mode: held, so that nothing can move {name}"):
+            named_actions(name, 1, limits=LimitsConfig(gripper_mode="held"))
+    for size in (0.0, -0.01, float("nan"), float("inf")):
+        with pytest.raises(InputError, match=r"--size: .* cm a step"):
+            named_actions("up", 1, size_m=size)
     with pytest.raises(InputError, match="one of none, up, down"):
         named_actions("sideways", 1)
     with pytest.raises(ValueError, match="0 steps"):

@@ -15,6 +15,7 @@ from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.prior.action_prior import (
     CARD,
     WEIGHTS,
@@ -24,7 +25,7 @@ from vjepa2_ac.planning.prior.action_prior import (
     load_prior,
     save_prior,
 )
-from vjepa2_ac.planning.prior.train_prior import PriorOptions, _Pairs, train_prior
+from vjepa2_ac.planning.prior.train_prior import PriorOptions, _Pairs, prior_loss, train_prior
 
 SIZES = PriorSizes(grid=3, dim=24, state=7, action=7, ahead=3)
 MEAN = (0.03, -0.02, 0.01, 0.0, 0.0, 0.0, 0.3)
@@ -105,9 +106,9 @@ def test_it_is_refused_for_another_encoder_and_where_a_file_is_damaged(folder: P
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
-        ({"planner": "prior"}, "planner: prior needs prior"),
-        ({"prior": "x", "warm_start": True}, "prior: x excludes warm_start"),
-        ({"prior": "x", "views": 2}, "views: 2 excludes prior"),
+        ({"planner": "prior"}, "planner=prior needs prior"),
+        ({"prior": "x", "warm_start": True}, "prior excludes warm_start"),
+        ({"prior": "x", "views": 2}, "views excludes prior"),
     ],
 )
 def test_settings_that_contradict_are_refused(changes: dict[str, object], found: str) -> None:
@@ -178,3 +179,20 @@ def test_the_command_writes_it_beside_the_run_and_says_how_to_plan(
     assert "of doing nothing" in said
     assert "planning.prior=" in said
     assert main(["prior", str(tmp_path)]) == 2
+
+
+def test_the_deviation_does_not_pull_the_mean() -> None:
+    changes = torch.tensor([[0.5, -1.0, 2.0]])
+    gradients = []
+    for deviation in (0.01, 1.0, 100.0):
+        mean = torch.zeros(1, 3, requires_grad=True)
+        prior_loss(mean, torch.full((1, 3), deviation), changes).backward()
+        gradients.append(mean.grad)
+    for gradient in gradients:
+        torch.testing.assert_close(gradient, -changes.sign() / 3)
+
+
+def test_a_command_without_a_prior_refuses_the_planner_of_that_name() -> None:
+    config = PlanningConfig(planner="prior", prior="nowhere")
+    with pytest.raises(InputError, match=r"planning\.planner: prior, in a command that loads none"):
+        Planner(config).plan(lambda actions: actions.sum(dim=(1, 2)), torch.Generator())

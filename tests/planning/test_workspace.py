@@ -96,7 +96,7 @@ def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -
     run = controller(workspace=CORNERS)
     action = run.act(image(0), position(0.63, 0.0, 0.3))
     assert action[0] <= -0.03 + SLACK
-    action = run.act(image(0), position(0.7, 0.0, 0.3))
+    action = run.act(image(1), position(0.7, 0.0, 0.3))
     assert not action.any()
     assert run.decision.why == "outside the workspace"
     assert run.decision.plan is None

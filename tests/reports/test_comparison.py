@@ -111,6 +111,34 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     assert np.array(everything["models"]["adapter"]["landscapes"]["maps"][0]["energy"]).shape == (3, 3, 3)
 
 
+def test_the_cost_of_wrong_actions_follows_from_the_errors_in_the_file(tmp_path: Path) -> None:
+    folder = written(tmp_path / "one", Halfway())
+    errors = json.loads((folder / METRICS_FILE).read_text())["by_clip"]["one_step"]["adapter"]
+    true, shuffled, persistence = (np.mean(errors[way]) for way in ("true", "shuffled", "persistence"))
+    metrics = read_metrics(folder)
+    assert metrics.of("cost_of_actions.shuffled").value == pytest.approx(shuffled / true - 1, rel=1e-5)
+    assert metrics.of("gap_of_actions.shuffled").value == pytest.approx((shuffled - true) / persistence, rel=1e-5)
+    assert metrics.of("one_step.zero").value == pytest.approx(np.mean(errors["zero"]) / persistence, rel=1e-5)
+    assert metrics.answer.uses_actions.share == metrics.of("cost_of_actions.shuffled").value
+
+
+def test_a_run_of_an_older_version_is_compared(tmp_path: Path) -> None:
+    """Keys of strata contained numbers of the data, and one-step errors by clip were absent."""
+    one, other = written(tmp_path / "one", Halfway()), written(tmp_path / "other", Halfway())
+    text = (other / METRICS_FILE).read_text()
+    assert "one_step.action_size.small" in text
+    metrics = json.loads(text.replace(".action_size.small", ".action size.0.0 to 1.2 cm"))
+    del metrics["by_clip"]["one_step"]
+    (other / METRICS_FILE).write_text(json.dumps(metrics))
+    found = compare([one, other])
+    models = {row.model for row in found.rows if row.key == "one_step.action_size.medium"}
+    assert models == {"one", "other"}
+    assert {row.model for row in found.rows if row.key == "one_step.action_size.small"} == {"one"}
+    table, paper = write_tables(found.rows, tmp_path / "comparison.png")
+    assert "one_step.action size.0.0 to 1.2 cm" in table.read_text()
+    assert "small: " in paper.read_text()
+
+
 def test_tables_for_a_paper_have_every_row_and_escape_names(tmp_path: Path) -> None:
     found = compare([written(tmp_path / "half_1", Halfway()), written(tmp_path / "100%", Copier())])
     table, paper = write_tables(found.rows, tmp_path / "comparison.png")

@@ -215,6 +215,17 @@ def test_the_card_describes_unusual_adapter_settings(trained, tmp_path: Path, da
     assert "warm-up: 1 step\n" in card
 
 
+def test_names_are_no_markup_in_the_card(trained, tmp_path: Path) -> None:
+    run = shutil.copytree(trained(), tmp_path / "<svg onload=a()>\n```\n# x: y`")
+    export_run(run, tmp_path / "hub", "hub")
+    card = (tmp_path / "hub" / CARD).read_text()
+    name = r"<svg onload=a()>\n```\n# x: y`"
+    assert f"\n# `{name.replace('`', '_')}`: a LoRA adapter" in card
+    outside = re.sub(r"^```\w*\n.*?^```$|`[^`\n]*`", "", card.partition("\n---\n")[2], flags=re.DOTALL | re.MULTILINE)
+    assert "<svg" not in outside
+    assert "# x" not in outside
+
+
 @pytest.mark.parametrize("sizes", [{}, {"model__sizes": TINY}], ids=["released sizes", "other sizes"])
 def test_the_code_of_the_card_runs(trained, tmp_path: Path, sizes: dict[str, Any]) -> None:
     run = trained(**sizes)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, shell_command
 
 if TYPE_CHECKING:
     import ssl
@@ -80,6 +79,8 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
     text = "instead of our arm a program in an environment of its own: 'PYTHON examples/worlds/robosuite.py Lift'"
     cli.add(parser, "--world COMMAND", text)
+    text = "longest wait for an answer of that program; for its first one, with loading, five times as long (120)"
+    cli.add(parser, "--world-timeout SECONDS", text, cli.number_between(0, 86_400, "seconds"))
     group = parser.add_argument_group("to test a model")
     cli.add_all(group)
     cli.add_checkpoint(group, default=None)
@@ -203,6 +204,8 @@ def _simulate(options: argparse.Namespace) -> int:
     """
     if options.world is not None:
         _refuse(options, ("task", "domain"), needed="none: the world has its own")
+    elif options.world_timeout is not None:
+        raise InputError(where="--world-timeout", found="no --world", needed="the program that it applies to")
     options.domain = options.domain or "A"
     if options.subject == "record":
         _refuse(options, _OF_A_MODEL, needed="a model that steers")
@@ -242,11 +245,11 @@ def _record_world(options: argparse.Namespace, target: Path) -> int:
     from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld
     from vjepa2_ac.simulation.recording.record_world import record_world
 
-    with OtherWorld(options.world) as world, cli.reporter() as reporter:
+    with OtherWorld(options.world, options.world_timeout) as world, cli.reporter() as reporter:
         seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
         solved, shown = record_world(world, target, seeds, reporter.task("recording"))
     done = f"the expert solved {solved} of {shown}, the others are play"
-    cli.show(f"{len(seeds)} episodes are in {target}; {done}. Next: vjepa2-ac init {target}")
+    cli.show(f"{len(seeds)} episodes are in {target}; {done}. Next: {shell_command('init', target)}")
     return 0
 
 
@@ -298,10 +301,9 @@ def _in_our_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: P
 def _in_their_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: Path) -> Benchmark:
     from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld, run_world_benchmark
 
-    with OtherWorld(options.world) as world, _agent(options) as agent, cli.reporter() as reporter:
-        about = world.about
-        name = re.sub(r"\W+", "-", f"{about.task} {about.world}").strip("-")
-        return run_world_benchmark(agent, world, chosen, options.out or home / name, reporter)
+    with OtherWorld(options.world, options.world_timeout) as env, _agent(options) as agent, cli.reporter() as reporter:
+        name = re.sub(r"\W+", "-", f"{env.about.task} {env.about.world}", flags=re.ASCII).strip("-")[:200]
+        return run_world_benchmark(agent, env, chosen, options.out or home / name, reporter)
 
 
 def _answer(benchmark: ClosedLoopBenchmark) -> Answer:
@@ -310,7 +312,7 @@ def _answer(benchmark: ClosedLoopBenchmark) -> Answer:
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
     agent, trials = benchmark.agent, benchmark.trials
-    how = "" if cli.is_server(agent.subject) else f"vjepa2-ac evaluate {agent.subject}"
+    how = "" if cli.is_server(agent.subject) else shell_command("evaluate", agent.subject)
     unknown = not_measured("predicts", how), not_measured("uses actions", how)
     measured = f"{trials.task_name}, {trials.place}, {trials.model_steps} steps of {trials.seconds_per_step:.2f} s"
     found = Answer(agent.subject, measured, "doing nothing", *unknown, benchmark.plans)
@@ -324,15 +326,15 @@ def _answer(benchmark: ClosedLoopBenchmark) -> Answer:
 def _next(answer: Answer, options: argparse.Namespace) -> str:
     """Return the command that follows from the answer of a closed loop."""
     if answer.plans.why:
-        what = f"--task {options.task or 'reach'}" if options.world is None else f"--world {shlex.quote(options.world)}"
-        return f"vjepa2-ac simulate {options.subject} {what} --episodes 50"
+        what = ("--task", options.task or "reach") if options.world is None else ("--world", options.world)
+        return shell_command("simulate", options.subject, *what, "--episodes", 50)
     if cli.is_server(options.subject):
         return f"your robot's client at {options.subject} (docs/serving.md)"
     if answer.predicts.share is None:
-        return f"vjepa2-ac evaluate {options.subject}"
+        return shell_command("evaluate", options.subject)
     if answer.plans.word == "yes":
-        return f"vjepa2-ac serve {options.subject}"
-    return f"vjepa2-ac data calibrate {options.subject}/config.yaml --axes {options.subject}"
+        return shell_command("serve", options.subject)
+    return shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, shell_command
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
@@ -78,7 +78,7 @@ def _convert(options: argparse.Namespace) -> None:
 
     with cli.reporter() as reporter:
         episodes, steps = convert_to_lerobot(config.data, options.out, reporter)
-    cli.show(f"{episodes:,} episodes, {steps:,} steps. Next: vjepa2-ac init {options.out}", files=[options.out])
+    cli.show(f"{episodes:,} episodes, {steps:,} steps. Next: {shell_command('init', options.out)}", files=[options.out])
 
 
 def _converter(options: argparse.Namespace) -> None:

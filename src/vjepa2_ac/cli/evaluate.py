@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError, UserError
+from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.process import is_first
 
 if TYPE_CHECKING:
@@ -127,19 +127,19 @@ def _next(measured: Evaluated, data: str | None) -> str:
 
     about, answer = measured.evaluation.about, measured.answer
     if not about.checkpoint:
-        return f"vjepa2-ac train {data}"
+        return shell_command("train", data)
     if answer.predicts.why:
-        return f"vjepa2-ac data check {about.subject}/config.yaml"
+        return shell_command("data", "check", f"{about.subject}/config.yaml")
     if "no" in {answer.predicts.word, answer.uses_actions.word}:
-        return f"vjepa2-ac data check {about.subject}/config.yaml --model {about.subject}"
+        return shell_command("data", "check", f"{about.subject}/config.yaml", "--model", about.subject)
     if answer.plans.says.startswith("solves"):  # the closed loop has been measured
-        return f"vjepa2-ac serve {about.subject}"
+        return shell_command("serve", about.subject)
     try:
         recorded = read_simulation(Path(about.data).resolve(strict=True))
     except (OSError, UserError):
-        return f"vjepa2-ac serve {about.subject}"
-    domain = f" --domain {recorded.worlds.name}" if isinstance(recorded.worlds, Domain) else ""
-    return f"vjepa2-ac simulate {about.subject} --task {recorded.task or 'reach'}{domain}"
+        return shell_command("serve", about.subject)
+    domain = ("--domain", recorded.worlds.name) if isinstance(recorded.worlds, Domain) else ()
+    return shell_command("simulate", about.subject, "--task", recorded.task or "reach", *domain)
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
@@ -157,7 +157,7 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     every = cli.record_of_options(
         EvaluationOptions,
         options,
-        data=cli.read_config(options.data, of_run=True) if options.data else None,
+        data=cli.read_config(options.data) if options.data else None,
         against=tuple(options.against) if options.against else None,
         probes=cli.record_of_options(ProbeOptions, options, planning_clips=clips),
         planning=(*(plan_settings or ()), *options.overrides),
@@ -184,7 +184,7 @@ def _compare(options: argparse.Namespace) -> None:
     tables = row_tables(comparison.rows, comparison.title) if options.all else []
     files = [plot_comparison(comparison, options.out), *write_tables(comparison.rows, options.out)]
     best = options.runs[list(comparison.answers).index(comparison.best)]
-    cli.show(*tables, str(comparison), *comparison.notes, f"Next: vjepa2-ac export {best}", files=files)
+    cli.show(*tables, str(comparison), *comparison.notes, f"Next: {shell_command('export', best)}", files=files)
 
 
 def _imagine(options: argparse.Namespace) -> None:
@@ -229,7 +229,7 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
     from vjepa2_ac.simulation.counterfactual import with_what_happens
 
     cli.say_places_elsewhere(options.subject)
-    data = None if options.data is None else cli.read_config(options.data, of_run=True)
+    data = None if options.data is None else cli.read_config(options.data)
     asked = ImagineOptions(
         decoder=options.decoder,
         actions=_words(options),

@@ -109,7 +109,7 @@ def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
     from vjepa2_ac.runs.folder import is_run
 
     if options.data is not None:
-        yield cli.read_config(options.data, of_run=True)
+        yield cli.read_config(options.data)
     elif is_run(subject):
         yield None
     elif subject == _BUILTIN_MODEL:

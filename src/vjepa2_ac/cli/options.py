@@ -12,7 +12,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
-from vjepa2_ac.errors import InputError, did_you_mean, printable
+from vjepa2_ac.errors import InputError, did_you_mean, printable, shell_command
 from vjepa2_ac.process import is_first
 from vjepa2_ac.storage import places
 
@@ -232,7 +232,7 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
         path: The YAML file.
         overrides: Such as training.steps=100.
         base: Whether `model.base` and `model.encoder` have to be there, too.
-        of_run: It may be the config of a run that was made.
+        of_run: It is the config of a run, whatever else is in its folder.
 
     Raises:
         InputError: The config is wrong, or one of them is not there.
@@ -384,7 +384,7 @@ def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:
 
 def _config_path(text: str) -> str:
     if places.is_url(text):
-        raise ValueError(f"is a URL. If it holds data, run `vjepa2-ac init {text}`, which writes a config")
+        raise ValueError(f"is a URL. If it holds data, run `{shell_command('init', text)}`, which writes a config")
     return places.on_this_machine(text)
 
 

@@ -168,7 +168,7 @@ def _goals(options: argparse.Namespace) -> None:
     if options.task is not None:
         _goals_by_label(options)
         return
-    config = None if _is_film(options) else cli.read_config(options.source, options.overrides, of_run=True)
+    config = None if _is_film(options) else cli.read_config(options.source, options.overrides)
     stride = _stride(options, config)
 
     from vjepa2_ac.cli.console.tables import goals_notes, goals_table
@@ -207,7 +207,7 @@ def _goals(options: argparse.Namespace) -> None:
 
 
 def _goals_by_label(options: argparse.Namespace) -> None:
-    config = cli.read_config(options.source, options.overrides, of_run=True)
+    config = cli.read_config(options.source, options.overrides)
 
     from vjepa2_ac.planning.demonstrations.make_goals import goals_by_label
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,11 +87,10 @@ def _kinematics(words: str | None) -> Callable[[np.ndarray], np.ndarray]:
     """Return the user's function from joints to poses; one that changes nothing, where none is named."""
     if words is None:
         return lambda numbers: numbers
-    from vjepa2_ac.registry import import_plugins
+    from vjepa2_ac.registry import import_user_module
 
     module, _, name = words.partition(":")
-    import_plugins([module], where=f"--kinematics {words}")
-    found = getattr(import_module(module), name, None)
+    found = getattr(import_user_module(module, where=f"--kinematics {words}"), name, None)
     if not callable(found):
         raise InputError(where=f"--kinematics {words}", found="no such function", needed="MODULE:FUNCTION")
     return found  # type: ignore[no-any-return]  # the user's

@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from importlib.metadata import entry_points
 from pathlib import Path
 
 from vjepa2_ac import __version__, process
@@ -18,6 +17,7 @@ from vjepa2_ac.cli import closed_loop, data, evaluate, explore, plan, policies, 
 from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parsed
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
 from vjepa2_ac.process import EXIT_STATUS, StoppedError, is_first, tidy_end
+from vjepa2_ac.registry import installed, load_installed
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,10 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
-    options = parsed(_parser(words), words)
-    options.words = words
-    handler: Handler = options.handler
     try:
+        options = parsed(_parser(words), words)
+        options.words = words
+        handler: Handler = options.handler
         _require_working_directory()
         if options.plugin:
             from vjepa2_ac.config.loading import name_plugins
@@ -130,9 +130,13 @@ def _parser(words: Sequence[str] = ()) -> Parser:
 
 def _add_others(words: Sequence[str], commands: Commands) -> None:
     """Add commands of installed packages, which are imported only if they are asked for."""
-    for one in entry_points(group="vjepa2_ac.commands"):
-        if next(iter(words), None) == one.name:
-            one.load()(commands)
-        else:
+    for one in installed("vjepa2_ac.commands"):
+        is_requested, is_taken = next(iter(words), None) == one.name, one.name in commands.choices
+        if is_requested and is_taken:
+            found = f"a command of this package, and one of {one.value}"
+            raise InputError(where=f"vjepa2-ac {one.name}", found=found, fix="Uninstall or rename the latter")
+        if is_requested:
+            load_installed(one)(commands)
+        elif not is_taken:
             about = f"of {one.value.partition(':')[0]}"
             commands.add_parser(one.name, help=about, description=about)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError, UserError
+from vjepa2_ac.errors import InputError, UnreachableError, UserError, shell_command
 from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.places import BUILTIN
 
@@ -112,7 +112,7 @@ def _init(options: argparse.Namespace) -> int:
     cli.show(*draft.costs, f"Written: {out}", *guessed)
     status = 0 if is_missing else _check(draft, out)
     if status:
-        cli.show(f"\nMend this first, then: vjepa2-ac data check {out}")
+        cli.show(f"\nMend this first, then: {shell_command('data', 'check', out)}")
     first = [(f"vjepa2-ac {_RECORD.format(path=path)}", "the data; half a minute on a core of its own")] * is_missing
     if not Path(model.path).exists() and (fetch := model.download):
         first.append((fetch[0], f"the model, once: {fetch[1]}"))
@@ -147,7 +147,7 @@ def _check(draft: Draft, out: Path) -> int:
     """Run `data check` on the config; a reason why it cannot be is printed, and the config stays."""
     from vjepa2_ac.cli.data import check_and_print
 
-    cli.show(f"\n$ vjepa2-ac data check {out}")
+    cli.show(f"\n$ {shell_command('data', 'check', out)}")
     try:
         return check_and_print(draft.config)
     except UserError as error:
@@ -158,14 +158,14 @@ def _check(draft: Draft, out: Path) -> int:
 def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
     """Return the commands from a trial to the real run, and what each is for."""
     trial, steps = f"runs/{name}-trial", draft.config.training.steps
-    short = f"training.steps={_TRIAL_STEPS} validation.every=50 checkpoint.every=50"
+    short = (f"training.steps={_TRIAL_STEPS}", "validation.every=50", "checkpoint.every=50")
     of_trial = ", ".join(filter(None, (f"{_TRIAL_STEPS} steps", draft.time_of(_TRIAL_STEPS))))
     of_run = draft.time_of(steps) or f"time not known before the trial: its time a step, times {steps:,}"
     return [
-        (f"vjepa2-ac train {out} --check", "everything that can fail, before the first step"),
-        (f"vjepa2-ac train {out} run_dir={trial} {short}", f"{of_trial}: does it learn, how long does a step take?"),
-        (f"vjepa2-ac evaluate {trial}", "against the base, on held-out episodes"),
-        (f"vjepa2-ac train {out}", f"the real run, {of_run}; the same command goes on after a stop"),
+        (shell_command("train", out, "--check"), "everything that can fail, before the first step"),
+        (shell_command("train", out, f"run_dir={trial}", *short), f"{of_trial}: does it learn, how long is a step?"),
+        (shell_command("evaluate", trial), "against the base, on held-out episodes"),
+        (shell_command("train", out), f"the real run, {of_run}; the same command goes on after a stop"),
     ]
 
 
@@ -235,9 +235,10 @@ def _doctor(options: argparse.Namespace) -> int:
     import torch
 
     from vjepa2_ac.cli.console.setup import memory_lines, verdict
+    from vjepa2_ac.data.streams import require_shared_memory
     from vjepa2_ac.distributed import slow_bf16
     from vjepa2_ac.model.checkpoints.loading import base_sizes
-    from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
+    from vjepa2_ac.training.cost.memory import USUAL_GPU, batch_bytes, estimate_memory, ways_to_fit
 
     sizes = base_sizes(config.model)
     gpu, available = "a GPU of 24 GB (there is none here)", USUAL_GPU
@@ -253,9 +254,13 @@ def _doctor(options: argparse.Namespace) -> int:
     )
     if unusual := config.adapter.out_of_line:
         cli.show(f"Warning: {unusual}.")
+    try:
+        require_shared_memory(config.data, batch_bytes(config, sizes))
+    except UnreachableError as error:
+        cli.show(f"Warning: {error}")
     if not torch.cuda.is_available() and config.training.precision == "bf16" and (slow := slow_bf16()):
         cli.show(f"Without a GPU set training.precision=fp32 model.dtype=float32: in bfloat16 {slow}.")
-    cli.show(f"The data are looked at by: vjepa2-ac data check {options.config}")
+    cli.show(f"The data are looked at by: {shell_command('data', 'check', options.config)}")
     return 0 if needed <= available else 1
 
 
@@ -280,7 +285,7 @@ def _demo(_options: argparse.Namespace) -> int:
     ]
     for words in commands[Path(_SIMULATED).exists() :]:
         print(f"$ vjepa2-ac {words}", flush=True)
-        program = [sys.executable, "-m", "vjepa2_ac.cli", *shlex.split(words)]
+        program = [sys.executable, "-P", "-m", "vjepa2_ac.cli", *shlex.split(words)]
         if status := subprocess.call(program):  # noqa: S603 - our own command
             return status
     return 0

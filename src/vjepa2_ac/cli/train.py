@@ -7,7 +7,7 @@ import contextlib
 from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.process import is_first
 
 
@@ -78,7 +78,7 @@ def _train(options: argparse.Namespace) -> None:
     with TrainingConsole() as reporter:
         folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
     if is_first() and not options.check:
-        cli.show(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
+        cli.show(f"The run is in {folder}; see how good it is: {shell_command('evaluate', folder)}")
 
 
 def _encode(options: argparse.Namespace) -> None:
@@ -143,7 +143,7 @@ def _decoder(options: argparse.Namespace) -> None:
     card = read_card(folder)
     if card.held_out:
         cli.show(held_out_table(card))
-    cli.show(f"See what a model imagines: vjepa2-ac imagine {config.run_dir} --decoder {folder}")
+    cli.show(f"See what a model imagines: {shell_command('imagine', config.run_dir, '--decoder', folder)}")
 
 
 def _export(options: argparse.Namespace) -> None:

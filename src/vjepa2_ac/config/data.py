@@ -20,7 +20,7 @@ from vjepa2_ac.config.section import (
     Section,
     Share,
 )
-from vjepa2_ac.registry import TRANSFORMS
+from vjepa2_ac.registry import SOURCES, TRANSFORMS
 
 # A serial number is a name, also where YAML takes it for a number.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
@@ -238,8 +238,21 @@ class DataConfig(Section):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        """Take part in the union."""
-        DataConfig.kinds[cls.model_fields["source"].default] = cls
+        """Take part in the union.
+
+        Raises:
+            InputError: Another class has this source.
+            TypeError: A section has the name of something else that all forms of data have.
+        """
+        for name, field in cls.model_fields.items():
+            section, common = field.annotation, DataConfig.model_fields.get(name)
+            base = Section if common is None else common.annotation
+            if not (isinstance(section, type) and issubclass(section, Section)):
+                continue
+            if hasattr(DataConfig, name) or not (isinstance(base, type) and issubclass(section, base)):
+                raise TypeError(f"{cls.__name__}.{name}: all forms of data have a key of this name. Choose another")
+        name = cls.model_fields["source"].default
+        DataConfig.kinds[name] = SOURCES.register(name)(cls)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:

@@ -7,7 +7,6 @@ import importlib.resources
 import json
 import os
 import re
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,16 +18,21 @@ from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import source_of
 from vjepa2_ac.config.run import ReplayConfig
 from vjepa2_ac.config.section import marks_of
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.registry import SOURCES, UNKNOWN_OPTION, import_plugins
+from vjepa2_ac.storage import read_bounded
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import message_of, parse_yaml
 
+_MOST_BYTES = 1_000_000  # no config needs more, and PyYAML reads 20 MB in a minute
+_OF_A_RUN = ("run_id", "environment.json", "metrics.jsonl")  # next to the config of a run
 _PACKAGED = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "configs"
 
 
 def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str] = ()) -> Config:
     """Read a config, from a file or from plain values, and apply `key.sub=value` overrides.
+
+    Plug-ins may be in the working directory, unless the file is in the folder of a run (`load_config_of_run`).
 
     Args:
         config: A file, `builtin:NAME` of the package, or plain values.
@@ -43,7 +47,9 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
     """
     if isinstance(config, Mapping):
         return parse_config(config, overrides, where="load_config")
-    return parse_config(_read_yaml(config_path(config)), overrides, where=str(config))
+    path = config_path(config)
+    of_run = any((path.parent / name).exists() for name in _OF_A_RUN)
+    return parse_config(_read_yaml(path), overrides, where=str(config), here=not of_run)
 
 
 def load_config_of_run(path: str | Path, overrides: Iterable[str] = ()) -> Config:
@@ -119,14 +125,13 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def config_as_yaml(config: Config) -> str:
     """Return the resolved config as YAML that `load_config` reads back to an equal config."""
-    return str(yaml.dump(config_as_dict(config), Dumper=_Dumper, sort_keys=False))
+    return str(yaml.dump(config_as_dict(config), Dumper=_Dumper, sort_keys=False, width=_NO_BREAKS))
 
 
 def yaml_line(key: str, value: Any) -> str:
     """Return a key and its value as one line of YAML, which reads back as they are."""
-    style = None if isinstance(value, dict | list) else False  # None: what has nothing nested within is on one line
-    text = yaml.dump({key: value}, Dumper=_Dumper, sort_keys=False, default_flow_style=style, width=10**6)
-    return str(text).rstrip("\n")
+    text = yaml.dump([{key: value}], Dumper=_Dumper, sort_keys=False, default_flow_style=True, width=_NO_BREAKS)
+    return str(text).removeprefix("[{").removesuffix("}]\n")
 
 
 def config_schema() -> dict[str, Any]:
@@ -141,8 +146,17 @@ def changed_keys(old: Config, new: Config) -> list[str]:
     return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
 
 
+_NO_BREAKS = 10**6  # characters of a line
+
+
 class _Dumper(yaml.SafeDumper):
-    """Quotes text that would be read as another type."""
+    """Quotes text that would be read as another type, and escapes what is not printable."""
+
+
+_Dumper.add_representer(
+    str,
+    lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, None if text.isprintable() else '"'),
+)
 
 
 _Dumper.add_implicit_resolver("!number", re.compile(r"^[-+]?[\d_]*\.?[\d_]*[eE][-+]?\d+$"), list("-+.0123456789"))
@@ -150,12 +164,12 @@ _Dumper.add_implicit_resolver("!number", re.compile(r"^[-+]?[\d_]*\.?[\d_]*[eE][
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_bounded(path, _MOST_BYTES).decode()
     except FileNotFoundError:
         fix = "`vjepa2-ac init` writes one for your data; `vjepa2-ac config list` shows those of the package"
         raise InputError(where=str(path), found="no such file", needed="a config", fix=fix) from None
     except IsADirectoryError:
-        fix = f"If it holds data, run `vjepa2-ac init {shlex.quote(str(path))}`, which writes a config"
+        fix = f"If it holds data, run `{shell_command('init', path)}`, which writes a config"
         if (path / "config.yaml").is_file():
             fix = f"The config of the run in it is {path / 'config.yaml'}"
         raise InputError(where=str(path), found="a folder", needed="a config, which is a YAML file", fix=fix) from None
@@ -251,7 +265,7 @@ def with_plugins(values: Mapping[str, Any], *, where: str, here: bool) -> dict[s
     import_plugins([one for one in plugins if one not in _named], where=f"{where}: plugins", here=here)
     replay = values.get("replay")
     for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
-        if (source := source_of(data)) not in DataConfig.kinds and source in SOURCES.names():
+        if (source := source_of(data)) in SOURCES.names():
             SOURCES.find(source)
     admit_forms_of_data()
     return {**values, "plugins": plugins} if plugins else dict(values)
@@ -265,14 +279,14 @@ def admit_forms_of_data(*, all_installed: bool = False) -> None:
     """
     for name in SOURCES.names() if all_installed else ():
         SOURCES.find(name)
-    if (count := len(DataConfig.kinds)) != _admitted[0]:
+    if _admitted != DataConfig.kinds:
         for section in (DataConfig, ReplayConfig, Config):
             section.model_rebuild(force=True)
         marks_of.cache_clear()
-        _admitted[0] = count
+        _admitted.update(DataConfig.kinds)
 
 
-_admitted = [len(DataConfig.kinds)]
+_admitted = dict(DataConfig.kinds)
 
 
 # ---- what is wrong ----

@@ -251,19 +251,14 @@ class Rule(NamedTuple):
 
     def on(self, config: PlanningConfig) -> tuple[bool, str]:
         """Return whether a config breaks the rule, and the message for it."""
-        (name, value, is_set), (other, other_value, is_other_set) = (
-            _option(config, one) for one in (self.option, self.other)
-        )
-        is_broken = is_set and is_other_set == (self.relation == "excludes")
-        found = f"{name}: {value} {self.relation} {other}" + f": {other_value}" * is_other_set
-        return is_broken, f"{found}, because {self.reason}. {self.fix}"
+        is_broken = _is_set(config, self.option) and _is_set(config, self.other) == (self.relation == "excludes")
+        return is_broken, f"{self.option} {self.relation} {self.other}, because {self.reason}. {self.fix}"
 
 
-def _option(config: PlanningConfig, option: str) -> tuple[str, Any, bool]:
-    """Return the name and the value of an option, and whether it is set."""
+def _is_set(config: PlanningConfig, option: str) -> bool:
     name, _, chosen = option.partition("=")
     value = getattr(config, name)
-    return name, value, value == chosen if chosen else value != PlanningConfig.model_fields[name].default
+    return bool(value == chosen if chosen else value != PlanningConfig.model_fields[name].default)
 
 
 RULES = (

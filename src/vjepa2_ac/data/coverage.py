@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt64
+from scipy.spatial import KDTree
 
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.files import connections_to, in_parallel
-from vjepa2_ac.data.index import UNKNOWN
+from vjepa2_ac.data.index import SPANS, UNKNOWN, EpisodeTable
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
@@ -38,6 +39,10 @@ PLAY = (
 
 _SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 DUPLICATES_FIX = "List copies in data.exclude, or keep related episodes in one split with data.split_by"
+
+_NEAR = 1e-4  # of means and deviations of copies: rounding to 0.1 mm changes them less
+_MOVING = 1e-2  # of deviations: episodes with smaller ones may agree because the robot stands still
+_MOST_COPIES = 8  # of one recording; of more, not all may be found
 
 ENOUGH_NEAR = 0.5  # a direction is covered by this share of the steps that go near it if all are equally frequent
 _SHORT_CM = 0.5  # a shorter step has no direction, and along an axis no sign (as evaluation.action_score.metrics)
@@ -103,13 +108,16 @@ def read_each(
             yield index, one
 
 
-def read_sample(dataset: Dataset, count: int, progress: Progress = no_progress) -> Iterator[ReadEpisode]:
-    """Read at most `count` episodes, without frames.
+def read_sample(
+    dataset: Dataset, count: int, progress: Progress = no_progress, *, also: Iterable[int] = ()
+) -> Iterator[ReadEpisode]:
+    """Read at most `count` episodes, and those in `also`, without frames.
 
     Raises:
         InputError: As `read_each`.
     """
-    for index, episode in read_each(dataset, sample_of(dataset, count), dataset.source.read, progress):
+    chosen = list(dict.fromkeys([*also, *sample_of(dataset, count)]))
+    for index, episode in read_each(dataset, chosen, dataset.source.read, progress):
         camera = episode.extrinsics if dataset.config.pose_frame == "camera" else None
         yield ReadEpisode(index, np.asarray(episode.states, np.float64), tuple(dataset.kept.of(index)), camera)
 
@@ -268,7 +276,7 @@ def _of_vectors(changes: Float[np.ndarray, "pairs dim"], usual: Float[np.ndarray
 
 @dataclass(frozen=True)
 class Duplicates:
-    """Used episodes that have the same states as another one."""
+    """Used episodes that have the same, or nearly the same, states as another one."""
 
     is_known: bool  # whether the states were compared
     episodes: int = 0
@@ -284,8 +292,8 @@ class Duplicates:
             return "no two episodes have the same states"
         (one, its_split), (other, others_split) = self.example
         return (
-            f"{self.episodes:,} episodes have the states of another episode ({self.different:,} different recordings)."
-            f" {self.across:,} of them have a copy in another split, such as"
+            f"{self.episodes:,} episodes have the states of another episode, exactly or nearly"
+            f" ({self.different:,} different recordings). {self.across:,} of them have a copy in another split, such as"
             f" {one} ({its_split}) and {other} ({others_split}). {DUPLICATES_FIX}"
         )
 
@@ -295,20 +303,21 @@ class Duplicates:
 
 
 def find_duplicates(dataset: Dataset) -> Duplicates:
-    """Compare the states of all used episodes by their hashes: fast, reads nothing."""
+    """Compare the states of all used episodes by their hashes and summaries: fast, reads nothing."""
     table = dataset.table
     if table.state_hash is None:
         return Duplicates(is_known=False)
     members = np.flatnonzero(dataset.taking_part & (table.state_hash != UNKNOWN))
     members = members[np.argsort(table.id_rank[members])]
-    hashes, count = np.unique(table.state_hash[members], return_counts=True)
-    members = members[np.isin(table.state_hash[members], hashes[count > 1])]
+    recordings = _recordings(table, members, table.state_hash[members])
+    is_copied = np.bincount(recordings)[recordings] > 1
+    members, recordings = members[is_copied], recordings[is_copied]
     if not len(members):
         return Duplicates(is_known=True)
     splits = np.argmax([dataset.members(split)[members] for split in _SPLITS], axis=0)
     groups: dict[int, list[tuple[str, Split]]] = defaultdict(list)
-    for member, split in zip(members.tolist(), splits.tolist(), strict=True):
-        groups[int(table.state_hash[member])].append((table.identity(member), _SPLITS[split]))
+    for number, member, split in zip(recordings.tolist(), members.tolist(), splits.tolist(), strict=True):
+        groups[number].append((table.identity(member), _SPLITS[split]))
     across = [group for group in groups.values() if len({split for _, split in group}) > 1]
     first, *others = (across or list(groups.values()))[0]
     other = next((one for one in others if one[1] != first[1]), others[0])
@@ -320,3 +329,16 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
         example=(first, other),
         copies=tuple(name for group in groups.values() for name, _ in group[1:]),
     )
+
+
+def _recordings(
+    table: EpisodeTable, members: Int[np.ndarray, " members"], hashes: UInt64[np.ndarray, " members"]
+) -> Int[np.ndarray, " members"]:
+    """Return a number for each episode: the same for equal and for nearly equal states."""
+    motion = table.motion[members]
+    numbers = np.unique(hashes, return_inverse=True)[1]
+    moving = np.flatnonzero(motion[:, SPANS].max(axis=1, initial=0.0) > _MOVING)  # not those of unknown motion
+    points = np.column_stack([motion[moving, 2:], table.num_steps[members[moving]]])
+    _, nearest = KDTree(points).query(points, k=_MOST_COPIES, p=np.inf, distance_upper_bound=_NEAR)
+    numbers[moving] = np.append(numbers[moving], len(members))[nearest].min(axis=1)  # the last one: no such neighbour
+    return np.asarray(numbers)

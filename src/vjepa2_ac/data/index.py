@@ -14,15 +14,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int8, Int32, UInt64
+from jaxtyping import Float, Float32, Int8, Int32, UInt64
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig
-from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.episode import STATE_DIM, EpisodeInfo
 from vjepa2_ac.errors import InputError, MissingFileError
+from vjepa2_ac.spaces import step_sizes
 from vjepa2_ac.storage import places
 from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
@@ -34,8 +35,10 @@ UNKNOWN = 0  # hash of an episode whose states were not read, since no other is 
 
 _NOT_KNOWN = -1  # number of a label, or success
 _COLUMNS = ("num_steps", "success", "ids", "id_hash", "id_rank")
-_HASH, _LOCATOR, _LABEL = "state_hash", "locator.", "label."
+_HASH, _MOTION, _LOCATOR, _LABEL = "state_hash", "motion", "locator.", "label."
 _HASH_BYTES = 8
+_NO_MOTION = (np.nan,) * 8
+MEANS, SPANS = slice(2, 5), slice(5, 8)  # of `StatesSummary.motion`
 _CACHE = "VJEPA2_AC_CACHE"
 _VERSION = 5  # of the cache: another number makes all of it be rebuilt
 
@@ -93,6 +96,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
     ids: np.ndarray  # the identities as UTF-8, of type S
     id_hash: UInt64[np.ndarray, " episodes"]  # the first 8 bytes of the identity's SHA-256
     id_rank: Int32[np.ndarray, " episodes"]  # rank of the identity in alphabetical order
+    motion: Float32[np.ndarray, "episodes 8"]  # as in `StatesSummary`; NaN: states not read, or an older index
     problems: tuple[EpisodeProblem, ...] = ()
     locators: Mapping[str, np.ndarray] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
@@ -123,6 +127,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             id_hash=np.array([identity_hash(info.id) for info in infos], np.uint64),
             id_rank=np.argsort(np.argsort(ids, kind="stable")).astype(np.int32),
             texts=dict(texts or {}),
+            motion=np.array([_NO_MOTION for _ in infos], np.float32),
         )
 
     def __len__(self) -> int:
@@ -159,7 +164,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             "texts": dict(self.texts),
             "labels": {name: labels.names for name, labels in self.labels.items()},
         })  # fmt: skip
-        arrays = {name: getattr(self, name) for name in _COLUMNS}
+        arrays = {name: getattr(self, name) for name in (*_COLUMNS, _MOTION)}
         arrays |= {} if self.state_hash is None else {_HASH: self.state_hash}
         arrays |= {f"{_LOCATOR}{name}": column for name, column in self.locators.items()}
         arrays |= {f"{_LABEL}{name}": labels.number for name, labels in self.labels.items()}
@@ -176,6 +181,8 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             arrays = read_arrays(data)
             text = json.loads(arrays["text"].tobytes())
             columns = {name: arrays[name] for name in _COLUMNS}
+            unknown = np.array([_NO_MOTION for _ in columns["ids"]], np.float32)
+            columns |= {_MOTION: arrays.get(_MOTION, unknown).reshape(-1, len(_NO_MOTION))}
             locators = {name.removeprefix(_LOCATOR): one for name, one in arrays.items() if name.startswith(_LOCATOR)}
             table = cls(
                 **columns,
@@ -217,6 +224,28 @@ def hash_of_states(states: Float[np.ndarray, "steps state_dim"]) -> int:
     other roundings agree: a value at an edge of any grid may be rounded to either side.
     """
     return hash_of_bytes(f"{states.shape} ".encode() + (states.astype("<f4") + np.float32(0)).tobytes())  # -0 is 0
+
+
+class StatesSummary(NamedTuple):
+    """What the index keeps of the states of an episode.
+
+    `motion` has the longest distance (metres) and the largest rotation (radians) between consecutive poses, then the
+    mean and the standard deviation of x, y and z over the episode; of vectors two zeros, and the first three numbers.
+    """
+
+    state_hash: int = UNKNOWN
+    motion: Sequence[float] = _NO_MOTION
+
+
+UNREAD = StatesSummary()
+
+
+def summary_of(states: Float[np.ndarray, "steps state_dim"]) -> StatesSummary:
+    """Return the summary of an episode with one or more steps."""
+    width = states.shape[1]
+    fastest = step_sizes(states).max(axis=0, initial=0.0) if width == STATE_DIM else np.zeros(2)
+    positions = states[:, np.arange(3) % width]
+    return StatesSummary(hash_of_states(states), [*fastest, *positions.mean(axis=0), *positions.std(axis=0)])
 
 
 def hash_of_bytes(content: bytes) -> int:
@@ -313,6 +342,8 @@ def get_or_make(
 ) -> T:
     """Return the object cached under a key; make and cache it if it is missing or damaged (a NotATableError).
 
+    The file ends with its key, so that the file of another key is not used under this name.
+
     Raises:
         UnreachableError: It is there and cannot be read.
     """
@@ -323,14 +354,17 @@ def get_or_make(
     try:
         if not (usage and usage.rebuild):
             with storage.user_can_read(path):
-                return from_bytes(path.read_bytes())
+                data = path.read_bytes()
+            if not data.endswith(key.encode()):
+                raise NotATableError("it is damaged, from an older version, or of other data")  # noqa: TRY301
+            return from_bytes(data.removesuffix(key.encode()))
     except MissingFileError:
         pass
     except (InputError, NotATableError) as error:
         logger.warning("%s: cannot be used (%s); the index is built again", path, error)
     made = make()
     try:
-        storage.write_atomically(path, to_bytes(made))
+        storage.write_atomically(path, to_bytes(made) + key.encode())
     except OSError as error:
         logger.warning("%s: cannot be written (%s); the index will be built again next time", path, error)
     return made

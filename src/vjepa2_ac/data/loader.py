@@ -5,21 +5,12 @@ The batch at a position of the run is a pure function of the seed and the positi
 
 from __future__ import annotations
 
-import atexit
 import itertools
-import multiprocessing
-import os
-import signal
-import threading
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
-from multiprocessing import forkserver, resource_tracker
-from typing import Any
 
-import torch
-from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
 from vjepa2_ac import storage
@@ -29,7 +20,7 @@ from vjepa2_ac.data.clips import ClipRequest, collate, no_clips
 from vjepa2_ac.data.dataset import Dataset, read_clip
 from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.selection import BrokenEpisodes, named
-from vjepa2_ac.data.streams import ToDevice
+from vjepa2_ac.data.streams import ToDevice, in_shared_memory, in_worker, results_of_workers
 from vjepa2_ac.data.transforms import ClipChanges
 from vjepa2_ac.data.windows import ClipOrder, far_neighbours, spread
 from vjepa2_ac.episode import Batch, Clip, Skipped
@@ -176,14 +167,18 @@ class _MicroBatches(TorchDataset[Batch]):
     share: Fraction = Fraction(0)  # of these
 
     def __getitems__(self, positions: list[int]) -> Batch | UserError:
-        """Return a micro-batch, or its error: DataLoader would change an error that is raised."""
+        """Return a micro-batch, or its error: DataLoader would change an error that is raised.
+
+        A worker puts the batch into shared memory here: PyTorch would do so in a thread, whose error gets lost.
+        """
         before = storage.bytes_fetched()
         try:
             read = self._read(positions)
             clips = [one for one in read if isinstance(one, Clip)]
             skipped = tuple(one for one in read if isinstance(one, Skipped))
             batch = collate(clips) if clips else no_clips(self.dataset.config.frames, self.dataset.widths)
-            return replace(batch, bytes_fetched=storage.bytes_fetched() - before, skipped=skipped)
+            batch = replace(batch, bytes_fetched=storage.bytes_fetched() - before, skipped=skipped)
+            return in_shared_memory(batch) if in_worker() else batch
         except UserError as error:
             return error
 
@@ -278,73 +273,4 @@ def prefetch_next(batches: Iterator[Batch]) -> None:
 def _micro_batches(
     clips: _MicroBatches, positions: Iterator[list[int]], workers: int, *, pinned: bool = False
 ) -> Generator[Batch | UserError, None, None]:
-    # A fork server has no threads: a plain fork may hang in OpenMP or CUDA, and Python warns of it.
-    context = multiprocessing.get_context("forkserver") if workers else None
-    if context is not None:
-        context.set_forkserver_preload([__name__])
-        _start_servers_deaf()
-    loader = DataLoader(
-        clips,
-        batch_sampler=positions,
-        collate_fn=_identity,
-        generator=torch.Generator(),  # otherwise the loader uses dropout's generator
-        num_workers=workers,
-        multiprocessing_context=context,
-        worker_init_fn=_end_with_the_run if workers else None,
-        prefetch_factor=clips.dataset.config.prefetch if workers else None,
-        pin_memory=pinned,
-    )
-    others = set(multiprocessing.active_children())
-    rows = iter(loader)
-    ours = set(multiprocessing.active_children()) - others
-    at_exit = partial(_end_workers, ours)
-    atexit.register(at_exit)  # multiprocessing sends SIGTERM, and waits for workers that ignore it
-    try:
-        yield from rows
-    finally:
-        del rows  # requests the workers to end, and waits for a while
-        _end_workers(ours)
-        atexit.unregister(at_exit)
-
-
-def _identity(batch: Any) -> Any:
-    return batch
-
-
-def _end_workers(workers: Iterable[multiprocessing.process.BaseProcess]) -> None:
-    """Kill workers that did not end on request: blocked by a clip, and ignoring SIGTERM."""
-    for worker in workers:
-        if worker.is_alive():
-            worker.kill()
-
-
-def _start_servers_deaf() -> None:
-    """Start the fork server with a run's stop signals blocked, which its workers inherit.
-
-    A signal to the whole process group, as from a terminal, `timeout` or Slurm, is for the run: it needs its workers to
-    finish the step, and ends them.
-    """
-    stop = {signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP}
-    for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the first one clears the mask
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, stop)
-        try:
-            start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _end_with_the_run(_worker: int) -> None:
-    """End this worker when its reading process has ended for any reason.
-
-    PyTorch's own watchdog checks the fork server, which lives as long as its workers: both would stay for ever.
-    """
-    run = multiprocessing.parent_process()
-    if run is None:
-        raise ValueError("not in a worker")
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which ends its workers
-
-    def watch() -> None:
-        run.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    return results_of_workers(clips, positions, workers, clips.dataset.config.prefetch, pinned=pinned)

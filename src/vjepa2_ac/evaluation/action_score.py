@@ -118,17 +118,18 @@ def measure_plans(
         prior: Network of `planning.prior`, on the device of the starts: one-step plans start from it.
     """
     fixed = SCORED.energy.model_copy(update={"samples_at_once": config.energy.samples_at_once})
-    planners = Planner(one_step_settings(config)), Planner(SCORED.model_copy(update={"energy": fixed}))
-    energies = [EnergyFunction.of(planner.config.energy) for planner in planners]
+    planner, scored = Planner(one_step_settings(config)), Planner(SCORED.model_copy(update={"energy": fixed}))
+    near, far = EnergyFunction.of(config.energy), EnergyFunction.of(fixed)
 
     def planned(start: PlanningStart) -> list[Plan]:
-        begun = (None if prior is None else _proposed(prior, start)), None
-        goals = start.following, start.goal
+        begun = None
+        if prior is not None:
+            mean, std = prior.next_action(start.frame.float(), start.state, start.following.float(), 1)
+            begun = PlanStart(mean[None], mean[None, None], std[None])
+        one, three = (torch.Generator().manual_seed(seed) for seed in start.seeds[:2])
         return [
-            planner.plan(WindowCost(model, start, goal, energy), torch.Generator().manual_seed(seed), first)
-            for planner, goal, energy, seed, first in zip(
-                planners, goals, energies, start.seeds[:2], begun, strict=True
-            )
+            planner.plan(WindowCost(model, start, start.following, near), one, begun),
+            scored.plan(WindowCost(model, start, start.goal, far), three),
         ]
 
     plans = list(zip(*shared(starts, planned, progress), strict=True))
@@ -137,12 +138,6 @@ def measure_plans(
     )
     empty = sum(plan.stopped == "no finite energy" for found in plans for plan in found)
     return Plans(one_step[:, :, 0], three_steps, empty)
-
-
-def _proposed(prior: ActionPrior, start: PlanningStart) -> PlanStart:
-    """Return the start of a one-step plan: what a prior proposes to reach the next frame in one step."""
-    mean, std = prior.next_action(start.frame.float(), start.state, start.following.float(), 1)
-    return PlanStart(mean[None], mean[None, None], std[None])
 
 
 def study_of(starts: Sequence[PlanningStart], config: PlanningConfig) -> PlanningStudy:

@@ -273,7 +273,7 @@ SPEED_CM_S = 2.0  # of the flange; slower, and
 TURN_DEGREES_S = 10.0  # turning slower, and
 GRIP = 0.05  # closing or opening by less than this share in a model step: idle
 _IDLE_SHARE = 0.1  # of the 95th percentile of the norm, where actions are no poses
-_PARTS = 3
+_SIZES = ("small", "medium", "large")  # thirds of the steps, by the size of the action
 
 
 def clips_of(
@@ -312,15 +312,14 @@ def clips_of(
 
 def strata_of(clips: Clips, space: ActionSpace) -> tuple[Stratum, ...]:
     """Return moving and idle steps, then thirds by the size of the action; empty strata are left out."""
-    found = [Stratum("moving", "motion", clips.moving), Stratum("idle", "motion", ~clips.moving)]
-    edges = np.quantile(clips.action_size, np.arange(1, _PARTS) / _PARTS)
+    found = [Stratum("motion.moving", "moving", clips.moving), Stratum("motion.idle", "idle", ~clips.moving)]
+    edges = np.quantile(clips.action_size, np.arange(1, len(_SIZES)) / len(_SIZES))
     part = np.searchsorted(edges, clips.action_size, side="right")
-    unit, form = space.shown_unit, ".1f" if space.shown_unit else ".3g"
-    for number in range(_PARTS):
+    for number, size in enumerate(_SIZES):
         if (steps := part == number).any():
             sizes = clips.action_size[steps]
-            name = f"{sizes.min():{form}} to {sizes.max():{form}} {unit}".rstrip()
-            found.append(Stratum(name, "action size", steps))
+            label = f"{size}: {sizes.min():.3g} to {sizes.max():.3g} {space.shown_unit}".rstrip()
+            found.append(Stratum(f"action_size.{size}", label, steps))
     return tuple(stratum for stratum in found if stratum.steps.any())
 
 

@@ -155,15 +155,18 @@ def measure_subject(
     first_only(accelerator, partial(_require_places, subject, asked))
     decoder = None if asked.decoder is None else load_decoder(asked.decoder)
     lpips = load_lpips(asked.lpips, asked.lpips_heads) if asked.lpips and asked.lpips_heads else None
+    plans_from_prior = asked.probes.planning_clips and config.planning.prior is not None
+    trained = load_prior(str(config.planning.prior), where="planning.prior") if plans_from_prior else None
     progress = reporter.task("looking through the data")
     dataset = first_of_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     loaded = load_subject(subject, config, asked, dataset, decoder)
     run, world_model, contenders = loaded.run, loaded.world_model, loaded.contenders
-    planning, prior = config.planning, None
-    if asked.probes.planning_clips and planning.prior is not None:
-        trained = load_prior(planning.prior, where="planning.prior")
-        prior = trained.of(world_model.encoder_fingerprint(), config.data.crop).to(accelerator.device)
+    prior = (
+        None
+        if trained is None
+        else trained.of(world_model.encoder_fingerprint(), config.data.crop).to(accelerator.device)
+    )
     through_cache = with_latents_if_there(config, dataset, world_model)
     if through_cache.config.is_cache and not asked.calibrate:
         world_model.set_encoder_aside()
@@ -181,7 +184,7 @@ def measure_subject(
             contenders,
             clips,
             _about(subject, run, config, dataset, asked),
-            probes=replace(asked.probes, planning=planning, prior=prior, axis_clips=axis_clips),
+            probes=replace(asked.probes, planning=config.planning, prior=prior, axis_clips=axis_clips),
             reporter=reporter,
         )
         decoded = None

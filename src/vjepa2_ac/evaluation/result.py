@@ -360,8 +360,8 @@ class ModelResult:
 class Stratum:
     """A group of steps; `steps` selects [clip, horizon] of the *teacher-forced* errors."""
 
-    name: str  # such as moving, idle, "0.0 to 1.2 cm"
-    kind: Literal["motion", "action size"]
+    key: str  # motion.moving, motion.idle, action_size.small, .medium or .large: the same for all data
+    label: str  # such as "moving", "small: 0 to 1.2 cm"
     steps: Bool[np.ndarray, "clips horizon"]
 
 

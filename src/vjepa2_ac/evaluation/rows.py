@@ -162,8 +162,8 @@ class _Rows(list[Row]):
             self.line(group, f"{actions} actions", f"one_step.{actions}", found, chance=1.0)
         for part in self.evaluation.strata:
             found = {name: one_step_over_persistence(one, "true", part) for name, one in self.errors.items()}
-            label = f"{part.name} ({int(part.steps.sum())} steps)"
-            self.line(group, label, f"one_step.{part.kind}.{part.name}", found, chance=1.0)
+            label = f"{part.label} ({int(part.steps.sum())} steps)"
+            self.line(group, label, f"one_step.{part.key}", found, chance=1.0)
         grown, gap = "Growth of the one-step error without the true actions", "The same, over the error of persistence"
         for actions in ACTIONS[1:]:
             name = f"{actions} actions"
@@ -176,8 +176,8 @@ class _Rows(list[Row]):
             return
         for part in self.evaluation.strata:
             found = {name: stratum_gain(one, base, part) for name, one in self.others.items()}
-            key = f"one_step_gain.{part.kind}.{part.name}"
-            self.line("One-step gain over the base", part.name, key, found, detail=True, **_GAIN)
+            key = f"one_step_gain.{part.key}"
+            self.line("One-step gain over the base", part.label, key, found, detail=True, **_GAIN)
 
     def add_sensitivity(self, model: str, found: Sensitivity) -> None:
         """Add the use of the actions at one step."""

@@ -19,7 +19,6 @@ from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
 from vjepa2_ac.simulation.closed_loop.rollout import send_action
 from vjepa2_ac.simulation.counterfactual import Resimulation, resimulate
 from vjepa2_ac.simulation.recording.record import JPEG_QUALITY, SIMULATION_FILE, carry_out
-from vjepa2_ac.simulation.world.motion import Joints
 
 _KEPT = 4  # arms, each at its own start
 
@@ -73,11 +72,9 @@ class Truth:
     @torch.no_grad()
     def _simulated(self, place: Place) -> TrueFrame:
         key, explorer = (place.episode, place.start), self._explorer
-        simulation, joints, closedness = self._arms(*key)
+        simulation = self._arms(*key)
         arm, is_next = simulation.arm, self._at.pop(key, None) == place.before
-        if not is_next and arm.block is None:  # what touches nothing is its joints
-            arm.set_joints(joints, closedness)
-        elif not is_next:
+        if not is_next:
             carry_out(arm, simulation.number, simulation.spec, until=place.start)
         reached = True
         for action in place.actions[-1:] if is_next else place.actions:
@@ -92,13 +89,12 @@ class Truth:
         pixels = frames_as_seen(view(frames, crop), explorer.world_model.image_size)[0]
         return TrueFrame(pixels, latents, arm.state, is_simulated=True, reached=reached)
 
-    def _arm(self, episode: int, start: int) -> tuple[Resimulation, Joints, float]:
-        """Return an arm that stands at a start, and its joints and closedness there."""
+    def _arm(self, episode: int, start: int) -> Resimulation:
+        """Return the simulation of an episode at a start."""
         explorer = self._explorer
         self._at.pop((episode, start), None)
         recording = explorer.dataset.source.read(explorer.episodes[episode], self._camera)
-        simulation = resimulate(self._folder, recording, start, self._camera)
-        return simulation, simulation.arm.joints, simulation.arm.closedness
+        return resimulate(self._folder, recording, start, self._camera)
 
 
 def _recorded(moment: Moment) -> TrueFrame:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import yaml_line
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, escaped
 
 GUESSED = "GUESSED: "
 _COLUMN = 34  # of the comments
@@ -29,7 +29,7 @@ Knobs = Mapping[str, "Knob | Knobs"]
 
 def as_yaml(head: Sequence[str], knobs: Knobs) -> str:
     """Return knobs as the text of a config: a comment at the top, and one behind each value that has a reason."""
-    lines = [f"# {line}".rstrip() for line in head]
+    lines = [f"# {escaped(line)}".rstrip() for line in head]
     for name, one in knobs.items():
         if not isinstance(one, Knob):
             lines.append("")
@@ -60,7 +60,7 @@ def _lines(knobs: Knobs, indent: str) -> Iterator[str]:
             yield f"{indent}{name}:"
             yield from _lines(one, indent + "  ")
             continue
-        line, comment = indent + yaml_line(name, one.value), GUESSED * one.is_guess + one.why
+        line, comment = indent + yaml_line(name, one.value), escaped(GUESSED * one.is_guess + one.why)
         yield f"{line:<{_COLUMN}}  # {comment}" if comment else line
 
 

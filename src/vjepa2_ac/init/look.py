@@ -20,7 +20,7 @@ from vjepa2_ac.data.sources.lerobot.info import INFO
 from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
 from vjepa2_ac.data.splits import describe_splits, held_out_by
 from vjepa2_ac.episode import STATE_DIM, Progress
-from vjepa2_ac.errors import InputError, UserError
+from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.init.converters import way_by
 from vjepa2_ac.init.found import FoundData, Knob, idle_rule, pick_camera, plain
 from vjepa2_ac.init.lerobot import look_at_lerobot
@@ -189,7 +189,8 @@ def _only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[str, str
         is_version = folder != path and _VERSION.fullmatch(_name_of(folder))
         sets.setdefault(folder.rpartition("/")[0] if is_version else folder, []).append((form, folder))
     if len(sets) > 1:
-        found, fix = f"{len(sets)} data sets: {', '.join(sorted(sets))}", f"Name one: `vjepa2-ac init {min(sets)}`"
+        found = f"{len(sets)} data sets: {', '.join(sorted(sets))}"
+        fix = f"Name one: `{shell_command('init', min(sets))}`"
         raise InputError(where=path, found=found, needed="one data set", fix=fix)
     versions = sorted(*sets.values(), key=lambda one: _as_version(_name_of(one[1])))
     return *versions[-1], [_name_of(folder) for _, folder in versions]

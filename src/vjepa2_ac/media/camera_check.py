@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from itertools import zip_longest
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -14,23 +14,16 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import StateSpace, rotation_angles
 
 _BLOCKS = 16  # along each side of an image: the mean of a block averages out the noise of a sensor, a scene stays
-_LEAST_CONTRAST = (
-    1.0  # of 255: a covered lens with noise of 10 stays below, a rendered scene at 5 % brightness is above
-)
+_LEAST_CONTRAST = 1.0  # of 255: a covered lens with a noise of 10 is below, a scene at 5 % of its light is above
 _STILL_M, _STILL_RAD = 0.005, math.radians(3.0)  # measured states of a still arm vary less
 _STILL_SHARE = 0.5  # the same for vectors, as a share of the largest change in a model step
 
-
-@dataclass(frozen=True, eq=False)
-class CameraFrame:
-    """The newest frame of one camera, and the state that was measured when this frame appeared."""
-
-    pixels: UInt8[np.ndarray, "height width 3"]
-    state: Float[np.ndarray, " dim"]
+CameraFrame = tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, " dim"]]
+"""The newest frame of one camera, and the state that was measured when this frame appeared."""
 
 
 def newest_frames(
-    views: Sequence[np.ndarray], state: Float[np.ndarray, " dim"], before: Sequence[CameraFrame]
+    views: Iterable[np.ndarray], state: Float[np.ndarray, " dim"], before: Iterable[CameraFrame]
 ) -> tuple[CameraFrame, ...]:
     """Return the newest frame of each camera: the earlier one where the pixels are equal.
 
@@ -39,12 +32,8 @@ def newest_frames(
         state: Measured.
         before: The newest frames so far; empty after a reset.
     """
-    if not before:
-        return tuple(CameraFrame(view.copy(), state) for view in views)
-    return tuple(
-        last if np.array_equal(view, last.pixels) else CameraFrame(view.copy(), state)
-        for view, last in zip(views, before, strict=True)
-    )
+    pairs = zip_longest(views, before)
+    return tuple(last if last and np.array_equal(last[0], view) else (view.copy(), state) for view, last in pairs)
 
 
 def has_moved(
@@ -62,10 +51,9 @@ def has_moved(
         largest: The largest change of each number in a model step; used for vectors, whose units are unknown.
     """
     (change,) = space.differences(np.stack([before, now]))
-    if space.position is None or space.rotation is None:
+    if not space.is_pose:
         return bool(((largest > 0) & (abs(change) > _STILL_SHARE * largest)).any())
-    angle = float(rotation_angles(change[None, space.rotation])[0])
-    return float(np.linalg.norm(change[space.position])) > _STILL_M or angle > _STILL_RAD
+    return float(np.linalg.norm(change[:3])) > _STILL_M or float(rotation_angles(change[None, 3:6])[0]) > _STILL_RAD
 
 
 def is_uniform(image: UInt8[np.ndarray, "height width 3"]) -> bool:
@@ -77,7 +65,7 @@ def is_uniform(image: UInt8[np.ndarray, "height width 3"]) -> bool:
     return bool(np.asarray(blocks, dtype=float).std(axis=(0, 1)).max() < _LEAST_CONTRAST)
 
 
-def require_contrast(views: Sequence[np.ndarray], *, where: str) -> None:
+def require_contrast(views: Iterable[np.ndarray], *, where: str) -> None:
     """Refuse an image if what one of its cameras shows has no contrast.
 
     Raises:

@@ -27,7 +27,7 @@ from vjepa2_ac.planning.chunks import ChunkScores
 from vjepa2_ac.planning.energy import EnergyFunction, Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints, prepare_for_planning
-from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, SearchCancelledError, until_cancelled
+from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, until_cancelled
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
 from vjepa2_ac.planning.settings import require_base_frame, warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.solvers import PlanStart
@@ -36,11 +36,8 @@ from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
 Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
-Unusable = Literal["uniform frame", "frozen frame"]
-Why = (
-    Literal["planned", "as planned", "out of time", "at the goal", "no finite energy", "outside the workspace"]
-    | Unusable
-)
+Fault = Literal["uniform frame", "frozen frame"]
+Why = Literal["planned", "as planned", "out of time", "at the goal", "no finite energy", "outside the workspace", Fault]
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,7 @@ class Decision:
     # the workspace, uniform frame (a camera's image has no contrast), frozen frame (it is the last one, although the
     # robot has moved): do nothing
     why: Why
-    energy_now: float  # of the current image, if nothing changed: to compare with the plan's; NaN of an unusable frame
+    energy_now: float  # of the current image, if nothing changed: to compare with the plan's; NaN for a faulty frame
     goals: tuple[int, ...]  # index of the goal that applies now, and after each model step of a plan
     progress: GoalProgress  # which goal that is, since when, and why it changed
     plan: Plan | None = None  # None if the goal is reached, or the robot is outside the workspace
@@ -214,11 +211,7 @@ class Controller:
         self.follow(timed(goals, durations), mask=mask)
 
     def follow(
-        self,
-        goals: Sequence[SubGoal],
-        *,
-        mask: np.ndarray | None = None,
-        cancelled: Cancelled = lambda: False,
+        self, goals: Sequence[SubGoal], *, mask: np.ndarray | None = None, cancelled: Cancelled = lambda: False
     ) -> None:
         """Set goals that take their turns by their own rules, and forget all observations.
 
@@ -245,10 +238,9 @@ class Controller:
             self.require_contrast(goal.image, where=f"goal {place}")
         ruled = with_shares(goals, self.config.goals)
         searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
-        latents = []
-        for goal in goals:
-            if cancelled():
-                raise SearchCancelledError
+        report, latents = until_cancelled(cancelled), []
+        for place, goal in enumerate(goals):
+            report(place, len(goals))
             latents.append(self.encoded(goal.image))
         weights = self._weights(mask, goals[0].image)
         self._goals, self._goal_latents, self._patch_weights = ruled, torch.stack(latents), weights
@@ -285,15 +277,15 @@ class Controller:
         """
         state = self._checked(frame, state)
         cameras = newest_frames(split_views(frame[None], self.config.views), state, self._cameras)
-        why = self._why_unusable(frame, cameras, state)
+        why = self._why_faulty(frame, cameras, state)
         if why is None:
             seen = self._with(frame, state)
             decision = self._decided(seen, samples, cancelled)
             self._progress = decision.progress
         else:  # the context begins again: it would not be frames that are a model step apart
-            seen, decision = [], self._unusable(state, why)
-        self._seen, self._cameras = seen, cameras  # after an error nothing has changed
-        self._done, self.decision = self._done + 1, decision
+            seen, decision = [], self._faulty(state, why)
+        # after an error nothing has changed
+        self._seen, self._cameras, self._done, self.decision = seen, cameras, self._done + 1, decision
         return decision.action
 
     @property
@@ -365,16 +357,15 @@ class Controller:
         views = split_views(image[None], self.config.views)
         return views if self.crop == "letterbox" else view(views, self.crop)
 
-    def _why_unusable(self, frame: np.ndarray, cameras: Sequence[CameraFrame], state: np.ndarray) -> Unusable | None:
-        """Return why a frame must not move the robot: one unusable camera of several is enough. None: it may."""
+    def _why_faulty(self, frame: np.ndarray, cameras: Sequence[CameraFrame], state: np.ndarray) -> Fault | None:
+        """Return why a frame must not move the robot: one faulty camera of several is enough. None: it may."""
         if any(map(is_uniform, self._shown(frame))):
             return "uniform frame"
-        largest = self.space.upper[0].double().numpy()
-        if any(has_moved(camera.state, state, self.spaces.state, largest) for camera in cameras):
-            return "frozen frame"
-        return None
+        space, largest = self.spaces.state, self.space.upper[0].double().numpy()
+        is_frozen = any(has_moved(before, state, space, largest) for _, before in cameras)
+        return "frozen frame" if is_frozen else None
 
-    def _unusable(self, state: np.ndarray, why: Unusable) -> Decision:
+    def _faulty(self, state: np.ndarray, why: Fault) -> Decision:
         """Return the decision to do nothing; goals make no progress, since the frame shows nothing about them."""
         progress = self._progress or GoalProgress(0, 0, math.nan)
         places, command = (progress.place,) * self.space.steps, self._command(state, np.zeros(len(state)))

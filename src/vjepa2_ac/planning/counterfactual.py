@@ -62,12 +62,11 @@ def named_actions(
     axis, sign = _DIRECTIONS[name]
     size = _size_along(axis, size_m, limits)
     if size == 0:
-        key, found, needed = "planning.limits.xyz", "0", "a limit above 0"
-        if axis == GRIPPER:
-            key = "planning.limits.gripper"
-            if limits is not None and limits.gripper_mode == "held":
-                key, found, needed = "planning.limits.gripper_mode", "held", "rounded or free"
-        raise InputError(where=key, found=f"{found}, so that nothing can move {name}", needed=needed)
+        key, found, needed = "gripper" if axis == GRIPPER else "xyz", "0", "a limit above 0"
+        if axis == GRIPPER and limits is not None and limits.gripper_mode == "held":
+            key, found, needed = "gripper_mode", "held", "rounded or free"
+        where = f"planning.limits.{key}"
+        raise InputError(where=where, found=f"{found}, so that nothing can move {name}", needed=needed)
     actions[:, axis] = sign * size
     return actions
 

@@ -12,7 +12,7 @@ from typing import Annotated
 from pydantic import Field
 
 from vjepa2_ac.config import Config, DataConfig
-from vjepa2_ac.config.loading import load_config_of_run, parse_config
+from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.data.windows import require_stride
@@ -24,7 +24,8 @@ from vjepa2_ac.storage.structured import read_json_object, record_of
 logger = logging.getLogger(__name__)
 
 USED = (
-    "planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype", "training.device", *MOVABLE,
+    "planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype", "model.encoder_weights",
+    "training.device", *MOVABLE,
 )  # fmt: skip
 _ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
 _SLACK = 1.1  # uniform motion has its 99th percentile below its limit, and that of some episodes is not exact
@@ -55,7 +56,7 @@ def planning_settings(
         plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
         its = parse_config(plain, overrides, where="overrides")
     else:
-        its = load_config_of_run(config, [*overrides, _ANY_TYPE])
+        its = load_config(config, [*overrides, _ANY_TYPE])
         its = its.model_copy(update={"model": its.model.with_base(subject)})
     require_limits(its)
     require_axes(its)

@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, escaped
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import merge_adapter, trainable_report
@@ -122,7 +122,7 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metr
 
 def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
     """Return the README.md of an adapter, in Markdown, with the Hub's front matter."""
-    config, model, name = run.config, run.world_model, folder.resolve().name
+    config, model, name = run.config, run.world_model, escaped(folder.resolve().name)
     environment = Environment(  # Markdown is not escaped
         loader=PackageLoader("vjepa2_ac", "assets"),
         undefined=StrictUndefined,
@@ -130,7 +130,8 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         trim_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"code": lambda name: f"`{name}`", "count": _count, "ratio": _ratio}
+    code = lambda name: f"`{escaped(str(name)).replace('`', '_')}`"  # noqa: E731 - names are no markup in a span of code
+    environment.filters |= {"code": code, "count": _count, "ratio": _ratio}
     measured = None if metrics is None else _measured(metrics)
     front = ModelCardData(
         library_name="peft",
@@ -144,7 +145,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         run=run,
         name=name,
         evaluation=metrics,
-        answer=None if metrics is None else replace(metrics.answer, subject=folder.resolve().name),
+        answer=None if metrics is None else replace(metrics.answer, subject=name),
         measured=measured,
         plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
         base=model.adaptation,

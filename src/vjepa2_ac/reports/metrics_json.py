@@ -14,10 +14,10 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from vjepa2_ac.errors import InputError, MissingFileError
+from vjepa2_ac.errors import InputError, MissingFileError, shell_command
 from vjepa2_ac.evaluation.answer import Answer, answer
 from vjepa2_ac.evaluation.request import SCORED
-from vjepa2_ac.evaluation.result import L1, Evaluation, Row, WrittenAbout
+from vjepa2_ac.evaluation.result import ACTIONS, L1, Evaluation, Row, WrittenAbout
 from vjepa2_ac.storage import user_can_read, write_atomically
 from vjepa2_ac.storage.structured import json_text
 
@@ -81,7 +81,7 @@ def read_metrics(folder: Path) -> Metrics:
         InputError: There is nothing, it is damaged, or of another format.
         UnreachableError: It cannot be read.
     """
-    path, fix = folder / METRICS_FILE, f"Write it with `vjepa2-ac evaluate {folder}`"
+    path, fix = folder / METRICS_FILE, f"Write it with `{shell_command('evaluate', folder)}`"
     try:
         with user_can_read(path):
             return TypeAdapter(Metrics).validate_json(path.read_bytes())
@@ -124,6 +124,10 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "by_clip": {
             "persistence": one.errors.of("rollout", L1, "persistence"),
             "models": {name: model.errors.of("rollout") for name, model in one.models.items()},
+            "one_step": {
+                name: {way: model.errors.of("teacher_forced", way=way).mean(1) for way in ("persistence", *ACTIONS)}
+                for name, model in one.models.items()
+            },
         },
         "models": {
             name: {key: getattr(model, key) for key in of_model}

@@ -9,6 +9,7 @@ import base64
 import json
 import math
 import re
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -104,7 +105,7 @@ def report_page(evaluation: Evaluation, found: Answer) -> str:
     )
     environment.tests["search_for"] = lambda text, word: word in text
     environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(visible, name.split("/")))
-    environment.filters |= {"bar": bar_of, "percent": percent, "interval": interval_of}
+    environment.filters |= {"quote": shlex.quote, "bar": bar_of, "percent": percent, "interval": interval_of}
     return environment.get_template("report.html.jinja").render(
         evaluation=evaluation,
         answer=found,

@@ -23,7 +23,7 @@ from typing import Annotated, Any, BinaryIO
 from pydantic import Field
 
 from vjepa2_ac.config.section import PositiveInt
-from vjepa2_ac.errors import InputError, MissingFileError
+from vjepa2_ac.errors import InputError, MissingFileError, shell_command
 from vjepa2_ac.storage import is_refusal, read_bounded, sha256_of_file, sync, user_can_read
 from vjepa2_ac.storage.structured import MOST_BYTES, json_object, read_json_object, record_of, shown
 
@@ -359,7 +359,7 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
     folder = run / CHECKPOINTS
     newest = newest_checkpoint(folder)
     if newest is None:
-        fix = f"Train on with `vjepa2-ac train {run} --resume`"
+        fix = f"Continue the training with `{shell_command('train', run, '--resume')}`"
         raise InputError(where=str(run), found="a run without a whole checkpoint", needed="at least one", fix=fix)
     state = written_state(newest)
     if by == NEWEST or (by == SELECTED and state.best_step is None):

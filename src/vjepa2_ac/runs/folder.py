@@ -36,7 +36,7 @@ from filelock import FileLock, Timeout
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config_of_run
 from vjepa2_ac.config.section import Affects, mark_of
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
 from vjepa2_ac.storage import read_bounded, try_writing_at, user_can_read, user_can_write, write_atomically
 from vjepa2_ac.storage.places import BUILTIN, is_url, literal
@@ -82,7 +82,7 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
         changed = [] if allow_config_change else changed_keys(read_run_config(folder), config)
         if differing := [key for key in changed if Affects.RUN in mark_of(key, Config)]:
             found = f"a run of another config; it differs in {', '.join(differing)}"
-            same = f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`"
+            same = f"Set another run_dir for a new run, or resume with `{shell_command('train', folder, '--resume')}`"
             fix = f"{same}; where the change is meant, add --allow-config-change"
             raise InputError(where=str(folder), found=found, needed="the same config, to go on with it", fix=fix)
     elif folder.exists() and not all(_is_without_config(path) for path in folder.iterdir()):

@@ -6,6 +6,7 @@ import hmac
 import ipaddress
 import logging
 import re
+import shlex
 import stat
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -84,11 +85,11 @@ def read_key(path: Path) -> str:
     key = text.partition("\n")[0].strip()
     if len(key) < LEAST_KEY or not key.isprintable() or " " in key:
         found = f"a first line of {len(key)} characters"
-        fix = f"Make one: python -c 'import secrets; print(secrets.token_urlsafe())' > {path}"
+        fix = f"Make one: python -c 'import secrets; print(secrets.token_urlsafe())' > {shlex.quote(str(path))}"
         needed = f"a key of {LEAST_KEY} characters or more, without spaces"
         raise InputError(where=f"--key-file {path}", found=found, needed=needed, fix=fix)
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        logger.warning("%s can be read by other users of this machine: chmod 600 %s", path, path)
+        logger.warning("%s can be read by other users of this machine: chmod 600 %s", path, shlex.quote(str(path)))
     return key
 
 

@@ -182,16 +182,19 @@ class Session:
         if self._goal is None:
             needed = f"a goal first: goal/image, goal/images or goal/name{self._known_names()}"
             raise InputError(where="request", found="no goal in this episode", needed=needed)
-        changes, planning_began, is_stopped = self._changes(request), self._clock(), self.stopped.is_set
-        seen, how = (request.frame, request.state), {"cancelled": lambda: is_stopped() or cancelled()}
+        changes, planning_began, seen = self._changes(request), self._clock(), (request.frame, request.state)
+
+        def is_over() -> bool:
+            return self.stopped.is_set() or cancelled()
+
         if request.is_score and changes is not None:  # nothing moves, and no decision is counted
-            found = self.controller.score(*seen, changes, **how)
+            found = self.controller.score(*seen, changes, cancelled=is_over)
             return {**found.as_dict(is_blind=self.options.is_blind), "goal": found.goal}
-        self.controller.act(*seen, samples=changes, **how)
+        self.controller.act(*seen, samples=changes, cancelled=is_over)
         decision, why = self._checked(request.state)
         self._note(request.frame)
         self._watch(decision)
-        if is_stopped():
+        if self.stopped.is_set():
             decision, why = replace(decision, plan=None, states=None), STOPPED
         return self._sent(*seen, (decision, why), (began, planning_began))
 

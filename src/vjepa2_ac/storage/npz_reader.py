@@ -18,6 +18,7 @@ from vjepa2_ac.storage import ByteReader, is_refusal
 
 _LOCAL_HEADER_BYTES = 30
 _MOST_BYTES = 1 << 30  # of an array that is read completely
+_MOST_UNPACKED, _MOST_RATIO = 1 << 30, 100  # a larger compressed array has at most this many times its packed bytes
 _KINDS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # as numpy writes; others expand without a bound
 _FIX = "Write the file again, with numpy.savez"
 
@@ -74,6 +75,9 @@ class NpzFile:
                 raise ValueError("an array of Python objects, which would have to be executed")
             if header.start + header.nbytes != member.file_size:
                 raise ValueError(f"shape {header.shape} of {header.dtype} in {member.file_size} bytes")
+            if member.file_size > max(_MOST_UNPACKED, _MOST_RATIO * member.compress_size):
+                unpacked = f"{member.compress_size:,} bytes that unpack to {member.file_size:,}"
+                raise ValueError(f"{unpacked}; above {_MOST_UNPACKED:,} bytes at most {_MOST_RATIO} times as many")
             return header
 
     def array(self, name: str) -> Shaped[np.ndarray, ...]:
@@ -95,11 +99,12 @@ class NpzFile:
         with self._damage_is_named(name), self._archive.open(member) as unpacked:
             stored = member.compress_type == zipfile.ZIP_STORED
             file, start = (self._file, self._start_of(member)) if stored else (unpacked, 0)
-            found: dict[int, Shaped[np.ndarray, " numbers"]] = {}
-            for row in sorted(set(rows)):
+            ordered, places = np.unique(rows, return_inverse=True)
+            found = np.empty((len(ordered), *header.shape[1:]), header.dtype)
+            for place, row in enumerate(ordered.tolist()):
                 file.seek(start + header.start + row * header.row_bytes)
-                found[row] = np.frombuffer(file.read(header.row_bytes), header.dtype, prod(header.shape[1:]))
-            return np.stack([found[row] for row in rows]).reshape(len(rows), *header.shape[1:])
+                found[place] = np.frombuffer(file.read(header.row_bytes), header.dtype).reshape(header.shape[1:])
+            return found if (places == np.arange(len(rows))).all() else found[places]
 
     def _start_of(self, member: zipfile.ZipInfo) -> int:
         """Return where the bytes of an uncompressed member begin in the file."""

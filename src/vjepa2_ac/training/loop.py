@@ -28,6 +28,7 @@ from vjepa2_ac.distributed import (
     leave_processes,
     require_same,
 )
+from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, newest_checkpoint, read_state
@@ -183,7 +184,14 @@ def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, repor
         while not (stopped_by or is_done(run.config, run.state)):
             step = run.state.step + 1
             is_logged = step % training.log_every == 0 or step == training.steps
-            metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
+            try:
+                metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
+            except UnreachableError:  # after a signal, data that do not come end the run before the step
+                if not stop.number or processes > 1:
+                    raise
+                stopped_by = stop.number
+                _save(run, metrics_log)
+                break
             reporter.stepped(step, metrics)
             if is_logged and metrics_log:
                 metrics_log.write("train", step, metrics)

@@ -5,6 +5,7 @@ What only some runs use is imported where they use it: a stride chosen by the mo
 
 from __future__ import annotations
 
+import platform
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -16,11 +17,20 @@ from torch import nn
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import find_duplicates
+from vjepa2_ac.config.model import ModelSizes
 from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.inspection.motion import warnings_from_index
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader
-from vjepa2_ac.data.streams import copies_for
-from vjepa2_ac.distributed import PRECISIONS, broadcast_object, first_of_machine, first_only, make_accelerator
+from vjepa2_ac.data.streams import copies_for, require_shared_memory
+from vjepa2_ac.distributed import (
+    PRECISIONS,
+    agreed,
+    all_gather_object,
+    broadcast_object,
+    first_of_machine,
+    first_only,
+    make_accelerator,
+)
 from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for
 from vjepa2_ac.encoding.encode_dataset import with_latents
 from vjepa2_ac.episode import Batch, LatentBatch
@@ -32,6 +42,7 @@ from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import RunState
+from vjepa2_ac.training.cost.memory import batch_bytes
 from vjepa2_ac.training.data_sets import (
     first_clip,
     open_data_sets,
@@ -138,8 +149,8 @@ def set_up(
         decoder = load_decoder(config.validation.decoder, where="validation.decoder:")
     # The others find the index of the first one on this machine, however long it takes.
     dataset, *others = first_of_machine(accelerator, lambda: open_data_sets(config, reporter))
-    if (duplicates := find_duplicates(dataset)).episodes:
-        reporter.note(f"Warning: {duplicates}.")
+    for warning in warnings_from_index(dataset):
+        reporter.note(f"Warning: {warning.text}.")
     _check_heads(config, dataset)
     chooser, calibration = None, None
     if is_auto:
@@ -158,6 +169,7 @@ def set_up(
     if decoder is not None:
         decoder.require_fit(world_model, config.data.crop, subject=str(config.model.base or "the random model"))
 
+    _require_shared_memory(config, clip, world_model.sizes, accelerator)
     for replayed in others:
         extrinsics_for(world_model, first_clip(replayed))
     use = partial(with_latents, model=world_model, accelerator=accelerator, reporter=reporter, check_only=check_only)
@@ -185,6 +197,13 @@ def set_up(
         replayed=others[0] if others else None,
         strip=strip,
     )
+
+
+def _require_shared_memory(config: Config, clip: Batch, sizes: ModelSizes, accelerator: Accelerator) -> None:
+    is_encoded_later = config.data.takes_latents and clip.latents is None
+    size = batch_bytes(config, sizes) if is_encoded_later else clip.nbytes * config.training.batch_size
+    nodes = all_gather_object(accelerator, platform.node())
+    agreed(accelerator, lambda: require_shared_memory(config.data, size, nodes.count(platform.node())))
 
 
 def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:

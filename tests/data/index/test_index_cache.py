@@ -80,6 +80,18 @@ def test_whatever_is_damaged_the_table_is_right(tmp_path: Path, caplog: pytest.L
     assert rebuilt > 150
 
 
+def test_the_index_of_another_data_set_is_not_used_under_this_name(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept(tmp_path, table=TABLE)
+    [path] = (tmp_path / "index").iterdir()
+    other = index_key({"files": 4}, "/data/set")
+    path.rename(path.with_name(f"{other}.index"))
+    assert ids(kept(tmp_path, other, table=EpisodeTable.of([EpisodeInfo("other", 1)]))) == ["other"]
+    assert "of other data" in caplog.text
+    assert ids(kept(tmp_path, other)) == ["other"]
+
+
 def test_a_folder_that_cannot_be_written_costs_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -1,7 +1,7 @@
 """Speeds that no arm reaches, padding, rotation formats and episode ends: faults are named, clean data stay silent."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +14,16 @@ from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.inspection import motion
 from vjepa2_ac.data.inspection.findings import Finding
-from vjepa2_ac.data.inspection.motion import Stretch, check_motion, count_at_end, padding_finding, speed_finding
+from vjepa2_ac.data.inspection.motion import (
+    Stretch,
+    check_motion,
+    count_at_end,
+    padding_finding,
+    speed_finding,
+    warnings_from_index,
+)
 
 STEPS, RATE_HZ = 40, 10.0
 LIMITS = MotionLimits()
@@ -86,9 +94,11 @@ def standing_at_the_ends(number: int) -> Pair:
     return states[order], frames[order]
 
 
-def config_of(folder: Path, make: Callable[[int], Pair], *, rate_hz: float = RATE_HZ, **changes: object) -> DataConfig:
+def config_of(
+    folder: Path, make: Callable[[int], Pair], *, rate_hz: float = RATE_HZ, episodes: int = 6, **changes: object
+) -> DataConfig:
     folder.mkdir(exist_ok=True)
-    for number in range(6):
+    for number in range(episodes):
         states, frames = make(number)
         np.savez(folder / f"{number:03d}.npz", states=states, frames=frames, fps_hz=rate_hz)
     values = {"source": "npz", "path": str(folder), "frames": 3, "stride": 2, "test_share": 0.0, "workers": 0}
@@ -110,7 +120,7 @@ def test_clean_motion_has_no_warning_at_any_rate(tmp_path: Path, make: Callable[
     assert {one.level for one in findings.values()} <= {"ok", "skipped"}
     assert findings["speed"].text.endswith("between control steps (6 of 6 episodes checked)")
     assert [name for name, one in findings.items() if one.level == "skipped"] == (
-        ["rotation format"] if make is near_the_base else []
+        ["scale", *(["rotation format"] if make is near_the_base else [])]
     )
 
 
@@ -119,7 +129,10 @@ def test_padding_is_named_with_its_steps_and_black_frames_are_counted(tmp_path: 
     assert set(warnings) == {"speed", "padding", "episode ends"}
     assert warnings["padding"].startswith("45 states in 6 episodes with a position and a rotation of exactly zero")
     assert re.search(r"Example: 00[135], steps 30 to 39\.", warnings["padding"])
-    assert "6 of 234 control steps, in 6 episodes, are faster than 2.5 m/s or 10 rad/s" in warnings["speed"]
+    fast = (
+        "faster than 2.5 m/s or 10 rad/s, which no arm reaches: 6 control steps in 6 episodes (6 of 6 episodes checked)"
+    )
+    assert warnings["speed"].startswith(fast)
     assert warnings["episode ends"].startswith("45 black and 0 frozen frames")
     assert re.search(r"Example: 00[135], the last 10 frames are black\.", warnings["episode ends"])
 
@@ -133,6 +146,87 @@ def test_speed_example_is_the_step_between_joined_recordings(tmp_path: Path) -> 
     text = speed_finding([stretch], RATE_HZ, LIMITS, "1 of 1 episode checked").text
     jump_m = np.linalg.norm(states[40, :3] - states[39, :3])
     assert f"Example: e, step 46 to 47: {RATE_HZ * jump_m:.1f} m/s" in text
+
+
+def with_one_outlier(number: int) -> Pair:
+    states, frames = clean(number)
+    states[7, 0] *= 8 if number == 3 else 1
+    return states, frames
+
+
+@pytest.mark.parametrize("in_sample", [200, 1])
+def test_one_impossible_position_in_one_episode_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_sample: int
+) -> None:
+    monkeypatch.setattr(motion, "_EPISODES", in_sample)
+    config = config_of(tmp_path / "set", with_one_outlier)
+    for text in (warnings_of(config)["speed"], *(one.text for one in warnings_from_index(open_dataset(config)))):
+        assert ": 2 control steps in 1 episode (" in text
+        assert "Example: 003, step " in text
+        assert re.search(r"step (6 to 7|7 to 8): \d\d\.\d m/s", text)
+    assert ("6 by the index" in warnings_of(config)["speed"]) == (in_sample == 1)
+    assert not warnings_from_index(open_dataset(config_of(tmp_path / "clean", clean)))
+
+
+def test_only_episodes_that_are_too_fast_by_the_index_are_read(tmp_path: Path) -> None:
+    dataset = open_dataset(config_of(tmp_path / "set", with_one_outlier))
+    reads: list[int] = []
+    read = dataset.source.read
+    dataset.source.read = lambda index, *_: reads.append(index) or read(index)  # type: ignore[method-assign, func-returns-value, assignment, misc]
+    assert [one.about for one in warnings_from_index(dataset)] == ["speed"]
+    assert [dataset.table.identity(index) for index in reads] == ["003"]
+
+
+def test_impossible_positions_that_the_idle_filter_removes_do_not_count(tmp_path: Path) -> None:
+    def make(number: int) -> Pair:
+        states, frames = padded(number)
+        states[30:] = states[29] + np.where(np.arange(7) == 0, 2.0, 0.0)
+        return states, frames
+
+    idle = {"rule": "motion", "shortest_idle_steps": 3, "shortest_kept_steps": 5, "cut_last_steps": 2}
+    assert "speed" not in {
+        one.about for one in warnings_from_index(open_dataset(config_of(tmp_path / "set", make, idle=idle)))
+    }
+
+
+def test_black_or_uniform_frames_of_some_episodes_are_named_and_no_frozen_camera(tmp_path: Path) -> None:
+    def make(number: int) -> Pair:
+        states, frames = clean(number)
+        if number in (2, 4):
+            frames[5:-5] = 40 * number - 80
+        return states, frames
+
+    warnings = warnings_of(config_of(tmp_path / "set", make))
+    assert set(warnings) == {"blank frames"}
+    assert warnings["blank frames"].startswith("the middle frame is black or uniform in 2 of 6 episodes checked: 00")
+
+
+def scaled(factor: float, numbers: Sequence[int]) -> Callable[[int], Pair]:
+    def make(number: int) -> Pair:
+        states, frames = clean(number)
+        states[:, :3] *= factor if number in numbers else 1
+        return states, frames
+
+    return make
+
+
+def test_episodes_at_another_scale_are_counted(tmp_path: Path) -> None:
+    half = config_of(tmp_path / "half", scaled(0.5, range(0, 12, 2)), episodes=12)
+    (warning,) = warnings_from_index(open_dataset(half))
+    assert warning.about == "scale"
+    assert re.match(
+        r"6 episodes, such as 0(0|1)\d, have positions and motions (1.9|2.0)\d times as large", warning.text
+    )
+    assert findings_of(half)["scale"] == warning
+    for name, make in {"clean": clean, "one": scaled(0.5, [3]), "moved": moved_in_x}.items():
+        assert findings_of(config_of(tmp_path / name, make, episodes=12))["scale"].level == "ok", name
+
+
+def moved_in_x(number: int) -> Pair:
+    """Return the motion of a second station, farther from the base in one direction only."""
+    states, frames = clean(number)
+    states[:, 0] += 0.6 * (number % 2)
+    return states, frames
 
 
 def test_single_zero_states_are_lost_measurements(tmp_path: Path) -> None:
@@ -184,7 +278,7 @@ def test_vectors_and_latent_caches_skip_what_needs_poses_and_frames(tmp_path: Pa
     values = {"source": "npz", "path": str(write_vectors(tmp_path / "set", width=7)), "states": "vector"}
     config = DataConfig.model_validate(values | {"frames": 3, "stride": 2, "workers": 0})
     findings = findings_of(config)
-    assert [one.level for one in findings.values()] == ["skipped", "skipped", "skipped", "ok"]
+    assert [one.level for one in findings.values()] == ["skipped"] * 4 + ["ok"] * 2
     assert findings["speed"].text == "needs poses (data.states: pose), found vectors"
 
 

@@ -13,6 +13,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import npz_reader
 
 STEPS = 20
 ARRAYS = {
@@ -97,3 +98,20 @@ def test_what_claims_more_than_an_episode_holds_is_refused_before_it_is_unpacked
     with pytest.raises(InputError, match=message):
         raise InputError(where=problem.where, found=problem.found, needed=problem.needed, fix=problem.fix)
     assert peak < 6 * _MB
+
+
+def test_frames_that_unpack_to_far_more_bytes_than_the_file_has_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(npz_reader, "_MOST_UNPACKED", 1 << 20)
+    folder = tmp_path / "set"
+    folder.mkdir()
+    noise = np.random.default_rng(0).integers(0, 8, (STEPS, 150, 150, 3)).astype(np.uint8)
+    np.savez_compressed(folder / "noisy.npz", **ARRAYS | {"frames": noise})
+    np.savez(folder / "plain.npz", **ARRAYS | {"frames": noise * 0})
+    np.savez_compressed(folder / "small.npz", **ARRAYS)
+    add(without(folder / "bomb.npz", "frames"), "frames", described((STEPS, 150, 150, 3), "|u1"), noise.nbytes)
+    table = table_of(folder)
+    (problem,) = table.problems
+    assert ([info.id for info in table], problem.where) == (["noisy", "plain", "small"], f"{folder}/bomb.npz: frames")
+    assert "bytes that unpack to 1,350,128; above 1,048,576 bytes at most 100 times as many" in problem.found

@@ -63,6 +63,8 @@ def test_the_command_notices_a_broken_picture_and_shows_where(
     run = tmp_path / "run"
     shutil.copytree(whole_run, run)
     words = ["monitor", str(run), "--false-alarms", "0.4"]
+    assert main([*words, "planning.views=2"]) == 2
+    assert "planning.views: 2" in capsys.readouterr().err
     assert main(words) == 0
     assert json.loads((run / MONITOR).read_text())["false_alarms"] == 0.4
     watch = [*words, "--data", str(tmp_path / "today.yaml"), "--threshold", str(run), "--out", str(tmp_path / "out")]

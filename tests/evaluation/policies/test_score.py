@@ -106,6 +106,44 @@ def test_the_real_controller_scores_the_same_places(dataset: Dataset) -> None:
     assert 0 < found.policies[0].mean.value < 10
 
 
+class Noting(Knowing):
+    """Notes what it is asked for."""
+
+    def score(self, frame: np.ndarray, state: np.ndarray, chunks: np.ndarray) -> ChunkScores:
+        self.frames, self.chunks = [*getattr(self, "frames", []), frame], [*getattr(self, "chunks", []), chunks]
+        return super().score(frame, state, chunks)
+
+
+def test_other_actions_are_of_other_episodes(dataset: Dataset) -> None:
+    run, one = Noting(tiny_model(), PlanningConfig()), policy(dataset, "one", 0.1)
+    score_policies(run, dataset, [one])
+    episodes = [name for name, step in sorted(one.places) if step < STEPS - 1]
+    true = np.stack([chunks[0] for chunks in run.chunks])
+    assert len(true) == len(episodes) == 2 * EPISODES
+    for name, chunks in zip(episodes, run.chunks, strict=True):
+        for other in chunks[1 : len(chunks) - 3]:
+            (places,) = np.nonzero((true == other).all(axis=(1, 2)))
+            assert {episodes[place] for place in places.tolist()}.isdisjoint({name})
+            assert len(places)
+
+
+def test_views_are_read_side_by_side_as_the_planner_sees_them(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for number in range(3):
+        views = {name: rng.integers(0, 255, (STEPS, 24, 32, 3), dtype=np.uint8) for name in ("frames", "right")}
+        states = np.tile([0.4, 0.0, 0.3, 3.1, 0.0, 0.0, 0.0], (STEPS, 1))
+        np.savez(tmp_path / f"{number}.npz", states=states + 0.01 * np.arange(STEPS)[:, None], fps_hz=15.0, **views)
+    how = {"source": "npz", "frames": 3, "stride": STRIDE, "workers": 0}
+    both = open_dataset(tmp_path, camera=("frames", "right"), **how)
+    one = PolicyChunks("one", ((both.table.identity(1), 3),), np.zeros((1, 1, 4, 7)) + 0.4)
+    run = Noting(tiny_model(), PlanningConfig(views=2))
+    score_policies(run, both, [one])
+    expected = [both.source.read(1, camera).read_frames([3])[0] for camera in ("frames", "right")]
+    np.testing.assert_array_equal(run.frames[0], np.hstack(expected))
+    with pytest.raises(InputError, match=r"data\.camera: frames\. needed: 2 cameras"):
+        score_policies(run, open_dataset(tmp_path, camera="frames", **how), [one])
+
+
 def test_places_that_not_all_have_are_left_out_and_unknown_episodes_refused(dataset: Dataset) -> None:
     one, other = policy(dataset, "one", 0.1), policy(dataset, "other", 0.1)
     fewer = PolicyChunks("other", other.places[:2], other.chunks[:2])

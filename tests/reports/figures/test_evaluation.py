@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from matplotlib.figure import Figure
 
-from evaluation_results import evaluation
+from evaluation_results import decoded_strips, evaluation
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import Comparison
-from vjepa2_ac.reports.figures.evaluation import draw_training, plot_comparison, plot_evaluation
+from vjepa2_ac.reports.figures.evaluation import draw_decoded, draw_training, plot_comparison, plot_evaluation
 
 NAMES = ("runs/lora", "_hidden", r"$\frac$", *(f"run {number}" for number in range(10)))
 
@@ -34,6 +35,17 @@ def test_names_that_look_like_formulas_and_missing_images_do_not_stop_the_image_
     bare = replace(one, examples=tuple(replace(example, frames=None) for example in one.examples))
     assert plot_evaluation(bare, tmp_path / "bare.png").stat().st_size > 1000
     assert plot_evaluation(replace(one, examples=()), tmp_path / "none.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_decoded_rollouts_without_a_finite_psnr_are_drawn_and_say_so(value: float) -> None:
+    one = decoded_strips(evaluation())
+    assert one.decoded is not None
+    curves = {key: (Estimate(value, value, value),) * one.horizon for key in one.decoded.curves}
+    figure = Figure()
+    draw_decoded(figure, one, replace(one.decoded, curves=curves))
+    figure.canvas.draw()
+    assert figure.axes[0].get_title().endswith("no finite value")
 
 
 def test_no_empty_chart_stands_beside_those_of_training() -> None:

@@ -1,10 +1,12 @@
 """Episodes end where the actions lead, and the metrics agree."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
-from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem, make_problem
+from vjepa2_ac.simulation.closed_loop.tasks import TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
 from vjepa2_ac.spaces import actions_from_states
 
@@ -74,6 +76,18 @@ def test_the_oracle_succeeds_and_nothing_and_chance_do_not(arm: SimulatedArm) ->
     assert [result.policy for result in results] == ["oracle", "do nothing", "random"]
     assert oracle.why_counts == {"scripted": 40}
     assert not oracle.unreachable.any()
+
+
+@pytest.mark.parametrize("task", ["reach", "push"])
+def test_moving_objects_start_every_episode_where_they_start_for_every_policy(task: TaskName) -> None:
+    spec = RolloutSpec(task, replace(DOMAIN_B, moving=3), episodes=2, steps=2, films=2)
+    arm = arm_for(task, spec.world, size=(45, 80))
+    zero, random, again = (run_task(spec, one, arm) for one in (ZeroActions(), RandomActions(SMALL), ZeroActions()))
+    for first, other, repeated in zip(zero.episodes, random.episodes, again.episodes, strict=True):
+        np.testing.assert_array_equal(first.goal_image, other.goal_image)
+        np.testing.assert_array_equal(first.frames[0], other.frames[0])
+        np.testing.assert_array_equal(first.frames, repeated.frames)
+        assert (first.frames[1] != first.frames[2]).any(), "nothing moves"
 
 
 def test_an_episode_starts_at_the_start_and_shows_the_goal(arm: SimulatedArm) -> None:

@@ -137,7 +137,7 @@ def test_every_second_step_is_recorded_where_that_suffices(tmp_path: Path) -> No
         (command("no rate"), "rate_hz: "),
         (command("dies"), "ended with status 1\n(.*\n)*RuntimeError: the cube fell off the table"),
         (command("refuses"), "the arm is asleep"),
-        (command("six numbers"), "not of seven finite numbers. needed: image, state, distance_m and success"),
+        (command("six numbers"), "state: 6 numbers in the shape \\(6,\\). needed: 7: x"),
         (command("no expert"), "fake 1.0 Come has no expert"),
         (command("hard"), "the expert solves 0 of 4 problems in 3 model steps. needed: half of them"),
     ],

@@ -61,13 +61,18 @@ def test_commands_differ_from_measurements_and_velocities_from_zero() -> None:
     assert np.abs(episode.action_dict.cartesian_velocity).max() < 5.0  # no jump where angles wrap
 
 
-def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(recorded: Path, tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("random.py").write_text("open('RAN', 'w')")  # as a user may call a script
     reported = []
     spec, how = RecordingSpec("B", STEPS, seed=3), {"episodes": EPISODES, "shards": 2, "workers": 2}
     again = record_dataset(tmp_path / "again", spec, **how, progress=lambda *state: reported.append(state))
     assert reported == [(done, EPISODES) for done in range(1, EPISODES + 1)]
     for file in sorted(recorded.iterdir()):
         assert file.read_bytes() == (again / file.name).read_bytes()
+    assert not Path("RAN").exists()
 
 
 def test_another_look_changes_the_images_and_nothing_else() -> None:

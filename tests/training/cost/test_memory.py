@@ -1,6 +1,8 @@
 """The memory estimate adds up what is allocated at once, depends on every relevant knob, and doctor prints it."""
 
 import json
+import shutil
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -97,10 +99,12 @@ def test_doctor_says_whether_it_fits_and_what_of_it_is_estimated(
     tmp_path, capsys, monkeypatch, batch: int, status: int, word: str
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=64e6))  # of shared memory, as in Docker
     path = tmp_path / "run.yaml"
     path.write_text(json.dumps(USUAL))
     assert main(["doctor", str(path), f"training.batch_size={batch}"]) == status
     reported = capsys.readouterr().out
+    assert ("Warning: /dev/shm: 64 MB free" in reported) == (batch == 8)
     assert word in reported
     assert "the CUDA context is estimated" in reported
     assert f"vjepa2-ac data check {path}" in reported

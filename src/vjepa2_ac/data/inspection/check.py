@@ -15,11 +15,11 @@ from jaxtyping import Float
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import ENOUGH_DIRECTIONS, Coverage, coverage_in, find_duplicates
+from vjepa2_ac.data.coverage import ENOUGH_DIRECTIONS, Coverage, coverage_in
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.excerpts import check_excerpts
 from vjepa2_ac.data.inspection.findings import Finding, Level, counted, first_case
-from vjepa2_ac.data.inspection.motion import check_motion
+from vjepa2_ac.data.inspection.motion import check_motion, duplicates_finding
 from vjepa2_ac.data.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.sources.indexed_source import FramesByStep
@@ -101,9 +101,7 @@ def _check_selection(dataset: Dataset) -> Iterator[Finding]:
         groups = len(np.unique(dataset.split_hash[dataset.taking_part]))
         exception = ", except for the splits of the data set" if held_out_by(dataset.table, config) else ""
         yield Finding("ok", "groups", f"{groups:,} groups by {config.split_by}; each is in one split{exception}")
-    duplicates = find_duplicates(dataset)
-    level = "skipped" if not duplicates.is_known else "warning" if duplicates.episodes else "ok"
-    yield Finding(level, "duplicates", str(duplicates))
+    yield duplicates_finding(dataset)
 
 
 def _check_test_split(dataset: Dataset) -> Iterator[Finding]:
@@ -196,6 +194,8 @@ def _frame_findings(
         else:
             is_far = np.linalg.norm(batch.actions[..., spaces.action.sized].numpy(), axis=-1) > _MOVED_M
         is_same = (batch.frames[:, 1:] == batch.frames[:, :-1]).flatten(2).all(dim=-1).numpy()
+        is_blank = np.ptp(batch.frames.numpy(), axis=(2, 3)).max(axis=-1) < _DARK  # the check "blank frames" has these
+        is_far &= ~is_blank[:, 1:]
         moved += int(is_far.sum())
         same += int((is_far & is_same).sum())
     mean = float(np.mean(means))
@@ -208,7 +208,7 @@ def _frame_findings(
     yield first_case(
         "frames",
         f"{same} of {moved} frames equal the previous frame although the robot moved",
-        (moved == 0, "skipped", "needs model steps in which the robot moves visibly, found none"),
+        (moved == 0, "skipped", "needs visible motion of the robot in frames that are not blank, found none"),
         (same > moved / 2, "error", "the frames do not show the motion. Check data.camera and the control rate"),
         (same > moved / 20, "warning", "check the control rate"),
     )

@@ -30,6 +30,7 @@ from vjepa2_ac.spaces import POSE, StateSpace
 EPISODES, _EPISODES_AT_URL = 24, 12  # an episode of DROID is about 5 MB
 STEPS = 64
 _ROWS, _COLUMNS = 24, 32  # of a small frame: an arm is still some pixels wide, and a camera's noise is averaged out
+BLANK = 8.0  # of 255: the parts of a black or uniform frame differ by less
 _STILL_FRAME = 0.1  # of an episode's median change: the codec noise of a repeated frame
 _STALE, _MOSTLY_STALE = 0.05, 0.5
 _COPIED = 0.2
@@ -43,6 +44,7 @@ _SHIFTS = 20  # pairings with other episodes, each covering all episodes
 _FEWEST_EPISODES = 8  # with fewer, chance level is not known well enough
 _SURE = 3.0  # standard errors, or deviations of chance
 _GAIN = 0.25  # of the value above chance, that another shift must add
+_BACKWARDS = 0.25  # by which an episode's frames fit better in opposite order; share of such episodes, at most
 _ABOVE = 0.15  # minimum above chance for matching frames: 0.3 and more was measured
 
 
@@ -82,6 +84,8 @@ def excerpts_of(dataset: Dataset, *, episodes: int = EPISODES, steps: int = STEP
 
 def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.ndarray, "steps rows columns"]:
     """Return frames in grey, each pixel the mean of a part; smaller frames are not reduced."""
+    if len(frames) > 1:  # one after the other: the grey frame has more bytes than the frame
+        return np.concatenate([small_grey(frame[None]) for frame in frames])
     grey = frames.mean(axis=3, dtype=np.float32)
     for axis, wanted in ((1, _ROWS), (2, _COLUMNS)):
         size = grey.shape[axis]
@@ -114,7 +118,7 @@ def excerpt_findings(
     excerpts: Sequence[Excerpt], space: StateSpace, stride: int, control_rate_hz: float
 ) -> Iterator[Finding]:
     """Yield what is unusual in excerpts, and whether frames and states belong together; reads nothing."""
-    excerpts = [one for one in excerpts if len(one.states) > 1]
+    excerpts = [one for one in excerpts if len(one.states) > 1 and np.ptp(one.grey) >= BLANK]
     if not excerpts:
         yield _agreement([], stride, control_rate_hz, is_sound=True)
         return
@@ -258,6 +262,10 @@ def _agreement(
         by = f"frames are {'at least ' * (abs(lag) == most)}{shift} ({abs(lag) / control_rate_hz:.2f} s)"
         level: Level = "error" if abs(lag) >= stride else "warning"  # an error: each action has the frames of another
         return Finding(level, "agreement", f"{by}; {text}. {fix}")
+    backwards = int((reverse - fitting > _BACKWARDS).sum())
+    if backwards > _BACKWARDS * len(pairs):
+        text = f"{backwards} of {len(pairs)} episodes have frames that fit the states better in opposite order ({text})"
+        return Finding("warning", "agreement", f"{text}. Check the order in time of both")
     text += f"; it is highest for frames that are {shift}" if lag else ""
     return Finding("ok", "agreement", f"frames change when the robot moves ({text})")
 

@@ -11,18 +11,24 @@ from jaxtyping import Bool, Float, Float32
 from vjepa2_ac import storage
 from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.config.sources import PoseFields, RotationFormat
-from vjepa2_ac.data.coverage import PERCENTILE, ReadEpisode, read_each, read_sample, sample_of
+from vjepa2_ac.data.coverage import PERCENTILE, ReadEpisode, find_duplicates, read_each, read_sample, sample_of
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.inspection.excerpts import is_still, num_excerpts, small_grey
-from vjepa2_ac.data.inspection.findings import Finding, counted
+from vjepa2_ac.data.index import MEANS, SPANS
+from vjepa2_ac.data.inspection.excerpts import BLANK, is_still, num_excerpts, small_grey
+from vjepa2_ac.data.inspection.findings import Finding, Level, counted, first_case
 from vjepa2_ac.data.poses import num_rotation_numbers
 from vjepa2_ac.data.rotation_formats import MIN_JUMPS, rotation_speeds, smoother_format
+from vjepa2_ac.data.selection import named
 from vjepa2_ac.data.sources.indexed_source import IndexedSource
-from vjepa2_ac.spaces import POSE, rotation_angles
+from vjepa2_ac.spaces import POSE, step_sizes
 
 _EPISODES, _EPISODES_AT_URL = 200, 12
+_MIDDLES = 64  # episodes whose middle frame is read
+_MOST_FAST = 200  # episodes that are read to name their steps
+# Measured: with half of the episodes at half the scale the groups are 5.8 (BridgeData) and 9.0 (simulated arm)
+# deviations apart, otherwise at most 4.0.
+_FEWEST_SCALED, _SEPARATION, _SCALE, _SAME_SHAPE = 4, 5.0, 1.4, 0.2
 _END_STEPS = 16  # steps at each end of an episode whose frames are read
-_BLACK = 8.0  # of 255: no part of a black frame is brighter
 _MIN_FROZEN = 3  # single repeated frames come from a camera with a lower rate
 _MOVED_M = 0.01  # an image shows such a motion
 _FARTHER = 1.5  # a step from or to zeros, relative to the 99th percentile of other steps: not a motion
@@ -44,25 +50,85 @@ def check_motion(dataset: Dataset) -> Iterator[Finding]:
         InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
     """
     if dataset.spaces.state.position is None:
-        for name in ("speed", "padding", "rotation format"):
+        for name in ("scale", "speed", "padding", "rotation format"):
             yield Finding("skipped", name, "needs poses (data.states: pose), found vectors")
     else:
         count = _EPISODES_AT_URL if storage.is_url(dataset.config.path) else _EPISODES
-        sample = list(read_sample(dataset, count))
-        checked = f"{len(sample):,} of {counted(len(dataset.episodes), 'episode')} checked"
-        stretches = [
-            Stretch(dataset.table.identity(one.index), start, one.states[start:end])
-            for one in sample
-            for start, end in one.kept
-            if end - start > 1
-        ]
-        yield speed_finding(stretches, dataset.control_rate_hz, dataset.config.motion_limits, checked)
-        yield padding_finding(stretches, checked)
+        sample = list(read_sample(dataset, count, also=_fast_episodes(dataset)))
+        yield scale_finding(dataset)
+        yield from _check_states(dataset, sample)
         yield from _check_rotation_format(dataset, sample)
     if dataset.config.is_cache:
         yield Finding("skipped", "episode ends", "needs frames; check the data set that this cache was made from")
     else:
+        yield _check_middles(dataset)
         yield _check_ends(dataset)
+
+
+def warnings_from_index(dataset: Dataset) -> list[Finding]:
+    """Return the warnings that need no frames: copies, another scale, and steps that no arm makes.
+
+    Only episodes are read that are too fast by the index.
+
+    Raises:
+        InputError: As `check_motion`.
+    """
+    findings = [duplicates_finding(dataset)]
+    if dataset.config.states == "pose":
+        sample = list(read_sample(dataset, 0, also=_fast_episodes(dataset)))
+        findings += scale_finding(dataset), *_check_states(dataset, sample)
+    return [one for one in findings if one.level == "warning"]
+
+
+def duplicates_finding(dataset: Dataset) -> Finding:
+    """Return whether episodes are copies of others, by the index."""
+    duplicates = find_duplicates(dataset)
+    level: Level = "skipped" if not duplicates.is_known else "warning" if duplicates.episodes else "ok"
+    return Finding(level, "duplicates", str(duplicates))
+
+
+def scale_finding(dataset: Dataset) -> Finding:
+    """Return whether the positions of some episodes are a multiple of those of the others, as with another unit."""
+    radii_m, spans_m = (np.linalg.norm(dataset.table.motion[:, part], axis=1) for part in (MEANS, SPANS))
+    members = dataset.episodes[(radii_m * spans_m)[dataset.episodes] > 0]  # not those of unknown motion
+    if len(members) < 2 * _FEWEST_SCALED:
+        needed = f"needs poses in the index of {2 * _FEWEST_SCALED} or more episodes"
+        return Finding("skipped", "scale", f"{needed}; `vjepa2-ac data index --rebuild` adds them to older indexes")
+    members = members[np.argsort(radii_m[members])]
+    radii_m, directions = radii_m[members], dataset.table.motion[members, MEANS] / radii_m[members, None]
+    features = np.column_stack([np.log(radii_m), directions, np.log(spans_m[members] / radii_m)])
+    gaps = np.diff(features[:, 0])[_FEWEST_SCALED - 1 : len(members) - _FEWEST_SCALED]
+    near, far = np.split(features, [_FEWEST_SCALED + int(gaps.argmax())])
+    change, noise = far.mean(axis=0) - near.mean(axis=0), np.sqrt((near[:, 0].var() + far[:, 0].var()) / 2)
+    compared = f"{len(members):,} of {counted(len(dataset.episodes), 'episode')} compared"
+    if change[0] < max(_SEPARATION * noise, np.log(_SCALE)) or np.linalg.norm(change[1:]) > _SAME_SHAPE:
+        return Finding("ok", "scale", f"no group of episodes has positions at another scale ({compared})")
+    example, factor = dataset.table.identity(int(members[len(near)])), np.exp(change[0])
+    text = f"{len(far):,} episodes, such as {example}, have positions and motions {factor:.2f} times as large"
+    return Finding("warning", "scale", f"{text} as the other {len(near):,} ({compared}). Check the unit of both groups")
+
+
+def _fast_episodes(dataset: Dataset) -> list[int]:
+    """Return at most 200 episodes in which, by the index, a step exceeds `data.motion_limits`; the fastest first."""
+    limits, members = dataset.config.motion_limits, dataset.episodes
+    excess = (dataset.table.motion[members, :2] / [limits.speed_m_s, limits.rotation_rad_s]).max(axis=1)
+    order = np.argsort(-excess)[: int((excess * dataset.control_rate_hz > 1).sum())]
+    return [int(index) for index in members[order[:_MOST_FAST]]]
+
+
+def _check_states(dataset: Dataset, sample: Sequence[ReadEpisode]) -> Iterator[Finding]:
+    """Yield the findings about speed and padding; the index knows the speed of episodes that were not read."""
+    num_indexed = int((dataset.table.motion[dataset.episodes, 0] >= 0).sum())
+    checked = f"{len(sample):,} of {counted(len(dataset.episodes), 'episode')} checked"
+    by_index = f", {num_indexed:,} by the index" if num_indexed > len(sample) else ""
+    stretches = [
+        Stretch(dataset.table.identity(one.index), start, one.states[start:end])
+        for one in sample
+        for start, end in one.kept
+        if end - start > 1
+    ]
+    yield speed_finding(stretches, dataset.control_rate_hz, dataset.config.motion_limits, checked + by_index)
+    yield padding_finding(stretches, checked)
 
 
 def speed_finding(
@@ -78,9 +144,7 @@ def speed_finding(
     """
     if not stretches:
         return Finding("skipped", "speed", "needs episodes of two or more steps, found none")
-    changes = np.concatenate([POSE.differences(one.states) for one in stretches])
-    speeds = control_rate_hz * np.linalg.norm(changes[:, POSE.position], axis=1)
-    turns = control_rate_hz * rotation_angles(changes[:, POSE.rotation])
+    speeds, turns = control_rate_hz * np.concatenate([step_sizes(one.states) for one in stretches]).T
     excess = np.maximum(speeds / motion_limits.speed_m_s, turns / motion_limits.rotation_rad_s)
     if excess.max() <= 1:
         text = f"at most {speeds.max():.2f} m/s and {turns.max():.2f} rad/s between control steps ({checked})"
@@ -90,7 +154,7 @@ def speed_finding(
     name, step = steps[worst]
     episodes = counted(len({steps[one][0] for one in fast}), "episode")
     limit = f"{motion_limits.speed_m_s:g} m/s or {motion_limits.rotation_rad_s:g} rad/s, which no arm reaches"
-    text = f"{len(fast):,} of {len(steps):,} control steps, in {episodes}, are faster than {limit} ({checked})"
+    text = f"faster than {limit}: {counted(len(fast), 'control step')} in {episodes} ({checked})"
     example = f"{name}, step {step} to {step + 1}: {speeds[worst]:.1f} m/s, {turns[worst]:.1f} rad/s"
     fix = "Look for padding, lost measurements and joined recordings; data.motion_limits sets the limits"
     return Finding("warning", "speed", f"{text}. Example: {example}. {fix}")
@@ -187,6 +251,20 @@ def _check_ends(dataset: Dataset) -> Finding:
     return Finding("warning", "episode ends", f"{text}. Example: {example} {kind}. {_EXCLUDE}")
 
 
+def _check_middles(dataset: Dataset) -> Finding:
+    """Find episodes whose middle frame shows nothing: there a camera failed, or images were lost."""
+
+    def is_blank(index: int) -> bool:
+        start, end = max(dataset.kept.of(index), key=lambda one: one[1] - one[0])
+        return bool(np.ptp(small_grey(dataset.read(index).read_frames([(start + end) // 2]))) < BLANK)
+
+    count = _EPISODES_AT_URL if storage.is_url(dataset.config.path) else _MIDDLES
+    seen = dict(read_each(dataset, sample_of(dataset, count), is_blank))
+    blank = [dataset.table.identity(index) for index, is_one in seen.items() if is_one]
+    text = f"the middle frame is black or uniform in {len(blank)} of {counted(len(seen), 'episode')} checked"
+    return first_case("blank frames", text, (bool(blank), "warning", f"{named(blank)}. {_EXCLUDE}"))
+
+
 def count_at_end(
     grey: Float32[np.ndarray, "steps rows columns"], states: Float[np.ndarray, "steps dim"], *, is_pose: bool
 ) -> tuple[int, int]:
@@ -197,7 +275,7 @@ def count_at_end(
         states: Their states.
         is_pose: Whether the states are poses; else frozen frames are not counted.
     """
-    black = _num_leading(grey.max(axis=(1, 2)) < _BLACK)
+    black = _num_leading(grey.max(axis=(1, 2)) < BLANK)
     same = _num_leading(is_still(np.abs(np.diff(grey, axis=0)).mean(axis=(1, 2), dtype=np.float64))) + 1
     has_moved = is_pose and np.ptp(states[:same, POSE.position], axis=0).max() > _MOVED_M
     return black, same if has_moved and same >= _MIN_FROZEN and same > black else 0

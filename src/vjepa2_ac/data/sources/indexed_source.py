@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import EpisodeFiles, connections_to, in_parallel
-from vjepa2_ac.data.index import UNKNOWN, EpisodeProblem, EpisodeTable, labels_of, nul_error
+from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, StatesSummary, labels_of, nul_error
 from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.episode import EpisodeInfo, EpisodeSource, Progress, Widths, no_progress
 from vjepa2_ac.errors import InputError
@@ -51,7 +51,7 @@ class Scanned:
     info: EpisodeInfo
     where: str  # its file, for messages
     place: Mapping[str, Any] = field(default_factory=dict)  # numbers or bytes: what the source finds it by
-    state_hash: int = UNKNOWN
+    states: StatesSummary = UNREAD
     labels: Mapping[str, str | None] = field(default_factory=dict)
     rate_hz: float | None = None  # control steps per second; None: the index does not know
     kind: str = ""  # what all episodes must have in common, in words
@@ -96,13 +96,14 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
             problems.append(EpisodeProblem(name, one.where, one.kind, f"{usual}, as in most episodes", fix))
     rows = [one for one in usable.values() if one.kind == usual]
     logger.info("%s: %d episodes, %d that cannot be used", config.path, len(rows), len(problems))
-    hashes, rate = [one.state_hash for one in rows], rows[0].rate_hz
+    hashes, rate = [one.states.state_hash for one in rows], rows[0].rate_hz
     return replace(
         EpisodeTable.of([one.info for one in rows]),
         problems=tuple(problems),
         locators={name: np.array([one.place[name] for one in rows]) for name in rows[0].place},
         texts={} if rate is None else {"control_rate_hz": str(rate)},
         state_hash=np.array(hashes, np.uint64) if any(hashes) else None,
+        motion=np.array([one.states.motion for one in rows], np.float32),
         labels=labels_of([one.labels for one in rows]),
     )
 

@@ -37,7 +37,7 @@ from jaxtyping import Float64, UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import walk
-from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key
+from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key, summary_of
 from vjepa2_ac.data.sources.indexed_source import (
     FramesByStep,
     IndexedSource,
@@ -146,8 +146,8 @@ class NpzSource(IndexedSource[DataConfig, None]):
         episode, labels = self._episode(identity, version, self._config.cameras)
         action = "" if episode.commands is None else f", {episode.commands.shape[1]} an action"
         kind = f"{episode.control_rate_hz:g} steps a second (fps_hz), {episode.states.shape[1]} numbers a state{action}"
-        where, hashed = self._path(identity), hash_of_states(episode.states)
-        return Scanned(episode.info, where, {}, hashed, labels, episode.control_rate_hz, kind)
+        where, states = self._path(identity), summary_of(episode.states)
+        return Scanned(episode.info, where, {}, states, labels, episode.control_rate_hz, kind)
 
     def _path(self, identity: str) -> str:
         return storage.join(self._config.path, identity + _SUFFIX)

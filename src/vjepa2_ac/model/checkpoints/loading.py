@@ -116,16 +116,13 @@ def load_official(
     file, given = MetaFile.open(Path(path)), sizes or ModelSizes()
     there = [key for key in _KEYS if isinstance(file.parts.get(key), dict)]
     key = encoder_weights if encoder_weights in there else (there or _KEYS)[0]
-    if len({_beginnings(file, one) for one in there}) > 1:
+    # Training changes every tensor, so the beginning of each shows it, and few pages of the file are read.
+    beginnings = [{name: value.flatten()[:_COMPARED] for name, value in file.tensors(one).items()} for one in there]
+    if len({fingerprint(one) for one in beginnings}) > 1:
         text = "%s: encoder and target_encoder differ; %s is used. Set model.encoder_weights for the other one"
         logger.warning(text, path, key)
     found = encoder_in_file(file, key, given.encoder.frame, given.encoder.heads)
     return _with_predictor(file, found, given, dtype)
-
-
-def _beginnings(file: MetaFile, key: str) -> str:
-    """Return a hash of the first values of each tensor of a part: training changes all, and few pages are read."""
-    return fingerprint({name: value.flatten()[:_COMPARED] for name, value in file.tensors(key).items()})
 
 
 def to_official(model: WorldModel) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Callable, Mapping
@@ -26,10 +27,7 @@ Part = Literal["encoder", "encoder 2.1", "predictor"]
 Rename = Callable[[str], tuple[str, int | None]]
 """Our name of a tensor -> the file's, and which third of a fused one it is (None: all of it)."""
 
-_PARTS = (
-    'both parts for model.base, as torch.save({"encoder": ..., "predictor": ...}, FILE) writes them; model.encoder.path'
-    " for an encoder alone (with model.random), and in addition to model.base for a predictor alone"
-)
+_PARTS = 'both parts, as of torch.save({"encoder": ..., "predictor": ...}, FILE), or model.encoder.path for the encoder'
 _NEEDED = "a checkpoint of V-JEPA 2, 2.1 or 2-AC as Meta publishes it"
 _SPLIT = ("q", "k", "v")
 _PREFIXES = re.compile(r"^(?:(?:module|backbone|_orig_mod)\.)+|_orig_mod\.")  # the last: of torch.compile, anywhere
@@ -164,11 +162,11 @@ def _problem_of(path: Path, error: Exception) -> tuple[str, str]:
     refused = re.search(r"GLOBAL ([\w.]+)", str(error))
     if refused:
         found = f"a pickle that would call {refused[1]}: it was refused, since loading it could run foreign code"
-        code = (
-            f"import torch; old = torch.load({str(path)!r}, map_location='cpu', weights_only=False);"
-            f" torch.save({{k: old[k] for k in {(*ENCODER_KEYS, 'predictor')} if k in old}},"
-            f" {str(path.with_suffix('.weights.pt'))!r})"
+        old, new, keys = map(
+            json.dumps, (str(path), str(path.with_suffix(".weights.pt")), [*ENCODER_KEYS, "predictor"])
         )
+        code = f'import torch; old = torch.load({old}, map_location="cpu", weights_only=False)'
+        code += f"; torch.save({{key: old[key] for key in {keys} if key in old}}, {new})"
         return found, f"If you trust the file, save its weights alone: `python -c {shlex.quote(code)}`"
     with path.open("rb") as file:
         head = file.read(24)

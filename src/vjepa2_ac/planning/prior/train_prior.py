@@ -121,10 +121,9 @@ def _trained(
                 share = min(1.0, step / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * (step - 1) / steps))
                 group["lr"] = share * options.learning_rate
             mean, deviation = prior(some.seen, some.wanted, some.remaining, some.states)
-            off = (mean - some.changes / prior.scale).abs()
-            loss = (off + off.detach() / deviation + deviation.log()).mean()  # the spread does not pull the mean
+            loss = prior_loss(mean, deviation, some.changes / prior.scale)
             optimizer.zero_grad(set_to_none=True)
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]  # torch
             norm = torch.nn.utils.clip_grad_norm_(prior.parameters(), _CLIP)
             if not math.isfinite(float(norm)):
                 found = f"a loss of step {step} that is not finite"
@@ -132,6 +131,15 @@ def _trained(
             optimizer.step()
             progress(step, steps)
     return prior.eval().requires_grad_(False)
+
+
+def prior_loss(mean: Tensor, deviation: Tensor, changes: Tensor) -> Tensor:
+    """Return the mean absolute error, plus the negative log-likelihood of a Laplace distribution for the deviation.
+
+    The error is detached in the second part: a large predicted deviation does not weaken the gradient of the mean.
+    """
+    off = (mean - changes).abs()
+    return (off + off.detach() / deviation + deviation.log()).mean()
 
 
 def _sizes(model: WorldModel, dataset: Dataset) -> PriorSizes:

@@ -140,12 +140,13 @@ def draw_decoded(figure: Any, evaluation: Evaluation, found: DecodedRollouts) ->
     """Draw the PSNR of decoded rollouts by horizon, where something moves if the true frames say so."""
     finite = {name for (_, name), curve in found.curves.items() if any(math.isfinite(one.value) for one in curve)}
     names = ("psnr_db.moving.truth", "psnr_db.whole.truth", "psnr_db.whole.decoded_truth")
-    metric = next(name for name in names if name in finite)
+    metric = max(names, key=lambda name: (name in finite, (found.sources[0], name) in found.curves))
     curves = {source.replace("_", " "): found.curves[source, metric] for source in found.sources}
     axes = _by_horizon(figure, evaluation, curves, level=None)
     _, region, reference = metric.split(".")
     where = "where something moves" if region == "moving" else "of the whole image"
-    axes.set(title=f"PSNR {where}, against the {reference.replace('_', ' ')}", ylabel="dB")
+    note = "" if metric in finite else ": no finite value"
+    axes.set(title=f"PSNR {where}, against the {reference.replace('_', ' ')}{note}", ylabel="dB")
 
 
 def draw_use_of_actions(figure: Any, evaluation: Evaluation) -> None:

@@ -421,13 +421,16 @@ def run_in(world: World, policy: Policy, problem: Problem, span: Span, *, keep_f
 
 
 def put(arm: SimulatedArm, state: State, block: Block | None, mark: Mark | None = None) -> SimulatedArm:
-    """Put arm, block and mark somewhere, via the arm's rest pose: its redundant joint must not depend on the past.
+    """Begin an episode: put arm, block and mark somewhere, and moving objects where they start.
+
+    The arm gets there via its rest pose: its redundant joint must not depend on the past.
 
     Raises:
         ValueError: There is a mark, and no place for it is given; or a block or a mark is to be put, and there is none.
     """
     if arm.mark is not None and mark is None:
         raise ValueError("no place for the mark on the table: give problem.mark")
+    arm.reset_clock()
     arm.set_joints(rest_joints(arm.domain), 0.0)
     arm.set_state(state)
     arm.place(block, mark)

@@ -7,12 +7,7 @@ nothing of this project, so that its pins are its own. docs/worlds.md has the pr
 from __future__ import annotations
 
 import base64
-import json
-import shlex
-import subprocess
-import tempfile
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,8 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from vjepa2_ac.episode import STATE_DIM, Progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.episode import Progress
 from vjepa2_ac.media.video import video_library
 from vjepa2_ac.planning.demonstrations.key_frames import (
     OF_MODEL_STEPS,
@@ -52,23 +46,21 @@ from vjepa2_ac.simulation.closed_loop.rollout import (
     run_trials,
 )
 from vjepa2_ac.simulation.closed_loop.tasks import Problem
-from vjepa2_ac.spaces import actions_from_states
+from vjepa2_ac.simulation.closed_loop.world_process import PROTOCOL, WorldProcess
+from vjepa2_ac.spaces import POSE, actions_from_states
 from vjepa2_ac.storage import user_can_write
 from vjepa2_ac.storage.structured import record_of
 
 EXPERT = "expert"
-_ENDS_S = 10.0  # a world that is told to end may take as long
-_LAST_LINES = 5  # of what it wrote about an error
 TRIES = 2  # so many times the problems are drawn, until the expert has solved enough of them
-_SAYS = "docs/worlds.md has the protocol; examples/worlds programs that follow it"
 
 
 @dataclass(frozen=True)
 class AboutWorld:
     """What a world says of itself, unasked, in its first line."""
 
-    world: str  # name and version
-    task: str
+    world: Annotated[str, Field(max_length=200)]  # name and version
+    task: Annotated[str, Field(max_length=200)]  # part of the names of files
     rate_hz: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]  # control steps per second
     steps: Annotated[int, Field(ge=1, le=1_000_000)]  # control steps that suffice for the task
     instruction: str = ""  # the task in words
@@ -83,35 +75,22 @@ class WorldObservation(Observation):
     goal: Image | None = None  # of a reset: the image to aim at, where the world has one
 
 
-class OtherWorld(ExitStack):
-    """A world that runs as a program; `close` ends it.
+class OtherWorld(WorldProcess):
+    """A third-party environment that runs as a program; `close` ends it.
 
     Args:
         command: Its program and arguments, as in a shell: PYTHON examples/worlds/robosuite.py Lift.
+        timeout_s: As of `WorldProcess`.
 
     Raises:
         InputError: It cannot be started, or is no world.
     """
 
-    def __init__(self, command: str) -> None:
-        super().__init__()
-        self.command = command
-        self._errors = self.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - it is closed with the world
+    def __init__(self, command: str, timeout_s: float | None = None) -> None:
+        super().__init__(command, timeout_s)
+        self._image_shape: tuple[int, ...] | None = None  # of the first observation
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - the user's own program
-                shlex.split(command),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._errors,
-                encoding="utf-8",
-                start_new_session=True,  # Ctrl-C ends us, and we end it
-            )
-        except (OSError, ValueError) as error:
-            self.close()
-            raise self.refused(f"it cannot be started: {error}") from None
-        self.callback(self._end)
-        try:
-            self.about = record_of(AboutWorld, self._read(), where=self._where, needed="what it is", fix=_SAYS)
+            self.about = record_of(AboutWorld, self.exchange(), where=self.where, needed="what it is", fix=PROTOCOL)
         except BaseException:
             self.close()
             raise
@@ -161,68 +140,34 @@ class OtherWorld(ExitStack):
         self._now = self.move(commanded(self._now.state, action), stride)
         return True, self._now
 
-    def refused(self, found: str, needed: str = "", fix: str = _SAYS) -> InputError:
-        """Return an error that says what is wrong with this world."""
-        return InputError(where=self._where, found=found, needed=needed, fix=fix)
-
-    @property
-    def _where(self) -> str:
-        return f"--world {self.command!r}"
-
     def _ask(self, **request: Any) -> WorldObservation:
-        if self._process.stdin is not None:
-            with suppress(OSError):  # it has ended, which reading finds
-                self._process.stdin.write(f"{json.dumps(request)}\n")
-                self._process.stdin.flush()
-        return self._observed(self._read())
-
-    def _read(self) -> dict[str, Any]:
-        """Return the next answer.
-
-        Raises:
-            InputError: There is none, or it is no JSON object, or it says what is wrong.
-        """
+        answer = self.exchange(request)
         try:
-            line = self._process.stdout.readline() if self._process.stdout else ""
-            answer = json.loads(line) if line else None
-        except ValueError:
-            raise self.refused(f"it wrote {line.strip()[:200]!r}", "a JSON object in a line") from None
-        if answer is None:
-            self._errors.seek(0)
-            said = self._errors.read().decode(errors="replace").strip().splitlines()[-_LAST_LINES:]
-            raise self.refused("\n".join([f"it has ended with status {self._process.wait()}", *said]) + "\n")
-        if not isinstance(answer, dict) or "error" in answer:
-            found = answer["error"] if isinstance(answer, dict) else answer
-            raise self.refused(str(found))
-        return answer
-
-    def _observed(self, answer: dict[str, Any]) -> WorldObservation:
-        try:
-            state, target = np.array(answer["state"], dtype=np.float64), answer.get("target")
-            if state.shape != (STATE_DIM,) or not np.isfinite(state).all():
-                raise ValueError(f"a state of {answer['state']}, not of seven finite numbers")  # noqa: TRY301
-            goal, distance_m, is_done = answer.get("goal"), float(answer["distance_m"]), answer["success"] is True
-            held = None if target is None else np.array(target, dtype=np.float64)
-            shown = None if goal is None else _image(goal)
-            return WorldObservation(_image(answer["image"]), state, distance_m, is_done, target=held, goal=shown)
-        except (KeyError, TypeError, ValueError) as error:
+            image, distance_m, is_done = _image(answer["image"]), float(answer["distance_m"]), answer["success"]
+            self._image_shape = self._image_shape or image.shape
+            if image.shape != self._image_shape:
+                raise ValueError(f"an image of {image.shape} after others of {self._image_shape}")  # noqa: TRY301
+            if not (np.isfinite(distance_m) and isinstance(is_done, bool)):
+                raise ValueError(f"distance_m {distance_m}, success {is_done!r}")  # noqa: TRY301
+            state, target, goal = self._pose(answer["state"], "state"), answer.get("target"), answer.get("goal")
+            held = None if target is None else self._pose(target, "target")
+            aim = None if goal is None else _image(goal)
+            return WorldObservation(image, state, distance_m, is_done, target=held, goal=aim)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             found = f"no {error}" if isinstance(error, KeyError) else str(error)
             raise self.refused(found, "image, state, distance_m and success") from None
 
-    def _end(self) -> None:
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                stream.close()
-        try:
-            self._process.wait(_ENDS_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+    def _pose(self, numbers: Any, name: str) -> Float[np.ndarray, " 7"]:
+        pose = np.array(numbers, dtype=np.float64)
+        POSE.require_state(pose, f"{self.where}: {name}")
+        return pose
 
 
 def _image(found: dict[str, Any]) -> Image:
     """Return an image from its height, width, and bytes in base64."""
     pixels = np.frombuffer(base64.b64decode(found["rgb"]), dtype=np.uint8)
+    if min(found["height"], found["width"]) < 1:
+        raise ValueError(f"an image of {found['height']}x{found['width']} pixels")
     return pixels.copy().reshape(found["height"], found["width"], 3)
 
 

@@ -30,6 +30,7 @@ from vjepa2_ac.data.sources.rlds.droid_writer import (
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.media.images import encode_jpeg
+from vjepa2_ac.process import safe_imports
 from vjepa2_ac.simulation.closed_loop.tasks import arm_for
 from vjepa2_ac.simulation.world.arm import Look, SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, load_mujoco, named_domain, sample_domain
@@ -109,6 +110,7 @@ def carry_out(
         from vjepa2_ac.simulation.recording.scripted_play import play  # imports torch
 
         return play(arm, spec.task, spec.steps if until is None else until, rng, script=index % 2 == 0, look=look)
+    arm.reset_clock()
     motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
     measured = slice(None if until is None else until + 1)
     for joints, closedness in zip(motion.joints[measured], motion.gripper[measured], strict=True):
@@ -169,8 +171,9 @@ def record_dataset(
     record = partial(record_episode, spec=replace(spec, domain=spec.worlds))
 
     def watched() -> Iterator[DroidEpisode]:
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:  # starts none before its work
-            recorded = (map if workers == 1 else pool.map)(record, range(episodes))
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+            with safe_imports():  # `pool.map` starts the workers
+                recorded = (map if workers == 1 else pool.map)(record, range(episodes))
             for done, episode in enumerate(recorded, start=1):
                 yield episode
                 progress(done, episodes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -36,26 +37,25 @@ def record_world(
         every: Control steps from one frame to the next.
 
     Returns:
-        How many of them the expert has solved, and how many it was to solve: all that are no play.
+        Number of episodes that the expert solved, and that it acted in; neither counts play.
 
     Raises:
         InputError: The folder cannot be written, or the world ends or answers something else.
     """
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    solved = 0
+    solved, name = 0, re.sub(r"[^\w .,()+-]", "-", world.about.task, flags=re.ASCII)  # the name of a file, and no path
     for done, seed in enumerate(seeds, start=1):
-        file = folder / f"{world.about.task}_{seed:06d}.npz"
-        if file.exists():
-            with np.load(file) as kept:
-                solved += bool(kept["success"])
-        else:
-            solved += _record(world, file, seed, every)
+        file = folder / f"{name}_{seed:06d}.npz"
+        if not file.exists():
+            _record(world, file, seed, every)
+        with np.load(file) as recorded:
+            solved += bool(recorded["success"]) and seed % 3 != PLAY
         progress(done, len(seeds))
     return solved, sum(seed % 3 != PLAY for seed in seeds)
 
 
-def _record(world: OtherWorld, file: Path, seed: int, every: int) -> bool:
+def _record(world: OtherWorld, file: Path, seed: int, every: int) -> None:
     about, kind = world.about, seed % 3
     ways = _played(world, seed, every) if kind == PLAY else _shown(world, seed, every, is_disturbed=kind == DISTURBED)
     steps = list(ways)
@@ -70,7 +70,6 @@ def _record(world: OtherWorld, file: Path, seed: int, every: int) -> bool:
             success=seen[-1].is_done,
             language=about.instruction,
         )
-    return seen[-1].is_done
 
 
 Step = tuple[WorldObservation, Float[np.ndarray, " 7"]]  # what is seen, and the target that led there
@@ -79,7 +78,7 @@ Step = tuple[WorldObservation, Float[np.ndarray, " 7"]]  # what is seen, and the
 def _shown(world: OtherWorld, seed: int, every: int, *, is_disturbed: bool) -> Iterator[Step]:
     """Yield the steps of the expert until it rests."""
     about, rng, now = world.about, np.random.default_rng([seed, 0]), world.reset(seed)
-    period, off, offset, rested = round(EVERY_S * about.rate_hz), round(OFF_S * about.rate_hz), np.zeros(3), 0
+    period, off, offset, rested = max(1, round(EVERY_S * about.rate_hz)), round(OFF_S * about.rate_hz), np.zeros(3), 0
     yield now, now.state
     for step in range(0, about.steps, every):
         if step % period < every and is_disturbed:

@@ -55,6 +55,10 @@ class SimulatedArm:
         self._circles, self._time_s = _Circles(self._model, domain), 0.0
         self.set_joints(rest_joints(domain), 0.0)
 
+    def reset_clock(self) -> None:
+        """Let the moving objects start where they are for a new arm, at the next `set_joints`."""
+        self._time_s = 1 / CONTROL_RATE_HZ  # `__init__` has set the joints once
+
     @property
     def joints(self) -> Joints:
         """Measured joint angles in radians."""

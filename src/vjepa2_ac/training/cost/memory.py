@@ -136,7 +136,7 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
         trained=parameters.trained * FLOAT32,
         gradients=parameters.trained * FLOAT32,
         moments=sum(_moments(config, elements) for elements in parameters.trained_tensors),
-        arriving=_arriving(config, sizes),
+        arriving=batch_bytes(config, sizes),
         latents=_latents(config, sizes, config.training.batch_size),
         encoding=_encoding(config, sizes, config.training.batch_size),
         step=step,
@@ -191,7 +191,8 @@ def _moments(config: Config, elements: int) -> int:
     return 2 * (elements + -(-elements // _ELEMENTS_OF_A_SCALE) * FLOAT32)
 
 
-def _arriving(config: Config, sizes: ModelSizes) -> int:
+def batch_bytes(config: Config, sizes: ModelSizes) -> int:
+    """Return the bytes of a batch as the loader sends it: latents, or frames, which may be larger or smaller."""
     frames = config.training.batch_size * config.data.frames
     if not config.data.takes_latents:
         return frames * 3 * sizes.image_size**2

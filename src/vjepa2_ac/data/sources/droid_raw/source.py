@@ -20,7 +20,7 @@ from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.config.sources import RAW_CAMERAS
 from vjepa2_ac.data.files import DEEPEST, in_parallel, list_folder
-from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key, key_of
+from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key, key_of, summary_of
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Scanned, require_as_indexed
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, require_library
@@ -152,7 +152,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             EpisodeInfo(identity, len(states), outcome),
             self._path(folder, TRAJECTORY),
             place={"place": json.dumps(vars(place)).encode()},
-            state_hash=hash_of_states(states),
+            states=summary_of(states),
             labels=_labels(metadata),
             rate_hz=self._config.droid_raw.control_rate_hz,
         )

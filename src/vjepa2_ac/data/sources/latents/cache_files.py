@@ -60,7 +60,7 @@ _JPEG_QUALITY = 85
 _MOST_BYTES = 1 << 30  # of a table
 Table = TypeVar("Table", EpisodeTable, StepSelection)
 _WHOLE, _BROKEN = ".safetensors", ".broken"
-_FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
+FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
 _ENCODE = "Run `vjepa2-ac encode`, which goes on where it was stopped; or copy the cache again"
 
 
@@ -267,7 +267,7 @@ class LatentFiles:
     def _opened(self, name: str) -> EpisodeFile:
         place, found = storage.join(self.folder, name), self._found(name)
         if found is None:
-            raise InputError(where=place, found="no such file", needed="latents of an episode", fix=_FIX)
+            raise InputError(where=place, found="no such file", needed="latents of an episode", fix=FIX)
         if self.cache is None:
             return EpisodeFile(place, self.key, found.size, partial(storage.read_ranges, place))
         key = f"{place} {found.version} {found.size}"
@@ -354,10 +354,10 @@ class EpisodeFile:
     def _reading(self) -> Iterator[None]:
         """Raise an error for the user if the file is missing, truncated, no safetensors file, or lacks something."""
         try:
-            with storage.user_can_read(self.path, needed="latents of an episode", fix=_FIX):
+            with storage.user_can_read(self.path, needed="latents of an episode", fix=FIX):
                 yield
         except (AttributeError, KeyError, IndexError, RuntimeError, ValueError, TypeError) as error:
             raise self._damaged(f"not a whole file of latents ({error})") from None
 
     def _damaged(self, found: str, needed: str = "") -> InputError:
-        return InputError(where=self.path, found=found, needed=needed, fix=_FIX)
+        return InputError(where=self.path, found=found, needed=needed, fix=FIX)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +14,12 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import fetched_data
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import StepSelection
-from vjepa2_ac.data.sources.indexed_source import IndexedSource
-from vjepa2_ac.data.sources.latents.cache_files import OPTIONAL, LatentFiles, read_key, read_tables
+from vjepa2_ac.data.sources.indexed_source import IndexedSource, measured_space
+from vjepa2_ac.data.sources.latents.cache_files import FIX, OPTIONAL, LatentFiles, read_key, read_tables
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, clip_parts
-from vjepa2_ac.episode import Episode, Progress, StepRanges
+from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import vector_states
 
 
 @dataclass(frozen=True)
@@ -62,17 +63,34 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         """
         table, opened = self._open()
         camera = camera or self.cameras[0]
-        record = opened.files.open(index, camera)
+        record, info = opened.files.open(index, camera), table[index]
+        arrays = {name: record.array(name) for name in OPTIONAL if name in record.names}
+        arrays["states"] = record.array("states")
+        self._require_plausible(arrays, info, f"{record.path}: {info.id}")
         return Episode(
-            info=table[index],
-            states=record.array("states"),
+            info=info,
             read_frames=lambda steps: record.pictures(record.places_of(steps)),
             control_rate_hz=float(table.texts["control_rate_hz"]),
             metadata=record.metadata,
             read_latents=lambda steps: record.latents(record.places_of(steps)),
             frame_steps=record.frame_steps,
-            **{name: record.array(name) for name in OPTIONAL if name in record.names},
+            **arrays,
         )
+
+    def _require_plausible(self, arrays: Mapping[str, np.ndarray], info: EpisodeInfo, where: str) -> None:
+        """Refuse an episode that no source gives.
+
+        Raises:
+            InputError: It has another number of steps, or numbers that are not finite or that no robot has.
+        """
+        for name, values in arrays.items():
+            width = STATE_DIM if name == "states" and self._config.states == "pose" else np.atleast_2d(values).shape[1]
+            if values.shape != (info.num_steps, width):
+                needed = f"{info.num_steps} x {width}, as the other files of the cache say"
+                raise InputError(where=f"{where}: {name}", found=f"shape {values.shape}", needed=needed, fix=FIX)
+            space = measured_space(self._config, width) if name == "states" else vector_states(width)
+            if name != "joint_velocities":  # only the idle filter reads them, and checks them
+                space.require_plausible(values, f"{where}: {name}", fix=FIX)
 
     def settle(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
         """Return the config with the names of the cameras.

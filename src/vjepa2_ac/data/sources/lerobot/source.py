@@ -14,7 +14,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.files import connections_to, in_parallel
-from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key
+from vjepa2_ac.data.index import EpisodeTable, StatesSummary, get_or_build, index_key, summary_of
 from vjepa2_ac.data.poses import poses_from
 from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.indexed_source import Found, FramesByStep, IndexedSource, Scanned, table_of
@@ -143,7 +143,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         header_of = cache(lambda path: read_header(path, where=path))
 
         def look(row: EpisodeRow) -> Found:
-            success, state_hash = row.success, row.state_hash
+            success, summary = row.success, StatesSummary(row.state_hash)
             try:
                 require_files(info, row, files, keys)
                 if row.id in overlaps:
@@ -151,13 +151,13 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
                 if reads_rows:
                     content, outcome = self._content(row)
                     success = success if outcome is None else outcome
-                    state_hash = hash_of_states(content["states"])
+                    summary = summary_of(content["states"])
                 if not is_far:
                     require_long_videos(info, row, keys, header_of)
             except InputError as error:
                 return as_problem(error, row.id)
             facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
-            return Scanned(facts, self._where(row), row.place, state_hash, labels, self._control_rate_hz)
+            return Scanned(facts, self._where(row), row.place, summary, labels, self._control_rate_hz)
 
         by_file: dict[str, list[EpisodeRow]] = {}  # so that a row group is decoded once
         for row in rows:

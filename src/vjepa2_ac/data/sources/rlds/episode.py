@@ -21,7 +21,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import RldsData, RldsFields
 from vjepa2_ac.config.sources import RECORD
 from vjepa2_ac.data.files import in_parallel
-from vjepa2_ac.data.index import UNKNOWN, EpisodeProblem, EpisodeTable, hash_of_states
+from vjepa2_ac.data.index import UNKNOWN, UNREAD, EpisodeProblem, EpisodeTable, hash_of_states, summary_of
 from vjepa2_ac.data.poses import num_rotation_numbers, poses_from, require_selection
 from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.indexed_source import Found, Scanned, require_as_indexed, table_of
@@ -323,7 +323,7 @@ def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsDa
     except InputError as error:
         return as_problem(error if is_far else _damage_or(error, read, span), name)
     place = dict(zip(_PLACE, (shard, span.number, span.offset, span.length), strict=True))
-    return Scanned(info_of(name, steps), str(span), place, UNKNOWN if states is None else hash_of_states(states))
+    return Scanned(info_of(name, steps), str(span), place, UNREAD if states is None else summary_of(states))
 
 
 def _checked_states(

@@ -20,6 +20,7 @@ _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 _MOST_NAMES = 5
 _MOST_EPISODES = 100_000  # of a shard; DROID's have some 50
+_MOST_SHARDS = 99_999  # TFDS numbers them with five digits
 _WINDOW_BYTES = 1 << 15  # a read behind a URL costs as much time as so many bytes
 _WINDOWS = 8  # read last: behind the images of one record is the head of the next
 
@@ -51,6 +52,8 @@ def find_shards(folder: str) -> list[Shard]:
     if (form := info.get("fileFormat", "tfrecord")) != "tfrecord":
         raise InputError(where=where, found=f"fileFormat {form}", needed="tfrecord", fix="Convert it with TFDS")
     try:
+        if (num_shards := sum(len(split.get("shardLengths", [])) for split in info["splits"])) > _MOST_SHARDS:
+            raise InputError(where=where, found=f"{num_shards:,} shards", needed=f"{_MOST_SHARDS:,} at most")
         listed = [shard for split in info["splits"] for shard in _listed(split, str(info["name"]))]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         found = f"not a description of a data set ({error!r})"

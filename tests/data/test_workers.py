@@ -1,0 +1,162 @@
+"""Loader workers: none makes its run wait for ever, shared memory is checked, and imports are safe."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections import namedtuple
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from clips import open_in_memory
+from failing_rows import Rows
+from memory_source import MemorySource
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data import loader, streams
+from vjepa2_ac.data.streams import require_shared_memory, results_of_workers
+from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.process import StopRequest, safe_imports
+from vjepa2_ac.training.setup import set_up
+
+Usage = namedtuple("Usage", "free")
+
+
+@pytest.fixture
+def shared_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """Set the free bytes of shared memory."""
+    monkeypatch.setattr(streams, "SHARED_MEMORY", tmp_path)
+    real = streams.shutil.disk_usage
+
+    def set_free(free: int) -> None:
+        def usage(path: object) -> Any:
+            return Usage(free) if path == tmp_path else real(path)
+
+        monkeypatch.setattr(streams.shutil, "disk_usage", usage)
+
+    return set_free
+
+
+def data(workers: int, prefetch: int = 2) -> DataConfig:
+    return DataConfig(path="none", workers=workers, prefetch=prefetch)
+
+
+@pytest.mark.parametrize(("workers", "prefetch", "processes"), [(4, 2, 1), (1, 5, 1), (2, 3, 2)])
+def test_shared_memory_must_hold_the_batches_of_all_workers(
+    shared_memory: Any, workers: int, prefetch: int, processes: int
+) -> None:
+    needed = 1000 * workers * prefetch * processes
+    shared_memory(needed)
+    require_shared_memory(data(workers, prefetch), 1000, processes)
+    shared_memory(needed - 1)
+    with pytest.raises(UnreachableError, match=r"--shm-size=8g or --ipc=host.*data\.workers=0"):
+        require_shared_memory(data(workers, prefetch), 1000, processes)
+    require_shared_memory(data(0, prefetch), 1000, processes)
+
+
+def test_a_system_without_shared_memory_is_not_checked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(streams, "SHARED_MEMORY", tmp_path / "none")
+    require_shared_memory(data(4), 10**18)
+
+
+def test_a_run_is_refused_before_its_first_step(make_config: Any, shared_memory: Any) -> None:
+    frames = 2 * 4 * 36 * 49 * 3  # a batch of two clips of 4 frames, and 49 numbers of states and actions each
+    shared_memory(2 * (frames + 2 * 4 * (4 * 7 + 3 * 7)) - 1)
+    with pytest.raises(UnreachableError, match=r"2 workers x 1 batches of 0\.0427 MB"):
+        set_up(make_config(data__workers=2, data__prefetch=1))
+    set_up(make_config(data__workers=0))
+
+
+def test_latents_that_are_not_encoded_yet_are_counted(make_config: Any, shared_memory: Any, tmp_path: Path) -> None:
+    shared_memory(2 * 2 * 4 * 4 * 24 * 2 - 1)  # two workers: a batch of two clips of 4 frames, 4 tokens of 24 numbers
+    changes = {"data__cache": "auto", "data__cache_dir": str(tmp_path / "cache"), "data__prefetch": 1}
+    with pytest.raises(UnreachableError, match=r"batches of 0\.00154 MB"):
+        set_up(make_config(**changes, data__workers=2), check_only=True)
+
+
+def test_a_batch_without_room_in_shared_memory_is_an_error_of_the_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: torch.Tensor) -> torch.Tensor:
+        raise RuntimeError("unable to allocate shared memory(shm)")
+
+    monkeypatch.setattr(loader, "in_worker", lambda: True)
+    dataset = open_in_memory(MemorySource([30] * 4))
+    with contextlib.closing(loader.training_loader(dataset, seed=0, batch_size=2)) as batches:
+        assert next(batches).frames.is_shared()
+        monkeypatch.setattr(torch.Tensor, "share_memory_", full)
+        with pytest.raises(UnreachableError, match=r"no room for a batch of .* MB .*unable to allocate.*--ipc=host"):
+            next(batches)
+
+
+def take_all(failure: str) -> list[list[int]]:
+    return list(results_of_workers(Rows(failure), ([number] for number in range(4)), 1, 2))
+
+
+def test_a_worker_that_dies_or_cannot_send_ends_the_run(capfd: pytest.CaptureFixture[str]) -> None:
+    assert take_all("") == [[0], [1], [2], [3]]
+    for failure, status in (("dies", 9), ("cannot be sent", 1)):
+        with pytest.raises(UnreachableError, match=rf"worker has ended unexpectedly \(exit code {status}\)"):
+            take_all(failure)
+    assert "A loader worker cannot send a batch: " in capfd.readouterr().err
+
+
+class Slow(Iterator[int]):
+    """Times out twice, then has a result; or raises something else."""
+
+    def __init__(self, error: str = "DataLoader timed out after 1.0 seconds") -> None:
+        self.errors = [RuntimeError(error)] * 2
+
+    def __next__(self) -> int:
+        if self.errors:
+            raise self.errors.pop()
+        return 7
+
+
+def test_a_slow_batch_is_waited_for_unless_a_signal_has_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert streams._next_row(Slow(), ()) == 7
+    with pytest.raises(RuntimeError, match="another"):
+        streams._next_row(Slow("another"), ())
+    stop = StopRequest()
+    stop.take(signal.SIGTERM, None)
+    stop._came_at -= 100.0
+    monkeypatch.setattr(streams, "stop_request", lambda: stop)
+    assert streams._next_row(Slow(), ()) == 7, "only a wait after the signal counts"
+    monkeypatch.setattr(streams, "_GRACE_S", 0.0)
+    with pytest.raises(UnreachableError, match="no batch after SIGTERM"):
+        streams._next_row(Slow(), ())
+
+
+# Files in the working directory that are named like modules.
+
+STARTS_A_WORKER = """
+import multiprocessing, os
+from vjepa2_ac.data.streams import _start_servers
+_start_servers()
+worker = multiprocessing.get_context("forkserver").Process(target=os.getpid)
+worker.start()
+worker.join()
+print(worker.exitcode, os.environ.get("PYTHONSAFEPATH"))
+"""
+
+
+def test_a_file_named_like_a_module_is_not_imported_by_workers(tmp_path: Path) -> None:
+    for name in ("random", "signal", "socket"):
+        (tmp_path / f"{name}.py").write_text("open('RAN', 'w')")
+    words = [sys.executable, "-P", "-W", "ignore", "-c", STARTS_A_WORKER]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("0 None\n", "")
+    assert not (tmp_path / "RAN").exists()
+
+
+@pytest.mark.parametrize("before", [None, "", "1"])
+def test_safe_imports_restore_the_environment(monkeypatch: pytest.MonkeyPatch, before: str | None) -> None:
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    if before is not None:
+        monkeypatch.setenv("PYTHONSAFEPATH", before)
+    with contextlib.suppress(KeyError), safe_imports():
+        assert os.environ["PYTHONSAFEPATH"] == "1"
+        raise KeyError
+    assert os.environ.get("PYTHONSAFEPATH") == before

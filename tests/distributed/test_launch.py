@@ -1,0 +1,99 @@
+"""Variables of a launcher that are left in the environment give one sentence, soon."""
+
+import logging
+import threading
+from typing import Any
+
+import pytest
+
+from vjepa2_ac import distributed
+from vjepa2_ac.errors import InputError, UnreachableError
+
+VARIABLES = {"RANK": "0", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29511"}
+
+
+@pytest.fixture
+def launched(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Set the variables of a launcher, and how the processes meet."""
+
+    def launched(variables: dict[str, str], meet: Any = None) -> None:
+        for name in VARIABLES:
+            monkeypatch.delenv(name, raising=False)
+        for name, value in variables.items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setattr(distributed, "rendezvous", meet or (lambda *_, **__: pytest.fail("met")))
+        monkeypatch.setattr(distributed.torch.distributed, "init_process_group", lambda *_, **__: None)
+
+    return launched
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"MASTER_ADDR": None, "MASTER_PORT": None},
+        {"MASTER_PORT": ""},
+        {"MASTER_PORT": "http"},
+        {"RANK": None},
+        {"RANK": "2"},
+        {"RANK": "1", "WORLD_SIZE": None},
+        {"WORLD_SIZE": "two"},
+    ],
+)
+def test_incomplete_variables_are_one_error(launched: Any, changes: dict[str, str | None]) -> None:
+    variables = {name: value for name, value in (VARIABLES | changes).items() if value is not None}
+    launched(variables)
+    with pytest.raises(InputError, match="Unset RANK and WORLD_SIZE if you did not start several") as caught:
+        distributed._meet("gloo")
+    assert all(f"{name}={value}" in str(caught.value) for name, value in variables.items())
+
+
+@pytest.mark.parametrize("variables", [{}, {"RANK": "0", "WORLD_SIZE": "1"}])
+def test_one_process_meets_no_other(launched: Any, variables: dict[str, str]) -> None:
+    launched(variables)
+    distributed._meet("gloo")
+
+
+class Store:
+    def set_timeout(self, _: object) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("changes", "missing"),
+    [
+        ({}, "process 2 of 2"),
+        ({"RANK": "1"}, "process 1 of 2"),
+        ({"WORLD_SIZE": "4"}, "the other 3 of 4 processes"),
+    ],
+)
+def test_who_is_waited_for_is_reported_while_it_is(
+    launched: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, changes: Any, missing: str
+) -> None:
+    reported = threading.Event()
+
+    def meet(*_: object, **__: object) -> Any:
+        assert reported.wait(60)
+        yield Store(), 0, 2
+
+    launched(VARIABLES | changes, meet)
+    monkeypatch.setattr(distributed, "_PATIENCE_S", 0.01)
+    monkeypatch.setattr(distributed._log, "warning", lambda *words: (logging.warning(*words), reported.set()))
+    distributed._meet("gloo")
+    (said,) = caplog.messages
+    assert said.startswith(f"Waiting for {missing} at 127.0.0.1:29511. Unset RANK and WORLD_SIZE")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        ("Timed out after 601 seconds waiting for clients. 3/4 clients joined.", "Only 3 of 4 processes joined"),
+        ("connection refused", "Not all 4 processes joined"),
+    ],
+)
+def test_processes_that_never_join_are_one_error(launched: Any, error: str, words: str) -> None:
+    def meet(*_: object, **__: object) -> Any:
+        raise RuntimeError(error)
+        yield
+
+    launched(VARIABLES | {"WORLD_SIZE": "4"}, meet)
+    with pytest.raises(UnreachableError, match=f"processes of this run: {words} within 10 minutes"):
+        distributed._meet("gloo")

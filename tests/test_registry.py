@@ -1,0 +1,256 @@
+"""Plug-ins: distinct names, errors that name the plug-in, and what the config of a run may import."""
+
+import importlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import pytest
+
+from run_fixtures import as_yaml
+from vjepa2_ac import registry as doors
+from vjepa2_ac.config import DataConfig, Section
+from vjepa2_ac.config.loading import load_config, parse_config
+from vjepa2_ac.config.section import Affects
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.settings import planning_settings
+from vjepa2_ac.registry import LOSSES, import_plugins
+
+Write = Callable[..., str]
+VALUES = {"run_dir": "run", "data": {"path": "none"}, "model": {"base": "builtin:sim-tiny"}}
+REGISTERS = "from vjepa2_ac.registry import LOSSES\n\n@LOSSES.register({name!r})\ndef {function}(p, t): return p - t\n"
+
+
+@pytest.fixture(autouse=True)
+def _restored(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Forget what a test registers and imports."""
+    modules, kinds, path = set(sys.modules), dict(DataConfig.kinds), sys.path[:]
+    for one in (LOSSES, doors.SOURCES):
+        for attribute in ("_things", "_origins"):
+            monkeypatch.setattr(one, attribute, getattr(one, attribute).copy())
+        monkeypatch.setattr(one, "_distinct", set())
+    monkeypatch.setattr(doors, "_registered", doors._registered[:])
+    monkeypatch.setattr(doors, "_plugins", set(doors._plugins))
+    yield
+    DataConfig.kinds.clear()
+    DataConfig.kinds.update(kinds)
+    sys.path[:] = path
+    for name in set(sys.modules) - modules:
+        if name.startswith("p_"):
+            del sys.modules[name]
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
+    """Write a module into the working directory, by default one that registers a loss; return its name."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+
+    def write(name: str, code: str | None = None, folder: str = ".") -> str:
+        Path(folder).mkdir(exist_ok=True)
+        Path(folder, f"{name}.py").write_text(REGISTERS.format(name=name, function=name) if code is None else code)
+        importlib.invalidate_caches()
+        return name
+
+    return write
+
+
+# Each name is registered once, whichever way.
+
+
+def test_a_name_of_this_package_cannot_be_registered_by_a_plugin(write: Write) -> None:
+    write("p_same", REGISTERS.format(name="l1", function="zero"))
+    with pytest.raises(InputError, match=r"'p_same' cannot.*'l1': registered by vjepa2_ac\.model\.distances already"):
+        import_plugins(["p_same"], where="own.yaml: plugins")
+    assert LOSSES.find("l1").__module__ == "vjepa2_ac.model.distances"
+
+
+def test_a_name_of_one_plugin_cannot_be_registered_by_another_nor_twice_in_one(write: Write) -> None:
+    import_plugins([write("p_first")], where="plugins")
+    write("p_second", REGISTERS.format(name="p_first", function="p_first"))
+    write("p_twice", REGISTERS.format(name="p_one", function="f") + REGISTERS.format(name="p_one", function="g"))
+    for module, owner in (("p_second", "p_first"), ("p_twice", "p_twice")):
+        with pytest.raises(InputError, match=f"registered by {owner} already"):
+            import_plugins([module], where="plugins")
+
+
+def test_objects_without_a_module_belong_to_the_module_that_registers_them(write: Write) -> None:
+    code = "from vjepa2_ac.registry import LOSSES\nLOSSES.register('p_object')(object())\n"
+    import_plugins([write("p_one", code)], where="plugins")
+    with pytest.raises(InputError, match="registered by p_one already"):
+        import_plugins([write("p_two", code)], where="plugins")
+
+
+def test_a_module_that_is_loaded_again_replaces_what_it_registered(write: Write) -> None:
+    import_plugins([write("p_edited")], where="plugins")
+    before = LOSSES.find("p_edited")
+    importlib.reload(sys.modules["p_edited"])
+    assert LOSSES.find("p_edited") is not before
+
+
+def install(folder: Path, package: str, entry_points: str, code: str = "thing = print\n") -> None:
+    """Leave in a folder what the installation of a package leaves."""
+    about = folder / f"{package}-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(entry_points)
+    (folder / f"{package}.py").write_text(code)
+    importlib.invalidate_caches()
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    """The folder of installed packages."""
+    sys.path.append(str(tmp_path / "site"))
+    return tmp_path / "site"
+
+
+def test_an_entry_point_cannot_have_a_name_of_this_package_or_of_another(site: Path) -> None:
+    install(site, "p_a", "[vjepa2_ac.losses]\nl1 = p_a:thing\np_new = p_a:thing\n")
+    install(site, "p_b", "[vjepa2_ac.losses]\np_new = p_b:thing\n")
+    for name, owners in (("l1", r"vjepa2_ac\.model\.distances and by p_a"), ("p_new", "p_a and by p_b")):
+        with pytest.raises(InputError, match=f"loss '{name}': registered by {owners}"):
+            parse_config({**VALUES, "training": {"loss": name}}, where="own.yaml")
+
+
+def test_a_package_may_register_what_it_lists_as_an_entry_point(site: Path) -> None:
+    code = REGISTERS.format(name="p_both", function="both")
+    install(site, "p_both", "[vjepa2_ac.losses]\np_both = p_both:both\n", code)
+    assert LOSSES.find("p_both").__module__ == "p_both"
+    assert LOSSES.known("p_both") == "p_both"
+
+
+def test_a_source_of_this_package_cannot_be_defined_again(site: Path) -> None:
+    with pytest.raises(InputError, match=r"form of data 'npz': registered by vjepa2_ac\.config\.sources already"):
+
+        class Again(DataConfig):
+            source: Annotated[Literal["npz"], Affects.EPISODES] = "npz"
+
+    install(site, "p_npz", "[vjepa2_ac.sources]\nnpz = p_npz:thing\n")
+    with pytest.raises(InputError, match=r"'npz': registered by vjepa2_ac\.config\.sources and by p_npz"):
+        parse_config({**VALUES, "data": {"source": "npz", "path": "none"}}, where="own.yaml")
+
+
+class Options(Section):
+    size: Annotated[int, Affects.EPISODES] = 3
+
+
+@pytest.mark.parametrize("name", ["idle", "frames", "cameras"])
+@pytest.mark.filterwarnings("ignore:Field name")
+def test_a_section_cannot_have_the_name_of_a_key_of_all_forms(name: str) -> None:
+    values = {"source": "p_own", name: Options(), "first_camera": "a", "__module__": __name__}
+    kinds = {"source": Annotated[Literal["p_own"], Affects.EPISODES], name: Options, "first_camera": ClassVar[str]}
+    with pytest.raises(TypeError, match=rf"Own\.{name}: all forms of data have a key of this name"):
+        type(DataConfig)("Own", (DataConfig,), {**values, "__annotations__": kinds})
+    assert "p_own" not in DataConfig.kinds
+
+
+# Plug-ins that fail give one error.
+
+
+@pytest.mark.parametrize(
+    ("code", "cause"),
+    [
+        ("x = 1\nraise RuntimeError('boom\\nmore')", r"RuntimeError: boom; .*p_fails\.py, line 2"),
+        ("import sys; sys.exit(7)", r"SystemExit: 7; .*p_fails\.py, line 1"),
+        ("def (", r"SyntaxError: .*p_fails\.py, line 1"),
+        ("def f(): f()\nf()", r"RecursionError: .*line 2"),
+        ("import no_such_library_x", r"ModuleNotFoundError: No module named 'no_such_library_x'; .*line 1"),
+    ],
+)
+def test_a_plugin_that_fails_is_one_error_with_the_line(write: Write, code: str, cause: str) -> None:
+    write("p_fails", code)
+    with pytest.raises(InputError, match=rf"^own.yaml: plugins: plugin 'p_fails' cannot be imported \({cause}\)"):
+        parse_config({**VALUES, "plugins": ["p_fails"]}, where="own.yaml")
+
+
+@pytest.mark.parametrize("name", ["../evil", "", "a-b", "a..b", "p_new.__main__", "vjepa2_ac.cli"])
+def test_names_that_are_no_modules_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match="a module of yours"):
+        import_plugins([name], where="plugins")
+
+
+def test_an_entry_point_that_fails_is_one_error(site: Path) -> None:
+    install(site, "p_broken", "[vjepa2_ac.losses]\np_broken = p_broken:thing\n", "raise OSError('boom')")
+    with pytest.raises(InputError, match=r"p_broken = p_broken:thing cannot be imported \(OSError: boom; .*line 1"):
+        LOSSES.find("p_broken")
+
+
+@pytest.mark.usefixtures("write")
+def test_a_module_that_registers_nothing_is_refused_each_time(write: Write) -> None:
+    write("p_helper", "x = 1")
+    write("p_outer", "import p_inner")
+    write("p_inner")
+    for _ in range(2):
+        with pytest.raises(InputError, match="'p_helper' registers nothing"):
+            import_plugins(["p_helper"], where="plugins")
+        import_plugins(["p_outer"], where="plugins")
+    import_plugins(["p_inner"], where="plugins")
+
+
+# A run may be a third party's.
+
+
+@pytest.fixture(params=["console script", "python -m", "PYTHONPATH=."])
+def _started(request: pytest.FixtureRequest, write: Write) -> None:
+    """The paths of imports, as they are after each way to start the program in the working directory."""
+    first = {"console script": [], "python -m": [str(Path.cwd())], "PYTHONPATH=.": ["."]}[request.param]
+    sys.path[:0] = first
+    _ = write
+
+
+PWNED = "open('PWNED', 'w')\n" + REGISTERS.format(name="p_evil", function="f")
+
+
+@pytest.mark.usefixtures("_started")
+def test_the_config_of_a_run_never_imports_from_the_working_directory(write: Write) -> None:
+    write("p_evil", PWNED)
+    install(Path(), "p_dist", "[vjepa2_ac.losses]\np_dist = p_dist:thing\n", PWNED)
+    Path("run").mkdir()
+    config = Path("run/config.yaml")
+    config.write_text(as_yaml(parse_config(VALUES, where="")).replace("plugins: []", "plugins: [p_evil]"))
+    Path("run/run_id").write_text("a")
+    read = (
+        load_config,
+        lambda path: planning_settings(str(path.parent)),
+        lambda path: planning_settings("builtin:sim-tiny", config=path),
+    )
+    for one in read:
+        with pytest.raises(InputError, match=r"plugin 'p_evil': no such module.*--plugin p_evil"):
+            one(config)
+    assert "p_dist" not in LOSSES.names()
+    assert not Path("PWNED").exists()
+
+
+def test_an_installed_module_is_not_shadowed_by_one_in_the_working_directory(write: Write, site: Path) -> None:
+    sys.path.insert(0, "")
+    write("p_shadowed", PWNED)
+    install(site, "p_shadowed", "", REGISTERS.format(name="p_shadowed", function="f"))
+    import_plugins(["p_shadowed"], where="run/config.yaml", here=False)
+    assert LOSSES.find("p_shadowed").__module__ == "p_shadowed"
+    write("p_entry", PWNED)
+    install(site, "p_entry", "[vjepa2_ac.losses]\np_entry = p_entry:thing\n")
+    assert LOSSES.find("p_entry") is print
+    assert not Path("PWNED").exists()
+    assert sys.path[0] == ""
+
+
+def test_an_installed_module_that_is_no_plugin_is_not_imported_for_a_run(write: Write, site: Path) -> None:
+    install(site, "p_other", "", "open('PWNED', 'w')")
+    _ = write
+    for module in ("p_other", "antigravity"):
+        sys.modules.pop("p_other", None)
+        with pytest.raises(InputError, match=f"'{module}' registers nothing"):
+            import_plugins([module], where="run/config.yaml", here=False)
+    assert not Path("PWNED").exists()
+    assert "antigravity" not in sys.modules
+
+
+@pytest.mark.parametrize("door", [load_config, lambda path: planning_settings("builtin:sim-tiny", config=path)])
+def test_the_users_own_config_imports_from_the_working_directory(write: Write, door: Callable[[Path], object]) -> None:
+    config = Path("mine.yaml")
+    write("p_mine")
+    config.write_text(as_yaml(parse_config(VALUES, where="")).replace("plugins: []", "plugins: [p_mine]"))
+    door(config)
+    assert LOSSES.known("p_mine")
