@@ -149,8 +149,11 @@ def test_a_device_is_asked_by_its_own_index(monkeypatch: pytest.MonkeyPatch) -> 
         load_model(TINY, device="cuda:9")
     monkeypatch.setenv("LOCAL_RANK", "1")
     assert [has_bf16(torch.device(name)) for name in ("cuda:0", "cuda:1", "cuda")] == [True, False, False]
+    monkeypatch.setenv("LOCAL_RANK", "0")
     with pytest.raises(UserError, match=r"card 1 of compute capability 7\.5"):
         load_model(TINY, device="cuda:1", dtype="bfloat16")
+    monkeypatch.setattr(WorldModel, "to", lambda model, _: model)
+    assert next(load_model(TINY, device="cuda:1").parameters()).dtype == torch.float32
 
 
 @torch.no_grad()

@@ -13,7 +13,9 @@ from same_run import assert_same_run
 from vjepa2_ac.api import load_run
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate_run import load_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
@@ -49,14 +51,21 @@ def exported(run: str, overrides: list[str]) -> WorldModel:
     return WorldModel.from_pretrained(export_run(Path(run), target, overrides=overrides).path)
 
 
+def evaluated(run: str, overrides: list[str]) -> WorldModel:
+    asked = EvaluationOptions(planning=tuple(overrides))
+    config = settle(run, asked)
+    return load_subject(run, config, asked, open_dataset(config.data)).world_model
+
+
 @pytest.mark.parametrize(
     "load",
     [
         lambda run, overrides: load_run(run, overrides=overrides).world_model,
         lambda run, overrides: load_to_plan(run, overrides=overrides).world_model,
         exported,
+        evaluated,
     ],
-    ids=["load_run", "plan", "export"],
+    ids=["load_run", "plan", "export", "evaluate"],
 )
 def test_a_run_is_used_with_its_moved_base_and_with_no_other(
     run: str, base_folder: Path, another: str, load: Callable[[str, list[str]], WorldModel]

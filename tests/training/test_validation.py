@@ -71,7 +71,7 @@ def test_clips_that_cannot_be_read_are_replaced_in_the_ranking(make_config, repo
     ]
     chosen = [names[place] for place in spread(8, 3)]
     others = [name for name in names if name not in chosen]
-    ranked, broken, read = [], {*chosen[:2], others[0]}, loader.read_clip
+    ranked, broken, read = [], {*chosen[1:], others[0]}, loader.read_clip
 
     def some_read(dataset: object, request: loader.ClipRequest) -> object:
         if (run.dataset.table.identity(request.episode), request.start) in broken:
@@ -84,7 +84,7 @@ def test_clips_that_cannot_be_read_are_replaced_in_the_ranking(make_config, repo
     monkeypatch.setattr(loader, "read_clip", some_read)
     monkeypatch.setattr(validation, "rank_actions", rank)
     validation.validate(run, reporter)
-    assert ranked == [name for name in (chosen[2], others[1], others[2]) for _ in range(2)], "two moves of each"
+    assert ranked == [name for name in (chosen[0], others[1], others[2]) for _ in range(2)], "two moves of each"
     broken.update(names)
     with pytest.raises(InputError, match="4 of 8 episodes are broken"):
         validation.validate(run, reporter)

@@ -89,8 +89,8 @@ def load_subject(
     notes: tuple[str, ...] = ()
     if BASE in against and config.model.base is None:
         if asked.against is not None:
-            found, needed = "a model without a base (model.base is not set)", "a base to compare with"
-            raise InputError(where="--against base", found=found, needed=needed, fix="Leave out --against base")
+            absent, needed = "a model without a base (model.base is not set)", "a base to compare with"
+            raise InputError(where="--against base", found=absent, needed=needed, fix="Leave out --against base")
     elif BASE in against and run is None:
         found.append(_contender(BASE, "base", _like(name, world_model, str(config.model.base), config, dataset.widths)))
     elif BASE in against and world_model.fresh_heads is not None:

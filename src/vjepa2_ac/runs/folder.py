@@ -107,7 +107,7 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     check_run_folder(config, allow_config_change=allow_config_change)
     folder = Path(config.run_dir)
     start = {"seed": config.seed, "folder": str(Path.cwd()), **environment()}
-    if changes := write_run_config(config):  # the first of all files: it makes the folder a run's
+    if changes := write_config(config):  # the first of all files: it makes the folder a run's
         start["config_changes"] = changes
     path = folder / ENVIRONMENT
     write_atomically(path, json.dumps([*_earlier_starts(path), start], indent=1).encode())
@@ -133,7 +133,7 @@ def run_id(folder: Path) -> str:
     return name
 
 
-def write_run_config(config: Config) -> list[str]:
+def write_config(config: Config) -> list[str]:
     """Write the config of this start into the run's folder if it differs, and return what changed since the last one.
 
     `train RUN --resume` reads it: a setting that was used for one start holds for the next.

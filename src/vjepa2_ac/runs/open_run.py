@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.runs.checkpoint import (
-    CHECKPOINTS,
-    RunState,
-    find_damage,
-    listed,
-    newest_checkpoint,
-    read_state,
-    step_of,
-)
-from vjepa2_ac.runs.folder import RunLock, asks_nothing_new, check_run_folder, open_run_folder, with_settled_values
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, find_damage, listed, step_of
+from vjepa2_ac.runs.folder import RunLock, check_run_folder, open_run_folder, with_settled_values
 from vjepa2_ac.runs.mirror import Mirror, open_remote
 
 
@@ -52,21 +44,6 @@ class OpenRun:
             found = f"{there}, which another start wrote while this one stood at {state.step}"
             raise InputError(where=str(newest), found=found, fix="Start again: the run continues from there")
         open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
-
-    def finished(self, is_done: Callable[[Config, RunState], bool]) -> RunState | None:
-        """Return the state of a run that has ended; None if there are steps to do, or the config asks for more.
-
-        Args:
-            is_done: Whether a run in this state has ended.
-
-        Raises:
-            InputError: All of its checkpoints are damaged.
-        """
-        checkpoint = newest_checkpoint(Path(self.config.run_dir, CHECKPOINTS))
-        if checkpoint is None or not asks_nothing_new(self.config):
-            return None
-        state = read_state(checkpoint)
-        return state if is_done(self.config, state) else None
 
     def mirror(self, run_id: str) -> Mirror | None:
         """Return what keeps `checkpoint.remote` up to date."""

@@ -31,8 +31,8 @@ from vjepa2_ac.distributed import (
 from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.runs.checkpoint import RunState
-from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, config_changes, read_run_config, write_run_config
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, newest_checkpoint, read_state
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, asks_nothing_new, config_changes, read_run_config, write_config
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.runs.trackers import open_trackers, require_installed
@@ -101,10 +101,10 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
 
 def _has_ended(opened: OpenRun, reporter: Reporter) -> bool:
     """Return whether the run has ended already; then write its config, and send what `checkpoint.remote` lacks."""
-    config = opened.config
-    if (state := opened.finished(is_done)) is None:
+    config, newest = opened.config, newest_checkpoint(Path(opened.config.run_dir, CHECKPOINTS))
+    if newest is None or not (asks_nothing_new(config) and is_done(config, state := read_state(newest))):
         return False
-    write_run_config(config)
+    write_config(config)
     reporter.note(_why_ended(config, state))
     if (mirror := opened.mirror(state.run_id)) is not None:
         with mirror:
