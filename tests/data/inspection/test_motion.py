@@ -220,8 +220,13 @@ def test_episodes_at_another_scale_are_counted(tmp_path: Path) -> None:
         r"6 episodes, such as 0(0|1)\d, have positions and motions (1.9|2.0)\d times as large", warning.text
     )
     assert findings_of(half)["scale"] == warning
-    for name, make in {"clean": clean, "one": scaled(0.5, [3]), "moved": moved_in_x}.items():
+    for name, make in {"clean": clean, "one": scaled(0.5, [3]), "moved": moved_in_x, "any size": of_any_size}.items():
         assert findings_of(config_of(tmp_path / name, make, episodes=12))["scale"].level == "ok", name
+
+
+def of_any_size(number: int) -> Pair:
+    """Return the motion of episodes that differ in scale, but not in two groups."""
+    return scaled(0.3 * (1 / 0.3) ** (number / 11), range(12))(number)
 
 
 def moved_in_x(number: int) -> Pair:
