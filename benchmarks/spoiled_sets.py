@@ -68,6 +68,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--data", metavar="CONFIG", help="another data set, of poses (a simulated arm)")
     parser.add_argument("--model", default="builtin:sim-tiny", help="what model.base takes, or a run (%(default)s)")
     parser.add_argument("--faults", nargs="+", default=[one.name for one in FAULTS], metavar="FAULT", help="(all)")
+    parser.add_argument("--no-probe", action="store_true", help="only `data check`, without a model")
     parser.add_argument("--episodes", type=int, default=24)
     parser.add_argument("--steps", type=int, default=61, help="of an episode, at most (61)")
     parser.add_argument("--clips", type=int, default=64, help="that are probed, at most (64)")
@@ -120,6 +121,8 @@ def _asked(
         config = _config(Path(folder), temporary, options.model, {"source": "npz", "stride": stride})
         try:
             findings.extend(check_data(config.data))
+            if options.no_probe:
+                return Outcome(tuple(findings), None, None)
             probe = probe_config(config, open_dataset(config.data), model=options.model, clips=options.clips)
         except InputError as error:
             return Outcome(tuple(findings), str(error), None)
@@ -155,7 +158,7 @@ def _probed(fault: Fault, probe: VariantProbe | None) -> str:
 def _said(fault: Fault, outcome: Outcome, new: set[tuple[str, str]]) -> Iterator[str]:
     probe = outcome.probe
     if probe is None:
-        yield f"{outcome.refusal}"[:_SAID]
+        yield (outcome.refusal or "")[:_SAID]
     else:
         better = "" if probe.better is None else f"; {probe.better.ratio.value:.3f} with {probe.better.name}"
         yield f"{probe.plain.ratio}{better}"
