@@ -14,7 +14,7 @@ import sys
 import unicodedata
 from collections.abc import Iterable
 from functools import partial
-from importlib.metadata import PackageNotFoundError, distribution
+from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -168,9 +168,7 @@ def pip_install(extra: str = "") -> str:
     if "url" in origin and "vcs_info" not in origin:  # a wheel, or a folder
         return f'{_pip()} install "{_PACKAGE}{wanted} @ {origin["url"]}"'
     # Not by the name alone: whoever registers it on an index could run code here.
-    from vjepa2_ac import __version__
-
-    return f'{_pip()} install "./vjepa2_ac-{__version__}-py3-none-any.whl{wanted}"'
+    return f'{_pip()} install "./vjepa2_ac-{version(_PACKAGE)}-py3-none-any.whl{wanted}"'
 
 
 def require_library(module: str, *, where: str, called: str, extra: str) -> Any:
