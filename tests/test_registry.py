@@ -226,11 +226,11 @@ def test_the_config_of_a_run_never_imports_from_the_working_directory(write: Wri
 def test_an_installed_module_is_not_shadowed_by_one_in_the_working_directory(write: Write, site: Path) -> None:
     sys.path.insert(0, "")
     write("p_shadowed", PWNED)
+    write("p_entry", PWNED)
     install(site, "p_shadowed", "", REGISTERS.format(name="p_shadowed", function="f"))
+    install(site, "p_entry", "[vjepa2_ac.losses]\np_entry = p_entry:thing\n")
     import_plugins(["p_shadowed"], where="run/config.yaml", here=False)
     assert LOSSES.find("p_shadowed").__module__ == "p_shadowed"
-    write("p_entry", PWNED)
-    install(site, "p_entry", "[vjepa2_ac.losses]\np_entry = p_entry:thing\n")
     assert LOSSES.find("p_entry") is print
     assert not Path("PWNED").exists()
     assert sys.path[0] == ""

@@ -263,7 +263,7 @@ def _meet(backend: str) -> None:
 def _rendezvous(meeting: Future[Any]) -> None:
     try:
         meeting.set_result(next(rendezvous("env://", timeout=_MEETING)))
-    except Exception as error:
+    except BaseException as error:  # or the other thread would wait for ever
         meeting.set_exception(error)
 
 

@@ -134,21 +134,24 @@ def test_a_slow_batch_is_waited_for_unless_a_signal_has_come(monkeypatch: pytest
 STARTS_A_WORKER = """
 import multiprocessing, os
 from vjepa2_ac.data.streams import _start_servers
-_start_servers()
-worker = multiprocessing.get_context("forkserver").Process(target=os.getpid)
-worker.start()
-worker.join()
-print(worker.exitcode, os.environ.get("PYTHONSAFEPATH"))
+if __name__ == "__main__":
+    _start_servers()
+    worker = multiprocessing.get_context("forkserver").Process(target=os.getpid)
+    worker.start()
+    worker.join()
+    print(worker.exitcode, os.environ.get("PYTHONSAFEPATH"))
 """
 
 
 def test_a_file_named_like_a_module_is_not_imported_by_workers(tmp_path: Path) -> None:
+    (tmp_path / "here").mkdir()
     for name in ("random", "signal", "socket"):
-        (tmp_path / f"{name}.py").write_text("open('RAN', 'w')")
-    words = [sys.executable, "-P", "-W", "ignore", "-c", STARTS_A_WORKER]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
+        (tmp_path / f"here/{name}.py").write_text("open('RAN', 'w')")
+    (tmp_path / "program.py").write_text(STARTS_A_WORKER)
+    words = [sys.executable, "-W", "ignore", str(tmp_path / "program.py")]
+    done = subprocess.run(words, cwd=tmp_path / "here", capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("0 None\n", "")
-    assert not (tmp_path / "RAN").exists()
+    assert not (tmp_path / "here/RAN").exists()
 
 
 @pytest.mark.parametrize("before", [None, "", "1"])

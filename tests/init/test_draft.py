@@ -70,6 +70,7 @@ def test_names_of_third_parties_never_become_keys(between: str) -> None:
     head, _, _ = text.partition("\n\n")
     assert all(line.startswith("# ") for line in head.splitlines())
     assert parse_yaml(text, where="here") == {"data": values}
+    assert not any(line.lstrip().startswith("plugins") for line in text.splitlines()), "a value is on one line"
     made = of(found)
     read = parse_config(parse_yaml(made.text(found, MACHINE), where="here"), where="here")
     assert read == made.config

@@ -83,7 +83,7 @@ def test_a_frozen_frame_moves_nothing_until_another_one_comes() -> None:
     assert found == ["planned", "frozen frame", "frozen frame", "planned", "planned"]
     assert why(run, image(1), STATE) == "frozen frame"
     run.reset(image(100))
-    assert why(run, image(1), MOVED) == "planned", "a reset forgets"
+    assert why(run, image(1), STATE) == "planned", "a reset forgets"
 
 
 def test_small_motions_add_up_while_the_frame_is_the_same() -> None:

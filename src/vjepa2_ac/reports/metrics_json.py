@@ -9,7 +9,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
@@ -17,7 +17,7 @@ from pydantic_core import to_jsonable_python
 from vjepa2_ac.errors import InputError, MissingFileError, shell_command
 from vjepa2_ac.evaluation.answer import Answer, answer
 from vjepa2_ac.evaluation.request import SCORED
-from vjepa2_ac.evaluation.result import ACTIONS, L1, Evaluation, Row, WrittenAbout
+from vjepa2_ac.evaluation.result import L1, Evaluation, Row, Way, WrittenAbout
 from vjepa2_ac.storage import user_can_read, write_atomically
 from vjepa2_ac.storage.structured import json_text
 
@@ -125,7 +125,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
             "persistence": one.errors.of("rollout", L1, "persistence"),
             "models": {name: model.errors.of("rollout") for name, model in one.models.items()},
             "one_step": {
-                name: {way: model.errors.of("teacher_forced", way=way).mean(1) for way in ("persistence", *ACTIONS)}
+                name: {way: model.errors.of("teacher_forced", way=way).mean(1) for way in get_args(Way)}
                 for name, model in one.models.items()
             },
         },

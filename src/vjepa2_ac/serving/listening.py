@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.serving.access import Access
 
-END_S = 2.0  # for connections and computations, when a server ends
+END_S = 1.5  # for connections and computations, when a server ends
 _Result = TypeVar("_Result")
 Handler = Callable[[Any], Coroutine[Any, Any, None]]
 

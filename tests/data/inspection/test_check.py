@@ -70,6 +70,14 @@ def test_wrong_numbers_are_named(about: str, level: str, words: str, changes: di
     assert (finding.level, words in finding.text) == (level, True), finding
 
 
+def test_blank_frames_are_no_frozen_camera() -> None:
+    frames = good()["frames"].clone()
+    frames[:2] = 0
+    frames[3] = torch.tensor([90, 20, 200], dtype=torch.uint8)
+    assert found_in(frames=frames)["frames"].text.startswith("0 of 4 frames equal")
+    assert found_in(frames=frames * 0)["frames"].level == "skipped"
+
+
 def knobs(droid: Path, **changes: object) -> DataConfig:
     values = {"path": str(droid), "frames": 3, "stride": 2, "workers": 0, "validation_share": 0.3, "test_share": 0.0}
     return DataConfig.model_validate(values | changes)

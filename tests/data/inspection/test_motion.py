@@ -13,6 +13,7 @@ from lerobot_sets import STATE, recorded, write_v30
 from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import MotionLimits
+from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.inspection import motion
 from vjepa2_ac.data.inspection.findings import Finding
@@ -150,7 +151,7 @@ def test_speed_example_is_the_step_between_joined_recordings(tmp_path: Path) -> 
 
 def with_one_outlier(number: int) -> Pair:
     states, frames = clean(number)
-    states[7, 0] *= 8 if number == 3 else 1
+    states[7, 0] *= 8 if number == 4 else 1
     return states, frames
 
 
@@ -160,9 +161,10 @@ def test_one_impossible_position_in_one_episode_is_named(
 ) -> None:
     monkeypatch.setattr(motion, "_EPISODES", in_sample)
     config = config_of(tmp_path / "set", with_one_outlier)
+    assert (open_dataset(config).table.find("004") in sample_of(open_dataset(config), in_sample)) == (in_sample > 1)
     for text in (warnings_of(config)["speed"], *(one.text for one in warnings_from_index(open_dataset(config)))):
         assert ": 2 control steps in 1 episode (" in text
-        assert "Example: 003, step " in text
+        assert "Example: 004, step " in text
         assert re.search(r"step (6 to 7|7 to 8): \d\d\.\d m/s", text)
     assert ("6 by the index" in warnings_of(config)["speed"]) == (in_sample == 1)
     assert not warnings_from_index(open_dataset(config_of(tmp_path / "clean", clean)))
@@ -174,7 +176,7 @@ def test_only_episodes_that_are_too_fast_by_the_index_are_read(tmp_path: Path) -
     read = dataset.source.read
     dataset.source.read = lambda index, *_: reads.append(index) or read(index)  # type: ignore[method-assign, func-returns-value, assignment, misc]
     assert [one.about for one in warnings_from_index(dataset)] == ["speed"]
-    assert [dataset.table.identity(index) for index in reads] == ["003"]
+    assert [dataset.table.identity(index) for index in reads] == ["004"]
 
 
 def test_impossible_positions_that_the_idle_filter_removes_do_not_count(tmp_path: Path) -> None:
@@ -218,8 +220,13 @@ def test_episodes_at_another_scale_are_counted(tmp_path: Path) -> None:
         r"6 episodes, such as 0(0|1)\d, have positions and motions (1.9|2.0)\d times as large", warning.text
     )
     assert findings_of(half)["scale"] == warning
-    for name, make in {"clean": clean, "one": scaled(0.5, [3]), "moved": moved_in_x}.items():
+    for name, make in {"clean": clean, "one": scaled(0.5, [3]), "moved": moved_in_x, "any size": of_any_size}.items():
         assert findings_of(config_of(tmp_path / name, make, episodes=12))["scale"].level == "ok", name
+
+
+def of_any_size(number: int) -> Pair:
+    """Return the motion of episodes that differ in scale, but not in two groups."""
+    return scaled(0.3 * (1 / 0.3) ** (number / 11), range(12))(number)
 
 
 def moved_in_x(number: int) -> Pair:

@@ -223,6 +223,15 @@ def test_equal_encoders_or_a_single_one_are_read_without_a_message(
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
+def test_tensors_that_are_expanded_beyond_the_memory_are_not_copied_to_be_compared(rewritten) -> None:
+    def change(whole: Whole) -> None:
+        for part in ("encoder", "target_encoder"):
+            whole[part]["module.norm.weight"] = torch.zeros(1).expand(1 << 46)
+
+    with pytest.raises(InputError, match=r"norm\.weight is \[70368744177664\], not \[48\]"):
+        load_official(rewritten(change), TINY_SIZES)
+
+
 def rename_one(whole: Whole) -> None:
     for part in (whole["encoder"], whole["target_encoder"]):
         part["module.blocks.1.norm1.scale"] = part.pop("module.blocks.1.norm1.weight")

@@ -148,6 +148,13 @@ def test_no_task_leaves_the_folder_of_its_recordings(program: Program, tmp_path:
     assert file.name.isprintable()
 
 
+def test_play_counts_as_no_solution_and_a_slow_world_is_recorded(program: Program, tmp_path: Path) -> None:
+    solved = "about['rate_hz'] = 0.3; answer['success'] = True\n"
+    with OtherWorld(program(first=f"{solved}{HELLO}")) as world:
+        assert record_world(world, tmp_path / "set", range(3)) == (2, 2)
+        assert record_world(world, tmp_path / "set", range(3)) == (2, 2), "nothing is recorded again"
+
+
 def test_an_error_output_of_any_length_takes_little_memory_and_its_end_is_shown(program: Program) -> None:
     flood = "for _ in range(128): sys.stderr.write('e' * 65536)"
     tracemalloc.start()

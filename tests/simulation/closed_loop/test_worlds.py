@@ -153,6 +153,8 @@ def test_options_of_our_arm_mean_nothing_in_a_world(model: str, capsys: pytest.C
     assert "--task: simulate" in capsys.readouterr().err
     assert main(["simulate", model, "--world", command(), "--domain", "B"]) == 2
     assert "--domain: simulate" in capsys.readouterr().err
+    assert main(["simulate", model, "--world-timeout", "5"]) == 2
+    assert "--world-timeout: no --world" in capsys.readouterr().err
     assert main(["simulate", "record", "folder", "--world", command(), "--cameras", "3"]) == 2
     assert "a world has one camera" in capsys.readouterr().err
 

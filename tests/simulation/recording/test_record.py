@@ -65,7 +65,8 @@ def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("random.py").write_text("open('RAN', 'w')")  # as a user may call a script
+    for name in ("random", "socket"):  # as a user may call a script
+        Path(f"{name}.py").write_text("open('RAN', 'w')")
     reported = []
     spec, how = RecordingSpec("B", STEPS, seed=3), {"episodes": EPISODES, "shards": 2, "workers": 2}
     again = record_dataset(tmp_path / "again", spec, **how, progress=lambda *state: reported.append(state))

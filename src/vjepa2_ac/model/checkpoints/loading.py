@@ -116,9 +116,10 @@ def load_official(
     file, given = MetaFile.open(Path(path)), sizes or ModelSizes()
     there = [key for key in _KEYS if isinstance(file.parts.get(key), dict)]
     key = encoder_weights if encoder_weights in there else (there or _KEYS)[0]
-    # Training changes every tensor, so the beginning of each shows it, and few pages of the file are read.
-    beginnings = [{name: value.flatten()[:_COMPARED] for name, value in file.tensors(one).items()} for one in there]
-    if len({fingerprint(one) for one in beginnings}) > 1:
+    # Training changes every tensor, so the beginning of each shows it, and few pages of the file are read. Flattening
+    # would copy a tensor that is not contiguous, and one of a few bytes may be expanded to any size.
+    tensors = [{name: one for name, one in file.tensors(key).items() if one.is_contiguous()} for key in there]
+    if len({fingerprint({name: one.flatten()[:_COMPARED] for name, one in part.items()}) for part in tensors}) > 1:
         text = "%s: encoder and target_encoder differ; %s is used. Set model.encoder_weights for the other one"
         logger.warning(text, path, key)
     found = encoder_in_file(file, key, given.encoder.frame, given.encoder.heads)

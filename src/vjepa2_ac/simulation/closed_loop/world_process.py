@@ -120,7 +120,7 @@ class WorldProcess(ExitStack):
 
     def _with_errors(self, found: str, fix: str = PROTOCOL) -> InputError:
         lines = self._errors.decode(errors="replace").strip().splitlines()[-_ERROR_LINES:]
-        return self.refused("\n".join([found, *lines]) + "\n", fix=fix)
+        return self.refused("\n".join([found, *(line[:_MOST_SHOWN] for line in lines)]) + "\n", fix=fix)
 
     def _read_errors(self) -> None:
         """Keep the end of the error output, so that neither memory nor disk fills, and the program never waits."""
