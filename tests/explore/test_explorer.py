@@ -86,9 +86,9 @@ def test_the_simulated_truth_is_what_happens_whatever_was_done_before(live: View
     arm = resimulate(folder, explorer.dataset.source.read(explorer.episodes[0]), 4)
     expected = arm.under(np.array(place.actions), explorer.stride)
     for before in ((), (LEFT,), (UP, LEFT), (UP, LEFT, UP, LEFT)):
-        live.truth.outcome.cache_clear()
+        live.truth._outcomes.cache_clear()
         live.truth.outcome(Place(0, 4, before))
-        live.truth.outcome.cache_clear()
+        live.truth._outcomes.cache_clear()
         true = live.truth.outcome(place)
         assert true is not None
         assert true.is_simulated

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from decisions import image
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.planning.goals import GOALS_FILE, NoiseFloor, SubGoal, read_goal_folder, write_goals
 
@@ -147,7 +147,7 @@ def test_a_file_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> No
         assert str(caught.value).isprintable()
     for file, complaint in (("pipe.png", "a pipe or a device"), ("loop.png", "symbolic links"), (".", "directory")):
         edit(folder, lambda goals, file=file: goals[1].update(file=file))
-        with pytest.raises(InputError, match=complaint):
+        with pytest.raises(UserError, match=complaint):
             read_goal_folder(folder)
     edit(folder, lambda goals: goals[1].update(file="inside.png"))
     assert len(read_goal_folder(folder).goals) == 3

@@ -349,7 +349,7 @@ def test_an_optimizer_file_that_would_run_code_is_refused_and_does_not(make_conf
     torch.save({"state": Bomb(tmp_path / "mark")}, checkpoint / "optimizer.pt")
     write_manifest(checkpoint)  # whoever can write the file can write the manifest
     with pytest.raises(InputError, match=r"optimizer\.pt: more than tensors and plain values.*run foreign code"):
-        train(config, reporter)
+        train(make_config(training__steps=2), reporter, allow_config_change=True)
     assert not (tmp_path / "mark").exists()
     torch.load(checkpoint / "optimizer.pt", weights_only=False)
     assert (tmp_path / "mark").exists(), "the bomb is one"
@@ -365,7 +365,7 @@ def test_a_checkpoint_of_another_base_is_refused_though_its_path_is_the_same(
     shutil.rmtree(base)
     WorldModel.random(WorldModel.from_pretrained(base_folder).sizes, seed=4).save_pretrained(base)
     with pytest.raises(InputError, match="an adapter trained on another predictor"):
-        train(config, reporter)
+        train(make_config(model__base=str(base), training__steps=2), reporter, allow_config_change=True)
 
 
 # Files of unknown origin: invalid ones are refused by name

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 from recording_cuda import RecordingCuda
 from run_fixtures import set_up
 from same_run import assert_same_run
-from vjepa2_ac.data import loader
+from vjepa2_ac.data import loader, streams
 from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import Batches, training_loader
@@ -89,7 +89,7 @@ def on_device(monkeypatch: pytest.MonkeyPatch) -> RecordingCuda:
     cuda = RecordingCuda()
     copies = ToDevice(cuda)
     monkeypatch.setattr(setup, "copies_for", lambda _: copies)
-    monkeypatch.setattr(loader, "DataLoader", unpinned)
+    monkeypatch.setattr(streams, "DataLoader", unpinned)
     return cuda
 
 

@@ -177,7 +177,7 @@ def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, repor
     throughput = Throughput.of(run.config, run.world_model.sizes, device, processes)
     reporter.note(str(throughput))
     reporter.started(run.state.step, training.steps)
-    checkpoint, saved_s = run.config.checkpoint, time.monotonic()
+    checkpoint, saved_s, saved_step = run.config.checkpoint, time.monotonic(), run.state.step
     every_s = math.inf if checkpoint.every_minutes is None else 60.0 * checkpoint.every_minutes
     with stop_on_signals() as stop, contextlib.closing(batches_from(run)) as batches:
         timed, stopped_by = TimedBatches(batches, device), 0
@@ -190,7 +190,8 @@ def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, repor
                 if not stop.number or processes > 1:
                     raise
                 stopped_by = stop.number
-                _save(run, metrics_log)
+                if run.state.step > saved_step:
+                    _save(run, metrics_log)
                 break
             reporter.stepped(step, metrics)
             if is_logged and metrics_log:
@@ -203,7 +204,7 @@ def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, repor
             stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
                 _save(run, metrics_log)
-                saved_s = time.monotonic()
+                saved_s, saved_step = time.monotonic(), step
             if mirror:
                 mirror.tick()
         has_ended = is_done(run.config, run.state)

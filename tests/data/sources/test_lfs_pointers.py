@@ -77,9 +77,11 @@ def test_a_pointer_in_place_of_any_other_file_is_named(tmp_path: Path) -> None:
         storage.read_bounded(path, 10_000)
 
 
-def test_other_small_files_missing_ones_and_pipes_pass(tmp_path: Path) -> None:
+def test_other_small_files_and_missing_ones_pass_and_pipes_are_refused(tmp_path: Path) -> None:
     (small := tmp_path / "small").write_bytes(b"{}")
     os.mkfifo(pipe := tmp_path / "pipe")
-    for path in (small, pipe, tmp_path, tmp_path / "none"):
+    for path in (small, tmp_path, tmp_path / "none"):
         storage.require_content(path)
+    with pytest.raises(InputError, match="a pipe or a device"):
+        storage.require_content(pipe)
     assert storage.read_bounded(small, 9) == b"{}"
