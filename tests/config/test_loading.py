@@ -217,11 +217,11 @@ class WithAlpha:
 @pytest.mark.parametrize(
     ("registry", "section", "values"),
     [
-        (LOSSES, "training.loss_options", {"loss": "mine", "loss_options": {"alhpa": 1}}),
-        (PLANNERS, "planning.planner_options", {"planner": "mine", "planner_options": {"alhpa": 1}}),
-        (ENERGIES, "planning.energy.options", {"energy": {"distance": "mine", "options": {"alhpa": 1}}}),
-        (TRACKERS, "tracking.others.mine", {"others": {"mine": {"alhpa": 1}}}),
-        (TRANSFORMS, "data.transforms.0.options", {"transforms": [{"name": "mine", "options": {"alhpa": 1}}]}),
+        (LOSSES, "training.loss_options", {"loss": "mine", "loss_options": {"alphaa": 1}}),
+        (PLANNERS, "planning.planner_options", {"planner": "mine", "planner_options": {"alphaa": 1}}),
+        (ENERGIES, "planning.energy.options", {"energy": {"distance": "mine", "options": {"alphaa": 1}}}),
+        (TRACKERS, "tracking.others.mine", {"others": {"mine": {"alphaa": 1}}}),
+        (TRANSFORMS, "data.transforms.0.options", {"transforms": [{"name": "mine", "options": {"alphaa": 1}}]}),
     ],
 )
 def test_a_wrong_option_is_named_by_its_whole_key(
@@ -232,7 +232,7 @@ def test_a_wrong_option_is_named_by_its_whole_key(
     with pytest.raises(InputError) as caught:
         parse_config(MINIMAL | {name: {**MINIMAL.get(name, {}), **values}}, where="x.yaml")
     lines = str(caught.value).splitlines()
-    assert f"  {section}.alhpa: unknown key; did you mean alpha?" in lines
+    assert f"  {section}.alphaa: unknown key; did you mean alpha?" in lines
     assert f"  {section}.alpha: missing; it has no default" in lines
 
 
