@@ -165,7 +165,7 @@ def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
         (shell_command("train", out, "--check"), "everything that can fail, before the first step"),
         (shell_command("train", out, f"run_dir={trial}", *short), f"{of_trial}: does it learn, how long is a step?"),
         (shell_command("evaluate", trial), "against the base, on held-out episodes"),
-        (shell_command("train", out), f"the real run, {of_run}; the same command goes on after a stop"),
+        (shell_command("train", out), f"the real run, {of_run}; the same command resumes it"),
     ]
 
 
@@ -271,7 +271,7 @@ def _demo(_options: argparse.Namespace) -> int:
     """See all of it on a simulated arm: record, train, judge, film.
 
     A tiny world model is trained with LoRA. All of it is in the folder demo, in 4 to 6 minutes on 2 cores, without a
-    download. The same command goes on after a stop.
+    download. Run the same command again to resume.
     """
     from vjepa2_ac.simulation.world.domains import load_mujoco
 
