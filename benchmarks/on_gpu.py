@@ -32,6 +32,7 @@ from timing import BESIDE
 _STEP = "--device cuda --frames 16 --repeats 3 --warm-up 1 --official"
 _PLAN = "--device cuda --horizon 1 --at-once 64 --no-memory --warm-up 1 --official"
 _QUICK = {"--device cuda": "--quick", "+graph": "", "--large --decisions 3": "--decisions 2"}  # instead, by --quick
+_CPU_SCALE = 10  # of time limits with --quick: a CPU without AVX-512 emulates bfloat16
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     parts = [part for part in PARTS if part.name in (options.only or [one.name for one in PARTS])]
     given, failed = list(sys.argv[1:] if arguments is None else arguments), []
+    scale = _CPU_SCALE if options.quick else 1
     processes: list[subprocess.Popen[bytes]] = [started(parts[0], given, options.out)]
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))
     try:
@@ -91,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if number + 1 < len(parts):
                 processes.append(started(parts[number + 1], given, options.out))
             with suppress(subprocess.TimeoutExpired):
-                processes[number].communicate(b"go\n", timeout=part.limit_s)
+                processes[number].communicate(b"go\n", timeout=part.limit_s * scale)
             code = end(processes[number])
             print(f"== {part.name}: exit {code}, {time.monotonic() - began:.0f} s", flush=True)
             print((options.out / f"{part.name}.log").read_text(), flush=True)
