@@ -117,7 +117,8 @@ def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, m
     assert '"train/loss": ' in (at_home / "run/curves.txt").read_text()
 
     for name, brightness in (("now", 90), ("goal", 160)):
-        Image.new("RGB", (48, 48), (brightness,) * 3).save(f"{name}.png")
+        scene = Image.linear_gradient("L").resize((48, 48)).point(lambda value, more=brightness: (value + more) // 2)
+        scene.convert("RGB").save(f"{name}.png")
     words = ["plan", "run", "--start", "now.png", "--goal", "goal.png", "--state", STATE, "--nodes", "0"]
     words += ["--out", "out", "planning.limits.xyz=[0.05,0.05,0.05]"]
     planned = command(*words, "--plugin", "my_module")
