@@ -96,7 +96,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
     ids: np.ndarray  # the identities as UTF-8, of type S
     id_hash: UInt64[np.ndarray, " episodes"]  # the first 8 bytes of the identity's SHA-256
     id_rank: Int32[np.ndarray, " episodes"]  # rank of the identity in alphabetical order
-    motion: Float32[np.ndarray, "episodes 8"]  # as in `StatesSummary`; NaN: states not read, or an older index
+    motion: Float32[np.ndarray, "episodes 8"]  # as in `StatesSummary`; NaN: states not read, or an older latent cache
     problems: tuple[EpisodeProblem, ...] = ()
     locators: Mapping[str, np.ndarray] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)

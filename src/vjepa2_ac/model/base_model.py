@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import importlib.resources
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from pathlib import Path
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes
 from vjepa2_ac.config.loading import flat
 from vjepa2_ac.config.model import Family, FramePath
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.storage.places import BUILTIN, HUB
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
@@ -81,9 +80,9 @@ def require_base_of_run(config: ModelConfig, run: Path, command: Sequence[str] =
         require_model(config)
     except InputError as error:
         key = error.where.partition(":")[0]
-        words = ["vjepa2-ac", *(command or ("train", str(run), "--resume")), f"{key}=PATH"]
+        moved = shell_command(*(command or ("train", run, "--resume")), f"{key}=PATH")
         needed = f"what {run} was trained on. It may be at any path: the fingerprint of its weights is compared"
-        fix = f"If it was moved, run `{shlex.join(words)}`"
+        fix = f"If it was moved, run `{moved}`"
         raise InputError(where=error.where, found=error.found, needed=needed, fix=fix) from None
 
 

@@ -222,7 +222,7 @@ def read_goal_folder(folder: Path) -> GoalFolder:
 
     Raises:
         InputError: There is no goals.json, it says something else, or a file is not in the folder, has no contrast, or
-            is no image of the first one's size.
+            is not an image with the size of the first image.
     """
     path, needed = folder / GOALS_FILE, f"the {GOALS_FILE} that `vjepa2-ac goals` writes"
     found = record_of(_GoalsFile, read_json_object(path, needed=needed), where=str(path), needed=needed)

@@ -212,7 +212,7 @@ class Session:
         decided: tuple[Decision | None, str],
         began: tuple[float, float],
     ) -> dict[str, Any]:
-        """Return the answer to a request for an action; it is counted, and told to observers.
+        """Return the answer to a request for an action; it is counted, and sent to observers.
 
         Args:
             frame: What the camera saw.

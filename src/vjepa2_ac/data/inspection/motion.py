@@ -92,8 +92,8 @@ def scale_finding(dataset: Dataset) -> Finding:
     radii_m, spans_m = (np.linalg.norm(dataset.table.motion[:, part], axis=1) for part in (MEANS, SPANS))
     members = dataset.episodes[(radii_m * spans_m)[dataset.episodes] > 0]  # not those of unknown motion
     if len(members) < 2 * _FEWEST_SCALED:
-        needed = f"needs poses in the index of {2 * _FEWEST_SCALED} or more episodes"
-        return Finding("skipped", "scale", f"{needed}; `vjepa2-ac data index --rebuild` adds them to older indexes")
+        needed = f"needs poses in the index of {2 * _FEWEST_SCALED} or more episodes, found {len(members)}"
+        return Finding("skipped", "scale", needed)
     members = members[np.argsort(radii_m[members])]
     radii_m, directions = radii_m[members], dataset.table.motion[members, MEANS] / radii_m[members, None]
     features = np.column_stack([np.log(radii_m), directions, np.log(spans_m[members] / radii_m)])

@@ -243,7 +243,7 @@ class _Place:
         return cls(place, index, ahead, episode.states[step], controller.spaces.state.differences(states))
 
     def frames(self, dataset: Dataset, views: int) -> np.ndarray:
-        """Return what so many cameras see there, side by side, and the goal image."""
+        """Return the images of the first `views` cameras at this position, side by side, and the goal image."""
         return recording_of(dataset, self.index, views).read([self.place[1], self.place[1] + self.ahead])
 
 
