@@ -132,21 +132,21 @@ class ActionPrior(nn.Module):
     @torch.no_grad()
     def next_action(
         self,
-        seen: Float[Tensor, "tokens dim"],
+        frame: Float[Tensor, "tokens dim"],
         state: Float[Tensor, " state_dim"],
-        wanted: Float[Tensor, "tokens dim"],
+        goal: Float[Tensor, "tokens dim"],
         remaining: int,
     ) -> tuple[Float[Tensor, " action_dim"], Float[Tensor, " action_dim"]]:
         """Return mean and standard deviation of the next action, on the CPU.
 
         Args:
-            seen: Latents of the current frame.
+            frame: Latents of the current frame.
             state: Measured.
-            wanted: Latents of the goal.
-            remaining: Model steps to it, at a guess.
+            goal: Latents of the goal.
+            remaining: Estimated number of model steps to the goal.
         """
-        left = torch.tensor([max(1, remaining)], device=seen.device)
-        mean, deviation = self(seen[None], wanted[None], left, state[None])
+        left = torch.tensor([max(1, remaining)], device=frame.device)
+        mean, deviation = self(frame[None], goal[None], left, state[None])
         std = math.sqrt(2) * deviation  # of a Laplace distribution
         return (mean * self.scale)[0].float().cpu(), (std * self.scale)[0].float().cpu()
 
