@@ -93,7 +93,12 @@ def test_the_line_that_installs_an_extra_fits_the_installation(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     origin = origin and origin.replace("HERE", str(tmp_path))
-    monkeypatch.setattr(PathDistribution, "read_text", lambda _self, _name: origin)
+    read_text = PathDistribution.read_text  # also reads the version
+    monkeypatch.setattr(
+        PathDistribution,
+        "read_text",
+        lambda self, name: origin if name == "direct_url.json" else read_text(self, name),
+    )
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
     assert pip_install(extra) == command
     monkeypatch.setenv("PATH", str(tmp_path))  # this environment is not activated
