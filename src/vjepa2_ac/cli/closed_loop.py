@@ -313,9 +313,9 @@ def _summary(benchmark: ClosedLoopBenchmark) -> Summary:
 
     agent, trials = benchmark.agent, benchmark.trials
     how = "`vjepa2-ac evaluate`" if cli.is_server(agent.subject) else shell_command("evaluate", agent.subject)
-    others = (not_measured(name, how) for name in ("predicts", "uses actions", "ranks actions"))
+    predicts, uses, ranks = (not_measured(name, how) for name in ("predicts", "uses actions", "ranks actions"))
     measured = f"{trials.task_name}, {trials.place}, {trials.model_steps} steps of {trials.seconds_per_step:.2f} s"
-    summary = Summary(agent.subject, measured, ZERO_ACTION, *others, plans=benchmark.verdict)
+    summary = Summary(agent.subject, measured, ZERO_ACTION, predicts, uses, ranks, benchmark.verdict)
     if agent.checkpoint and (Path(agent.subject) / METRICS_FILE).is_file():
         evaluated = read_metrics(Path(agent.subject))
         if evaluated.about.checkpoint == agent.checkpoint:
