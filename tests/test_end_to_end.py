@@ -54,7 +54,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-FEW = ["--sensitivity-clips", "2", "--samples", "6", "--landscapes", "1", "--nodes", "3", "--examples", "1"]
+FEW = ["--ranking-clips", "2", "--samples", "6", "--landscapes", "1", "--nodes", "3", "--examples", "1"]
 ERRORS = "rollout.l1.over_persistence."
 
 

@@ -174,7 +174,7 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     home, step = Path(config.run_dir), str(cell.step)
     rows = [row for row in read_metrics_log(home / "metrics.jsonl") if row["kind"] == "validation"]
     (validated,) = (row for row in rows if row["step"] == cell.step)
-    probes = ProbeOptions(sensitivity_clips=24, samples=32, landscape_clips=4, axis_clips=0, nodes=5, examples=0)
+    probes = ProbeOptions(ranking_clips=24, samples=32, landscape_clips=4, axis_clips=0, nodes=5, examples=0)
     asked = EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes)
     with joined(config) as accelerator:
         evaluation = measure_subject(str(home), asked, accelerator)

@@ -22,7 +22,7 @@ REACHED_CM = 5.0
 ALL, FEWEST = "simulated arm, all changes", 9  # cells of a correlation
 GONE = {"contrast": "a loss term, `training.action_contrast`: measured at commit 6117de8, the last with the term"}
 """Cures that no longer can be run, whose measurements stay."""
-_SHOWN = ("rollout_over_persistence_last", "action_rank")
+_SHOWN = ("rollout_over_persistence_last", "action_ranking_error")
 
 
 def _selected(cells: list[Figures]) -> Figures:
@@ -186,7 +186,7 @@ def draw(cells: Sequence[Figures], path: Path) -> None:
     panels = figure.subplots(2, 3, sharex=True)
     shown: dict[str, Callable[[Figures], float]] = {
         "error / persistence": lambda one: one["validation"]["rollout_over_persistence_last"],
-        "others that look better": lambda one: one["validation"]["action_rank"],
+        "others that look better": lambda one: one["validation"]["action_ranking_error"],
         "cm left in closed loop": left_cm,
     }
     for row, motions in zip(panels, ("narrow", "varied"), strict=True):

@@ -29,7 +29,7 @@ from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.spaces import vector_actions
 from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, about, again, clips_batch
 
-PROBES = ProbeOptions(sensitivity_clips=6, samples=20, landscape_clips=3, axis_clips=0, nodes=5, examples=3, at_once=7)
+PROBES = ProbeOptions(ranking_clips=6, samples=20, landscape_clips=3, axis_clips=0, nodes=5, examples=3, at_once=7)
 
 
 def evaluated(trained: object, base: object | None = None, *, size: int = 4, **changes: object) -> Evaluation:
@@ -218,7 +218,7 @@ def test_the_axes_of_base_and_adapter_are_found_and_those_of_vectors_are_not() -
 
 
 def test_nothing_but_errors_is_measured_where_nothing_else_is_asked_for() -> None:
-    probes = ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0)
+    probes = ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0)
     found = evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=probes)
     assert found.notes == ()
     assert found.models["model"].sensitivity is None

@@ -29,10 +29,10 @@ from vjepa2_ac.reports.write import Evaluated, evaluate_subject
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.training.loop import train
 
-PROBES = ProbeOptions(sensitivity_clips=3, samples=6, landscape_clips=1, nodes=3, examples=1)
-NONE = ProbeOptions(sensitivity_clips=0, examples=0)
-FEW = ["--sensitivity-clips", "0", "--examples", "1", "--clips", "5"]
-QUICK = ["--sensitivity-clips", "3", "--samples", "6", "--landscapes", "1", "--nodes", "3", "--examples", "1"]
+PROBES = ProbeOptions(ranking_clips=3, samples=6, landscape_clips=1, nodes=3, examples=1)
+NONE = ProbeOptions(ranking_clips=0, examples=0)
+FEW = ["--ranking-clips", "0", "--examples", "1", "--clips", "5"]
+QUICK = ["--ranking-clips", "3", "--samples", "6", "--landscapes", "1", "--nodes", "3", "--examples", "1"]
 
 
 @pytest.fixture(scope="module")

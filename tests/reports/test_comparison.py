@@ -17,7 +17,7 @@ from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_met
 from vjepa2_ac.reports.paper import write_tables
 from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 
-PROBES = ProbeOptions(sensitivity_clips=4, samples=10, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
+PROBES = ProbeOptions(ranking_clips=4, samples=10, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
 
 
 def written(folder: Path, model: object, *, clips: int = 12, seed: int = 0, **changes: object) -> Path:

@@ -168,13 +168,13 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
     one = evaluation(with_base=False)
     adapter = replace(one.models["adapter"], sensitivity=None, landscapes=None, distribution=None)
     bare = replace(one, models={"adapter": adapter}, examples=(), training=(), strata=(), episodes=(), copies=None)
-    shown = Page(page_of(replace(bare, notes=("--sensitivity-clips is 0: no energy landscapes.",)))).shown
+    shown = Page(page_of(replace(bare, notes=("--ranking-clips is 0: no energy landscapes.",)))).shown
     for what in (
         "Compared with the base", "Energy landscapes", "Example clips", "Training curves", "Other strides",
         "Spread of the predictions", "Decoded images", "Plans beside demonstrations",
     ):  # fmt: skip
         assert f"{what}: not measured." in shown
-    assert "Energy landscapes: not measured. --sensitivity-clips is 0: no" in shown
+    assert "Energy landscapes: not measured. --ranking-clips is 0: no" in shown
     assert "No film: vjepa2-ac evaluate runs/kitchen --decoder FOLDER" in shown
 
 

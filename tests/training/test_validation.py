@@ -46,10 +46,10 @@ def test_each_validation_logs_the_ranking_with_intervals(make_config, reporter) 
     rows = validations(train(make_config(**EVERY_STEP, validation__ranking_samples=8), reporter))
     assert [row["step"] for row in rows] == list(range(7))
     for row in rows:
-        assert 0.0 <= row["action_rank"] <= 1.0
-        assert row["action_rank"] == pytest.approx((row["action_rank_box"] + row["action_rank_shell"]) / 2)
+        assert 0.0 <= row["action_ranking_error"] <= 1.0
+        assert row["action_ranking_error"] == pytest.approx((row["action_ranking_error_box"] + row["action_ranking_error_shell"]) / 2)
         assert row["energy_spread"] > 0.0
-    assert len({row["action_rank"] for row in rows}) > 1
+    assert len({row["action_ranking_error"] for row in rows}) > 1
 
 
 def test_what_is_ranked_does_not_change_the_run(make_config, reporter, tmp_path) -> None:
@@ -59,7 +59,7 @@ def test_what_is_ranked_does_not_change_the_run(make_config, reporter, tmp_path)
     ]
     weights = [newest_checkpoint(folder / "checkpoints") / "adapter/adapter_model.safetensors" for folder in folders]
     assert weights[0].read_bytes() == weights[1].read_bytes()
-    assert "action_rank" not in validations(folders[1])[0]
+    assert "action_ranking_error" not in validations(folders[1])[0]
 
 
 def test_clips_that_cannot_be_read_are_replaced_in_the_ranking(make_config, reporter, monkeypatch) -> None:

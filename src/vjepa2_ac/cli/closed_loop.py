@@ -308,14 +308,14 @@ def _in_their_world(options: argparse.Namespace, chosen: BenchmarkOptions, home:
 
 def _summary(benchmark: ClosedLoopBenchmark) -> Summary:
     """Return the verdict of the closed loop, with the other verdicts that `evaluate` wrote for this checkpoint."""
-    from vjepa2_ac.evaluation.summary import ZERO_ACTION, Summary, not_measured
+    from vjepa2_ac.evaluation.summary import Summary, not_measured
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
     agent, trials = benchmark.agent, benchmark.trials
     how = "`vjepa2-ac evaluate`" if cli.is_server(agent.subject) else shell_command("evaluate", agent.subject)
     predicts, uses, ranks = (not_measured(name, how) for name in ("predicts", "uses actions", "ranks actions"))
     measured = f"{trials.task_name}, {trials.place}, {trials.model_steps} steps of {trials.seconds_per_step:.2f} s"
-    summary = Summary(agent.subject, measured, ZERO_ACTION, predicts, uses, ranks, benchmark.verdict)
+    summary = Summary(agent.subject, measured, predicts, uses, ranks, benchmark.verdict)
     if agent.checkpoint and (Path(agent.subject) / METRICS_FILE).is_file():
         evaluated = read_metrics(Path(agent.subject))
         if evaluated.about.checkpoint == agent.checkpoint:

@@ -105,7 +105,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     about = {name: value for name, value in vars(one.about).items() if name != "space"}
     decoded, planning = one.decoded, {"three_steps_settings": SCORED}
     of_study = ("clips", "places", "demonstrated", "one_step_beyond", "three_steps_beyond", "settings")
-    of_model = ("role", "sensitivity", "ranking", "landscapes", "plans")  # what rows come from, but for errors
+    of_model = ("role", "ranking", "landscapes", "distribution", "plans")  # what rows come from, but for errors
     metrics = {
         "format": FORMAT,
         "summary": {**vars(summary), "sentence": summary.sentence},
@@ -124,6 +124,10 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "by_clip": {
             "persistence": one.errors.of("rollout", L1, "persistence"),
             "models": {name: model.errors.of("rollout") for name, model in one.models.items()},
+            "last_horizon": {
+                metric.name: {name: model.errors.of("rollout", metric)[:, -1] for name, model in one.models.items()}
+                for metric in one.metrics
+            },
             "one_step": {
                 name: {way: model.errors.of("teacher_forced", way=way).mean(1) for way in get_args(Way)}
                 for name, model in one.models.items()

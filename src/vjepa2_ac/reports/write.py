@@ -53,7 +53,7 @@ _GREY, _PASSED = 170, (31, 111, 180)  # of gaps and bar, on white as well as on 
 _PARTS = {  # title, and how the keys of the rows begin; what it means stands in the template
     "errors": ("Error by horizon", r"(rollout|teacher_forced)\.\w+\.(over_pers|error)"),
     "base": ("Compared with the base", r"(rollout|teacher_forced)\.|one_step_gain"),
-    "actions": ("Use of the actions", "cost_of|gap_of|sensitivity|ranking|axes"),
+    "actions": ("Use of the actions", "cost_of|gap_of|ranking|axes"),
     "steps": ("Where it helps", "one_step"),
     "examples": ("Example clips", "$^"),
     "decoded": ("Decoded images", "decoded"),
@@ -154,7 +154,6 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
     labels = {
         f"rollout.{L1.name}.over_persistence.{last}": f"L1 error / persistence, {ahead}",
         "ranking.rank": "action-ranking error",
-        "sensitivity.rank.clips": "others' actions that look better",
         "one_step.motion.moving": "one-step L1 error / persistence, moving",
         f"spread.{last}": f"spread / that of the truth, {ahead}",
     }

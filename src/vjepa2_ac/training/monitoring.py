@@ -117,12 +117,13 @@ class Watch:
                 copying = "; copying the last frame would be better" if now > 1.0 > before else ""
                 text = f"the {name} is {now:.3f} of persistence's in the validation (before training {before:.3f})"
                 yield name + copying, text + copying
-        if _number(metrics, "action_rank_low") > _number(self._at_start, "action_rank_high"):  # intervals are apart
-            words = "predicts better and plans worse than the base" if better else "plans worse than the base"
-            rank, before = _number(metrics, "action_rank"), _number(self._at_start, "action_rank")
-            text = f"the model {words}: {rank:.1%} of other moves look better than the true one"
-            hint = "`vjepa2-ac data check` says how varied the motion of the data is"
-            yield "rank", f"{text} (before training {before:.1%}, chance 50 %). {hint}"
+        error = "action_ranking_error"
+        if _number(metrics, f"{error}_low") > _number(self._at_start, f"{error}_high"):  # intervals are apart
+            words = "predicts better, but ranks actions worse" if better else "ranks actions worse"
+            now, before = 100 * _number(metrics, error), 100 * _number(self._at_start, error)
+            text = f"the model {words} than the base model: its action-ranking error is {now:.1f} %"
+            hint = "`vjepa2-ac data check` measures how diverse the motion of the data is"
+            yield "rank", f"{text} (before training {before:.1f} %, chance 50 %). {hint}"
 
     def _of_loss(self, loss: float) -> Iterator[tuple[str, str]]:
         if not math.isfinite(loss):  # a step without clips, or one that was refused
