@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +28,7 @@ SAME_RANK = 0.005  # absolute; likewise for action-ranking errors
 CHANCE = 0.5  # action-ranking error of a model that ignores its actions
 CLOSED_LOOP_FILE = "closed_loop.json"  # in RUN/closed_loop/TASK-DOMAIN
 _BASE, _PERSISTENCE, _CHANCE = "with the base model", "with persistence", "chance"  # what a verdict compares with
-_COLUMNS = 80
+_COLUMNS, _NO_BREAK = 80, "\N{NO-BREAK SPACE}"
 
 
 @dataclass(frozen=True)
@@ -51,10 +52,9 @@ class Verdict:
         """The interval as text, with digits and direction of the statement's number; empty without an interval."""
         if self.value is None or self.low is None or self.high is None:
             return ""
-        low, high = (self.low, self.high) if self.value >= 0 else (-self.high, -self.low)
         if self.unit == "%":
-            return interval_of(Estimate(abs(self.value), low, high))
-        return f"[{low:z.1f}, {high:z.1f}]"
+            return interval_of(Estimate(self.value, self.low, self.high))
+        return f"[{self.low:z.1f}, {self.high:z.1f}]"
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,8 @@ class Summary:
             return f"{claim.capitalize()} is not better than {verdict.compared_with}.{check}"
         if verdict.compared_with == _CHANCE:
             return "Action ranking is worse than chance, so the model cannot be used for planning."
+        if verdict.high is not None and verdict.high < 0:
+            return "The error is lower with shuffled actions than with true ones. Check data, axes and stride first."
         return "The model predicts typical motion and ignores the actions, so it cannot be used for planning."
 
     def __str__(self) -> str:
@@ -113,11 +115,18 @@ class Summary:
         for verdict in self.verdicts:
             label = f"  {verdict.name:<13}  {verdict.conclusion:<{width}}  "
             room = _COLUMNS - len(label) - len(verdict.interval) - 1
-            text = f"{verdict.statement} {verdict.reference}"
+            text = _with_fixed_units(f"{verdict.statement} {verdict.reference}")
             first = textwrap.wrap(text, room)[0]
             lines.append(f"{label}{first:<{room}} {verdict.interval}".rstrip())
-            lines += (" " * len(label) + line for line in textwrap.wrap(text[len(first) :], _COLUMNS - len(label)))
-        return "\n".join([*lines, *textwrap.wrap(self.sentence, _COLUMNS)])
+            rest = textwrap.wrap(text[len(first) :].lstrip(), _COLUMNS - len(label))
+            lines += (" " * len(label) + line for line in rest)
+        lines += textwrap.wrap(_with_fixed_units(self.sentence), _COLUMNS)
+        return "\n".join(lines).replace(_NO_BREAK, " ")
+
+
+def _with_fixed_units(text: str) -> str:
+    """Return a text in which no line break separates a number from its unit."""
+    return re.sub(r"(?<=\d) (?=%|cm\b|s\b)", _NO_BREAK, text)
 
 
 def summarize(evaluation: Evaluation, rows: Sequence[Row]) -> Summary:
@@ -206,9 +215,10 @@ def percent(share: float) -> str:
 
 
 def interval_of(share: Estimate) -> str:
-    """Return the interval of a share in percent, with as many digits as the share; empty without an interval."""
+    """Return the interval of a share's size, whose sign a word gives, in percent; empty without an interval."""
     form = "z.0f" if abs(share.value) >= 0.0995 else "z.1f"
-    return f"[{100 * share.low:{form}}, {100 * share.high:{form}}]" if share.has_interval else ""
+    low, high = (share.low, share.high) if share.value >= 0 else (-share.high, -share.low)
+    return f"[{100 * low:{form}}, {100 * high:{form}}]" if share.has_interval else ""
 
 
 def conclusion_of(gain: Estimate, same: float) -> Conclusion:
@@ -280,7 +290,7 @@ def _uses_actions(rows: Mapping[str, Row], ranks_actions: Verdict) -> Verdict:
     low, high = ranks_actions.low, ranks_actions.high
     if conclusion == "yes" and low is not None and high is not None and high >= CHANCE:
         conclusion, compared_with = "no" if low > CHANCE else "inconclusive", _CHANCE
-        reference = f"(but {ranks_actions.statement}, chance 50 % {ranks_actions.interval})"
+        reference = f"(but {ranks_actions.statement} {ranks_actions.interval}, chance 50 %)"
     statement = f"one-step error {_amount(cost, 'higher', 'lower')} with shuffled actions"
     return replace(_verdict("uses actions", conclusion, statement, cost, compared_with), reference=reference)
 
