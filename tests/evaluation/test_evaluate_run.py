@@ -112,7 +112,7 @@ def test_figures_depend_on_neither_the_batch_size_nor_the_workers(config: Config
     one, other = figures_of(run), figures_of(tmp_path / "b")
     for name in ("base", "adapter"):
         assert rollout(one, name) == pytest.approx(rollout(other, name), rel=1e-5)
-        ranks = [metrics["models"][name]["sensitivity"]["rankings"][0]["rank"] for metrics in (one, other)]
+        ranks = [metrics["models"][name]["ranking"]["ranks"] for metrics in (one, other)]
         assert ranks[0] == ranks[1]
     assert one["clips"] == other["clips"]
 

@@ -149,7 +149,7 @@ def test_better_action_ranking_needs_a_lower_error_than_chance_and_the_base_mode
 
 def test_the_third_line_is_action_ranking_until_a_closed_loop_was_measured(tmp_path: Path) -> None:
     bare, measured = summary_of(model("model", 0.5)), summary_of(ranked("model", 0.5, 0.02, shuffled=0.9))
-    assert bare.ranks_actions == not_measured("ranks actions", "evaluate --ranking-clips 32")
+    assert bare.ranks_actions == not_measured("ranks actions", "`vjepa2-ac evaluate --ranking-clips 32`")
     shares = {name: share_of(count, 50) for name, count in {"m": 45, "random": 2, "oracle": 50}.items()}
     plans = closed_loop(shares, "m", "oracle", 50, "reach")
     (tmp_path / "closed_loop" / "reach-B").mkdir(parents=True)

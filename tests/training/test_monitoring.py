@@ -229,15 +229,18 @@ def ranking(rank: float, low: float, high: float) -> dict[str, float]:
     return {"action_ranking_error": rank, "action_ranking_error_low": low, "action_ranking_error_high": high}
 
 
-def test_a_model_that_predicts_better_and_plans_worse_is_warned_of_once(config: Config) -> None:
+def test_a_model_that_predicts_better_and_ranks_actions_worse_is_warned_of_once(config: Config) -> None:
     start = validation(0.9) | ranking(0.03, 0.02, 0.04)
     unsure, sure = validation(0.7) | ranking(0.05, 0.039, 0.07), validation(0.6) | ranking(0.06, 0.05, 0.07)
     found = warned(config, (0, start), (3, unsure), (6, sure), (9, sure))
     assert list(found) == [6]
-    assert "the model predicts better and plans worse than the base" in found[6][0]
-    assert "6.0% of other moves look better than the true one (before training 3.0%" in found[6][0]
+    assert "the model predicts better, but ranks actions worse than the base model" in found[6][0]
+    assert "its action-ranking error is 6.0 % (before training 3.0 %, chance 50 %)" in found[6][0]
     worse = validation(0.95) | ranking(0.06, 0.05, 0.07)
-    assert any("the model plans worse than the base" in text for text in warned(config, (0, start), (3, worse))[3])
+    assert any(
+        "the model ranks actions worse than the base model" in text
+        for text in warned(config, (0, start), (3, worse))[3]
+    )
 
 
 def test_a_run_that_diverges_says_so_and_its_report_does_too(make_diverging, reporter) -> None:

@@ -47,7 +47,9 @@ def test_each_validation_logs_the_ranking_with_intervals(make_config, reporter) 
     assert [row["step"] for row in rows] == list(range(7))
     for row in rows:
         assert 0.0 <= row["action_ranking_error"] <= 1.0
-        assert row["action_ranking_error"] == pytest.approx((row["action_ranking_error_box"] + row["action_ranking_error_shell"]) / 2)
+        assert row["action_ranking_error"] == pytest.approx(
+            (row["action_ranking_error_box"] + row["action_ranking_error_shell"]) / 2
+        )
         assert row["energy_spread"] > 0.0
     assert len({row["action_ranking_error"] for row in rows}) > 1
 

@@ -299,7 +299,7 @@ def _ranks_actions(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Ver
     """Conclude from the action-ranking error: yes needs less than the base model's and less than chance."""
     key = "ranking.rank"
     if key not in rows:
-        return not_measured("ranks actions", "evaluate --ranking-clips 32")
+        return not_measured("ranks actions", "`vjepa2-ac evaluate --ranking-clips 32`")
     rank = rows[key].estimate
     statement = f"action-ranking error {percent(rank.value)} %"
     conclusion, reference, compared_with = conclusion_of(rank.below(CHANCE), SAME_RANK), "chance 50 %", _CHANCE

@@ -1,6 +1,6 @@
 """The report of an evaluation: measured, and written as metrics.json, evaluation.png, and one HTML page.
 
-The page has the answer and a film first, then every number and its figure, folded; it needs no network and no script.
+The page shows the summary and a video first, then every number and plot, folded; it needs no network and no script.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from vjepa2_ac.distributed import first_only, joined
 from vjepa2_ac.episode import short_names
@@ -42,7 +42,6 @@ PLOT, REPORT = "evaluation.png", "report.html"
 MOST_CLIPS = 4  # example clips, and as many decoded ones
 _AT_EACH_END = 8  # episodes in a table
 _BYTES = 3_000_000  # of all clips together
-_MOST_TILES = 4
 _AT_AN_END = 10.0  # percent of the width of a bar, free on both sides
 LONGEST_S = 6.0  # of the film
 MOST_BYTES = 600_000  # likewise
@@ -105,8 +104,10 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
     environment.tests["search_for"] = lambda text, word: word in text
     environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(visible, name.split("/")))
     environment.filters |= {"quote": shlex.quote, "bar": bar_of, "percent": percent, "interval": interval_of}
+    environment.filters["coded"] = coded
+    environment.filters["figure"] = lambda row: f"{percent(row.value)} %" if row.better else f"{row.value:.2f}"
     environment.filters["baseline"] = lambda one: (
-        f"{one.baseline:.0%}" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
+        f"{percent(one.baseline)} %" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
     )
     return environment.get_template("report.html.jinja").render(
         evaluation=evaluation,
@@ -117,6 +118,14 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         short=short_names(evaluation.clips.episode_ids),
         style=Markup(resources.files("vjepa2_ac").joinpath("assets/report.css").read_text("utf-8")),  # noqa: S704
     )
+
+
+def coded(text: str) -> Markup:
+    """Return a text as HTML, with what is between backticks as code."""
+    parts = [escape(visible(part)) for part in text.split("`")]
+    if len(parts) % 2 == 0:  # a backtick without its partner
+        return Markup("`").join(parts)
+    return Markup("").join(Markup("<code>{}</code>").format(part) if n % 2 else part for n, part in enumerate(parts))
 
 
 def bar_of(verdict: Verdict) -> dict[str, float]:
@@ -149,22 +158,24 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
 
 
 def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> list[tuple[str, Row, Row | None]]:
-    """Return the most important shares that the answer does not give: label, the evaluated model's, the base's."""
+    """Return the most important rows that the summary does not show: label, the evaluated model's, the base model's."""
     last, ahead = evaluation.horizon, f"{evaluation.seconds_ahead:.1f} s ahead"
     labels = {
         f"rollout.{L1.name}.over_persistence.{last}": f"L1 error / persistence, {ahead}",
         "ranking.rank": "action-ranking error",
-        "one_step.motion.moving": "one-step L1 error / persistence, moving",
-        f"spread.{last}": f"spread / that of the truth, {ahead}",
+        "one_step.motion.moving": "one-step L1 error / persistence, moving steps",
+        f"spread.{last}": f"spread of the predictions, {ahead}",
     }
-    given = {verdict.value for verdict in summary.verdicts}
-    known = {(row.key, row.model): row for row in rows if not math.isnan(row.value) and row.value not in given}
-    tiles = [
+    if evaluation.base is None:  # the first verdict is on this error
+        del labels[f"rollout.{L1.name}.over_persistence.{last}"]
+    if summary.plans is None:
+        del labels["ranking.rank"]
+    known = {(row.key, row.model): row for row in rows if not math.isnan(row.value)}
+    return [
         (label, known[key, evaluation.trained], known.get((key, evaluation.base or "")))
         for key, label in labels.items()
         if (key, evaluation.trained) in known
     ]
-    return tiles[:_MOST_TILES]
 
 
 def _episodes(scores: Sequence[EpisodeScore]) -> list[RowTable]:
@@ -200,7 +211,7 @@ def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
 
 
 class PageFilm(NamedTuple):
-    """One clip as a film. URLs are data: URLs."""
+    """One clip as a video. URLs are data: URLs."""
 
     url: str  # animated
     still: str  # its last frame
@@ -225,7 +236,7 @@ def film_of(evaluation: Evaluation) -> PageFilm | None:
     step = min(_STEP_S, (LONGEST_S - _FIRST_S - _LAST_S) / max(len(times) - 2, 1))
     shown = [_FIRST_S, *[step] * (len(times) - 2), _LAST_S]
     (url,), (still,) = webp_urls([frames], shown, at_most=MOST_BYTES), webp_urls([frames[-1:]], at_most=MOST_BYTES)
-    return PageFilm(url, still, ("what happened", *(f"the {name} imagines" for name in models)), strip)
+    return PageFilm(url, still, ("true frames", *(f"predicted by {name}" for name in models)), strip)
 
 
 def _frame(images: Sequence[Frame], passed: float) -> Frame:
