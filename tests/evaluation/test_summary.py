@@ -196,6 +196,8 @@ def test_a_measurement_of_fewer_episodes_than_the_evaluation_has_no_conclusion_a
     assert summary.ranks_actions.reference == "(chance 50 %; 2 episodes are too few for a conclusion)"
     assert summary.uses_actions.conclusion == "yes"
     assert summary.sentence == "Inconclusive: action ranking. Measure more held-out episodes."
+    unclear = replace(summary, predicts=replace(summary.predicts, conclusion="inconclusive"))
+    assert unclear.sentence == "Inconclusive: prediction, action ranking. Measure more held-out episodes."
 
 
 def with_spread(result: ModelResult, spread: float) -> ModelResult:

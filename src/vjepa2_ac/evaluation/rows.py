@@ -177,9 +177,9 @@ class _Rows(list[Row]):
 
     def add_ranking(self, model: str, found: ActionRanking) -> None:
         """Add the action-ranking error, and how much prediction and energy change with the action."""
-        group = "Action ranking: alternative actions with a lower energy than the true one"
+        group = "Action-ranking error: alternative actions with a lower energy than the true one"
         share: dict[str, Any] = {"form": ".1%", "chance": 0.5}
-        self.line(group, "action-ranking error", "ranking.rank", {model: found.rank}, **share)
+        self.line(group, "of all alternatives", "ranking.rank", {model: found.rank}, **share)
         self.line(group, "of those in the box", "ranking.box", {model: found.box}, **share)
         self.line(group, "of those of the same length", "ranking.shell", {model: found.shell}, **share)
         for key, label, one in (
@@ -189,7 +189,7 @@ class _Rows(list[Row]):
             self.line(group, label, f"ranking.{key}", {model: one}, better="higher", chance=0.0)
         base = None if self.base is None else self.base.ranking
         if base is not None and base is not found:
-            label, difference = "action-ranking error minus the base model's", {model: rank_difference(found, base)}
+            label, difference = "of all alternatives, minus the base model's", {model: rank_difference(found, base)}
             self.line(group, label, "ranking.difference_to_base", difference, form="+.1%", chance=0.0, detail=True)
 
     def add_landscapes(self, model: str, found: Landscapes) -> None:

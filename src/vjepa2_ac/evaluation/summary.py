@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 import math
 import re
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from textwrap import wrap
 from typing import Literal
 
 import numpy as np
@@ -29,6 +30,7 @@ CHANCE = 0.5  # action-ranking error of a model that ignores its actions
 CLOSED_LOOP_FILE = "closed_loop.json"  # in RUN/closed_loop/TASK-DOMAIN
 _BASE, _PERSISTENCE, _CHANCE = "with the base model", "with persistence", "chance"  # what a verdict compares with
 _COLUMNS, _NO_BREAK = 80, "\N{NO-BREAK SPACE}"
+_wrap = partial(wrap, break_on_hyphens=False)  # commands and paths have hyphens
 
 
 @dataclass(frozen=True)
@@ -87,9 +89,9 @@ class Summary:
                 return self._denial(name, verdict)
         if unclear := [name for name, verdict in claims.items() if verdict.conclusion == "inconclusive"]:
             more = "problems" if unclear == ["planning"] else "held-out episodes"
-            return f"Inconclusive: {' and '.join(unclear)}. Measure more {more}."
+            return f"Inconclusive: {', '.join(unclear)}. Measure more {more}."
         if missing := [name for name, verdict in claims.items() if verdict.conclusion == "not measured"]:
-            return f"Not measured: {' and '.join(missing)}."
+            return f"Not measured: {', '.join(missing)}."
         better = f"Better prediction than {self.predicts.compared_with}, sensitive to the actions"
         if self.plans is not None:
             return f"{better}, and it solves more problems than {self.plans.compared_with}."
@@ -110,17 +112,17 @@ class Summary:
     def __str__(self) -> str:
         gap = _COLUMNS - len(self.subject) - len(self.measured)
         header = f"{self.subject}{' ' * gap}{self.measured}"
-        lines = [header] if gap > 1 else [*textwrap.wrap(self.subject, _COLUMNS), self.measured]
+        lines = [header] if gap > 1 else [*_wrap(self.subject, _COLUMNS), self.measured]
         width = max(len(verdict.conclusion) for verdict in self.verdicts)
         for verdict in self.verdicts:
             label = f"  {verdict.name:<13}  {verdict.conclusion:<{width}}  "
             room = _COLUMNS - len(label) - len(verdict.interval) - 1
             text = _with_fixed_units(f"{verdict.statement} {verdict.reference}")
-            first = textwrap.wrap(text, room)[0]
+            first = _wrap(text, room)[0]
             lines.append(f"{label}{first:<{room}} {verdict.interval}".rstrip())
-            rest = textwrap.wrap(text[len(first) :].lstrip(), _COLUMNS - len(label))
+            rest = _wrap(text[len(first) :].lstrip(), _COLUMNS - len(label))
             lines += (" " * len(label) + line for line in rest)
-        lines += textwrap.wrap(_with_fixed_units(self.sentence), _COLUMNS)
+        lines += _wrap(_with_fixed_units(self.sentence), _COLUMNS)
         return "\n".join(lines).replace(_NO_BREAK, " ")
 
 
