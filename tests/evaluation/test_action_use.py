@@ -55,7 +55,7 @@ def ranked(model: Predictor, batch: LatentBatch, samples: int = 40) -> ActionRan
 
 
 def pool_of(moves: list[RolloutStart], space: ActionSpace, samples: int) -> ActionPool:
-    return ActionPool(np.stack([move.true for move in moves]), space, ProbeOptions(samples=samples), 0)
+    return ActionPool(np.stack([move.true for move in moves]), space, ProbeOptions(samples=samples))
 
 
 def test_a_move_is_the_longest_within_reach_there_and_back() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -159,7 +159,6 @@ class ActionPool:
     actions: Float[np.ndarray, "count action_dim"]
     space: ActionSpace
     probes: ProbeOptions  # `samples` drawn per move from each source; the box extends by `reach_cm`, for poses only
-    seed: int  # a move gets the same alternatives whatever else is measured
 
     def in_box(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
         """Draw uniformly: for poses (dx, dy, dz) in the box, the rest being true; for vectors every number."""
@@ -205,13 +204,22 @@ def rank_actions(
         moves: One or more; of vectors, the largest of each number bounds the box.
         space: Of the actions.
         probes: Their `reach_cm`, half the width of the box (of poses only), `samples` of each kind, and `at_once`.
-        seed: Of the alternatives.
+        seed: Of the alternatives: a move gets the same ones whatever else is measured.
         progress: Called with the number of finished moves.
     """
     ids = tuple(move.episode_id for move in moves)
-    pool = ActionPool(np.stack([move.true for move in moves]), space, probes, seed)
-    places, (change, spread, now) = _places(model, moves, pool, (pool.in_box, pool.on_shell), progress)
-    in_box, on_shell = _ranks(places, probes.samples)
+    pool = ActionPool(np.stack([move.true for move in moves]), space, probes)
+
+    def ranked(move: RolloutStart) -> tuple[float, ...]:
+        generator = move.generator(seed)
+        drawn = [move.true[None], pool.in_box(move, generator), pool.on_shell(move, generator)]
+        (true, *energies), (_, *changes) = evaluate_actions(model, move, np.concatenate(drawn), at_once=probes.at_once)
+        alternatives = np.reshape(energies, (2, -1))
+        is_same = np.abs(alternatives - true) <= _SAME * max(abs(true), 1e-12)
+        box, shell = np.where(is_same, 0.5, alternatives < true).mean(axis=1)
+        return box, shell, np.mean(changes[: probes.samples]), alternatives[0].std(), move.persistence
+
+    in_box, on_shell, change, spread, now = np.array(shared(moves, ranked, progress)).T
     ranks = (in_box + on_shell) / 2
     return ActionRanking(
         samples=probes.samples,
@@ -224,38 +232,6 @@ def rank_actions(
         spread=ratio(spread, now, ids),
         change=ratio(change, now, ids),
     )
-
-
-def _places(
-    model: Predictor,
-    starts: Sequence[RolloutStart],
-    pool: ActionPool,
-    draws: Sequence[Callable[[RolloutStart, np.random.Generator], np.ndarray]],
-    progress: Progress,
-) -> tuple[Float[np.ndarray, "draws starts 2"], Float[np.ndarray, "3 starts"]]:
-    """Evaluate the true action of each start among those of each draw.
-
-    Returns:
-        How many others have a lower energy and how many an equal one; of the first draw the mean change of the
-        prediction and the standard deviation of the energy, and the error of persistence.
-    """
-
-    def placed(start: RolloutStart) -> tuple[list[np.ndarray], tuple[float, float, float]]:
-        generator = start.generator(pool.seed)
-        drawn = [start.true[None], *(draw(start, generator) for draw in draws)]
-        energies, changes = evaluate_actions(model, start, np.concatenate(drawn), at_once=pool.probes.at_once)
-        own, others = energies[0], energies[1:].reshape(len(draws), -1)
-        same = np.abs(others - own) <= _SAME * max(abs(own), 1e-12)
-        numbers = changes[1 : 1 + pool.probes.samples].mean(), others[0].std(), start.persistence
-        return [((others < own) & ~same).sum(axis=1), same.sum(axis=1)], numbers
-
-    places, numbers = zip(*shared(starts, placed, progress), strict=True)
-    return np.moveaxis(np.array(places, dtype=np.float64), 2, 0), np.array(numbers).T
-
-
-def _ranks(places: Float[np.ndarray, "*draws starts 2"], samples: int) -> Float[np.ndarray, "*draws starts"]:
-    """Return the share of the others with a lower energy; equal ones count half."""
-    return np.asarray((places[..., 0] + places[..., 1] / 2) / samples)
 
 
 def measure_landscapes(

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 from itertools import product
 from typing import Any
 
+from vjepa2_ac.data.inspection.findings import counted
 from vjepa2_ac.evaluation.action_score import AXES, differences_of, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.estimates import (
     Curve,
@@ -194,7 +195,7 @@ class _Rows(list[Row]):
 
     def add_landscapes(self, model: str, found: Landscapes) -> None:
         """Add where the energy is lowest."""
-        group, label = f"Energy landscapes of {_clips(len(found.maps))}", "lowest energy to the true action"
+        group, label = f"Energy landscapes of {counted(len(found.maps), 'clip')}", "lowest energy to the true action"
         label += f", {found.unit}" if found.unit else ""
         style: dict[str, Any] = {"chance": found.chance_distance, "unit": found.unit}
         self.line(group, label, "landscapes.distance", {model: found.distance}, **style)
@@ -207,7 +208,7 @@ class _Rows(list[Row]):
         signs = zip(found.axis_names, found.sign_agreement, found.sign_chance, found.sign_clips, strict=True)
         for axis, agreement, chance, count in signs:
             if count:
-                label, right = f"its {axis} has the true sign ({_clips(count)})", {model: agreement}
+                label, right = f"its {axis} has the true sign ({counted(count, 'clip')})", {model: agreement}
                 self.line(group, label, f"landscapes.sign.{axis}", right, better="higher", chance=chance)
 
     def add_plans(self) -> None:
@@ -218,12 +219,12 @@ class _Rows(list[Row]):
         models = ways_of(self.evaluation)
         free = {"doing nothing": study.zero, "random": study.random, "within limits": study.within_limits}
         found = {name: metrics_of(study, plans) for name, plans in (free | models).items()}
-        group = f"Plans beside demonstrations, from {_clips(len(study.clips))}"
+        group = f"Plans beside demonstrations, from {counted(len(study.clips), 'clip')}"
         for key, (label, form, detail) in _PLANS.items():
             kind, _, axis = key.partition(".")
             count = int(signed_along(study, AXES.index(axis)).sum()) if kind == "signs" else None
             if count != 0:
-                label += "" if count is None else f" ({_clips(count)})"
+                label += "" if count is None else f" ({counted(count, 'clip')})"
                 style: dict[str, Any] = {"form": form, "detail": detail}
                 style["better"] = "higher" if kind in {"score", "signs"} else "lower"
                 self.line(group, label, f"plans.{key}", {name: one[key] for name, one in found.items()}, **style)
@@ -251,7 +252,3 @@ class _Rows(list[Row]):
                 shown = {self.evaluation.horizon} if reference == main else ()
                 better = "lower" if name == "lpips" else "higher"
                 self.curves(group, f"decoded.{metric}", curves, shown, form=form, better=better)
-
-
-def _clips(number: int) -> str:
-    return f"{number} clip{'s' * (number != 1)}"

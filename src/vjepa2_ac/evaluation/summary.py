@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 
+from vjepa2_ac.data.inspection.findings import counted
 from vjepa2_ac.evaluation.estimates import over_persistence
 from vjepa2_ac.evaluation.result import L1, Evaluation, Row
 from vjepa2_ac.intervals import ENOUGH_EPISODES, Estimate
@@ -142,7 +143,7 @@ def summarize(evaluation: Evaluation, rows: Sequence[Row]) -> Summary:
     ranks_actions = _of_enough(_ranks_actions(trained_rows, base_rows), ranked)
     summary = Summary(
         subject=evaluation.title,
-        measured=f"{_count(len(clips), 'clip')}, {_count(clips.episodes, 'held-out episode')}",
+        measured=f"{counted(len(clips), 'clip')}, {counted(clips.episodes, 'held-out episode')}",
         predicts=_predicts(evaluation, trained_rows, base_rows),
         uses_actions=_uses_actions(trained_rows, ranks_actions),
         ranks_actions=ranks_actions,
@@ -181,11 +182,7 @@ def _without_conclusion(verdict: Verdict) -> Verdict:
 
 
 def _are_too_few(number: int, what: str) -> str:
-    return f"{_count(number, what)} {'is' if number == 1 else 'are'} too few for a conclusion"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number != 1)}"
+    return f"{counted(number, what)} {'is' if number == 1 else 'are'} too few for a conclusion"
 
 
 def not_measured(name: str, how: str) -> Verdict:
@@ -358,7 +355,7 @@ def closed_loop(shares: Mapping[str, Estimate], model: str, oracle: str, problem
     elif problems < ENOUGH_EPISODES:
         needs = f"{_are_too_few(problems, 'problem')}; use --episodes 50."
     others = ", ".join(f"{name} {percent(one.value)} %" for name, one in shares.items() if name != model)
-    statement = f"solves {percent(share.value)} % of {_count(problems, f'{task} problem')}"
+    statement = f"solves {percent(share.value)} % of {counted(problems, f'{task} problem')}"
     competitors = "the zero action and random actions"
     verdict = _verdict("plans", "inconclusive" if needs else conclusion, statement, share, competitors)
     return replace(verdict, reference=f"({others})", needs=needs, baseline=best.value)
