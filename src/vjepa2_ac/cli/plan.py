@@ -70,7 +70,8 @@ def add_goals(commands: cli.Commands) -> None:
 def _plan(options: argparse.Namespace) -> int:
     """Plan actions from an image and a state to a goal image.
 
-    Written are plan.json, and an image of how the planner came to it. Status 1 where the model gives no finite energy.
+    Writes plan.json, and an image of the search. Exits with status 1 if the model gives no finite energy, or predicts
+    that the plan is worse than the zero action or than the current frame; the first line of the result then says so.
     """
     from vjepa2_ac.data.sources.indexed_source import measured_space
 
@@ -91,7 +92,7 @@ def _plan(options: argparse.Namespace) -> int:
     decoder = cli.given_decoder(options)
     session = cli.load_planning_session(options)
     if decoder is not None:
-        decoder.require_fit(session.world_model, session.config.data.crop, subject=options.subject)
+        decoder.require_fit(session.world_model, session.config.data, subject=options.subject)
     request = PlanRequest(start, state, session.goals_of(goals), mask)
     with cli.reporter() as reporter:
         reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
@@ -105,14 +106,14 @@ def _plan(options: argparse.Namespace) -> int:
     with user_can_write(options.out):
         file = write_plan(found, about, options.out / PLAN_FILE)
         image = plot_plan(found, options.out / PLAN_IMAGE, imagined)
-    cli.show(plan_table(found), summarize(found), files=[file, image])
-    return int(found.decision.why == "no finite energy")
+    cli.show(*filter(None, [found.warning]), plan_table(found), summarize(found), files=[file, image])
+    return int(found.decision.why == "no finite energy" or bool(found.warning))
 
 
 def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     """Return what a search predicts, and on a CPU what is quicker."""
     count = sum(config.sequences)
-    text = f"Planning: {count:,} action sequences in {config.iterations} iteration{'s' * (config.iterations > 1)}"
+    text = f"Planning: {count:,} action sequence{'s' * (count != 1)} in {config.iterations} iteration{'s' * (config.iterations > 1)}"
     text += f", {config.horizon} model step{'s' * (config.horizon > 1)} each"
     if config.budget_s is not None:
         text += f", for {config.budget_s:g} s at most"
