@@ -64,15 +64,11 @@ class PlanResult:
         return self.controller.spaces.state
 
     @property
-    def warning(self) -> str:
-        """A sentence on each energy that is lower than the plan's: the zero action's, and the present one; "": none."""
+    def worse_than(self) -> dict[str, float]:
+        """Energies that are lower than the one predicted for the plan: of the zero action, and of the current frame."""
         energy = math.nan if self.decision.plan is None else self.decision.plan.energy
-        found = [
-            f"The plan is predicted to be worse than {what}: energy {energy:.4f} against {other:.4f}{_change(energy, other)}."
-            for what, other in (("the zero action", self.doing_nothing), ("the current frame", self.decision.energy_now))
-            if energy > other
-        ]
-        return " ".join(found)
+        others = {"zero action": self.doing_nothing, "current frame": self.decision.energy_now}
+        return {name: other for name, other in others.items() if energy > other}
 
     @property
     def unused_goals(self) -> tuple[int, ...]:
@@ -177,7 +173,7 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
         "seed": controller.seed,
         "crop": controller.crop,
         "why": decision.why,
-        "warning": answer.warning,
+        "worse_than": list(answer.worse_than),
         "actions": answer.actions,
         "states": answer.states,
         "goal_of_each_step": decision.goals,
@@ -240,8 +236,18 @@ def summarize(answer: PlanResult) -> str:
     return " ".join(found)
 
 
+def warn_of_plan(answer: PlanResult) -> tuple[str, ...]:
+    """Return a sentence on each energy that is lower than the one predicted for the plan."""
+    energy = math.nan if answer.decision.plan is None else answer.decision.plan.energy
+    return tuple(
+        f"The plan is predicted to be worse than the {name}:"
+        f" energy {energy:.4f} against {other:.4f}{_change(energy, other)}."
+        for name, other in answer.worse_than.items()
+    )
+
+
 def _change(energy: float, reference: float) -> str:
-    return f" ({100 * (energy / reference - 1):+.0f} %)" if reference else ""
+    return f" ({100 * (energy - reference) / abs(reference):+.0f} %)" if reference else ""
 
 
 def _count(number: int, what: str) -> str:

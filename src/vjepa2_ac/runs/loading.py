@@ -14,7 +14,7 @@ from vjepa2_ac.model.base_model import require_base_of_run
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.process import is_first
-from vjepa2_ac.runs.checkpoint import BEST, NEWEST, SELECTED, ADAPTER, SelectedCheckpoint, select_checkpoint, step_of
+from vjepa2_ac.runs.checkpoint import ADAPTER, BEST, NEWEST, SELECTED, SelectedCheckpoint, select_checkpoint, step_of
 from vjepa2_ac.runs.folder import MOVABLE, is_of_moved, read_run_config
 from vjepa2_ac.storage.structured import read_json_object
 
@@ -114,8 +114,7 @@ def describe_selection(folder: Path) -> str:
         references = [f"{untrained_model(config, chosen.path)} {metric(first)}"] if step and first is not None else []
         references += ["chance 50 %"] * is_by_rank
         text += f" ({', '.join(references)})" if references else ""
-    return "
-".join(filter(None, (f"{text}.", note_about(config, chosen))))
+    return "\n".join(filter(None, (f"{text}.", note_about(config, chosen))))
 
 
 def run_config_of(folder: Path, overrides: Iterable[str]) -> Config:
