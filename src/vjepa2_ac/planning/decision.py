@@ -247,7 +247,10 @@ def warn_of_plan(answer: PlanResult) -> tuple[str, ...]:
 
 
 def _change(energy: float, reference: float) -> str:
-    return f" ({100 * (energy - reference) / abs(reference):+.0f} %)" if reference else ""
+    if not reference:
+        return ""
+    percent = 100 * (energy - reference) / abs(reference)
+    return f" ({percent:+.{0 if abs(percent) >= 10 else 1}f} %)"
 
 
 def _count(number: int, what: str) -> str:
