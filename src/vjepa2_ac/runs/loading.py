@@ -108,13 +108,13 @@ def describe_selection(folder: Path) -> str:
     def metric(value: float) -> str:
         return f"{100 * value:.1f} %" if is_by_rank else f"{value:.3f}"
 
-    text = f"Selected checkpoint: step {step:,}, {chosen.why}"
+    lines = [f"Selected checkpoint: step {step:,}, {chosen.why}."]
     if best is not None:
-        text += f"; {'action-ranking error' if is_by_rank else 'rollout error / persistence'} {metric(best)}"
         references = [f"{untrained_model(config, chosen.path)} {metric(first)}"] if step and first is not None else []
-        references += ["chance 50 %"] * is_by_rank
-        text += f" ({', '.join(references)})" if references else ""
-    return "\n".join(filter(None, (f"{text}.", note_about(config, chosen))))
+        references += ["chance 50 %"] if is_by_rank else ["copying the last frame 1"]
+        name = "Action-ranking error" if is_by_rank else "Rollout error / persistence"
+        lines.append(f"{name}: {metric(best)} ({', '.join(references)}).")
+    return "\n".join(filter(None, (*lines, note_about(config, chosen))))
 
 
 def run_config_of(folder: Path, overrides: Iterable[str]) -> Config:
