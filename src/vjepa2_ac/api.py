@@ -224,6 +224,7 @@ def load_run(
         found, fix = "an adapter without its run", "Name its base, too: load_model(BASE, adapter=FOLDER)"
         raise InputError(where=str(folder), found=found, needed="the folder of a run", fix=fix)
     run = loading.load_run(folder, str(checkpoint), loading.run_config_of(folder, overrides))
+    run.warn_if_untrained()
     run.world_model.to(place).eval()
     return run
 

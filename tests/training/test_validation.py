@@ -13,7 +13,8 @@ from vjepa2_ac.data.windows import spread
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart
 from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state, select_checkpoint
+from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
+from vjepa2_ac.runs.loading import describe_selection
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
@@ -96,14 +97,21 @@ def test_the_lowest_rank_is_selected_though_the_error_falls_on(make_config, repo
     ranks_are((0.9, 0.10), (0.8, 0.05), (0.7, 0.06), (0.6, 0.07), (0.5, 0.08), (0.4, 0.2), (0.3, 0.3))
     folder = train(make_config(**EVERY_STEP, checkpoint__keep=1), reporter)
     assert {path.name for path in (folder / "checkpoints").iterdir()} == {checkpoint_name(1), checkpoint_name(6)}
-    assert str(select_checkpoint(folder)) == "step-00000001 (the best by action ranking)"
+    assert describe_selection(folder) == (
+        "Selected checkpoint: step 1, the best by action ranking.\n"
+        "Action-ranking error: 5.0 % (base model 10.0 %, chance 50 %)."
+    )
 
 
 def test_a_base_that_is_never_beaten_is_selected(make_config, reporter, ranks_are) -> None:
     ranks_are((0.9, 0.01), *[(0.5, 0.02)] * 6)
     folder = train(make_config(**EVERY_STEP, checkpoint__keep=1), reporter)
     assert {path.name for path in (folder / "checkpoints").iterdir()} == {checkpoint_name(0), checkpoint_name(6)}
-    assert "the base: none of its checkpoints is better" in str(select_checkpoint(folder))
+    assert describe_selection(folder).splitlines() == [
+        "Selected checkpoint: step 0, the best by action ranking.",
+        "Action-ranking error: 1.0 % (chance 50 %).",
+        "The selected checkpoint is the base model: fine-tuning did not improve action ranking.",
+    ]
 
 
 def test_a_run_that_stops_after_its_base_was_saved_goes_on_as_if_it_had_not(

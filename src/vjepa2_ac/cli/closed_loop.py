@@ -173,7 +173,7 @@ def _loaded(
 
     loaded = cli.load_planning_session(options)
     if watch is not None and watch.decoder is not None:
-        watch.decoder.require_fit(loaded.world_model, loaded.config.data.crop, subject=options.subject)
+        watch.decoder.require_fit(loaded.world_model, loaded.config.data, subject=options.subject)
         watch.decoder.to(loaded.world_model.device)
     steps = require_stride(loaded.config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
     how = SessionOptions(
@@ -346,7 +346,8 @@ def _agent(options: argparse.Namespace) -> Iterator[Agent]:
 
     if not cli.is_server(options.subject):
         decoder = cli.given_decoder(options)
-        yield agent_of_session(cli.load_planning_session(options), decoder)
+        session = cli.load_planning_session(options)
+        yield agent_of_session(session, decoder, in_our_world=options.world is None)
         return
     key = None if options.key_file is None else read_key(options.key_file)
     with PlanningClient(options.subject, key) as client:

@@ -72,7 +72,7 @@ def imagine_image(
     _require_some(actions)
     model, config = session.world_model, session.config
     decoder = load_decoder(decoder_name)
-    decoder.require_fit(model, config.data.crop, subject=session.subject)
+    warnings = decoder.require_fit(model, config.data, subject=session.subject)
     decoder.to(model.device)
     space = measured_space(config.data, len(seen.state))
     _require_directions(space, where="--state")
@@ -99,6 +99,7 @@ def imagine_image(
         rollouts=tuple(Imagined("model", word, taken, imagined(taken)) for word, taken in chosen.items()),
         notes=(
             f"Times in the film suppose {_RATE_HZ:g} control steps in a second.",
+            *warnings,
             *worth_knowing(decoder.card, first, decoded_first),
         ),
     )

@@ -150,6 +150,7 @@ class WrittenAbout:
     frames: int  # of a clip
     stride: int  # control steps per model step
     seconds_per_step: float
+    is_base: bool = field(default=False, kw_only=True)  # the checkpoint has the weights of the base model
 
 
 @dataclass(frozen=True)
@@ -399,7 +400,8 @@ class Evaluation:
     def title(self) -> str:
         """What was evaluated, for people: the name of a run with its step, or of a model."""
         step = self.about.checkpoint_path.rpartition("-")[2]
-        return f"{self.about.subject}, step {int(step)}" if step.isdecimal() else self.about.subject
+        base = " (the base model)" if self.about.is_base else ""
+        return f"{self.about.subject}, step {int(step)}{base}" if step.isdecimal() else self.about.subject
 
     @property
     def trained(self) -> str:
