@@ -9,6 +9,14 @@ from vjepa2_ac.episode import Progress, no_progress
 INDEXING = "looking through the data set"  # a task of many
 
 
+def duration(hours: float) -> str:
+    """Return a time for people: hours, or minutes."""
+    if hours >= 1:
+        return f"about {hours:,.1f} hours"
+    minutes = round(60 * hours)
+    return f"about {minutes} minute{'s' if minutes > 1 else ''}" if minutes else "less than a minute"
+
+
 class Reporter:
     """Shows nothing; others show what they like of it. In a run it is silent in all processes but the first."""
 

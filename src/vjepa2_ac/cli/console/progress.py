@@ -14,10 +14,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextCol
 from rich.table import Column, Table
 from rich.text import Text
 
+from vjepa2_ac.cli.console.waiting import begin_work
 from vjepa2_ac.errors import printable
 from vjepa2_ac.reporter import Reporter
 
-_LINE_EVERY_S = 10.0
+_FIRST_LINE_S, _LINE_EVERY_S = 4.0, 10.0
 _WIDE = 120  # columns that leave room for a long bar
 _BESIDE_A_CELL = 3  # a line and two spaces
 _WHOLE = 16  # characters: a longer word of a table, such as a path, may be divided
@@ -97,7 +98,7 @@ class ProgressBar:
 
     def __init__(self, title: str, unit: str = "") -> None:
         self._title, self._unit, self._total = title, unit, -1
-        self._first, self._began, self._last_line = 0, 0.0, 0.0
+        self._first, self._began, self._next_line = 0, 0.0, 0.0
         self._bar: Progress | None = None
 
     def __call__(self, done: int, total: int, words: str = "") -> None:
@@ -110,11 +111,12 @@ class ProgressBar:
             words = f"{speed:.{1 if speed < 100 else 0}f} {self._unit}/s"
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=done, words=words, left=self._left(done, now))
-        elif not console.is_terminal and (done == total or now - self._last_line >= _LINE_EVERY_S):
-            self._last_line = now
+        elif not console.is_terminal and (done == total or now >= self._next_line):
+            self._next_line = now + _LINE_EVERY_S
             console.print("  ".join(filter(None, (f"{self._title} {done}/{total}", words, self._left(done, now)))))
         if done >= total:
             self.close()
+            begin_work(f"work after {self._title}")
 
     def close(self) -> None:
         """Restore the terminal."""
@@ -125,7 +127,8 @@ class ProgressBar:
     def _open(self, done: int, total: int) -> None:
         self.close()
         self._first, self._total = done, total
-        self._began = self._last_line = time.monotonic()
+        self._began = time.monotonic()
+        self._next_line = self._began + _FIRST_LINE_S
         if not console.is_terminal:
             return
         self._bar = Progress(
@@ -161,6 +164,7 @@ class ConsoleReporter(Reporter):
         """Begin another task; return its bar."""
         self._bar.close()
         self._bar = ProgressBar(title, unit)
+        begin_work(title)
         return self._bar
 
     def __enter__(self) -> Self:

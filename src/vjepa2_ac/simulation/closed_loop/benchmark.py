@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE, Verdict, closed_loop
 from vjepa2_ac.media.film import below_each_other, side_by_side
@@ -27,7 +29,7 @@ from vjepa2_ac.planning.demonstrations.key_frames import (
     with_frames_between,
 )
 from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
-from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.reporter import SILENT, Reporter, duration
 from vjepa2_ac.simulation.closed_loop.agent import Agent
 from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Oracle, Policy, RandomActions, ZeroActions
 from vjepa2_ac.simulation.closed_loop.rollout import (
@@ -47,6 +49,7 @@ from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
+_LONG_S = 5.0  # a decision that takes longer says how long the others take
 _SMALL = (18, 32)  # height and width of images that nobody looks at
 
 
@@ -199,9 +202,31 @@ def run_benchmark(
     results = []
     for policy in (model, *policies):
         spec = options if policy is model else replace(options, films=0)
-        results.append(run_task(spec, policy, arm, reporter.task(f"{options.task}: {policy.name}")))
+        progress = reporter.task(f"{options.task}: {policy.name}", "decisions")
+        if policy is model:
+            progress = announcing(progress, agent, options, reporter)
+        results.append(run_task(spec, policy, arm, progress))
     benchmark = ClosedLoopBenchmark(agent, options, tuple(results))
     return benchmark, write_benchmark(benchmark, folder)
+
+
+def announcing(progress: Progress, agent: Agent, trials: Trials, reporter: Reporter) -> Progress:
+    """Return a progress that also notes how long all decisions of the model take, as soon as this was measured.
+
+    The first decision includes preparations, so the second one counts, unless the first one is long.
+    """
+    before, is_noted = time.monotonic(), False
+    work = f"{trials.episodes} episodes x {trials.model_steps} decisions, {sum(agent.planning.sequences):,} action"
+
+    def shown(done: int, total: int) -> None:
+        nonlocal before, is_noted
+        seconds, before = time.monotonic() - before, time.monotonic()
+        if not is_noted and (done == 2 or (done == 1 and seconds > _LONG_S)):
+            is_noted = True
+            reporter.note(f"{work} sequences each: {duration(total * seconds / 3600)} on this machine")
+        progress(done, total)
+
+    return shown
 
 
 def write_benchmark(benchmark: ClosedLoopBenchmark, folder: Path) -> tuple[Path, ...]:

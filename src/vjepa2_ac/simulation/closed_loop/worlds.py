@@ -32,6 +32,7 @@ from vjepa2_ac.simulation.closed_loop.benchmark import (
     BenchmarkOptions,
     ClosedLoopBenchmark,
     DemonstrationSpec,
+    announcing,
     every_step,
     of_demonstrations_alike,
     write_benchmark,
@@ -269,7 +270,9 @@ def run_world_benchmark(
     limits, results = agent.planning.limits, []
     policies: tuple[Policy, ...] = (model, ZeroActions(), RandomActions(limits, options.seed))
     for policy in policies:
-        progress = reporter.task(f"{name}: {policy.name}")
+        progress = reporter.task(f"{name}: {policy.name}", "decisions")
+        if policy is model:
+            progress = announcing(progress, agent, trials, reporter)
         films = options.films if policy is model else 0
         results.append(run_trials(world, policy, trials, films, progress))
     benchmark = ClosedLoopBenchmark(agent, trials, (*results, shown))
