@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
+from vjepa2_ac.cli.next_command import next_simulation, option_words
 from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.process import is_first
 
 if TYPE_CHECKING:
+    from vjepa2_ac.cli.console.progress import ConsoleReporter
     from vjepa2_ac.decoding.imagine import Imagination
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.reporter import Reporter
     from vjepa2_ac.reports.write import Evaluated
+    from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
 
 
 def add_evaluate(commands: cli.Commands) -> None:
@@ -112,7 +117,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
             tables = row_tables(rows_of(measured.evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
-        cli.show(str(measured.summary), f"Next: {_next(measured, options.data)}")
+        cli.show(str(measured.summary), *_next(measured, options, reporter))
         film = "" if measured.evaluation.decoded is None else "film and "
         cli.show(f"Report with {film}all tables: {measured.report}")
     if len(evaluations) > 1:
@@ -120,26 +125,58 @@ def _evaluate(options: argparse.Namespace) -> None:
     leave_processes()
 
 
-def _next(measured: Evaluated, data: str | None) -> str:
-    """Return the command that follows from the summary."""
+def _next(measured: Evaluated, options: argparse.Namespace, reporter: ConsoleReporter) -> list[str]:
+    """Return the command that follows from the summary, as lines."""
+    from vjepa2_ac.runs.folder import is_of_moved
+
+    about, summary = measured.evaluation.about, measured.summary
+    config = options.data or f"{about.subject}/config.yaml"
+    overrides = [*option_words(options, "plugin"), *(options.plan_settings or ()), *options.overrides]
+    if not about.checkpoint:
+        is_other = cli.read_config(config).model.base not in {None, about.subject}
+        words = ["train", config, *overrides, *[f"model.base={about.subject}"] * is_other]
+    elif summary.predicts.needs:
+        words = ["data", "check", config]
+    elif "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}:
+        is_loadable = not any(map(is_of_moved, overrides))
+        words = ["data", "check", config, *["--model", about.subject] * is_loadable]
+    else:
+        words = [about.subject, *option_words(options, "checkpoint"), *overrides]
+        if summary.plans is None and (problems := _problems_of(about.data)) is not None:
+            return _next_closed_loop(measured, problems, words, reporter)
+        words = ["serve", *words]
+    return [f"Next: {shell_command(*words)}"]
+
+
+def _problems_of(data: str) -> BenchmarkOptions | None:
+    """Return the problems for a model of data that `simulate record` made; None: other data."""
+    from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
     from vjepa2_ac.simulation.recording.record import read_simulation
     from vjepa2_ac.simulation.world.domains import Domain
 
-    about, summary = measured.evaluation.about, measured.summary
-    if not about.checkpoint:
-        return shell_command("train", data)
-    if summary.predicts.needs:
-        return shell_command("data", "check", f"{about.subject}/config.yaml")
-    if "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}:
-        return shell_command("data", "check", f"{about.subject}/config.yaml", "--model", about.subject)
-    if summary.plans is not None:
-        return shell_command("serve", about.subject)
     try:
-        recorded = read_simulation(Path(about.data).resolve(strict=True))
+        recorded = read_simulation(Path(data).resolve(strict=True))
     except (OSError, UserError):
-        return shell_command("serve", about.subject)
-    domain = ("--domain", recorded.worlds.name) if isinstance(recorded.worlds, Domain) else ()
-    return shell_command("simulate", about.subject, "--task", recorded.task or "reach", *domain)
+        return None
+    domain = recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
+    return BenchmarkOptions(task=recorded.task or "reach", domain=domain)
+
+
+def _next_closed_loop(
+    measured: Evaluated, problems: BenchmarkOptions, words: Sequence[str], reporter: ConsoleReporter
+) -> list[str]:
+    """Return the command that tests a run in closed loop; it is as fast as the predictions of the action ranking."""
+    from vjepa2_ac.distributed import is_on_cpu
+    from vjepa2_ac.planning.settings import planning_settings
+
+    name, (subject, *others), prediction_s = measured.evaluation.trained, words, None
+    config = planning_settings(subject, overrides=[word for word in others if "planning." in word])
+    if (ranking := measured.evaluation.models[name].ranking) is not None:
+        seconds = reporter.seconds[f"action ranking, {name}"] * int(os.environ.get("WORLD_SIZE", "1"))
+        prediction_s = seconds / (len(ranking.ranks) * (1 + 2 * ranking.samples))
+    words = [subject, "--task", problems.task, "--domain", str(problems.domain), *others]
+    decisions, on_cpu = problems.episodes * problems.model_steps, is_on_cpu(config.training)
+    return next_simulation(words, config.planning, decisions, prediction_s, on_cpu=on_cpu)
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:

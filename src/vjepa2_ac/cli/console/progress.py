@@ -97,7 +97,8 @@ class ProgressBar:
     """
 
     def __init__(self, title: str, unit: str = "") -> None:
-        self._title, self._unit, self._total = title, unit, -1
+        self.title, self._unit, self._total = title, unit, -1
+        self.created = time.monotonic()
         self._first, self._began, self._next_line = 0, 0.0, 0.0
         self._bar: Progress | None = None
 
@@ -113,10 +114,10 @@ class ProgressBar:
             self._bar.update(self._bar.task_ids[0], completed=done, words=words, left=self._left(done, now))
         elif not console.is_terminal and (done == total or now >= self._next_line):
             self._next_line = now + _LINE_EVERY_S
-            console.print("  ".join(filter(None, (f"{self._title} {done}/{total}", words, self._left(done, now)))))
+            console.print("  ".join(filter(None, (f"{self.title} {done}/{total}", words, self._left(done, now)))))
         if done >= total:
             self.close()
-            begin_work(f"work after {self._title}")
+            begin_work(f"work after {self.title}")
 
     def close(self) -> None:
         """Restore the terminal."""
@@ -139,7 +140,7 @@ class ProgressBar:
             _Words("{task.fields[words]}", table_column=Column()),  # wraps if it does not fit
             console=console,
         )
-        self._bar.add_task(self._title, total=total, completed=done, words="", left="")
+        self._bar.add_task(self.title, total=total, completed=done, words="", left="")
         self._bar.start()
 
     def _left(self, done: int, now: float) -> str:
@@ -154,7 +155,7 @@ class ConsoleReporter(Reporter):
     """Shows messages, and one task after another as a bar; at the end of its `with` block the terminal is restored."""
 
     def __init__(self) -> None:
-        self._bar = ProgressBar("")
+        self._bar, self.seconds = ProgressBar(""), dict[str, float]()  # of finished tasks, by title
 
     def note(self, text: str) -> None:
         """Print a message."""
@@ -162,10 +163,14 @@ class ConsoleReporter(Reporter):
 
     def task(self, title: str, unit: str = "") -> ProgressBar:
         """Begin another task; return its bar."""
-        self._bar.close()
+        self._end()
         self._bar = ProgressBar(title, unit)
         begin_work(title)
         return self._bar
+
+    def _end(self) -> None:
+        self._bar.close()
+        self.seconds[self._bar.title] = time.monotonic() - self._bar.created
 
     def __enter__(self) -> Self:
         """Return this reporter."""
@@ -173,4 +178,4 @@ class ConsoleReporter(Reporter):
 
     def __exit__(self, *_: object) -> None:
         """Restore the terminal."""
-        self._bar.close()
+        self._end()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +15,6 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE, Verdict, closed_loop
 from vjepa2_ac.media.film import below_each_other, side_by_side
@@ -40,7 +39,7 @@ from vjepa2_ac.simulation.closed_loop.rollout import (
     Trials,
     World,
     run_episode,
-    run_task,
+    run_trials,
 )
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, Problem, TaskName, TaskProblem, arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
@@ -198,35 +197,34 @@ def run_benchmark(
     options, limits = replace(options, stride=agent.stride), agent.planning.limits
     arm = arm_for(options.task, options.world, views=agent.planning.views)
     model = agent.policy(arm, _goals_of(agent, options, arm, reporter))
-    policies: tuple[Policy, ...] = (ZeroActions(), RandomActions(limits, options.seed), Oracle(limits, arm))
-    results = []
-    for policy in (model, *policies):
-        spec = options if policy is model else replace(options, films=0)
-        progress = reporter.task(f"{options.task}: {policy.name}", "decisions")
-        if policy is model:
-            progress = announcing(progress, agent, options, reporter)
-        results.append(run_task(spec, policy, arm, progress))
-    benchmark = ClosedLoopBenchmark(agent, options, tuple(results))
+    policies = (model, ZeroActions(), RandomActions(limits, options.seed), Oracle(limits, arm))
+    results = try_policies(SimulatedWorld(arm), policies, agent, options, options.films, reporter)
+    benchmark = ClosedLoopBenchmark(agent, options, results)
     return benchmark, write_benchmark(benchmark, folder)
 
 
-def announcing(progress: Progress, agent: Agent, trials: Trials, reporter: Reporter) -> Progress:
-    """Return a progress that also notes how long all decisions of the model take, as soon as this was measured.
+def try_policies(
+    world: World, policies: Sequence[Policy], agent: Agent, trials: Trials, films: int, reporter: Reporter
+) -> tuple[ClosedLoopResult, ...]:
+    """Let policies solve the same problems; the first one is the model, with some episodes filmed.
 
-    The first decision includes preparations, so the second one counts, unless the first one is long.
+    A note says how long all decisions of the model take, as soon as some were measured. The first one includes
+    preparations, so the second one counts, unless the first one is long.
     """
-    before, is_noted = time.monotonic(), False
     work = f"{trials.episodes} episodes x {trials.model_steps} decisions, {sum(agent.planning.sequences):,} action"
+    results = list[ClosedLoopResult]()
 
     def shown(done: int, total: int) -> None:
-        nonlocal before, is_noted
-        seconds, before = time.monotonic() - before, time.monotonic()
-        if not is_noted and (done == 2 or (done == 1 and seconds > _LONG_S)):
-            is_noted = True
-            reporter.note(f"{work} sequences each: {duration(total * seconds / 3600)} on this machine")
+        ends.append(time.monotonic())
         progress(done, total)
+        if not results and done == (1 if ends[min(done, 1)] - ends[0] > _LONG_S else 2):
+            seconds = ends[done] - ends[done - 1]
+            reporter.note(f"{work} sequences each: {duration(total * seconds / 3600)} on this machine")
 
-    return shown
+    for policy in policies:
+        ends, progress = list[float](), reporter.task(f"{trials.task_name}: {policy.name}", "decisions")
+        results.append(run_trials(world, policy, trials, 0 if results else films, shown))
+    return tuple(results)
 
 
 def write_benchmark(benchmark: ClosedLoopBenchmark, folder: Path) -> tuple[Path, ...]:
