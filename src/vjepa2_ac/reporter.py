@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.errors import counted
 
 INDEXING = "looking through the data set"  # a task of many
 
@@ -14,7 +15,7 @@ def duration(hours: float) -> str:
     if hours >= 1:
         return f"about {hours:,.1f} hours"
     minutes = round(60 * hours)
-    return f"about {minutes} minute{'s' if minutes > 1 else ''}" if minutes else "less than a minute"
+    return f"about {counted(minutes, 'minute')}" if minutes else "less than a minute"
 
 
 class Reporter:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
+from vjepa2_ac.cli.console.waiting import begin_work
 from vjepa2_ac.cli.next_command import next_simulation, option_words
 from vjepa2_ac.errors import InputError, shell_command
 
@@ -190,7 +191,9 @@ def _loaded(
     session = Session(controller, kept, how)
     about = metadata_of(loaded, session)
     told = about if options.metadata == "full" else roboarena_metadata(session)
+    begin_work("the first decision")
     cli.show(in_words(about, options.subject), f"a first decision took {warm_up(controller):.1f} s")
+    begin_work("")
     if options.record is not None:
         about = {**about, "overrides": options.overrides, "config": options.config, **loaded.as_dict()}
         session.recorder = Recorder(options.record, about, int(_GB * options.record_gb))
@@ -325,49 +328,44 @@ def _summary(benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> Sum
 
 def _next(summary: Summary, benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> list[str]:
     """Return the command that follows from the verdicts of a closed loop, as lines; none if no command does."""
-    from vjepa2_ac.runs.folder import is_of_moved, is_run
+    from vjepa2_ac.runs.folder import is_of_moved
 
     if benchmark.verdict.needs:
         return _next_benchmark(benchmark, options)
     if cli.is_server(options.subject):
         return [f"Next: your robot's client at {options.subject} (docs/serving.md)"]
     command = _evaluate_command(options)
-    if summary.predicts.value is not None and benchmark.verdict.conclusion == "yes":
+    if command and summary.predicts.value is not None:
+        command = shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
+        command *= not any(map(is_of_moved, options.overrides))
+    if benchmark.verdict.conclusion == "yes" and (summary.predicts.value is not None or not command):
         words = option_words(options, "checkpoint", "config", "goals", "plugin")
         command = shell_command("serve", options.subject, *words, *options.overrides)
-    elif summary.predicts.value is not None:
-        can_load = is_run(options.subject) and not any(map(is_of_moved, options.overrides))
-        words = ["data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject]
-        command = shell_command(*words) if can_load else ""
     return [f"Next: {command}"] * bool(command)
 
 
 def _next_benchmark(benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> list[str]:
-    """Return the same command with more problems, or with more steps if the oracle needs them."""
+    """Return the same command with more problems, and with more steps if the oracle needs them, as lines."""
     import numpy as np
 
     from vjepa2_ac.distributed import is_on_cpu
     from vjepa2_ac.evaluation.summary import CHANCE
 
-    trials, planning, count = benchmark.trials, benchmark.agent.planning, {"episodes": 50}
-    if benchmark.results[-1].success_rate.value < CHANCE:
-        count = {"steps": 2 * trials.model_steps}
-    words = [options.subject, *option_words(options, **count), *options.overrides]
-    decisions = count.get("episodes", trials.episodes) * count.get("steps", trials.model_steps)
+    planning, trials, oracle = benchmark.agent.planning, benchmark.trials, benchmark.results[-1]
+    episodes, steps = max(50, trials.episodes), trials.model_steps * (1 + (oracle.success_rate.value < CHANCE))
+    changes = {"episodes": episodes} | ({"steps": steps} if steps != trials.model_steps else {})
     prediction_s = float(np.median(benchmark.results[0].seconds)) / (sum(planning.sequences) * planning.horizon)
+    words = [options.subject, *option_words(options, **changes), *options.overrides]
     on_cpu = not cli.is_server(options.subject) and is_on_cpu(cli.require_to_plan(options).training)
-    return next_simulation(words, planning, decisions, prediction_s, on_cpu=on_cpu)
+    return next_simulation(words, planning, episodes * steps, prediction_s, on_cpu=on_cpu)
 
 
 def _evaluate_command(options: argparse.Namespace) -> str:
-    """Return the command that evaluates what was simulated; empty if its data are not known."""
+    """Return the command that evaluates what was simulated; empty for what is no run, whose data are not known."""
     from vjepa2_ac.runs.folder import is_of_moved, is_run
 
-    words = [options.subject, *option_words(options, "checkpoint", "plugin")]
-    if is_run(options.subject):
-        return shell_command("evaluate", *words, *filter(is_of_moved, options.overrides))
-    data = ("--data", options.config, "--out", "evaluation")
-    return "" if options.config is None else shell_command("evaluate", *words, *data)
+    words = [*option_words(options, "checkpoint", "plugin"), *filter(is_of_moved, options.overrides)]
+    return shell_command("evaluate", options.subject, *words) if is_run(options.subject) else ""
 
 
 @contextmanager

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.reporter import Reporter
     from vjepa2_ac.reports.write import Evaluated
-    from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
 
 
 def add_evaluate(commands: cli.Commands) -> None:
@@ -130,52 +129,47 @@ def _next(measured: Evaluated, options: argparse.Namespace, reporter: ConsoleRep
     from vjepa2_ac.runs.folder import is_of_moved
 
     about, summary = measured.evaluation.about, measured.summary
+    settings = [*(options.plan_settings or ()), *options.overrides]
     config = options.data or f"{about.subject}/config.yaml"
-    overrides = [*option_words(options, "plugin"), *(options.plan_settings or ()), *options.overrides]
+    words = ["data", "check", config]
     if not about.checkpoint:
-        is_other = cli.read_config(config).model.base not in {None, about.subject}
-        words = ["train", config, *overrides, *[f"model.base={about.subject}"] * is_other]
-    elif summary.predicts.needs:
-        words = ["data", "check", config]
-    elif "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}:
-        is_loadable = not any(map(is_of_moved, overrides))
-        words = ["data", "check", config, *["--model", about.subject] * is_loadable]
-    else:
-        words = [about.subject, *option_words(options, "checkpoint"), *overrides]
-        if summary.plans is None and (problems := _problems_of(about.data)) is not None:
-            return _next_closed_loop(measured, problems, words, reporter)
-        words = ["serve", *words]
-    return [f"Next: {shell_command(*words)}"]
+        words = ["train", config, *[f"model.base={about.subject}"] * (cli.read_config(config).model.base is not None)]
+    elif not summary.predicts.needs and "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}:
+        words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
+    elif not summary.predicts.needs:
+        if summary.plans is None and (lines := _next_closed_loop(measured, settings, options, reporter)):
+            return lines
+        words = ["serve", about.subject, *option_words(options, "checkpoint"), *settings]
+    return [f"Next: {shell_command(*words, *option_words(options, 'plugin'))}"]
 
 
-def _problems_of(data: str) -> BenchmarkOptions | None:
-    """Return the problems for a model of data that `simulate record` made; None: other data."""
+def _next_closed_loop(
+    measured: Evaluated, settings: Sequence[str], options: argparse.Namespace, reporter: ConsoleReporter
+) -> list[str]:
+    """Return the command that tests a run in closed loop, as lines; none for data that `simulate record` did not make.
+
+    Its time follows from that of the action ranking.
+    """
+    from vjepa2_ac.distributed import is_on_cpu
+    from vjepa2_ac.planning.settings import planning_settings
     from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
     from vjepa2_ac.simulation.recording.record import read_simulation
     from vjepa2_ac.simulation.world.domains import Domain
 
+    evaluation, prediction_s = measured.evaluation, None
     try:
-        recorded = read_simulation(Path(data).resolve(strict=True))
+        recorded = read_simulation(Path(evaluation.about.data).resolve(strict=True))
     except (OSError, UserError):
-        return None
+        return []
     domain = recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
-    return BenchmarkOptions(task=recorded.task or "reach", domain=domain)
-
-
-def _next_closed_loop(
-    measured: Evaluated, problems: BenchmarkOptions, words: Sequence[str], reporter: ConsoleReporter
-) -> list[str]:
-    """Return the command that tests a run in closed loop; it is as fast as the predictions of the action ranking."""
-    from vjepa2_ac.distributed import is_on_cpu
-    from vjepa2_ac.planning.settings import planning_settings
-
-    name, (subject, *others), prediction_s = measured.evaluation.trained, words, None
-    config = planning_settings(subject, overrides=[word for word in others if "planning." in word])
-    if (ranking := measured.evaluation.models[name].ranking) is not None:
-        seconds = reporter.seconds[f"action ranking, {name}"] * int(os.environ.get("WORLD_SIZE", "1"))
+    if (ranking := evaluation.models[evaluation.trained].ranking) is not None:
+        seconds = reporter.seconds[f"action ranking, {evaluation.trained}"] * int(os.environ.get("WORLD_SIZE", "1"))
         prediction_s = seconds / (len(ranking.ranks) * (1 + 2 * ranking.samples))
-    words = [subject, "--task", problems.task, "--domain", str(problems.domain), *others]
-    decisions, on_cpu = problems.episodes * problems.model_steps, is_on_cpu(config.training)
+    problems = BenchmarkOptions(task=recorded.task or "reach")
+    words = ["--task", problems.task, "--domain", domain, *option_words(options, "checkpoint", "plugin"), *settings]
+    config = planning_settings(evaluation.about.subject, overrides=settings)
+    decisions = problems.episodes * problems.model_steps
+    words, on_cpu = [evaluation.about.subject, *words], is_on_cpu(config.training)
     return next_simulation(words, config.planning, decisions, prediction_s, on_cpu=on_cpu)
 
 
@@ -220,8 +214,7 @@ def _compare(options: argparse.Namespace) -> None:
 
     tables = row_tables(comparison.rows, comparison.title) if options.all else []
     files = [plot_comparison(comparison, options.out), *write_tables(comparison.rows, options.out)]
-    best = options.runs[list(comparison.summaries).index(comparison.best)]
-    cli.show(*tables, str(comparison), *comparison.notes, f"Next: {shell_command('export', best)}", files=files)
+    cli.show(*tables, str(comparison), *comparison.notes, comparison.next_command, files=files)
 
 
 def _imagine(options: argparse.Namespace) -> None:

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from vjepa2_ac.errors import shell_command
+from vjepa2_ac.errors import counted, shell_command
 
 if TYPE_CHECKING:
     from vjepa2_ac.config.planning import PlanningConfig
@@ -42,22 +42,23 @@ def next_simulation(
     """Return the command `simulate` and how long it takes here, as lines.
 
     Args:
-        words: The command's words. Those of the quick planner are added for a CPU, if they do not say how long to
-            search.
-        planning: What these words mean.
+        words: The command's words. On a CPU those of the quick planner are added, if they do not set its size.
+        planning: Of the model with these words.
         decisions: Of the model.
         prediction_s: Measured seconds for each model step of an action sequence; None: not measured.
         on_cpu: Whether the model computes on a CPU.
     """
     from vjepa2_ac.reporter import duration
 
-    how, is_chosen = "", any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)
+    time, how = "its time was not measured", ""
+    is_chosen = any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)
     is_long = sum(planning.sequences) > QUICK_SEQUENCES and planning.planner != "gradient" and planning.budget_s is None
-    if on_cpu and is_long and not is_chosen and max(planning.cem.elites, planning.icem.elites) <= QUICK["samples"]:
+    fits = max(planning.cem.elites, planning.icem.elites) <= QUICK["samples"]
+    if on_cpu and is_long and fits and not is_chosen:
         words, how = [*words, *QUICK_WORDS], ", with the quick planner for a CPU"
         planning = planning.model_copy(update=QUICK)
-    count, time = sum(planning.sequences), "its time was not measured"
+    count = sum(planning.sequences)
     if prediction_s is not None:
         time = f"{duration(decisions * count * planning.horizon * prediction_s / 3600)} here"
-    about = f"{decisions:,} decisions of {count:,} action sequences each"
+    about = f"{counted(decisions, 'decision')} of {counted(count, 'action sequence')} each"
     return [f"Next: {shell_command('simulate', *words)}", f"  ({time}: {about}{how})"]

@@ -11,44 +11,47 @@ from vjepa2_ac.cli.console.waiting import begin_work, watch_silence
 
 
 class Clock:
-    """Silence that a test lets pass; a printed line ends it."""
+    """Time that passes as a test says; a printed line ends the silence."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.silent_s, self.lines = 0.0, list[str]()
+        self.now_s, self.printed_s, self.lines = 100.0, 100.0, list[str]()
         monkeypatch.setattr(waiting, "_CHECK_S", 0.001)
-        monkeypatch.setattr(waiting, "silent_s", lambda: self.silent_s)
+        monkeypatch.setattr(waiting, "silent_s", lambda: self.now_s - self.printed_s)
+        monkeypatch.setattr(time, "monotonic", lambda: self.now_s)
         monkeypatch.setattr(sys, "stderr", self)
 
     def write(self, text: str) -> None:
-        self.silent_s = 0.0
-        self.lines += [text.partition(":")[0]] * (text != "\n")
+        self.printed_s = self.now_s
+        self.lines += [text] * (text != "\n")
 
     def after(self, seconds: float) -> list[str]:
-        """Return the lines that a silence of some seconds brings."""
-        count, self.silent_s = len(self.lines), seconds
-        time.sleep(0.03)
+        """Return the lines that come after some more seconds."""
+        count, self.now_s = len(self.lines), self.now_s + seconds
+        time.sleep(0.02)
         return self.lines[count:]
 
 
 def test_each_work_is_named_after_five_seconds_of_silence_and_then_more_rarely(monkeypatch) -> None:
     clock = Clock(monkeypatch)
     with watch_silence():
-        assert clock.after(4.9) == []
-        assert clock.after(5.1) == ["loading libraries and model"]
-        assert clock.after(14.9) == []
-        assert clock.after(15.1) == ["loading libraries and model"]
+        assert clock.after(4.5) == []
+        assert clock.after(0.5) == ["loading libraries and model: 5 s so far"]
+        assert clock.after(14.0) == []
+        assert clock.after(1.0) == ["loading libraries and model: 20 s so far"]
         assert clock.after(59.0) == []
-        assert clock.after(61.0) == ["loading libraries and model"]
+        assert clock.after(1.0) == ["loading libraries and model: 80 s so far"]
+        clock.after(30.0)
         with ConsoleReporter() as reporter:
             measuring = reporter.task("measuring")
-            assert clock.after(5.1) == ["measuring"]
+            assert clock.after(4.0) == [], "it has not lasted 5 seconds, however long the silence"
+            assert clock.after(1.0) == ["measuring: 5 s so far"]
             measuring(2, 2)
-            assert clock.after(5.1) == ["work after measuring"]
+            assert clock.after(5.0) == ["work after measuring: 5 s so far"]
         begin_work("")
         assert clock.after(1000.0) == []
+    begin_work("nobody watches")
     assert clock.after(1000.0) == []
 
 
-def test_output_of_other_streams_than_the_own_ones_is_not_watched(capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_of_other_streams_than_the_own_ones_is_not_watched() -> None:
     assert waiting.silent_s() == 0.0
-

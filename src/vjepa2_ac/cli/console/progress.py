@@ -109,7 +109,7 @@ class ProgressBar:
         now = time.monotonic()
         if self._unit and done:
             speed = done / max(now - self._began, 1e-9)
-            words = f"{speed:.{1 if speed < 100 else 0}f} {self._unit}/s"
+            words = f"{speed:{'.2g' if speed < 1 else '.1f' if speed < 100 else '.0f'}} {self._unit}/s"
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=done, words=words, left=self._left(done, now))
         elif not console.is_terminal and (done == total or now >= self._next_line):

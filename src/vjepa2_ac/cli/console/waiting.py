@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from vjepa2_ac.errors import printable
 from vjepa2_ac.process import is_first, silent_s
@@ -19,18 +18,13 @@ _SILENT_S = (5.0, 15.0, 60.0)  # seconds without output before the first, the se
 _CHECK_S = 0.25
 
 
-class _Work(NamedTuple):
-    title: str  # empty: nothing to report, as in a server that waits for requests
-    began: float
-
-
-_work = _Work("", 0.0)
+_work = ("", 0.0)  # what the command does, and since when
 
 
 def begin_work(title: str) -> None:
-    """Set what the command does from now on; empty: nothing that anybody waits for."""
+    """Set what the command does from now on; empty: nothing to report, as in a server that waits for requests."""
     global _work
-    _work = _Work(title, time.monotonic())
+    _work = (title, time.monotonic())
 
 
 @contextlib.contextmanager
@@ -51,6 +45,7 @@ def _watch(ended: threading.Event) -> None:
     while not ended.wait(_CHECK_S):
         if work is not _work:
             work, lines = _work, 0
-        if work.title and silent_s() >= _SILENT_S[min(lines, len(_SILENT_S) - 1)]:
+        (title, began), least_s = work, _SILENT_S[min(lines, len(_SILENT_S) - 1)]
+        if title and min(silent_s(), time.monotonic() - began) >= least_s:
             lines += 1
-            print(printable(f"{work.title}: {time.monotonic() - work.began:.0f} s so far"), file=sys.stderr)
+            print(printable(f"{title}: {time.monotonic() - began:.0f} s so far"), file=sys.stderr)

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE, Verdict, closed_loop
 from vjepa2_ac.media.film import below_each_other, side_by_side
 from vjepa2_ac.media.images import encode_png
@@ -211,7 +211,8 @@ def try_policies(
     A note says how long all decisions of the model take, as soon as some were measured. The first one includes
     preparations, so the second one counts, unless the first one is long.
     """
-    work = f"{trials.episodes} episodes x {trials.model_steps} decisions, {sum(agent.planning.sequences):,} action"
+    work = f"{counted(trials.episodes, 'episode')} x {counted(trials.model_steps, 'decision')}"
+    work += f", {counted(sum(agent.planning.sequences), 'action sequence')} each"
     results = list[ClosedLoopResult]()
 
     def shown(done: int, total: int) -> None:
@@ -219,7 +220,7 @@ def try_policies(
         progress(done, total)
         if not results and done == (1 if ends[min(done, 1)] - ends[0] > _LONG_S else 2):
             seconds = ends[done] - ends[done - 1]
-            reporter.note(f"{work} sequences each: {duration(total * seconds / 3600)} on this machine")
+            reporter.note(f"{work}: {duration(total * seconds / 3600)} on this machine")
 
     for policy in policies:
         ends, progress = list[float](), reporter.task(f"{trials.task_name}: {policy.name}", "decisions")
