@@ -7,7 +7,7 @@ from typing import Any
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import counted
 
-INDEXING = "looking through the data set"  # a task of many
+INDEXING, LOADING = "looking through the data set", "loading the model"  # tasks of many
 
 
 def duration(hours: float) -> str:

@@ -118,6 +118,7 @@ def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
         from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
         with tempfile.TemporaryDirectory() as folder:
+            begin_work("recording episodes of the simulated arm")
             path = Path(folder) / "data"
             record_dataset(path, RecordingSpec("A", seed=5), episodes=_EPISODES)
             shares = ["data.validation_share=0.1", "data.test_share=0.8"]

@@ -6,6 +6,7 @@ Nothing is measured here: missing results have to be written by `vjepa2-ac evalu
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from vjepa2_ac.runs.checkpoint import SAME_RANK, step_of
 
 _LINE = "  {:<22}  {:>10}  {:>17}  {:>21}  {:>18}"  # of the columns, whose heads have three lines
 _WHAT = ("", "", "error vs", "one-step error", "action-ranking")
-_OF_WHAT = ("run", "checkpoint", "{}", "with shuffled actions", "error, chance 50 %")
+_OF_WHAT = "with shuffled actions", "error, chance 50 %"
 _BETTER = ("", "", "(lower is better)", "(higher is better)", "(lower is better)")
 _SAME = ("split", "frames", "stride", "cameras")
 _SAME_LATENTS = 1e-3  # errors of persistence that differ by a larger share are of other latents
@@ -44,8 +45,8 @@ class Comparison:
         """Return the checkpoint and the metrics of each run in columns, and the difference of the errors."""
         first, key = next(iter(self.measured.values())), f"rollout.{L1.name}.gain_over_base.{len(self.seconds)}"
         has_base = all(one.of(key) or _step(one) == 0 for one in self.measured.values())
-        heads = [_WHAT, _OF_WHAT, _BETTER]
-        lines = [_LINE.format(*head).rstrip().format("base model" if has_base else "persistence") for head in heads]
+        reference = "base model" if has_base else "persistence"
+        lines = [_LINE.format(*head).rstrip() for head in (_WHAT, ("run", "checkpoint", reference, *_OF_WHAT), _BETTER)]
         for name, one in self.measured.items():
             gain, step = one.of(key), _step(one)
             error = self.curves[name][-1].value - 1 if not has_base else -gain.value if gain else 0.0
@@ -54,7 +55,7 @@ class Comparison:
             numbers = (_shown(error, "+.1f"), _shown(used, "+.1f"), _shown(rank, ".1f"))
             lines.append(_LINE.format(name if len(name) <= 22 else f"…{name[-21:]}", checkpoint, *numbers))
         title = f"{len(self.measured)} runs on the same {first.summary.measured}, {self.seconds[-1]:.1f} s ahead"
-        return "\n".join([title, *lines, self._difference])
+        return "\n".join([title, *lines, *textwrap.wrap(self._difference, 100)])
 
     @property
     def _difference(self) -> str:
@@ -85,7 +86,7 @@ class Comparison:
             return f"No run is recommended: {why}"
         folder = self.folders[best]
         step = _step(self.measured[best])
-        return f"Next: {shell_command('export', folder, f'{folder.name}-merged', '--checkpoint', step)}"
+        return f"Next: {shell_command('export', folder, f'{folder.resolve().name}-merged', '--checkpoint', step)}"
 
 
 def compare(folders: Sequence[Path]) -> Comparison:
@@ -163,7 +164,7 @@ def _number(verdict: Verdict) -> float:
 
 
 def _shown(share: float, form: str) -> str:
-    return "not measured" if math.isnan(share) else f"{100 * share:{form}} %"
+    return "not measured" if math.isnan(share) else f"{round(100 * share, 1) + 0.0:{form}} %"
 
 
 def _step(metrics: Metrics) -> int | None:

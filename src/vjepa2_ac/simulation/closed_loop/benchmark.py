@@ -276,6 +276,7 @@ def _goals_of(agent: Agent, options: BenchmarkOptions, arm: SimulatedArm, report
     if options.sub_goals == "every-step":
         spec = every_step(spec)
     goals_of = DemonstratedGoals(options.task, options.world, spec, views=agent.planning.views)
+    reporter.task("demonstrations of all problems")
     goals_of.require(options.problems)
     return goals_of
 
