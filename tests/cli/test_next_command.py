@@ -2,15 +2,22 @@
 
 import argparse
 import shlex
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from vjepa2_ac.cli.console.progress import ConsoleReporter
+from vjepa2_ac.cli.evaluate import _next
 from vjepa2_ac.cli.next_command import QUICK, next_simulation, option_words
 from vjepa2_ac.cli.options import parsed
 from vjepa2_ac.cli.program import _parser
+from vjepa2_ac.config.loading import config_as_yaml, load_config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.errors import shell_command
+from vjepa2_ac.simulation.recording import record
+from vjepa2_ac.simulation.recording.record import RecordedSimulation, RecordingSpec
 
 
 def parse(words: list[str]) -> argparse.Namespace:
@@ -101,3 +108,46 @@ def test_a_time_that_was_not_measured_is_not_claimed() -> None:
         "its time was not measured: 400 decisions"
         in next_simulation(["run"], PlanningConfig(), 400, None, on_cpu=True)[1]
     )
+
+
+def next_of_evaluate(
+    words: str, *, checkpoint: str = "step-00000008 (the newest)", needs: str = "", predicts: str = "yes"
+) -> list[str]:
+    """Return the lines that `evaluate` prints for an evaluation of these words."""
+    options, reporter = parse(["evaluate", *shlex.split(words)]), ConsoleReporter()
+    reporter.seconds["action ranking, adapter"] = 2.0
+    ranking = SimpleNamespace(ranks=np.zeros(10), samples=50)
+    about = SimpleNamespace(subject=options.subjects[0], checkpoint=checkpoint, data=__file__)
+    verdicts = {"predicts": SimpleNamespace(needs=needs, conclusion=predicts), "plans": None}
+    summary = SimpleNamespace(**verdicts, uses_actions=SimpleNamespace(conclusion="yes"))
+    adapter = SimpleNamespace(ranking=ranking)
+    evaluation = SimpleNamespace(about=about, trained="adapter", models={"adapter": adapter})
+    return _next(SimpleNamespace(evaluation=evaluation, summary=summary), options, reporter)
+
+
+def test_real_data_are_never_sent_to_the_simulated_arm(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = "builtin:sim-tiny --checkpoint 8 --planning planning.horizon=2"
+    (command,) = next_of_evaluate(given)
+    assert command == "Next: vjepa2-ac serve builtin:sim-tiny --checkpoint 8 planning.horizon=2"
+    recorded = RecordedSimulation.of(RecordingSpec("B", task="pick"), 3)
+    monkeypatch.setattr(record, "read_simulation", lambda _: recorded)
+    command, time = next_of_evaluate(given)
+    quick = "planning.horizon=2 planning.samples=64 planning.iterations=4"
+    expected = f"simulate builtin:sim-tiny --task pick --domain B --checkpoint 8 {quick}"
+    assert command == f"Next: vjepa2-ac {expected}"
+    parse(shlex.split(expected))
+    minutes = round(50 * 12 * 256 * 2 * 2.0 / (10 * 101) / 60)  # decisions, sequences, steps, measured seconds
+    assert time.startswith(f"  (about {minutes} minutes here: 600 decisions of 256 action sequences each")
+
+
+def test_what_comes_before_planning_keeps_the_data(tmp_path: Path) -> None:
+    other = tmp_path / "my robot.yaml"
+    other.write_text(config_as_yaml(load_config("builtin:demo", [f"data.path={tmp_path}"])))
+    given, check = f"runs/a --data '{other}' --out out model.base=moved", f"Next: vjepa2-ac data check '{other}'"
+    assert next_of_evaluate(given, needs="1 episode is too few.") == [check]
+    assert next_of_evaluate(given, predicts="no") == [check], "a moved base cannot be named there"
+    assert next_of_evaluate(f"runs/a --data '{other}' --out out", predicts="no") == [f"{check} --model runs/a"]
+    assert next_of_evaluate("runs/a", predicts="no") == ["Next: vjepa2-ac data check runs/a/config.yaml --model runs/a"]
+    expected = f"train '{other}' model.base=my.pt"
+    assert next_of_evaluate(f"my.pt --data '{other}' --out out", checkpoint="") == [f"Next: vjepa2-ac {expected}"]
+    assert parse(shlex.split(expected)).overrides == ["model.base=my.pt"]

@@ -133,7 +133,8 @@ def _next(measured: Evaluated, options: argparse.Namespace, reporter: ConsoleRep
     config = options.data or f"{about.subject}/config.yaml"
     words = ["data", "check", config]
     if not about.checkpoint:
-        words = ["train", config, *[f"model.base={about.subject}"] * (cli.read_config(config).model.base is not None)]
+        is_other = cli.read_config(config).model.base not in {None, about.subject}
+        words = ["train", config, *[f"model.base={about.subject}"] * is_other]
     elif not summary.predicts.needs and "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}:
         words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
     elif not summary.predicts.needs:

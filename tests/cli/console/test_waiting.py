@@ -42,10 +42,18 @@ def test_each_work_is_named_after_five_seconds_of_silence_and_then_more_rarely(m
         assert clock.after(1.0) == ["loading libraries and model: 80 s so far"]
         clock.after(30.0)
         with ConsoleReporter() as reporter:
-            measuring = reporter.task("measuring")
+            reporter.task("measuring")
             assert clock.after(4.0) == [], "it has not lasted 5 seconds, however long the silence"
             assert clock.after(1.0) == ["measuring: 5 s so far"]
-            measuring(2, 2)
+            clock.after(30.0)
+            encoding = reporter.task("encoding")
+            encoding(0, 100)
+            clock.now_s += 4.5
+            encoding(1, 100)
+            clock.printed_s = clock.now_s
+            assert clock.after(9.0) == [], "the bar has printed a line, and prints the next one after 10 seconds"
+            encoding(100, 100)
+            reporter.task("measuring")(2, 2)
             assert clock.after(5.0) == ["work after measuring: 5 s so far"]
         begin_work("")
         assert clock.after(1000.0) == []

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from vjepa2_ac.errors import printable
 from vjepa2_ac.process import is_first, silent_s
@@ -18,13 +19,25 @@ _SILENT_S = (5.0, 15.0, 60.0)  # seconds without output before the first, the se
 _CHECK_S = 0.25
 
 
-_work = ("", 0.0)  # what the command does, and since when
+@dataclass
+class _Work:
+    title: str  # what the command does; empty: nothing to report, as in a server that waits for requests
+    began: float
+    lines: int = 0  # about this work, which were printed
+
+
+_work = _Work("", 0.0)
 
 
 def begin_work(title: str) -> None:
-    """Set what the command does from now on; empty: nothing to report, as in a server that waits for requests."""
+    """Set what the command does from now on; empty: nothing to report."""
     global _work
-    _work = (title, time.monotonic())
+    _work = _Work(title, time.monotonic())
+
+
+def count_line() -> None:
+    """Note that a line about the current work was printed."""
+    _work.lines += 1
 
 
 @contextlib.contextmanager
@@ -41,11 +54,8 @@ def watch_silence() -> Iterator[None]:
 
 
 def _watch(ended: threading.Event) -> None:
-    work, lines = _work, 0
     while not ended.wait(_CHECK_S):
-        if work is not _work:
-            work, lines = _work, 0
-        (title, began), least_s = work, _SILENT_S[min(lines, len(_SILENT_S) - 1)]
-        if title and min(silent_s(), time.monotonic() - began) >= least_s:
-            lines += 1
-            print(printable(f"{title}: {time.monotonic() - began:.0f} s so far"), file=sys.stderr)
+        work, now = _work, time.monotonic()
+        if work.title and min(silent_s(), now - work.began) >= _SILENT_S[min(work.lines, len(_SILENT_S) - 1)]:
+            count_line()
+            print(printable(f"{work.title}: {now - work.began:.0f} s so far"), file=sys.stderr)
