@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
+from vjepa2_ac.cli.next_command import QUICK_SEQUENCES, QUICK_WORDS
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.planning.goals import GoalFolder
 
-_QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # docs/planning.md says how good it is
+_QUICK = " ".join(QUICK_WORDS)
 _COLUMNS = 100
 _FILMS = (".mp4", ".m4v", ".mov")
 
@@ -120,7 +121,7 @@ def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     text += f", {config.horizon} model step{'s' * (config.horizon > 1)} each"
     if config.budget_s is not None:
         text += f", for {config.budget_s:g} s at most"
-    is_long = on_cpu and config.planner != "gradient" and count > _QUICK_SEQUENCES
+    is_long = on_cpu and config.planner != "gradient" and count > QUICK_SEQUENCES
     return f"{text}." + f"\nQuick, for a CPU: {_QUICK}" * is_long
 
 

@@ -34,7 +34,7 @@ from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.prior.action_prior import load_prior
-from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.reporter import LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.loading import TrainedRun, load_run
@@ -166,6 +166,7 @@ def measure_subject(
     progress = reporter.task("looking through the data")
     dataset = first_of_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
+    reporter.task(LOADING)
     loaded = load_subject(subject, config, asked, dataset, decoder)
     run, world_model, contenders = loaded.run, loaded.world_model, loaded.contenders
     prior = (

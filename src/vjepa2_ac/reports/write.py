@@ -292,6 +292,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
     asked = asked or EvaluationOptions()
     with joined(settle(subject, asked)) as accelerator:
         evaluation = measure_subject(subject, asked, accelerator, reporter=reporter)
+        reporter.task("writing report and figures")
         rows = rows_of(evaluation)
         summary, about = summarize(evaluation, rows), evaluation.about
         if about.checkpoint:

@@ -160,6 +160,7 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
     """
     if run.state.step:
         return None
+    reporter.task("measuring the model before the first step")
     found = validate(run, reporter)
     config, error = run.config, one_step_over_persistence(found.errors).value
     if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:

@@ -50,14 +50,15 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
     reporter = TrainingConsole()
     reporter.validated(10, Validation(errors(), ranking_of(np.array([0.1, 0.2]), ("a", "b"))))
     reporter.started(10, 100)
-    for step in (11, 12, 13):
-        now[0] += 6.0
+    for step in (11, 12, 13, 14):
+        now[0] += 4.5
         reporter.stepped(step, FIGURES)
     validation, ranked, *lines = written.getvalue().splitlines()
     assert validation.startswith("validation at step 10: one-step error/persistence 0.250")
     assert ranked.startswith("  other moves that look better than the true one: 15.0% [")
     words = "loss 0.5123  error/persistence 0.250  1.50 clips/s"
-    assert lines == [f"training 12/100  {words}  0:08:48 left"], "a line every 10 seconds"
+    expected = [f"training 11/100  {words}  0:06:40 left", f"training 14/100  {words}  0:06:27 left"]
+    assert lines == expected, "a line before 5 seconds, then one every 10"
 
 
 @pytest.mark.parametrize(("share", "reported"), [(0.2, False), (0.35, True)])
