@@ -142,6 +142,12 @@ def refusal_of(error: OSError) -> tuple[str, str]:
     return f"{said} ({owned}; this process runs as uid {os.geteuid()})", fix
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: "1 episode", "1,200 episodes"."""
+    plural = re.sub("(ch|x|s)$", r"\1e", noun)
+    return f"{number:,} {noun if number == 1 else f'{plural}s'}"
+
+
 def shell_command(*words: object) -> str:
     """Return a command of this program as it is typed in a shell, with paths quoted where they need it."""
     return shlex.join([_PACKAGE, *map(str, words)])

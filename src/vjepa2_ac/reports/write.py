@@ -24,6 +24,7 @@ from markupsafe import Markup
 
 from vjepa2_ac.distributed import first_only, joined
 from vjepa2_ac.episode import short_names
+from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.answer import Answer, Question, answer, interval_of, percent, with_closed_loop
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
@@ -168,11 +169,11 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], found: Answer) -> list[t
 
 def _episodes(scores: Sequence[EpisodeScore]) -> list[RowTable]:
     """Return the best and the worst episodes."""
-    parts = {f"All {len(scores)} episodes, best first": scores} if scores else {}
+    parts = {f"All {counted(len(scores), 'episode')}, best first": scores} if scores else {}
     if len(scores) > 2 * _AT_EACH_END:
         parts = {
-            f"The {_AT_EACH_END} best of {len(scores)} episodes, best first": scores[:_AT_EACH_END],
-            f"The {_AT_EACH_END} worst of {len(scores)} episodes, worst last": scores[-_AT_EACH_END:],
+            f"The {_AT_EACH_END} best of {counted(len(scores), 'episode')}, best first": scores[:_AT_EACH_END],
+            f"The {_AT_EACH_END} worst of {counted(len(scores), 'episode')}, worst last": scores[-_AT_EACH_END:],
         }
     columns = ("clips", "L1 error / persistence", "gain over the base")
     return [RowTable(title, columns, tuple(map(_episode, part))) for title, part in parts.items()]

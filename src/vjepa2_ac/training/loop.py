@@ -28,7 +28,7 @@ from vjepa2_ac.distributed import (
     leave_processes,
     require_same,
 )
-from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.errors import UnreachableError, counted
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, newest_checkpoint, read_state
@@ -115,7 +115,7 @@ def _has_ended(opened: OpenRun, reporter: Reporter) -> bool:
 def _why_ended(config: Config, state: RunState) -> str:
     """Return why training ends at a step."""
     if state.step >= config.training.steps:
-        return f"Training is finished: all {config.training.steps:,} steps are done (training.steps)."
+        return f"Training is finished after {counted(config.training.steps, 'step')} (training.steps)."
     return (
         f"Training ends at step {state.step:,}: step {state.best_step:,} is the best, and"
         f" {config.training.patience} validations after it were no better (training.patience)."

@@ -16,6 +16,7 @@ from rich import box
 from rich.table import Table
 
 from vjepa2_ac import __version__
+from vjepa2_ac.errors import counted
 
 if TYPE_CHECKING:
     from vjepa2_ac.model.checkpoints.published import Published
@@ -41,7 +42,7 @@ def report_lines() -> Iterator[str]:
     yield f"vjepa2-ac {__version__} {commit}".rstrip()
     yield f"Python {platform.python_version()}, {platform.platform()}"
     name, has = re.search(r"model name\s*: (.*)", about), [one for one in _INSTRUCTIONS if one in about.split()]
-    yield f"CPU: {name[1] if name else platform.machine()}, {os.cpu_count()} cores, {' '.join(has)}"
+    yield f"CPU: {name[1] if name else platform.machine()}, {counted(os.cpu_count() or 1, 'core')}, {' '.join(has)}"
     asked = [line for line in requires("vjepa2-ac") or [] if not re.search("extra == .(data|dev|docs)", line)]
     yield f"Libraries: {', '.join(dict.fromkeys(_with_version(line) for line in asked))}"
     for key, value in sorted(os.environ.items()):
@@ -51,7 +52,7 @@ def report_lines() -> Iterator[str]:
 
     import torch
 
-    yield f"PyTorch: CUDA {torch.version.cuda}, sees {torch.cuda.device_count()} GPUs"
+    yield f"PyTorch: CUDA {torch.version.cuda}, sees {counted(torch.cuda.device_count(), 'GPU')}"
 
 
 def _output(command: str) -> str:

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vjepa2_ac.cli.console.progress import MetricsTable, console
+from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import Row, sections
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE
@@ -111,8 +112,8 @@ def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
     """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
     trials = benchmark.trials
     table = MetricsTable(
-        f"{trials.task_name} in {trials.place}: {trials.episodes} problems of seed {trials.seed},"
-        f" {trials.model_steps} steps of {trials.seconds_per_step:.2f} s (95 % interval over episodes)",
+        f"{trials.task_name} in {trials.place}: {counted(trials.episodes, 'problem')} of seed {trials.seed},"
+        f" {counted(trials.model_steps, 'step')} of {trials.seconds_per_step:.2f} s (95 % interval over episodes)",
         ["", f"{trials.criterion} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
     )
     for result in benchmark.results:
@@ -134,9 +135,9 @@ def benchmark_notes(benchmark: ClosedLoopBenchmark) -> tuple[str, ...]:
         unusual = {why: number for why, number in result.why_counts.items() if why not in _USUAL}
         if unusual:
             counts = ", ".join(f"{why} {number}" for why, number in unusual.items())
-            notes.append(f"{result.policy}: of {result.seconds.size} decisions {counts}")
+            notes.append(f"{result.policy}: of {counted(result.seconds.size, 'decision')} {counts}")
         if result.unreachable.any():
-            notes.append(f"{result.policy}: {result.unreachable.sum()} commands led out of the arm's reach")
+            notes.append(f"{result.policy}: {counted(result.unreachable.sum(), 'command')} led out of the arm's reach")
     return tuple(notes)
 
 
@@ -144,7 +145,8 @@ def held_out_table(card: DecoderCard) -> Table:
     """Return a table of how well the decoder shows frames of held-out episodes, beside what needs no network."""
     held_out = card.held_out
     table = MetricsTable(
-        f"{held_out['frames']:,} frames of {held_out['episodes']:,} held-out episodes (95 % interval over episodes)",
+        f"{counted(held_out['frames'], 'frame')} of {counted(held_out['episodes'], 'held-out episode')}"
+        " (95 % interval over episodes)",
         ["", "PSNR, dB", "SSIM"],
     )
     for name, label in _DECODERS.items():
@@ -165,9 +167,10 @@ def print_finding(finding: Finding) -> None:
 
 def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
     """Return the output of `data index`."""
-    lines = [f"{len(table):,} episodes, {int(table.num_steps.sum()):,} steps; opened in {seconds:.2f} s"]
+    steps = counted(int(table.num_steps.sum()), "step")
+    lines = [f"{counted(len(table), 'episode')}, {steps}; opened in {seconds:.2f} s"]
     if table.problems:
-        lines.append(f"{len(table.problems):,} broken episodes; the first: {table.problems[0].where}")
+        lines.append(f"{counted(len(table.problems), 'broken episode')}; the first: {table.problems[0].where}")
     for path in dict.fromkeys(watch.files):
         size = f"{path.stat().st_size / 1e6:.2f} MB" if path.is_file() else "could not be kept"
         lines.append(f"  {path}  {size}")
