@@ -241,7 +241,7 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
         longest = int(lengths[dataset.episodes[members]].max(initial=0))
         if 0 < longest < clip:
             most = (longest - 1) // dataset.config.model_stride
-            found = f"{asked.steps} model steps, and the longest {asked.split} episode has {most}"
+            found = f"{counted(asked.steps, 'model step')}, and the longest {asked.split} episode has {most}"
             raise InputError(where="--steps", found=found, needed=f"{most} at most")
         windows = validation_windows(dataset, asked.split, clips=_SEARCHED)
         return max(windows, key=lambda window: _motion(dataset, *window))

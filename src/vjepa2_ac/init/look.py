@@ -75,6 +75,7 @@ def look_at_raw(path: str) -> FoundData:
     episodes = None if is_remote else len(find_episodes(path, _CONNECTIONS))
     if episodes == 0:
         raise InputError(where=path, found="no episode", needed="folders with trajectory.h5 and metadata_*.json")
+    size = "behind a URL" if episodes is None else counted(episodes, "episode")
     return FoundData(
         source="droid_raw",
         path=path,
@@ -82,9 +83,7 @@ def look_at_raw(path: str) -> FoundData:
         rate_hz=Knob(15.0, "DROID's"),
         episodes=episodes,
         idle={"rule": Knob("commands", "openpi's rule, on the commanded joint velocities")},
-        about=(
-            f"raw DROID, {'behind a URL' if episodes is None else counted(episodes, 'episode')}, 15 steps a second",
-        ),
+        about=(f"raw DROID, {size}, 15 steps a second",),
     )
 
 

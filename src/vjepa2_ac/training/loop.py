@@ -118,7 +118,7 @@ def _why_ended(config: Config, state: RunState) -> str:
         return f"Training is finished after {counted(config.training.steps, 'step')} (training.steps)."
     return (
         f"Training ends at step {state.step:,}: step {state.best_step:,} is the best, and"
-        f" {config.training.patience} validations after it were no better (training.patience)."
+        f" no better one followed in {counted(config.training.patience or 0, 'validation')} (training.patience)."
     )
 
 
