@@ -59,6 +59,9 @@ _HARDLY = 0.01  # numbers of vectors are of the order of 1: a smaller change is 
 _STEP, _OFTEN, _HALF = 0.1, 0.05, 0.5  # shares: of the farthest change, of the steps, of the numbers
 
 
+NO_COVERAGE = "needs episodes with more consecutive steps than data.stride, found none"
+
+
 @dataclass(frozen=True, eq=False)
 class ReadEpisode:
     """An episode of a sample, without frames."""

@@ -107,6 +107,7 @@ def report_page(evaluation: Evaluation, found: Answer) -> str:
     environment.tests["search_for"] = lambda text, word: word in text
     environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(visible, name.split("/")))
     environment.filters |= {"quote": shlex.quote, "bar": bar_of, "percent": percent, "interval": interval_of}
+    environment.filters["count"] = counted
     return environment.get_template("report.html.jinja").render(
         evaluation=evaluation,
         answer=found,

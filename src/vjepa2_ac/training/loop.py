@@ -175,7 +175,6 @@ def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, repor
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
     throughput = Throughput.of(run.config, run.world_model.sizes, device, processes)
-    reporter.note(str(throughput))
     reporter.started(run.state.step, training.steps)
     checkpoint, saved_s, saved_step = run.config.checkpoint, time.monotonic(), run.state.step
     every_s = math.inf if checkpoint.every_minutes is None else 60.0 * checkpoint.every_minutes

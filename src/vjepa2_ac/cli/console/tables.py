@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.table import Table
-from rich.text import Text
 
-from vjepa2_ac.cli.console.progress import MetricsTable, console
+from vjepa2_ac.cli.console.progress import MetricsTable, console, wrapped
 from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import Row, sections
 from vjepa2_ac.intervals import Estimate
@@ -40,7 +39,7 @@ def row_tables(rows: Sequence[Row], title: str) -> list[Table]:
     for columns, group in groupby(sections([row for row in rows if not row.detail]), lambda one: one.columns):
         shared = list(group)
         with_chance = any(chance for section in shared for _, chance, _ in section.lines)
-        head = ["", *(["by nothing or chance"] if with_chance else []), *columns]
+        head = ["", *(["persistence or chance"] if with_chance else []), *columns]
         table = MetricsTable("" if tables else f"{title} ({sure})", head)
         for section in shared:
             table.add_section()
@@ -78,8 +77,8 @@ def goals_table(made: MadeGoals) -> Table:
     table = MetricsTable(f"Goals of {made.recording.name} (at least and at most: model steps)", columns)
     for place, (key, goal) in enumerate(zip(made.keys, made.goals, strict=True)):
         name = f"{place + 1} {goal.name}".strip()
-        row = [name, str(key.frame), str(goal.at_least), "" if goal.at_most is None else str(goal.at_most)]
-        row += ["" if goal.share is None else f"{goal.share:g}", goal.gripper or ""]
+        row = [name, str(key.frame), str(goal.at_least), "no limit" if goal.at_most is None else str(goal.at_most)]
+        row += ["not used" if goal.share is None else f"{goal.share:g}", goal.gripper or "default"]
         if made.course is not None:
             began, before = made.course.began[place], made.course.step_before[place]
             row += [f"{began:.4g}", f"{before:.4g}" + (f" ({before / began:.0%})" if began > 0 else "")]
@@ -161,8 +160,9 @@ def _estimate(values: dict[str, float | None]) -> Estimate:
 
 def print_finding(finding: Finding) -> None:
     """Print one line of `data check`."""
-    level = Text(f"{finding.level:<7}", style=_COLOURS[finding.level])
-    console.print(level, console.render_str(f"{finding.about:<16}{finding.text}"), sep="  ")
+    text = console.render_str(wrapped(f"{finding.level:<7}  {finding.about:<15}  {finding.text}"))
+    text.stylize(_COLOURS[finding.level], 0, 7)
+    console.print(text)
 
 
 def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
@@ -198,9 +198,9 @@ def variants_table(
     """Return the table of `data check --model` and of `data calibrate`: a row for each variant of the same clips."""
     table = MetricsTable(f"{title} (95 % interval over episodes)", ["variant", "error / persistence", *columns])
     for one in results:
-        moved = "" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
+        moved = "not measured" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
         cells = {
-            "difference": str(one.difference or ""),
+            "difference": str(one.difference or "reference"),
             "error": f"{one.error:.4f}",
             "persistence": f"{one.persistence:.4f}",
             "moves by": moved,

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import ENOUGH_DIRECTIONS, Coverage, coverage_in
+from vjepa2_ac.data.coverage import ENOUGH_DIRECTIONS, NO_COVERAGE, Coverage, coverage_in
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.excerpts import check_excerpts
 from vjepa2_ac.data.inspection.findings import Finding, Level, first_case
@@ -68,8 +68,7 @@ def check_data(
     yield from _check_clips(dataset, seed=seed, batch_size=batch_size, clips=clips)
     yield from _check_video_rates(dataset)
     yield from check_motion(dataset)
-    if coverage := coverage_in(dataset):
-        yield from coverage_findings(coverage)
+    yield from coverage_findings(coverage_in(dataset))
     yield from check_excerpts(dataset)
 
 
@@ -90,7 +89,7 @@ def _check_selection(dataset: Dataset) -> Iterator[Finding]:
         except InputError as error:
             if split == "train":
                 raise
-            level: Level = "error" if share else "ok"  # training opens validation, and test if it has a share
+            level: Level = "error" if share else "skipped"  # training opens validation, and test if it has a share
             yield Finding(level, split, f"{shorten(error.found, _LONGEST, placeholder=' …')}. {error.fix}")
             continue
         short = f"; {counted(len(windows.short), 'episode')} shorter than a clip" if len(windows.short) else ""
@@ -275,8 +274,11 @@ def _percentiles(values: Float[np.ndarray, " pairs"], form: str) -> str:
     return ", ".join(f"{value:{form}} ({at} %)" for value, at in zip(numbers, PERCENTILES, strict=True))
 
 
-def coverage_findings(coverage: Coverage) -> Iterator[Finding]:
+def coverage_findings(coverage: Coverage | None) -> Iterator[Finding]:
     """Yield whether the motion is diverse enough to plan with."""
+    if coverage is None:
+        yield Finding("skipped", "coverage", NO_COVERAGE)
+        return
     unless_narrow: Level = "ok" if coverage.is_known else "skipped"
     is_low = coverage.is_known and coverage.metrics.get("directions", 1.0) < ENOUGH_DIRECTIONS
     levels: dict[str, Level] = {"directions": "warning" if is_low else unless_narrow}

@@ -11,7 +11,15 @@ from jaxtyping import Bool, Float
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import Coverage, Duplicates, ReadEpisode, coverage_by, find_duplicates, read_sample
+from vjepa2_ac.data.coverage import (
+    NO_COVERAGE,
+    Coverage,
+    Duplicates,
+    ReadEpisode,
+    coverage_by,
+    find_duplicates,
+    read_sample,
+)
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
 from vjepa2_ac.episode import Progress, no_progress
@@ -150,6 +158,9 @@ class Inspection:
             "states": f"{values['state_dim']} numbers: {', '.join(ranges)}",
             "actions": f"{values['action_dim']} numbers, {config.actions}{how}",
         }
+        coverage = {"coverage": NO_COVERAGE}
+        if self.coverage is not None:
+            coverage = {**self.coverage.lines, "coverage": self.coverage.verdict}
         if self.has_poses:
             about_states = {
                 "standing still": f"{values['still_share']:.1%} of the steps, by the measured motion",
@@ -162,13 +173,13 @@ class Inspection:
             "steps": f"{values['steps']:,} at {values['control_rate_hz']:g} per second: {lasting}",
             "length": f"{lengths} steps (least, 10 %, median, 90 %, most)",
             "cameras": f"{', '.join(values['cameras'])}; used: {', '.join(values['camera'])}",
-            "success": "not known" if success is None else f"{success:.1%} {known}",
-            "left out": removed or "nothing",
+            "success": "not recorded" if success is None else f"{success:.1%} {known}",
+            "left out": removed or "no episodes and no steps",
             "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
             "duplicates": f"{self.duplicates}{'; inspect.json lists the copies' if copies else ''}",
             "sample": f"{counted(len(self.sample), 'episode')}, for what follows",
             **about_states,
-            **({} if self.coverage is None else {**self.coverage.lines, "coverage": self.coverage.verdict}),
+            **{name: f"not measured: {text}" if text.startswith("needs") else text for name, text in coverage.items()},
         }
 
 
