@@ -96,8 +96,8 @@ def test_whoever_loads_a_run_is_warned_of_limits_that_leave_what_it_was_taught(
 ) -> None:
     session = load_to_plan(str(run), overrides=["planning.limits.xyz=[0.05,0.02,0.012]"])
     assert len(session.warnings) == 1
-    assert "planning.limits.xyz leaves what" in session.warnings[0]
-    assert "dx 5 (3) cm, dz 1.2 (1) cm. In brackets" in session.warnings[0]
+    assert "planning.limits.xyz exceeds the motions in the training data of" in session.warnings[0]
+    assert "dx 5 (3) cm, dz 1.2 (1) cm (99th percentile" in session.warnings[0]
     assert "planning.limits.xyz=data stays within" in session.warnings[0]
     assert session.as_dict()["warnings"] == list(session.warnings)
     assert [(one.levelno, one.getMessage()) for one in caplog.records] == [(logging.WARNING, session.warnings[0])]

@@ -122,11 +122,10 @@ class Watch:
                 text = f"the {name} is {now:.3f} of persistence's in the validation (before training {before:.3f})"
                 yield name + copying, text + copying
         if _number(metrics, "action_rank_low") > _number(self._at_start, "action_rank_high"):  # intervals are apart
-            words = "predicts better and plans worse than the base" if better else "plans worse than the base"
-            rank, before = _number(metrics, "action_rank"), _number(self._at_start, "action_rank")
-            text = f"the model {words}: {rank:.1%} of other moves look better than the true one"
-            hint = "`vjepa2-ac data check` says how varied the motion of the data is"
-            yield "rank", f"{text} (before training {before:.1%}, chance 50 %). {hint}"
+            rank, before = (100 * _number(row, "action_rank") for row in (metrics, self._at_start))
+            text = f"the action-ranking error is {rank:.1f} % (before training {before:.1f} %, chance 50 %)"
+            text += ", although predictions are better than the base's" if better else ""
+            yield "rank", f"{text}. `vjepa2-ac data check` measures how diverse the motions of the data are"
 
     def _of_loss(self, loss: float) -> Iterator[tuple[str, str]]:
         if not math.isfinite(loss):  # a step without clips, or one that was refused

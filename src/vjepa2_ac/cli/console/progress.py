@@ -25,7 +25,7 @@ _BESIDE_A_CELL = 3  # a line and two spaces
 _WHOLE = 16  # characters: a longer word of a table, such as a path, may be divided
 _LONGEST_LINE = 100  # columns
 _COMMAND = r"(?<![\w/.-])(vjepa2-ac |(\S+ -m )?pip install )((?!   #).)*"
-_IN_ONE_PIECE = re.compile(rf"`[^`\n]*`|{_COMMAND}|(?<=\d) %")
+_IN_ONE_PIECE = re.compile(rf"^ +|`[^`\n]*`|{_COMMAND}|(?<=\d) %", re.MULTILINE)
 _SPACE = "\ue000"  # stands for a space that is not broken
 
 
@@ -36,7 +36,7 @@ def wrapped(text: str) -> str:
     """
     width, lines = min(_LONGEST_LINE, console.width), []
     for line in _IN_ONE_PIECE.sub(lambda found: found[0].replace(" ", _SPACE), text).split("\n"):
-        columns = re.match(r"(.{0,38} {2,})?", line)[0]  # type: ignore[index]  # it always matches
+        columns = re.match(r"(.{0,38} {2,})?", line.replace(_SPACE, " "))[0]  # type: ignore[index]  # always matches
         indent = " " * (len(columns) if columns.strip() else len(columns) + 2)
         style = textwrap.TextWrapper(width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
         lines += style.wrap(line) if len(line) > width else [line]

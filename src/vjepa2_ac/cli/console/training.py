@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from vjepa2_ac.cli.console.progress import ConsoleReporter, show
+from vjepa2_ac.evaluation.answer import interval_of, percent
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, Validation
 
@@ -42,7 +43,8 @@ class TrainingConsole(ConsoleReporter):
         self._validation = f"one-step error {true:.3f} of persistence"
         rank = "not measured (needs validation.ranking_clips and clips in which the robot moves)"
         if found.ranking is not None:
-            rank = f"{found.ranking.rank:.1%} (0 % is best, chance 50 %)"
+            measured = found.ranking.rank
+            rank = f"{percent(measured.value)} % {interval_of(measured)} (0 % is best, chance 50 %)"
         show(
             f"validation at step {step:,}, errors relative to persistence (1: copying the last frame)",
             f"  one-step error        {true:.3f}; with zero actions {zero:.3f}, with shuffled actions {shuffled:.3f}",
