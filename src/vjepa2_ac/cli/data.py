@@ -202,8 +202,8 @@ def _inspect(options: argparse.Namespace) -> None:
 def _calibrate(options: argparse.Namespace) -> int:
     """Find how many control steps a model's step is, or its axes.
 
-    By its error over persistence at each stride. With --axes: how its axes lie to the robot's; status 1 where that
-    stays unknown.
+    By its error relative to persistence at each stride. With --axes: the rotation between its axes and the robot's;
+    status 1 where it cannot be measured.
     """
     config = cli.read_config(options.config, options.overrides, base=options.axes is None)
     if options.axes is not None:

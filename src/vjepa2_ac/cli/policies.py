@@ -167,8 +167,7 @@ def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray]
             control_steps=options.control_steps,
             progress=reporter.task("scoring", "places"),
         )
-    where = f"{counted(found.places, 'frame')} of {counted(found.episodes, 'episode')}"
-    title = f"Energy relative to no motion, at {where}"
+    title = f"Energy relative to no motion, {counted(found.places, 'frame')} of {counted(found.episodes, 'episode')}"
     table = MetricsTable(title, ["policy", "all chunks", "its best", "behind the one before"])
     for one in found.policies:
         table.add_row(one.name, str(one.mean), str(one.best), "" if one.behind is None else str(one.behind))
@@ -269,10 +268,10 @@ def _prior(options: argparse.Namespace) -> None:
     folder = options.out or Path(options.subject if run else config.run_dir) / "prior"
     with cli.reporter() as reporter:
         card = train_prior(config, folder, cli.record_of_options(PriorOptions, options), reporter)
+    text = "Error on held-out clips: not measured; it needs a test split."
     if found := card.held_out:
         true, others = (found[name]["value"] for name in ("true_goals", "goals_of_others"))
-        cli.show(
-            f"Its error on held-out clips is {true:.2f} of doing nothing; with goals of other clips {others:.2f}"
-            + (": it does not look at the goal." if others <= true else ".")
-        )
+        text = f"Error on held-out clips relative to no motion: {true:.2f}; with goals of other clips {others:.2f}."
+        text += " The prior ignores the goal." if others <= true else ""
+    cli.show(text)
     cli.show(f"The prior is in {folder}. Plan with it: planning.prior={folder} planning.samples=100")

@@ -200,12 +200,12 @@ def _download(options: argparse.Namespace) -> None:
 
     It goes on where it stopped; its size is checked.
     """
-    from vjepa2_ac.cli.console.setup import published_notes, published_summary, published_table
+    from vjepa2_ac.cli.console.setup import PUBLISHED_NOTES, published_summary, published_table
     from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, download, find_published
     from vjepa2_ac.storage.places import literal
 
     if options.list:
-        cli.show(published_table(PUBLISHED), *published_notes())
+        cli.show(published_table(PUBLISHED), *PUBLISHED_NOTES)
         return
     known = find_published(options.name or OFFICIAL)
     path, url = options.to or Path("checkpoints") / known.file, options.url or known.url

@@ -141,8 +141,7 @@ def _decoder(options: argparse.Namespace) -> None:
         cli.show("Everything is in place: data, model, folder and disk were checked; nothing was written.")
         return
     card = read_card(folder)
-    if card.held_out:
-        cli.show(held_out_table(card))
+    cli.show(held_out_table(card) if card.held_out else "Held-out frames: not measured; they need a test split.")
     cli.show(f"See what a model imagines: {shell_command('imagine', config.run_dir, '--decoder', folder)}")
 
 

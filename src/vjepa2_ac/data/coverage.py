@@ -59,9 +59,6 @@ _HARDLY = 0.01  # numbers of vectors are of the order of 1: a smaller change is 
 _STEP, _OFTEN, _HALF = 0.1, 0.05, 0.5  # shares: of the farthest change, of the steps, of the numbers
 
 
-NO_COVERAGE = "needs episodes with more consecutive steps than data.stride, found none"
-
-
 @dataclass(frozen=True, eq=False)
 class ReadEpisode:
     """An episode of a sample, without frames."""
@@ -151,6 +148,13 @@ class Coverage:
     def noted(self) -> dict[str, Any]:
         """Return what a run stores about its data, as plain values."""
         return {"percentile": PERCENTILE, "changes": self.usual.tolist(), "narrow": self.narrow}
+
+
+def lines_of(coverage: Coverage | None) -> dict[str, str]:
+    """Return the results as text by name, the verdict last; a text that begins with "needs" was not measured."""
+    if coverage is None:
+        return {"coverage": "needs episodes with more consecutive steps than data.stride, found none"}
+    return {**coverage.lines, "coverage": coverage.verdict}
 
 
 def coverage_in(dataset: Dataset, *, episodes: int = 64) -> Coverage | None:

@@ -29,6 +29,11 @@ UNTESTED = (
     "Estimated with fake tensors. On an H100 the estimate was within 1 % of the peak that PyTorch measured; the CUDA"
     " allowance was not measured."
 )
+PUBLISHED_NOTES = (
+    "The column encoder has the number of parameters; pixels are the size of its images.",
+    "The licence is that of Meta's repository. Sizes with 'about' are estimates.",
+    "Meta publishes no hashes of these files: `download` checks their size.",
+)
 _INSTRUCTIONS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16", "asimd", "sve", "bf16")  # of products of matrices
 _SETTINGS = re.compile("(ACCELERATE|CUDA|GOMP|MKL|MUJOCO|NCCL|OMP|PYTORCH|TORCH|VJEPA2_AC)_.*|.*RANK|WORLD_SIZE")
 
@@ -100,14 +105,10 @@ def verdict(needed: int, available: int, gpu: str | None, knobs: list[str] | Non
         gpu: Its name; None: there is none on this machine.
         knobs: Changes that make it fit, or None if none do.
     """
-    comparison = f"{abs(available - needed) / _GIGABYTE:.1f} GB {'below' if needed <= available else 'above'}"
-    comparison += f" the {available / _GIGABYTE:.1f} GB of {gpu or 'a usual GPU'}"
-    text = f"{'Fits' if needed <= available else 'Does not fit'}: the estimated peak is {needed / _GIGABYTE:.1f} GB,"
-    text += f" {comparison}."
-    if needed > available and knobs is None:
-        text += " No config key makes it fit: use a larger GPU or a smaller model."
-    elif needed > available:
-        text += f" It fits with {', '.join(knobs or ())}."
+    fits, size, room = needed <= available, f"{needed / _GIGABYTE:.1f} GB", f"{available / _GIGABYTE:.1f} GB"
+    text = f"{'Fits' if fits else 'Does not fit'}: the estimated peak is {size}; {gpu or 'a usual GPU'} has {room}."
+    if not fits:
+        text += f" It fits with {', '.join(knobs)}." if knobs else " It needs a larger GPU or a smaller model."
     return text if gpu else f"{text}\nThis machine: not measured; it needs a GPU, PyTorch finds none."
 
 
@@ -122,16 +123,6 @@ def published_table(published: Sequence[Published]) -> Table:
         pixels = str(one.image_size)
         table.add_row(one.name, one.holds, one.family, encoder, pixels, one.size, one.licence, one.key)
     return table
-
-
-def published_notes() -> list[str]:
-    """Return what the table does not say, a line each."""
-    encoders = "The column encoder has the number of parameters; pixels are the size of its images."
-    return [
-        encoders,
-        "The licence is that of Meta's repository. Sizes with 'about' are estimates.",
-        "Meta publishes no hashes of these files: what is checked is the size.",
-    ]
 
 
 def published_summary(one: Published, url: str) -> str:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import ENOUGH_DIRECTIONS, NO_COVERAGE, Coverage, coverage_in
+from vjepa2_ac.data.coverage import ENOUGH_DIRECTIONS, Coverage, coverage_in, lines_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.excerpts import check_excerpts
 from vjepa2_ac.data.inspection.findings import Finding, Level, first_case
@@ -276,11 +276,8 @@ def _percentiles(values: Float[np.ndarray, " pairs"], form: str) -> str:
 
 def coverage_findings(coverage: Coverage | None) -> Iterator[Finding]:
     """Yield whether the motion is diverse enough to plan with."""
-    if coverage is None:
-        yield Finding("skipped", "coverage", NO_COVERAGE)
-        return
-    unless_narrow: Level = "ok" if coverage.is_known else "skipped"
-    is_low = coverage.is_known and coverage.metrics.get("directions", 1.0) < ENOUGH_DIRECTIONS
-    levels: dict[str, Level] = {"directions": "warning" if is_low else unless_narrow}
-    yield from (Finding(levels.get(name, "ok"), name, text) for name, text in coverage.lines.items())
-    yield Finding("warning" if coverage.narrow else unless_narrow, "coverage", coverage.verdict)
+    metrics, narrow = (coverage.metrics, coverage.narrow) if coverage else ({}, "")
+    is_low = {"directions": metrics.get("directions", 1.0) < ENOUGH_DIRECTIONS, "coverage": bool(narrow)}
+    for name, text in lines_of(coverage).items():
+        level: Level = "skipped" if text.startswith("needs") else "warning" if is_low.get(name) else "ok"
+        yield Finding(level, name, text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,12 +13,12 @@ from jaxtyping import Bool, Float
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.coverage import (
-    NO_COVERAGE,
     Coverage,
     Duplicates,
     ReadEpisode,
     coverage_by,
     find_duplicates,
+    lines_of,
     read_sample,
 )
 from vjepa2_ac.data.dataset import Dataset
@@ -158,9 +159,6 @@ class Inspection:
             "states": f"{values['state_dim']} numbers: {', '.join(ranges)}",
             "actions": f"{values['action_dim']} numbers, {config.actions}{how}",
         }
-        coverage = {"coverage": NO_COVERAGE}
-        if self.coverage is not None:
-            coverage = {**self.coverage.lines, "coverage": self.coverage.verdict}
         if self.has_poses:
             about_states = {
                 "standing still": f"{values['still_share']:.1%} of the steps, by the measured motion",
@@ -179,7 +177,7 @@ class Inspection:
             "duplicates": f"{self.duplicates}{'; inspect.json lists the copies' if copies else ''}",
             "sample": f"{counted(len(self.sample), 'episode')}, for what follows",
             **about_states,
-            **{name: f"not measured: {text}" if text.startswith("needs") else text for name, text in coverage.items()},
+            **{name: re.sub("^needs", "not measured: needs", text) for name, text in lines_of(self.coverage).items()},
         }
 
 
