@@ -134,6 +134,7 @@ PLURAL = re.compile(
 LATER = {"closed_loop.py", "answer.py", "rows.py", "comparison.py", "benchmark.py", "worlds.py"}  # of other branches
 ALWAYS_PLURAL = (
     "{size}", "split} episodes", "exceed steps", "{lengths} steps", "{self.episodes:,} episodes have", "at_most} steps",
+    "episodes are broken",
 )  # fmt: skip
 
 

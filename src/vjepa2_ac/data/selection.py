@@ -234,7 +234,7 @@ class BrokenEpisodes:
         if len(self) <= (allowed := max_broken(self._episodes)):
             return
         name, reason = next(iter(self._reasons.items()))
-        found = f"broken: {len(self)} of {counted(self._episodes, 'episode')}. The first, {name}: {reason.rstrip('.')}"
+        found = f"{len(self)} of {self._episodes} episodes are broken. The first, {name}: {reason.rstrip('.')}"
         needed, fix = f"at most {allowed} with data.broken_episodes: skip", "Repair or fetch them again"
         error = InputError(where=f"data.path: {self._config.path}", found=found, needed=needed, fix=fix)
         raise self.refusal(error, tuple(self._reasons))

@@ -182,7 +182,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         steps = len(found["pose"])
         for serial, count in place.frames.items():
             if abs(steps - count) > 1:
-                wrong, needed = f"{counted(steps, 'step')}; frames in {serial}.mp4: {count}", "a frame for every step"
+                wrong, needed = f"{counted(steps, 'step')}, but {count} frames in {serial}.mp4", "one for each step"
                 raise InputError(where=path, found=wrong, needed=f"{needed}; the last one may be missing", fix=_FIX)
         if self._config.pose_frame == "camera" and not found.keys() >= set(serials):
             needed, fix = "observation/camera_extrinsics of the camera", "Set data.pose_frame: base"
