@@ -61,7 +61,7 @@ ORDERS: dict[str, list[str]] = {
         "estimates measure distribution",
         "action_use",
         "action_score calibration policies",
-        "rows answer evaluate",
+        "rows summary evaluate",
         "decoded",
         "evaluate_run",
         "imagined imagined_plan",

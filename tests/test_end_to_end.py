@@ -69,7 +69,7 @@ def test_evaluate_ends_with_the_result_in_words_a_picture_and_paths(
     assert main(["evaluate", str(workshop / "lora"), "--clips", "8", "--all", *FEW]) == 0
     printed = capsys.readouterr().out
     result = json.loads((workshop / "lora" / "metrics.json").read_text())
-    assert " ".join(result["answer"]["sentence"].split()) in " ".join(printed.split())
+    assert " ".join(result["summary"]["sentence"].split()) in " ".join(printed.split())
     assert str(workshop / "lora" / "report.html") in printed
     assert (workshop / "lora" / "evaluation.png").read_bytes().startswith(b"\x89PNG")
     assert list(result["by_clip"]["models"]) == ["base", "adapter"]

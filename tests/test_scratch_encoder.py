@@ -80,7 +80,7 @@ def test_it_is_evaluated_and_plans(workshop: Path, capsys: pytest.CaptureFixture
     run = workshop / "whole"
     few = ["--clips", "4", "--sensitivity-clips", "2", "--samples", "6", "--landscapes", "1", "--nodes", "3"]
     assert main(["evaluate", str(run), *few]) == 0
-    assert json.loads((run / "metrics.json").read_text())["answer"]["subject"] in capsys.readouterr().out
+    assert json.loads((run / "metrics.json").read_text())["summary"]["subject"] in capsys.readouterr().out
     small = ["planning.samples=16", "planning.iterations=1", "planning.horizon=1"]
     out = ["--out", str(workshop / "simulated"), "--films", "0"]
     assert main(["simulate", str(run), "--episodes", "1", "--steps", "1", *out, *small]) == 0

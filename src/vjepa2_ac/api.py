@@ -285,7 +285,7 @@ def evaluate(
             energy landscapes, examples.
 
     Returns:
-        `answer`, three questions, as lines by `str`; `error_over_persistence` of each model by horizon (below 1: better
+        `summary`, the verdicts, as lines by `str`; `error_over_persistence` of each model by horizon (below 1: better
         than copying the first frame); `files` that were written; `evaluation`, all arrays.
 
     Raises:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from vjepa2_ac.evaluation.answer import answer
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
     gain_over,
@@ -23,6 +22,7 @@ from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import L1, L2, MODES, Evaluation, PredictionErrors, Stratum
 from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.model_setup import Axes
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
@@ -55,9 +55,9 @@ def test_a_perfect_predictor_scores_zero_in_every_metric(oracle: Evaluation) -> 
             for one in over_persistence(oracle.models["adapter"].errors, mode, metric):
                 assert one.value == pytest.approx(0.0, abs=1e-5)
     assert [one.value for one in gain_over(*pair_of(oracle))] == pytest.approx([1.0] * (TIME - 1))
-    found = answer(oracle, rows_of(oracle))
+    found = summarize(oracle, rows_of(oracle))
     assert found.predicts.says.startswith("error 100 % lower than the base's")
-    assert found.uses_actions.word == "yes"
+    assert found.uses_actions.conclusion == "yes"
 
 
 def test_spread_and_discrepancy_of_the_rollouts_are_those_of_the_predicted_latents() -> None:
@@ -85,7 +85,7 @@ def test_a_model_that_ignores_actions_has_no_sensitivity_and_the_rank_of_chance(
             {k: k / (ranking.samples + 1) for k in ranking.top}
         )
     assert gap_of_actions(found.models["adapter"].errors, "shuffled") == Estimate(0.0, 0.0, 0.0)
-    assert answer(found, rows_of(found)).uses_actions.word == "no"
+    assert summarize(found, rows_of(found)).uses_actions.conclusion == "no"
 
 
 def test_an_oracle_ranks_the_true_action_first(oracle: Evaluation) -> None:

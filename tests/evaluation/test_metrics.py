@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from vjepa2_ac.evaluation.answer import answer
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import L1, L2, MODES, Evaluation, Metric
 from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
 from worlds import Copier, Halfway, Oracle, about, again, clips_batch
@@ -42,7 +42,7 @@ def test_an_added_metric_appears_in_rows_verdict_and_comparison(tmp_path: Path) 
 
 def test_more_is_better_where_a_metric_says_so() -> None:
     better, worse = (evaluated(*pair, LARGER) for pair in ((Oracle(), Halfway()), (Copier(), Halfway())))
-    assert not answer(better, rows_of(better)).predicts.beside, "it agrees with L1"
-    assert not answer(worse, rows_of(worse)).predicts.beside
+    assert not summarize(better, rows_of(better)).predicts.reference, "it agrees with L1"
+    assert not summarize(worse, rows_of(worse)).predicts.reference
     mistaken = evaluated(Oracle(), Halfway(), SMALLER)
-    assert "(by height " in answer(mistaken, rows_of(mistaken)).predicts.beside
+    assert "(by height " in summarize(mistaken, rows_of(mistaken)).predicts.reference

@@ -20,8 +20,8 @@ from run_fixtures import TINY, SilentReporter, one_thread, tiny_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.answer import Answer, not_measured
 from vjepa2_ac.evaluation.result import Row
+from vjepa2_ac.evaluation.summary import not_measured
 from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.checkpoints.loading import load_official
 from vjepa2_ac.model.network.world_model import WorldModel

@@ -17,9 +17,9 @@ from PIL import Image, ImageSequence
 
 from evaluation_results import decoded_strips, evaluation, page_of
 from planned import with_plans
-from vjepa2_ac.evaluation.answer import Question, answer
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
 from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.reports.write import LONGEST_S, MOST_BYTES, MOST_CLIPS, bar_of, film_of, report_page
 
 pytestmark = pytest.mark.usefixtures("drawn")
@@ -60,7 +60,7 @@ def images(html: str) -> list[bytes]:
 
 def test_the_first_screen_gives_the_answer_of_the_console_and_four_other_numbers() -> None:
     for one, changes in ((usual()[0], {}), (evaluation(episodes=2, clips=8), {"plans": SOLVED})):
-        found = replace(answer(one, rows_of(one)), **changes)
+        found = replace(summarize(one, rows_of(one)), **changes)
         first = report_page(one, found).partition("<details")[0]
         shown = " ".join(Page(re.sub("<[^>]*>", " ", first.partition("</style>")[2])).shown.split())
         assert not [word for word in str(found).split() if word not in shown]

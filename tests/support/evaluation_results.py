@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from vjepa2_ac.evaluation.answer import answer
 from vjepa2_ac.evaluation.calibration.axes import TRIED_DEGREES, AxisFit, fit_axes
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.result import (
@@ -36,6 +35,7 @@ from vjepa2_ac.evaluation.result import (
     Way,
 )
 from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import mean_of
 from vjepa2_ac.reports.write import report_page
 from vjepa2_ac.spaces import POSE_CHANGE
@@ -144,8 +144,8 @@ def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, mo
 
 
 def page_of(one: Evaluation) -> str:
-    """Return the report with the answer that the console shows."""
-    return report_page(one, answer(one, rows_of(one)))
+    """Return the report with the summary that the console shows."""
+    return report_page(one, summarize(one, rows_of(one)))
 
 
 def decoded_strips(one: Evaluation, size: int = 64) -> Evaluation:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from vjepa2_ac.evaluation.answer import Answer
+    from vjepa2_ac.evaluation.summary import Summary, Verdict
     from vjepa2_ac.explore.watch import WatchPage
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
@@ -282,8 +282,8 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     if options.all:
         name = f"{options.subject}: checkpoint {checkpoint}" if checkpoint else options.subject
         cli.show(name, benchmark_table(benchmark), files=files)
-    answer = _answer(benchmark)
-    cli.show(*benchmark_notes(benchmark), str(answer), f"Next: {_next(answer, options)}")
+    summary = _summary(benchmark)
+    cli.show(*benchmark_notes(benchmark), str(summary), f"Next: {_next(summary, benchmark.verdict, options)}")
     cli.show(*(f"Film: {file}" for file in files[1:2]))
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
 
@@ -306,33 +306,33 @@ def _in_their_world(options: argparse.Namespace, chosen: BenchmarkOptions, home:
         return run_world_benchmark(agent, env, chosen, options.out or home / name, reporter)
 
 
-def _answer(benchmark: ClosedLoopBenchmark) -> Answer:
-    """Return the answer of the closed loop; the other two questions as `evaluate` answered them of this checkpoint."""
-    from vjepa2_ac.evaluation.answer import Answer, not_measured
+def _summary(benchmark: ClosedLoopBenchmark) -> Summary:
+    """Return the verdict of the closed loop, with the other verdicts that `evaluate` wrote for this checkpoint."""
+    from vjepa2_ac.evaluation.summary import ZERO_ACTION, Summary, not_measured
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
     agent, trials = benchmark.agent, benchmark.trials
-    how = "" if cli.is_server(agent.subject) else shell_command("evaluate", agent.subject)
-    unknown = not_measured("predicts", how), not_measured("uses actions", how)
+    how = "`vjepa2-ac evaluate`" if cli.is_server(agent.subject) else shell_command("evaluate", agent.subject)
+    predicts, uses, ranks = (not_measured(name, how) for name in ("predicts", "uses actions", "ranks actions"))
     measured = f"{trials.task_name}, {trials.place}, {trials.model_steps} steps of {trials.seconds_per_step:.2f} s"
-    found = Answer(agent.subject, measured, "doing nothing", *unknown, benchmark.plans)
+    summary = Summary(agent.subject, measured, ZERO_ACTION, predicts, uses, ranks, benchmark.verdict)
     if agent.checkpoint and (Path(agent.subject) / METRICS_FILE).is_file():
         evaluated = read_metrics(Path(agent.subject))
         if evaluated.about.checkpoint == agent.checkpoint:
-            found = replace(evaluated.answer, measured=measured, plans=benchmark.plans)
-    return found
+            summary = replace(evaluated.summary, measured=measured, plans=benchmark.verdict)
+    return summary
 
 
-def _next(answer: Answer, options: argparse.Namespace) -> str:
-    """Return the command that follows from the answer of a closed loop."""
-    if answer.plans.why:
+def _next(summary: Summary, plans: Verdict, options: argparse.Namespace) -> str:
+    """Return the command that follows from the verdicts of a closed loop."""
+    if plans.needs:
         what = ("--task", options.task or "reach") if options.world is None else ("--world", options.world)
         return shell_command("simulate", options.subject, *what, "--episodes", 50)
     if cli.is_server(options.subject):
         return f"your robot's client at {options.subject} (docs/serving.md)"
-    if answer.predicts.share is None:
+    if summary.predicts.value is None:
         return shell_command("evaluate", options.subject)
-    if answer.plans.word == "yes":
+    if plans.conclusion == "yes":
         return shell_command("serve", options.subject)
     return shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
 

@@ -94,8 +94,8 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.cli.console.tables import row_tables
     from vjepa2_ac.distributed import leave_processes
-    from vjepa2_ac.evaluation.answer import spread
     from vjepa2_ac.evaluation.rows import rows_of
+    from vjepa2_ac.evaluation.summary import spread_of_errors
     from vjepa2_ac.reporter import SILENT
     from vjepa2_ac.reports.write import evaluate_subject
 
@@ -112,27 +112,27 @@ def _evaluate(options: argparse.Namespace) -> None:
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
             tables = row_tables(rows_of(measured.evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
-        cli.show(str(measured.answer), f"Next: {_next(measured, options.data)}")
+        cli.show(str(measured.summary), f"Next: {_next(measured, options.data)}")
         film = "" if measured.evaluation.decoded is None else "film and "
         cli.show(f"Report with {film}all tables: {measured.report}")
     if len(evaluations) > 1:
-        cli.show(spread(evaluations))
+        cli.show(spread_of_errors(evaluations))
     leave_processes()
 
 
 def _next(measured: Evaluated, data: str | None) -> str:
-    """Return the command that follows from the answer."""
+    """Return the command that follows from the summary."""
     from vjepa2_ac.simulation.recording.record import read_simulation
     from vjepa2_ac.simulation.world.domains import Domain
 
-    about, answer = measured.evaluation.about, measured.answer
+    about, summary = measured.evaluation.about, measured.summary
     if not about.checkpoint:
         return shell_command("train", data)
-    if answer.predicts.why:
+    if summary.predicts.needs:
         return shell_command("data", "check", f"{about.subject}/config.yaml")
-    if "no" in {answer.predicts.word, answer.uses_actions.word}:
+    if "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}:
         return shell_command("data", "check", f"{about.subject}/config.yaml", "--model", about.subject)
-    if answer.plans.says.startswith("solves"):  # the closed loop has been measured
+    if summary.plans is not None:
         return shell_command("serve", about.subject)
     try:
         recorded = read_simulation(Path(about.data).resolve(strict=True))
@@ -183,7 +183,7 @@ def _compare(options: argparse.Namespace) -> None:
 
     tables = row_tables(comparison.rows, comparison.title) if options.all else []
     files = [plot_comparison(comparison, options.out), *write_tables(comparison.rows, options.out)]
-    best = options.runs[list(comparison.answers).index(comparison.best)]
+    best = options.runs[list(comparison.summaries).index(comparison.best)]
     cli.show(*tables, str(comparison), *comparison.notes, f"Next: {shell_command('export', best)}", files=files)
 
 

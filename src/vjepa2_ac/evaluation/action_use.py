@@ -324,6 +324,7 @@ def measure_landscapes(
         return _landscape(model, start, grid_axes(true, half, nodes), true, space.shown_factor, probes.at_once)
 
     maps = shared(starts, landscape, progress)
+    ids = [one.episode_id for one in maps]
     least = space.shown_factor * half / (nodes - 1)
     chance = np.mean([np.linalg.norm(_places_of(one.axes) - one.true, axis=1).mean() for one in maps])
     agreements, chances, counts = zip(*(_signs(maps, axis, least) for axis in range(3)), strict=True)
@@ -331,7 +332,8 @@ def measure_landscapes(
         axis_names=space.names[_AXES],
         unit=space.shown_unit,
         maps=tuple(maps),
-        distance=mean_of(np.array([one.distance for one in maps]), [one.episode_id for one in maps]),
+        distance=mean_of(np.array([one.distance for one in maps]), ids),
+        sharpness=mean_of(np.array([np.ptp(one.energy) / one.energy.mean() for one in maps]), ids),
         chance_distance=float(chance),
         sign_agreement=agreements,
         sign_chance=chances,

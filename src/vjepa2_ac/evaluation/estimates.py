@@ -9,6 +9,7 @@ from vjepa2_ac.evaluation.result import (
     ActionRanking,
     Actions,
     EpisodeScore,
+    Landscapes,
     Metric,
     Mode,
     PredictionErrors,
@@ -74,6 +75,12 @@ def stratum_gain(errors: PredictionErrors, others: PredictionErrors, stratum: St
 def rank_difference(one: ActionRanking, other: ActionRanking) -> Estimate:
     """Return the mean rank of one model minus that of another on the same moves, paired: below 0 is better."""
     return mean_of(one.ranks - other.ranks, one.episode_ids)
+
+
+def distance_difference(one: Landscapes, other: Landscapes) -> Estimate:
+    """Return the mean distance of one model's energy minimum minus that of another on the same clips, paired."""
+    distances = np.array([[each.distance for each in found.maps] for found in (one, other)])
+    return mean_of(distances[0] - distances[1], [each.episode_id for each in one.maps])
 
 
 def episode_scores(errors: PredictionErrors, base: PredictionErrors | None) -> tuple[EpisodeScore, ...]:

@@ -2,7 +2,7 @@
 
 Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). All errors compare
 layer-normalised latents, by all metrics that are registered. What has intervals is computed from these by
-`evaluation.estimates`; the rows by `evaluation.rows`, the answer by `evaluation.answer`.
+`evaluation.estimates`; the rows by `evaluation.rows`, the summary by `evaluation.summary`.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ class Row:
     better: Literal["lower", "higher", ""] = "lower"
     chance: float | None = None  # what doing nothing has, or a model that ignores its actions
     note: str = ""
+    unit: str = ""  # of the value, if it has one and `name` does not give it: cm
     detail: bool = False  # not for a screen
 
     @property
@@ -274,6 +275,7 @@ class Landscapes:
     unit: str  # cm, or "" where the states are no poses
     maps: tuple[Landscape, ...]
     distance: Estimate  # mean over clips
+    sharpness: Estimate  # mean over clips of (highest - lowest) / mean energy of a landscape; 0: flat
     chance_distance: float  # the same of a node drawn at random
     sign_agreement: tuple[Estimate, Estimate, Estimate]  # per axis: share of clips whose minimum has the true sign
     sign_chance: tuple[float, float, float]  # share of the nodes that have it

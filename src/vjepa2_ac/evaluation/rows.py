@@ -12,6 +12,7 @@ from vjepa2_ac.evaluation.estimates import (
     Curve,
     cost_of_actions,
     difference_to,
+    distance_difference,
     gain_over,
     gap_of_actions,
     mean_error,
@@ -211,7 +212,14 @@ class _Rows(list[Row]):
         """Add where the energy is lowest."""
         group, label = f"Energy landscapes of {_clips(len(found.maps))}", "lowest energy to the true action"
         label += f", {found.unit}" if found.unit else ""
-        self.line(group, label, "landscapes.distance", {model: found.distance}, chance=found.chance_distance)
+        style: dict[str, Any] = {"chance": found.chance_distance, "unit": found.unit}
+        self.line(group, label, "landscapes.distance", {model: found.distance}, **style)
+        label, sharpness = "sharpness: (highest - lowest) / mean energy", {model: found.sharpness}
+        self.line(group, label, "landscapes.sharpness", sharpness, better="higher", chance=0.0)
+        base = None if self.base is None else self.base.landscapes
+        if base is not None and base is not found:
+            label, difference = "distance minus the base's", {model: distance_difference(found, base)}
+            self.line(group, label, "landscapes.difference_to_base", difference, form="+.3f", chance=0.0, detail=True)
         signs = zip(found.axis_names, found.sign_agreement, found.sign_chance, found.sign_clips, strict=True)
         for axis, agreement, chance, count in signs:
             if count:

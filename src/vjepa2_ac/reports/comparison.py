@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.answer import Answer, interval_of, percent
 from vjepa2_ac.evaluation.result import L1, Row
+from vjepa2_ac.evaluation.summary import Summary, interval_of, percent
 from vjepa2_ac.intervals import Estimate, bootstrapped
 from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
 
-_NAME, _CELL, _MOST_RUNS = 22, 16, 8  # columns of a name and of an answer, and lines on a screen
+_NAME, _CELL, _MOST_RUNS = 22, 16, 8  # columns of a name and of a verdict, and lines on a screen
 _SAME = ("split", "frames", "stride", "cameras")
 _SAME_LATENTS = 1e-3  # errors of persistence that differ by a larger share are of other latents
 
@@ -33,27 +33,31 @@ class Comparison:
     seconds: Float[np.ndarray, " horizon"]
     curves: Mapping[str, tuple[Estimate, ...]]  # run -> rollout error over persistence by horizon
     notes: tuple[str, ...]
-    answers: Mapping[str, Answer]
+    summaries: Mapping[str, Summary]
 
     @property
     def best(self) -> str:
         """The run whose error is clearly the lowest; else the first."""
         clear = [row for row in self.rows if row.key == "gain_over_first" and row.estimate.side(of=0.0) == 1]
-        return max(clear, key=lambda row: row.value).model if clear else next(iter(self.answers))
+        return max(clear, key=lambda row: row.value).model if clear else next(iter(self.summaries))
 
     def __str__(self) -> str:
-        """Return the answers of all runs, a line each, and how much better than the first one the best of them is."""
-        first, *others = self.answers
+        """Return the verdicts on all runs, a line each, and how much better than the first one the best of them is."""
+        first, *others = self.summaries
         gains = {row.model: row for row in self.rows if row.key == "gain_over_first"}
-        wide = min(max(map(len, self.answers)), _NAME)
-        lines = [f"{len(self.answers)} runs on the same {self.answers[first].measured}, {self.seconds[-1]:.1f} s ahead"]
+        wide = min(max(map(len, self.summaries)), _NAME)
+        lines = [
+            f"{len(self.summaries)} runs on the same {self.summaries[first].measured}, {self.seconds[-1]:.1f} s ahead"
+        ]
         lines.append(
-            "  " + " " * wide + "".join(f"  {question.name:<{_CELL}}" for question in self.answers[first].questions)
+            "  " + " " * wide + "".join(f"  {question.name:<{_CELL}}" for question in self.summaries[first].verdicts)
         )
-        for name, found in list(self.answers.items())[:_MOST_RUNS]:
-            cells = [f"{one.word} {'' if one.share is None else f'{percent(one.share)} %'}" for one in found.questions]
+        for name, found in list(self.summaries.items())[:_MOST_RUNS]:
+            cells = [
+                f"{one.conclusion} {'' if one.value is None else f'{percent(one.value)} %'}" for one in found.verdicts
+            ]
             lines.append(f"  {name[-wide:]:<{wide}}" + "".join(f"  {cell:<{_CELL}}" for cell in cells))
-        lines.append("  (error below the base's; cost of a wrong action; moves that look better)")
+        lines.append("  (error below the base's; cost of a wrong action; action-ranking error)")
         best = max(others, key=lambda name: gains[name].value)
         gain = gains[best].estimate
         how = {1: "lower", -1: "higher", 0: "not clearly other"}[gain.side(of=0.0)]
@@ -95,7 +99,7 @@ def compare(folders: Sequence[Path]) -> Comparison:
         seconds=about.seconds_per_step * np.arange(1, about.frames),
         curves={name: _curve(metrics) for name, metrics in measured.items()},
         notes=_notes(measured),
-        answers={name: metrics.answer for name, metrics in measured.items()},
+        summaries={name: metrics.summary for name, metrics in measured.items()},
     )
 
 

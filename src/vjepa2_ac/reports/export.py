@@ -115,7 +115,7 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metr
                 shutil.copyfile(folder / PLOT, fresh / PLOT)
             told = json.loads((folder / METRICS_FILE).read_bytes())  # without paths of this machine
             told["about"] |= {"subject": folder.resolve().name, "checkpoint_path": _measured(metrics)}
-            told["answer"] |= {"subject": folder.resolve().name}
+            told["summary"] |= {"subject": folder.resolve().name}
             write_atomically(fresh / METRICS_FILE, json.dumps(told, indent=1))
         write_atomically(fresh / CARD, card)
 
@@ -145,7 +145,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         run=run,
         name=name,
         evaluation=metrics,
-        answer=None if metrics is None else replace(metrics.answer, subject=name),
+        summary=None if metrics is None else replace(metrics.summary, subject=name),
         measured=measured,
         plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
         base=model.adaptation,

@@ -15,14 +15,14 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from vjepa2_ac.errors import InputError, MissingFileError, shell_command
-from vjepa2_ac.evaluation.answer import Answer, answer
 from vjepa2_ac.evaluation.request import SCORED
 from vjepa2_ac.evaluation.result import L1, Evaluation, Row, Way, WrittenAbout
+from vjepa2_ac.evaluation.summary import Summary, summarize
 from vjepa2_ac.storage import user_can_read, write_atomically
 from vjepa2_ac.storage.structured import json_text
 
 METRICS_FILE = "metrics.json"
-FORMAT = 4  # incremented when a reader of the file would have to change
+FORMAT = 5  # incremented when a reader of the file would have to change
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class WrittenErrors:
 class Metrics:
     """The content of metrics.json that programs read, but for what the rows come from."""
 
-    format: Literal[4]
-    answer: Answer
+    format: Literal[5]
+    summary: Summary
     trained: str
     base: str | None
     about: WrittenAbout
@@ -100,7 +100,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     from vjepa2_ac.evaluation.rows import rows_of  # reading needs no PyTorch
 
     one, clips, study, rows = evaluation, evaluation.clips, evaluation.planning, rows_of(evaluation)
-    found = answer(one, rows)
+    summary = summarize(one, rows)
     named = list(zip(clips.episode_ids, clips.starts, strict=True))
     about = {name: value for name, value in vars(one.about).items() if name != "space"}
     decoded, planning = one.decoded, {"three_steps_settings": SCORED}
@@ -108,7 +108,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     of_model = ("role", "sensitivity", "ranking", "landscapes", "plans")  # what rows come from, but for errors
     metrics = {
         "format": FORMAT,
-        "answer": {**vars(found), "sentence": found.sentence},
+        "summary": {**vars(summary), "sentence": summary.sentence},
         "trained": one.trained,
         "base": one.base,
         "about": about | {"is_pose": one.about.space.position is not None},

@@ -6,7 +6,6 @@ The page has the answer and a film first, then every number and its figure, fold
 from __future__ import annotations
 
 import base64
-import json
 import math
 import re
 import shlex
@@ -25,12 +24,12 @@ from markupsafe import Markup
 from vjepa2_ac.distributed import first_only, joined
 from vjepa2_ac.episode import short_names
 from vjepa2_ac.errors import counted
-from vjepa2_ac.evaluation.answer import Answer, Question, answer, interval_of, percent, with_closed_loop
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import L1, DecodedStrip, EpisodeScore, Evaluation, Example, Row, RowTable, sections
 from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.summary import Summary, Verdict, interval_of, percent, summarize, with_closed_loop
 from vjepa2_ac.media.figure import svg_of, visible
 from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_webp
@@ -89,10 +88,10 @@ class PagePart(NamedTuple):
     notes: Sequence[str]
 
 
-def report_page(evaluation: Evaluation, found: Answer) -> str:
-    """Return an evaluation and its answer as one HTML page that needs no network, no script and no other file.
+def report_page(evaluation: Evaluation, summary: Summary) -> str:
+    """Return an evaluation and its summary as one HTML page that needs no network, no script and no other file.
 
-    The same evaluation and answer give the same bytes. It is smaller than 5 MB for any evaluation of usual length:
+    The same evaluation and summary give the same bytes. It is smaller than 5 MB for any evaluation of usual length:
     clips, points of curves and episodes are limited, and images of clips have the best quality that fits.
     """
     rows = rows_of(evaluation)
@@ -108,10 +107,13 @@ def report_page(evaluation: Evaluation, found: Answer) -> str:
     environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(visible, name.split("/")))
     environment.filters |= {"quote": shlex.quote, "bar": bar_of, "percent": percent, "interval": interval_of}
     environment.filters["count"] = counted
+    environment.filters["baseline"] = lambda one: (
+        f"{one.baseline:.0%}" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
+    )
     return environment.get_template("report.html.jinja").render(
         evaluation=evaluation,
-        answer=found,
-        tiles=_tiles(evaluation, rows, found),
+        verdicts=summary,
+        tiles=_tiles(evaluation, rows, summary),
         film=film_of(evaluation),
         parts=_parts(evaluation, rows),
         short=short_names(evaluation.clips.episode_ids),
@@ -119,13 +121,13 @@ def report_page(evaluation: Evaluation, found: Answer) -> str:
     )
 
 
-def bar_of(question: Question) -> dict[str, float]:
-    """Return where the number of an answer, its interval and what it is held against are, in percent of a width."""
-    if question.share is None:
+def bar_of(verdict: Verdict) -> dict[str, float]:
+    """Return the positions of a verdict's number, its interval and its baseline, in percent of a width."""
+    value = verdict.value
+    if value is None:
         return {}
-    places = {"point": question.share, "against": question.against, "low": question.share, "high": question.share}
-    if question.interval:
-        places |= zip(("low", "high"), (one / 100 for one in json.loads(question.interval)), strict=True)
+    low, high = (value if end is None else end for end in (verdict.low, verdict.high))
+    places = {"point": value, "against": verdict.baseline, "low": low, "high": high}
     least = min(places.values())
     inside = (100 - 2 * _AT_AN_END) / (max(places.values()) - least or 1.0)
     return {name: round(_AT_AN_END + inside * (place - least), 1) for name, place in places.items()}
@@ -148,17 +150,17 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
     ]
 
 
-def _tiles(evaluation: Evaluation, rows: Sequence[Row], found: Answer) -> list[tuple[str, Row, Row | None]]:
+def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> list[tuple[str, Row, Row | None]]:
     """Return the most important shares that the answer does not give: label, the evaluated model's, the base's."""
     last, ahead = evaluation.horizon, f"{evaluation.seconds_ahead:.1f} s ahead"
     labels = {
         f"rollout.{L1.name}.over_persistence.{last}": f"L1 error / persistence, {ahead}",
-        "ranking.rank": "other moves that look better",
+        "ranking.rank": "action-ranking error",
         "sensitivity.rank.clips": "others' actions that look better",
         "one_step.motion.moving": "one-step L1 error / persistence, moving",
         f"spread.{last}": f"spread / that of the truth, {ahead}",
     }
-    given = {question.share for question in found.questions}
+    given = {verdict.value for verdict in summary.verdicts}
     known = {(row.key, row.model): row for row in rows if not math.isnan(row.value) and row.value not in given}
     tiles = [
         (label, known[key, evaluation.trained], known.get((key, evaluation.base or "")))
@@ -210,15 +212,15 @@ class PageFilm(NamedTuple):
 
 
 def film_of(evaluation: Evaluation) -> PageFilm | None:
-    """Return the film of the decoded clip whose last images differ most between base and model; None: none is decoded.
+    """Return the video of the decoded clip with the median error, else of the first one; None: none is decoded.
 
-    Without a base it is the clip in which most happens. The first frame is given to all.
+    The first frame is given to all models.
     """
     strips = () if evaluation.decoded is None else evaluation.decoded.strips
     if not strips:
         return None
     models = [name for name in (evaluation.base, evaluation.trained) if name is not None]
-    strip = max(strips, key=lambda one: _difference(one, models))
+    strip = next((one for one in strips if "median" in one.why), strips[0])
     true = "truth" if "truth" in strip.rows else "decoded_truth"
     columns = [strip.rows[name] for name in (true, *models)]
     times = range(len(columns[0]))
@@ -227,11 +229,6 @@ def film_of(evaluation: Evaluation) -> PageFilm | None:
     shown = [_FIRST_S, *[step] * (len(times) - 2), _LAST_S]
     (url,), (still,) = webp_urls([frames], shown, at_most=MOST_BYTES), webp_urls([frames[-1:]], at_most=MOST_BYTES)
     return PageFilm(url, still, ("what happened", *(f"the {name} imagines" for name in models)), strip)
-
-
-def _difference(strip: DecodedStrip, models: Sequence[str]) -> float:
-    other = strip.rows[models[-1]][-1 if len(models) > 1 else 0]
-    return float(np.abs(strip.rows[models[0]][-1].astype(np.float64) - other).mean())
 
 
 def _frame(images: Sequence[Frame], passed: float) -> Frame:
@@ -264,7 +261,7 @@ class Evaluated:
     """The result of an evaluation, and its files."""
 
     evaluation: Evaluation
-    answer: Answer  # does it predict better, does it use the actions, does it plan better; as text by `str`
+    summary: Summary  # the verdicts; as text by `str`
     files: tuple[Path, ...]  # written files
 
     @property
@@ -288,15 +285,15 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
     with joined(settle(subject, asked)) as accelerator:
         evaluation = measure_subject(subject, asked, accelerator, reporter=reporter)
         rows = rows_of(evaluation)
-        found, about = answer(evaluation, rows), evaluation.about
+        summary, about = summarize(evaluation, rows), evaluation.about
         if about.checkpoint:
-            found = with_closed_loop(found, Path(about.subject), about.checkpoint)
-        files = first_only(accelerator, partial(_written, evaluation, found, rows, asked.out or Path(subject)))
-    return Evaluated(evaluation, found, files or ())
+            summary = with_closed_loop(summary, Path(about.subject), about.checkpoint)
+        files = first_only(accelerator, partial(_written, evaluation, summary, rows, asked.out or Path(subject)))
+    return Evaluated(evaluation, summary, files or ())
 
 
-def _written(evaluation: Evaluation, found: Answer, rows: Sequence[Row], folder: Path) -> tuple[Path, ...]:
-    write_atomically(folder / REPORT, report_page(evaluation, found))
+def _written(evaluation: Evaluation, summary: Summary, rows: Sequence[Row], folder: Path) -> tuple[Path, ...]:
+    write_atomically(folder / REPORT, report_page(evaluation, summary))
     return (
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE),

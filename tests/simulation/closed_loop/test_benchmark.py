@@ -20,7 +20,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.cli.console.tables import benchmark_notes
 from vjepa2_ac.decoding.decoder_folder import load_decoder
-from vjepa2_ac.evaluation.answer import CLOSED_LOOP_FILE
+from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE
 from vjepa2_ac.media.images import read_image
 from vjepa2_ac.media.video import read_header
 from vjepa2_ac.model.network.world_model import WorldModel

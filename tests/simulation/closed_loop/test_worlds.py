@@ -21,7 +21,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.answer import CLOSED_LOOP_FILE
+from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.simulation.closed_loop.agent import agent_of_session
 from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions

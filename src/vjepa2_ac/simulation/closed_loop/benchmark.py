@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from vjepa2_ac import __version__
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.answer import CLOSED_LOOP_FILE, Question, closed_loop
+from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE, Verdict, closed_loop
 from vjepa2_ac.media.film import below_each_other, side_by_side
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import video_library, write_video
@@ -165,7 +165,7 @@ class ClosedLoopBenchmark:
     results: tuple[ClosedLoopResult, ...]
 
     @property
-    def plans(self) -> Question:
+    def verdict(self) -> Verdict:
         """Whether the model plans better than what looks at no image."""
         shares = {result.policy: result.success_rate for result in self.results}
         model, *_, oracle = shares
@@ -233,7 +233,7 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
             "version": __version__,
             "time": utc_now(),
         },
-        "plans": asdict(benchmark.plans),
+        "verdict": asdict(benchmark.verdict),
         "policies": {result.policy: _metrics(result) for result in benchmark.results},
     }
 

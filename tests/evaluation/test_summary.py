@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from evaluation_results import ranking_of
-from vjepa2_ac.evaluation.answer import Answer, answer, closed_loop, not_measured, with_closed_loop
 from vjepa2_ac.evaluation.evaluate import clips_of
 from vjepa2_ac.evaluation.result import (
     L1,
@@ -20,6 +19,7 @@ from vjepa2_ac.evaluation.result import (
     PredictionErrors,
 )
 from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.summary import closed_loop, not_measured, with_closed_loop
 from vjepa2_ac.intervals import share_of
 from vjepa2_ac.spaces import POSE_CHANGE
 from worlds import about
@@ -69,7 +69,7 @@ def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
 
 def asked(*models: ModelResult, episodes: int = 8) -> Answer:
     found = evaluation(*models, episodes=episodes)
-    return answer(found, rows_of(found))
+    return summarize(found, rows_of(found))
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_it_plans_better_where_fewer_other_moves_look_better_than_with_the_base(
 
 def test_actions_are_used_only_where_wrong_ones_cost_something() -> None:
     deaf, listening = asked(model("model", 0.5)), asked(model("model", 0.5, shuffled=0.9))
-    assert (deaf.uses_actions.word, listening.uses_actions.word) == ("no", "yes")
+    assert (deaf.uses_actions.conclusion, listening.uses_actions.conclusion) == ("no", "yes")
     assert deaf.sentence.startswith("It learned the scene, not the arm")
     assert listening.uses_actions.says == "a wrong action costs 81 %"
 
@@ -144,9 +144,9 @@ def with_errors(found: Evaluation, name: str, true: dict[Metric, np.ndarray]) ->
 
 def test_it_is_said_where_l2_contradicts_l1() -> None:
     found = evaluation(model("base", 0.95), model("adapter", 0.8))
-    assert not answer(found, rows_of(found)).predicts.beside
+    assert not summarize(found, rows_of(found)).predicts.reference
     denied = with_errors(found, "adapter", by(0.8, 1.25))
-    assert answer(denied, rows_of(denied)).predicts.beside == "(by l2 32 % higher)"
+    assert summarize(denied, rows_of(denied)).predicts.reference == "(by l2 32 % higher)"
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_an_answer_fits_a_screen_whatever_it_is(episodes: int, others: float, ra
     pair = ranked("base", 1.0, 0.05), ranked("adapter", 0.6, rank, shuffled=others)
     found = evaluation(*pair, episodes=episodes)
     found = replace(found, about=replace(found.about, subject="runs/a-kitchen-with-a-name-that-is-long-enough-to-wrap"))
-    text = answer(found, rows_of(found))
+    text = summarize(found, rows_of(found))
     lines = str(text).splitlines()
     assert len(lines) <= 12
     assert max(map(len, lines)) <= 80
