@@ -131,7 +131,7 @@ CONSTANT = r"[\w.]*\b_?[A-Z][A-Z_]+|\d"
 PLURAL = re.compile(
     rf"\{{(?!{CONSTANT})([^{{}}:]+)(?::,)?\}} (?:(?!of |or |and |that )[a-z-]+ ){{0,2}}?(?:{COUNTED})\b(?!/)"
 )
-LATER = {"closed_loop.py", "answer.py", "rows.py", "comparison.py", "benchmark.py", "worlds.py"}  # of other branches
+LATER = {"closed_loop.py", "summary.py", "rows.py", "comparison.py", "benchmark.py", "worlds.py"}  # of other branches
 ALWAYS_PLURAL = (
     "{size}", "split} episodes", "exceed steps", "{lengths} steps", "{self.episodes:,} episodes have", "at_most} steps",
     "episodes are broken",

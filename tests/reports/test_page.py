@@ -20,6 +20,7 @@ from planned import with_plans
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.summary import summarize
+from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.reports.write import LONGEST_S, MOST_BYTES, MOST_CLIPS, bar_of, film_of, report_page
 
 pytestmark = pytest.mark.usefixtures("drawn")
@@ -168,13 +169,17 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
     one = evaluation(with_base=False)
     adapter = replace(one.models["adapter"], sensitivity=None, landscapes=None, distribution=None)
     bare = replace(one, models={"adapter": adapter}, examples=(), training=(), strata=(), episodes=(), copies=None)
-    shown = Page(page_of(replace(bare, notes=("--sensitivity-clips is 0: no energy landscapes.",)))).shown
+    noted = replace(bare, notes=("--sensitivity-clips is 0: no energy landscapes.",))
+    shown = Page(page_of(noted)).shown
     for what in (
         "Compared with the base", "Energy landscapes", "Example clips", "Training curves", "Other strides",
         "Spread of the predictions", "Decoded images", "Plans beside demonstrations",
     ):  # fmt: skip
         assert f"{what}: not measured." in shown
     assert "Energy landscapes: not measured. --sensitivity-clips is 0: no" in shown
+    written = metrics_as_dict(noted)["not_measured"]
+    assert len(written) == 8
+    assert all(reason in shown for reason in written.values()), "the page and metrics.json give the same reasons"
     assert "No film: vjepa2-ac evaluate runs/kitchen --decoder FOLDER" in shown
 
 

@@ -35,7 +35,7 @@ from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_webp
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation
-from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, not_measured, write_metrics
 from vjepa2_ac.reports.paper import write_tables
 from vjepa2_ac.storage import write_atomically
 
@@ -103,7 +103,6 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.tests["search_for"] = lambda text, word: word in text
     environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(visible, name.split("/")))
     environment.filters |= {"quote": shlex.quote, "bar": bar_of, "percent": percent, "interval": interval_of}
     environment.filters["count"] = counted
@@ -116,6 +115,7 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         tiles=_tiles(evaluation, rows, summary),
         film=film_of(evaluation),
         parts=_parts(evaluation, rows),
+        missing=not_measured(evaluation),
         short=short_names(evaluation.clips.episode_ids),
         style=Markup(resources.files("vjepa2_ac").joinpath("assets/report.css").read_text("utf-8")),  # noqa: S704
     )
