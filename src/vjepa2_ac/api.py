@@ -329,7 +329,7 @@ class _Told(Reporter):
         from vjepa2_ac.evaluation.estimates import over_persistence
 
         by_horizon = ", ".join(f"{ratio.value:.3f}" for ratio in over_persistence(found.errors, "rollout"))
-        better = f"; other moves that look better {found.ranking.rank:.1%}" if found.ranking else ""
+        better = f"; action-ranking error {found.ranking.rank:.1%}" if found.ranking else ""
         self._note(f"Validation at step {step}: error over persistence by horizon {by_horizon}{better}")
 
 

@@ -341,7 +341,7 @@ function sentence(header, text, verdicts) {
       `${one.id} error ${value(one.error)}${verdicts[number] && ` (${verdicts[number]})`}`,
   );
   const { name } = hello.episodes[header.episode];
-  const known = header.copying === null ? "what is true is unknown" : `${errors.join(", ")}, copying ${value(header.copying)}`;
+  const known = header.copying === null ? "ground truth not available" : `${errors.join(", ")}, copying ${value(header.copying)}`;
   say(header.actions.length ? `${text}: ${known}. ${header.note}` : `${name}, control step ${header.start}: the given frame.`);
 }
 
