@@ -87,7 +87,7 @@ def test_evaluate_of_several_runs_tells_their_spread(workshop: Path, capsys: pyt
 def test_a_finished_run_has_nothing_left_to_do(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = sorted(path.name for path in (workshop / "lora" / "checkpoints").iterdir())
     assert main(["train", str(workshop / "lora"), "--resume"]) == 0
-    assert "all 3 steps are done" in capsys.readouterr().out
+    assert "finished after 3 steps" in capsys.readouterr().out
     assert sorted(path.name for path in (workshop / "lora" / "checkpoints").iterdir()) == before
 
 

@@ -192,7 +192,8 @@ def test_the_card_describes_base_data_and_training(
     for words in (
         str(base_folder), base.predictor_fingerprint(), base.encoder_fingerprint(), f"rlds, `{data_folder}`",
         "`exterior_1_left`", "4 frames, one every 2 control steps", "2 of 2 planned", "rank 4, alpha 8",
-        "batch 2 x accumulation 1", "0.05", "rollout of 2 steps", "parameters are trained", "Not evaluated",
+        "batch 2 x accumulation 1", "0.05", "rollout of 2 steps", "parameters are trained",
+        "**Not measured**: the run had no",
     ):  # fmt: skip
         assert words in card, words
     weights = peft.PeftModel.from_pretrained(base.predictor, str(tmp_path / "hub")).state_dict()
@@ -249,7 +250,7 @@ def test_the_card_shows_what_was_measured(copied, tmp_path: Path) -> None:
     assert "not measured" in card
     assert "| ahead | base | adapter |\n|---|---|---|\n| 0.50 s | 0.900 [0.800, 0.950] | 0.700 |" in card
     assert "another checkpoint" not in card
-    assert "Not evaluated" not in card
+    assert "**Not measured**: the run had no" not in card
     assert f"]({PLOT})" in card
     assert (tmp_path / "hub" / PLOT).read_bytes() == b"a picture"
     assert "somewhere" not in (tmp_path / "hub" / METRICS_FILE).read_text(), "a path of this machine"

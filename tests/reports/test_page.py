@@ -20,6 +20,7 @@ from planned import with_plans
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.summary import Verdict, summarize
+from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.reports.write import LONGEST_S, MOST_BYTES, MOST_CLIPS, bar_of, film_of, report_page
 
 pytestmark = pytest.mark.usefixtures("drawn")
@@ -182,7 +183,8 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
     one = evaluation(with_base=False)
     adapter = replace(one.models["adapter"], ranking=None, landscapes=None, distribution=None)
     bare = replace(one, models={"adapter": adapter}, examples=(), training=(), strata=(), episodes=(), copies=None)
-    shown = Page(page_of(replace(bare, notes=("--ranking-clips is 0: no energy landscapes.",)))).shown
+    noted = replace(bare, notes=("--ranking-clips is 0: no energy landscapes.",))
+    shown = Page(page_of(noted)).shown
     for what in (
         "Compared with the base", "Energy landscapes", "Example clips", "Training curves", "Other strides",
         "Spread of the predictions", "Decoded images", "Plans beside demonstrations",
@@ -190,6 +192,9 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
         assert f"{what}: not measured." in shown
     assert "Energy landscapes: not measured. --ranking-clips is 0: no" in shown
     assert "`" not in shown, "a command is shown as code"
+    written = metrics_as_dict(noted)["not_measured"]
+    assert len(written) == 8
+    assert all(reason.replace("`", "") in shown for reason in written.values()), "page and metrics.json agree"
     assert "No video: vjepa2-ac evaluate runs/kitchen --decoder FOLDER" in shown
 
 

@@ -98,7 +98,7 @@ def test_a_run_with_new_heads_resumes_bit_for_bit(make_robot: MakeConfig, report
     with pytest.raises(KilledError):
         train(make_robot(**stopped), dying_reporter(type(reporter)(), 3))
     train(make_robot(**stopped), reporter)
-    assert any(note.startswith("Going on from") for note in reporter.notes)
+    assert any(note.startswith("Resuming from") for note in reporter.notes)
     assert_same_run(tmp_path / "whole", tmp_path / "stopped")
 
 

@@ -164,7 +164,7 @@ def test_a_model_that_hardly_uses_the_actions_is_said_to_once_after_warm_up_and_
             self.step = step
 
         def note(self, text: str) -> None:
-            if "hardly uses them" in text:
+            if "ignores its actions" in text:
                 self.warned.append(self.step)
 
     sizes = {

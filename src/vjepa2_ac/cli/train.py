@@ -7,7 +7,7 @@ import contextlib
 from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError, shell_command
+from vjepa2_ac.errors import InputError, counted, shell_command
 from vjepa2_ac.process import is_first
 
 
@@ -108,7 +108,7 @@ def _encode(options: argparse.Namespace) -> None:
     if not encoded.is_finished:
         cli.show(f"This process has done its share; others are still at work on {encoded.folder}")
         return
-    episodes = f"{encoded.encoded:,} of {encoded.episodes:,} episodes"
+    episodes = f"{encoded.encoded:,} of {counted(encoded.episodes, 'episode')}"
     knobs = f"data.source=latents data.path={encoded.folder}" if options.out else "data.cache=auto"
     cli.show(
         *(f"left out: {name}: {reason}" for name, reason in encoded.broken.items()),
@@ -144,8 +144,7 @@ def _decoder(options: argparse.Namespace) -> None:
         cli.show("Everything is in place: data, model, folder and disk were checked; nothing was written.")
         return
     card = read_card(folder)
-    if card.held_out:
-        cli.show(held_out_table(card))
+    cli.show(held_out_table(card) if card.held_out else "Held-out frames: not measured; they need a test split.")
     cli.show(f"See what a model imagines: {shell_command('imagine', config.run_dir, '--decoder', folder)}")
 
 

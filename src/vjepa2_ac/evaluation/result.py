@@ -54,7 +54,7 @@ class Row:
         return Estimate(self.value, self.low, self.high)
 
     def __str__(self) -> str:
-        text = "\N{EN DASH}" if math.isnan(self.value) else f"{self.estimate:{self.form}}"
+        text = "not measured" if math.isnan(self.value) else f"{self.estimate:{self.form}}"
         return f"{text} ({self.note})" if self.note else text
 
 

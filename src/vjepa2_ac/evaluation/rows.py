@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from itertools import product
 from typing import Any
 
-from vjepa2_ac.data.inspection.findings import counted
+from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.action_score import AXES, differences_of, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.estimates import (
     Curve,

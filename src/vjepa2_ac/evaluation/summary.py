@@ -18,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 
-from vjepa2_ac.data.inspection.findings import counted
+from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.estimates import over_persistence
 from vjepa2_ac.evaluation.result import L1, Evaluation, Row
 from vjepa2_ac.intervals import ENOUGH_EPISODES, Estimate

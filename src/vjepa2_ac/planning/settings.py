@@ -159,8 +159,8 @@ def warn_beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
             name = f"planning.limits.{knob}"
             way_out = f"{name}=data stays within" if knob in {"xyz", "axes"} else f"lower {name}"
             found.append(
-                f"{name} leaves what {folder} was taught: {', '.join(beyond)}. In brackets: how far 99 % of its steps"
-                f" go. Beyond that the model guesses; {way_out}"
+                f"{name} exceeds the motions in the training data of {folder}: {', '.join(beyond)} (99th percentile of"
+                f" the data in parentheses). Predictions beyond it are unreliable; {way_out}"
             )
     for text in found:
         logger.warning(text)

@@ -23,6 +23,19 @@ from vjepa2_ac.storage.structured import json_text
 
 METRICS_FILE = "metrics.json"
 FORMAT = 5  # incremented when a reader of the file would have to change
+_NEEDS = {  # parts of an evaluation: a word of the note that says why a part is missing, and what the part needs
+    "base": ("no base", "The comparison needs a base model; a model without one was evaluated."),
+    "spread": ("spread", "The spread is the variance over clips and needs two or more clips."),
+    "landscapes": ("energy landscapes", "Energy landscapes need clips that move and actions of three or more numbers."),
+    "planning": ("No plans", "Planning takes minutes and was not requested: vjepa2-ac evaluate --planning."),
+    "examples": ("example clips", "Example clips need a data set with frames."),
+    "decoded": (
+        "decoded images",
+        "Decoded images need evaluate --decoder FOLDER, made by vjepa2-ac decoder.",
+    ),
+    "training": ("metrics.jsonl", "Training curves need the metrics.jsonl of a run."),
+    "strides": ("strides", "Strides are compared by vjepa2-ac data calibrate."),
+}
 
 
 @dataclass(frozen=True)
@@ -66,6 +79,17 @@ class Metrics:
         """Return the row of a key for a model, by default the evaluated one; None: it was not measured."""
         name = model or self.trained
         return next((row for row in self.rows if row.key == key and row.model == name), None)
+
+
+def not_measured(one: Evaluation) -> dict[str, str]:
+    """Return the parts of an evaluation that were not measured, with the reason of each."""
+    model = one.models[one.trained]
+    found = {**vars(one), **vars(model), **one.beside, "base": one.base, "spread": model.distribution}
+    return {
+        part: next((note for note in one.notes if word in note), needs)
+        for part, (word, needs) in _NEEDS.items()
+        if not found.get(part)
+    }
 
 
 def write_metrics(evaluation: Evaluation, path: Path) -> Path:
@@ -142,6 +166,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "decoded": None if decoded is None else {"decoder": decoded.decoder, "notes": decoded.notes},
         **{name: found.as_dict() for name, found in one.beside.items()},
         "notes": one.notes,
+        "not_measured": not_measured(one),
     }
     plain: dict[str, Any] = to_jsonable_python(
         metrics, inf_nan_mode="null", fallback=lambda array: _rounded(array.tolist())

@@ -23,6 +23,7 @@ from markupsafe import Markup, escape
 
 from vjepa2_ac.distributed import first_only, joined
 from vjepa2_ac.episode import short_names
+from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
@@ -34,7 +35,7 @@ from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_webp
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation
-from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, not_measured, write_metrics
 from vjepa2_ac.reports.paper import write_tables
 from vjepa2_ac.storage import write_atomically
 
@@ -101,10 +102,9 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.tests["search_for"] = lambda text, word: word in text
     environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(visible, name.split("/")))
     environment.filters |= {"quote": shlex.quote, "bar": bar_of, "percent": percent, "interval": interval_of}
-    environment.filters["coded"] = coded
+    environment.filters |= {"coded": coded, "count": counted}
     environment.filters["figure"] = lambda row: f"{percent(row.value)} %" if row.better else f"{row.value:.2f}"
     environment.filters["baseline"] = lambda one: (
         f"{percent(one.baseline)} %" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
@@ -115,6 +115,7 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         tiles=_tiles(evaluation, rows, summary),
         film=film_of(evaluation),
         parts=_parts(evaluation, rows),
+        missing=not_measured(evaluation),
         short=short_names(evaluation.clips.episode_ids),
         style=Markup(resources.files("vjepa2_ac").joinpath("assets/report.css").read_text("utf-8")),  # noqa: S704
     )
@@ -180,11 +181,11 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
 
 def _episodes(scores: Sequence[EpisodeScore]) -> list[RowTable]:
     """Return the best and the worst episodes."""
-    parts = {f"All {len(scores)} episodes, best first": scores} if scores else {}
+    parts = {f"All {counted(len(scores), 'episode')}, best first": scores} if scores else {}
     if len(scores) > 2 * _AT_EACH_END:
         parts = {
-            f"The {_AT_EACH_END} best of {len(scores)} episodes, best first": scores[:_AT_EACH_END],
-            f"The {_AT_EACH_END} worst of {len(scores)} episodes, worst last": scores[-_AT_EACH_END:],
+            f"The {_AT_EACH_END} best of {counted(len(scores), 'episode')}, best first": scores[:_AT_EACH_END],
+            f"The {_AT_EACH_END} worst of {counted(len(scores), 'episode')}, worst last": scores[-_AT_EACH_END:],
         }
     columns = ("clips", "L1 error / persistence", "gain over the base")
     return [RowTable(title, columns, tuple(map(_episode, part))) for title, part in parts.items()]

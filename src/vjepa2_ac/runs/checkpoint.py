@@ -23,7 +23,7 @@ from typing import Annotated, Any, BinaryIO
 from pydantic import Field
 
 from vjepa2_ac.config.section import PositiveInt
-from vjepa2_ac.errors import InputError, MissingFileError, shell_command
+from vjepa2_ac.errors import InputError, MissingFileError, counted, shell_command
 from vjepa2_ac.storage import is_refusal, read_bounded, sha256_of_file, sync, user_can_read
 from vjepa2_ac.storage.structured import MOST_BYTES, json_object, read_json_object, record_of, shown
 
@@ -190,7 +190,7 @@ def newest_checkpoint(folder: Path) -> Path | None:
             return path
         logger.warning("%s: %s; this checkpoint is skipped", path, problem)
     if found:
-        damaged, fix = f"all {len(found)} checkpoints are damaged", "To start again from step 0, delete this folder"
+        damaged, fix = f"damaged: {counted(len(found), 'checkpoint')}", "To start again from step 0, delete this folder"
         raise InputError(where=str(folder), found=damaged, fix=fix)
     return None
 

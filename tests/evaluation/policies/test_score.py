@@ -209,7 +209,7 @@ def test_the_command_scores_the_chunks_of_a_scene(
     capsys.readouterr()
     assert main(["score", str(base_folder), *scene, "--control-steps", "2"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "is not known" in said
+    assert "Action ranking of this model: not measured" in said
     assert "doing nothing" in said
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.intervals import Estimate, mean_of, ratio, ratio_difference
 from vjepa2_ac.planning.chunks import ChunkForm, changes_of_chunks
 from vjepa2_ac.planning.controller import Controller
@@ -169,7 +169,7 @@ def score_policies(
     seen = [_Place.of(dataset, place, max(1, steps) * stride, controller) for place in places]
     kept = [one for one in seen if one is not None]
     if not kept:
-        needed = f"{steps * stride} control steps after it in the episode"
+        needed = f"{counted(steps * stride, 'control step')} after it in the episode"
         raise InputError(where="--policy", found="no place with a goal", needed=needed)
     rng, energies, ids = np.random.default_rng(0), list[np.ndarray](), [one.place[0] for one in kept]
     rows = [{place: row for row, place in reversed([*enumerate(one.places)])} for one in policies]
