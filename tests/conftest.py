@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from jaxtyping import install_import_hook
 
 import missing
+import shape_checks
 
-# Where arrays change shape, each call is checked while testing. In the other rooms it would double the suite's time
-# for what mypy proves already.
+# Where arrays change shape, each call with arrays is checked while testing. In the other packages it would double the
+# suite's time for what mypy proves already.
 CHECKED = [
     "vjepa2_ac.spaces",
     "vjepa2_ac.media.images",
@@ -25,7 +25,7 @@ CHECKED = [
 ]
 ABSENT = missing.absent(os.environ)
 if missing.SHAPES not in ABSENT:
-    _hook = install_import_hook(CHECKED, "beartype.beartype")
+    shape_checks.install(CHECKED, "beartype.beartype")
 if missing.is_installed("hypothesis"):
     from hypothesis import HealthCheck, settings
 
@@ -105,6 +105,14 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Nothing of a test stays in the user's cache folder, and nothing in there helps a test."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VJEPA2_AC_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _without_fsync() -> Iterator[None]:
+    """No test waits for a disk: what `fsync` protects from, the loss of power, happens in none."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
         yield
 
 

@@ -8,6 +8,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -175,10 +176,15 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         raise InputError(where=str(path), found="a folder", needed="a config, which is a YAML file", fix=fix) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
-    values = parse_yaml(text, where=str(path))
+    return _mapping(text, str(path))
+
+
+@lru_cache(maxsize=8)  # a command reads the config of its run several times, and PyYAML is slow
+def _mapping(text: str, where: str) -> dict[str, Any]:
+    values = parse_yaml(text, where=where)
     if not isinstance(values, dict):
         found = "nothing" if values is None else f"a {type(values).__name__}"
-        raise InputError(where=str(path), found=found, needed="a mapping of keys to values")
+        raise InputError(where=where, found=found, needed="a mapping of keys to values")
     return values
 
 

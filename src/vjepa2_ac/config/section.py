@@ -84,6 +84,7 @@ def marks_of(knobs: type[BaseModel]) -> Mapping[str, Affects]:
     return dict(_marks(knobs, None, "", ~Affects.NOTHING))
 
 
+@cache
 def mark_of(key: str, knobs: type[BaseModel]) -> Affects:
     """Return the mark of a knob, or of that which holds a value, such as data.fields.cameras.left.
 
