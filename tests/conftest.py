@@ -125,20 +125,31 @@ def _ordinary_scheduling() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _undrawn() -> Iterator[Callable[..., None]]:
-    """Figures are composed, and stay empty but where `drawn` is asked for: drawing is half of an evaluation's time."""
+def _undrawn() -> Iterator[Callable[[pytest.MonkeyPatch], None]]:
+    """Figures are composed, strips with one column, and stay empty where `drawn` is not used.
+
+    Drawing is half of an evaluation's time.
+    """
     from matplotlib.figure import Figure
 
-    draw = Figure.draw
-    Figure.draw = lambda *_: None  # type: ignore[method-assign]
-    yield draw
-    Figure.draw = draw  # type: ignore[method-assign]
+    from vjepa2_ac.media import film
+
+    draw, columns = Figure.draw, film._MOST_COLUMNS
+
+    def draw_all(patch: pytest.MonkeyPatch) -> None:
+        patch.setattr(Figure, "draw", draw)
+        patch.setattr(film, "_MOST_COLUMNS", columns)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "draw", lambda *_: None)
+        patch.setattr(film, "_MOST_COLUMNS", 1)
+        yield draw_all
 
 
 @pytest.fixture
-def drawn(_undrawn: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+def drawn(_undrawn: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures have content."""
-    monkeypatch.setattr("matplotlib.figure.Figure.draw", _undrawn)
+    _undrawn(monkeypatch)
 
 
 @pytest.fixture(scope="session")

@@ -48,11 +48,11 @@ Usual = tuple[Evaluation, str, Page]
 
 
 @pytest.fixture(scope="module")
-def usual(_undrawn: Callable[..., None]) -> Usual:
+def usual(_undrawn: Callable[[pytest.MonkeyPatch], None]) -> Usual:
     """An evaluation of which everything was measured, its page with figures that have content, and that in pieces."""
     one = decoded_strips(with_plans(evaluation(others=("runs/other",))))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("matplotlib.figure.Figure.draw", _undrawn)
+        _undrawn(patch)
         html = page_of(one)
     return one, html, Page(html)
 
@@ -179,7 +179,7 @@ def test_the_page_refers_to_nothing_but_itself_and_is_the_same_each_time(usual: 
 @pytest.mark.usefixtures("drawn")
 def test_the_page_stays_small_whatever_was_measured() -> None:
     rng = np.random.default_rng(0)
-    one = evaluation(frames=16, size=512)
+    one = evaluation(frames=16, size=256)
     noise = rng.integers(0, 256, size=one.examples[0].frames.shape, dtype=np.uint8)
     curve = TrainingCurve("loss", tuple(range(5_000)), tuple(map(float, range(5_000))))
     html = page_of(replace(one, examples=(replace(one.examples[0], frames=noise),) * 6, training=(curve,) * 4))
