@@ -36,7 +36,7 @@ def write_config(folder: Path, name: str, model: dict[str, object] = MODEL, **mo
             "steps": 4, "batch_size": 2, "accumulation": 1, "warmup_steps": 0, "precision": "fp32", "device": "cpu",
             "allow_weak_base": True,
         },
-        "validation": {"every": 4, "clips": 4, "batch_size": 2, "ranking_samples": 4},
+        "validation": {"every": 4, "clips": 4, "batch_size": 2, "ranking_clips": 2, "ranking_samples": 4},
         "checkpoint": {"every": 1},
         **more,
     }  # fmt: skip
