@@ -19,7 +19,7 @@ NOT_MADE = {
     "data check builtin:demo data.path=gs://": "needs a network",
     "simulate ws://": "needs a server; tests/serving has one",
 }
-OF_A_RUN = ("data.test_share=0.3", "validation.ranking_clips=1", *runpy.run_path(str(ROOT / "scripts/walk.py"))["FEW_STEPS"].split())
+OF_A_RUN = ("data.test_share=0.3", *runpy.run_path(str(ROOT / "scripts/walk.py"))["FEW_STEPS"].split())
 
 
 @pytest.fixture(scope="module")
