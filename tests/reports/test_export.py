@@ -54,7 +54,7 @@ EVALUATED = {
 
 
 Trained = Callable[..., Path]
-QUICK = ["--clips", "4", "--ranking-clips", "2", "--samples", "4", "--landscapes", "1", "--nodes", "3"]
+QUICK = ["--clips=4", "--ranking-clips=2", "--samples=4", "--landscapes=1", "--axes=0", "--nodes=3", "--examples=1"]
 
 
 @pytest.fixture(scope="module")

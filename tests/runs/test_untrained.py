@@ -29,7 +29,7 @@ from vjepa2_ac.runs.loading import load_run
 
 SELECTED = "The selected checkpoint is the base model: fine-tuning did not improve action ranking."
 SCRATCH = {"model__base": None, "model__random": TINY, "adapter__kind": "none"}
-FEW = EvaluationOptions(clips=3, probes=ProbeOptions(sensitivity_clips=0, examples=0))
+FEW = EvaluationOptions(clips=3, probes=ProbeOptions(ranking_clips=0, examples=0))
 
 
 def untrained_run(config: Config, *, newest: int = 6, rank: float | None = 0.1, widths: Widths | None = None) -> Path:

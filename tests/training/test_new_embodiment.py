@@ -29,7 +29,7 @@ from vjepa2_ac.training.loop import train
 
 MakeConfig = Callable[..., Config]
 HEADS = ["action_encoder", "state_encoder"]
-PROBES = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, nodes=3, examples=1)
+PROBES = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, axis_clips=0, nodes=3, examples=1)
 QUICK = EvaluationOptions(split="validation", clips=4, probes=PROBES)
 ROBOTS = {"14/14": Widths(14, 14), "8/7": Widths(8, 7), "7/8": Widths(7, 8)}
 
