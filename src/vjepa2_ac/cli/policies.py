@@ -120,11 +120,11 @@ def _score_chunks(options: argparse.Namespace, to_poses: Callable[[np.ndarray], 
     ranking = ranking_of_run(options.subject, session.checkpoint)
     blind = is_blind(ranking)
     title = f"Energy after {counted(changes.shape[1], 'model step')} (now: {found.now:.4f})"
-    table = MetricsTable(title, ["chunk", "energy", "relative to no motion"])
+    table = MetricsTable(title, ["chunk", "energy", "relative to the zero action"])
     for chunk in found.order.tolist():
         beside = found.energies[chunk] / found.doing_nothing - 1
         table.add_row(str(chunk), f"{found.energies[chunk]:.4f}", f"{beside:+.1%}")
-    table.add_row("no motion", f"{found.doing_nothing:.4f}", "+0.0%")
+    table.add_row("zero action", f"{found.doing_nothing:.4f}", "+0.0%")
     notes = [f"Spread of the chunks: {found.spread:.1%} of the energy now."]
     if found.tied > 1:
         notes.append(f"{found.tied} chunks share the lowest energy: the model does not distinguish them.")
@@ -167,7 +167,7 @@ def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray]
             control_steps=options.control_steps,
             progress=reporter.task("scoring", "places"),
         )
-    title = f"Energy relative to no motion, {counted(found.places, 'frame')} of {counted(found.episodes, 'episode')}"
+    title = f"Energy relative to the zero action, {counted(found.places, 'frame')} of {counted(found.episodes, 'episode')}"
     table = MetricsTable(title, ["policy", "all chunks", "its best", "behind the one before"])
     for one in found.policies:
         table.add_row(one.name, str(one.mean), str(one.best), "" if one.behind is None else str(one.behind))
@@ -270,7 +270,7 @@ def _prior(options: argparse.Namespace) -> None:
     text = "Error on held-out clips: not measured; it needs a test split."
     if found := card.held_out:
         true, others = (found[name]["value"] for name in ("true_goals", "goals_of_others"))
-        text = f"Error on held-out clips relative to no motion: {true:.2f}; with goals of other clips {others:.2f}."
+        text = f"Error on held-out clips relative to the zero action: {true:.2f}; with goals of other clips {others:.2f}."
         text += " The prior ignores the goal." if others <= true else ""
     cli.show(text)
     cli.show(f"The prior is in {folder}. Plan with it: planning.prior={folder} planning.samples=100")
