@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -272,4 +273,4 @@ def _prior(options: argparse.Namespace) -> None:
             f"Its error on held-out clips is {true:.2f} of doing nothing; with goals of other clips {others:.2f}"
             + (": it does not look at the goal." if others <= true else ".")
         )
-    cli.show(f"The prior is in {folder}. Plan with it: planning.prior={folder} planning.samples=100")
+    cli.show(f"The prior is in {folder}. Plan with it: {shlex.quote(f'planning.prior={folder}')} planning.samples=100")
