@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import vjepa2_ac
-from vjepa2_ac.errors import InputError, pip_install, printable, shell_command
+from vjepa2_ac.errors import InputError, counted, pip_install, printable, shell_command
 from vjepa2_ac.reports.metrics_json import read_metrics
 
 
@@ -124,3 +124,40 @@ def test_no_command_is_printed_with_a_path_that_is_not_quoted() -> None:
         for command in re.findall(r"vjepa2-ac ([a-z]+ [^`\"\n]*?\{[^}]*\})", path.read_text())
     ]
     assert [one for one in found if one.partition(": ")[2] not in allowed] == []
+
+
+COUNTED = "episodes|clips|steps|problems|workers|processes|cores|GPUs|checkpoints|commands|decisions|places|validations"
+CONSTANT = r"[\w.]*\b_?[A-Z][A-Z_]+|\d"
+PLURAL = re.compile(
+    rf"\{{(?!{CONSTANT})([^{{}}:]+)(?::,)?\}} (?:(?!of |or |and |that )[a-z-]+ ){{0,2}}?(?:{COUNTED})\b(?!/)"
+)
+LATER = {"closed_loop.py", "summary.py", "rows.py", "comparison.py", "benchmark.py", "worlds.py"}  # of other branches
+ALWAYS_PLURAL = (
+    "{size}", "split} episodes", "exceed steps", "{lengths} steps", "{self.episodes:,} episodes have", "at_most} steps",
+    "episodes are broken",
+)  # fmt: skip
+
+
+def test_a_number_before_a_noun_is_counted_so_that_one_has_no_plural() -> None:
+    """`counted` makes it; numbers that are always above 1 are named above."""
+    wrong = [
+        f"{path.name}: {line.strip()}"
+        for path in sorted(Path(vjepa2_ac.__file__).parent.rglob("*.py"))
+        for line in path.read_text().splitlines()
+        if 'f"' in line and "ValueError" not in line and PLURAL.search(line)
+        if path.name not in LATER and not any(words in line for words in ALWAYS_PLURAL)
+    ]
+    assert not wrong, "\n".join(wrong)
+    assert PLURAL.search('f"{len(one):,} held-out episodes"')
+    assert not PLURAL.search("f\"{counted(len(one), 'episode')} of one run\"")
+
+
+@pytest.mark.parametrize(
+    ("number", "noun", "text"),
+    [
+        (0, "episode", "0 episodes"), (1, "held-out episode", "1 held-out episode"), (1200, "step", "1,200 steps"),
+        (1, "process", "1 process"), (2, "process", "2 processes"), (2, "batch", "2 batches"),
+    ],
+)  # fmt: skip
+def test_a_noun_has_the_plural_of_its_number(number: int, noun: str, text: str) -> None:
+    assert counted(number, noun) == text

@@ -54,12 +54,13 @@ def test_check_with_json_prints_one_object_with_the_same_findings(
     config: str, capsys: Printed, words: list[str]
 ) -> None:
     assert main(["data", "check", config, "--limit", "4", *words]) == 0
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith(LEVELS)]
+    text = capsys.readouterr().out
+    lines, words_of_all = [line for line in text.splitlines() if line.startswith(LEVELS)], " ".join(text.split())
     assert main(["data", "check", config, "--limit", "4", "--json", *words]) == 0
     printed = json.loads(capsys.readouterr().out)
-    shown = [f"{one['level']:<7}  {one['name']:<16}{one['text']}" for one in printed["findings"]]
+    shown = [f"{one['level']} {one['name']} {one['text']}" for one in printed["findings"]]
     assert len(shown) == len(lines)
-    assert {*lines} ^ {*shown} <= {line for line in [*lines, *shown] if " s" in line}, "only times differ"
+    assert not [line for line in shown if line not in words_of_all and " s" not in line], "only times differ"
     levels = [one["level"] for one in printed["findings"]]
     assert [printed[name] for name in ("errors", "warnings", "skipped")] == [
         levels.count(level) for level in ("error", "warning", "skipped")
@@ -135,7 +136,7 @@ def test_convert_writes_a_data_set_that_can_be_checked(config: str, tmp_path: Pa
     assert main(["data", "convert", config, str(out), "data.camera=wrist_left", 'data.idle={"rule": "motion"}']) == 0
     printed = capsys.readouterr().out
     assert "writing episodes 8/8" in printed
-    assert f"8 episodes, 320 steps. Next: vjepa2-ac init {out}" in printed.replace("\n", "")
+    assert f"8 episodes, 320 steps. Next: vjepa2-ac init {out}" in " ".join(printed.split())
     keys = ["data.source=lerobot", f"data.path={out}", "data.lerobot.state=[observation.state]"]
     keys += ["data.lerobot.cameras={wrist_left: observation.images.wrist_left}", "data.camera=wrist_left"]
     assert main(["data", "check", config, *keys, "--limit", "4"]) == 0
@@ -167,7 +168,7 @@ def test_axes_are_fitted_written_and_drawn_and_a_model_that_knows_none_is_told(
     assert "Not to plan by: " in printed
     read = json.loads((out / "axes.json").read_text())
     assert read["pairs"] == 12
-    assert read["problem"] in printed.replace("\n", " ")
+    assert read["problem"] in " ".join(printed.split())
     assert read["model"]["subject"] == "builtin:sim-tiny"
     assert (out / "axes.png").stat().st_size > 1000
     capsys.readouterr()

@@ -48,7 +48,7 @@ def test_data_that_cannot_be_trained_on_give_a_config_all_the_same_and_status_2(
     assert main(["init", "data/my robot/v1.0", "--model", "builtin:sim-tiny"]) in {1, 2}
     told = capsys.readouterr()
     assert "episodes among 2" in told.out + told.err
-    assert "Mend this first, then: vjepa2-ac data check my-robot.yaml\n\nNext:" in told.out
+    assert "Fix these errors first, then: vjepa2-ac data check my-robot.yaml\n\nNext:" in told.out
     assert load_config(here / "my-robot.yaml").data.validation_share == 0.15
 
 
@@ -66,5 +66,5 @@ def test_the_released_model_is_to_be_fetched_first(capsys: pytest.CaptureFixture
     assert main(["init", "data/my robot/v1.0", "--out", "sub/a.yaml"]) == 0
     told = capsys.readouterr().out
     assert "vjepa2-ac download   # the model, once: 11.7 GB, about 16 minutes at 100 Mbit/s" in told
-    assert "# the real run, time not known before the trial: its time a step, times 200; the same" in told
+    assert "# the real run, 200 times the trial's step time; repeat to resume" in told
     assert load_config("sub/a.yaml").model.base == "checkpoints/vjepa2-ac-vitg.pt"

@@ -331,7 +331,7 @@ def test_success_that_is_not_known_of_all_is_left_out_with_a_note(
         convert_to_lerobot(config_of("x"), tmp_path / f"out{expected}", Noting())
         assert "is_episode_successful" not in info_of(tmp_path / f"out{expected}")["features"]
         assert len(notes) == 1
-    assert notes == ["Success is left out: it is not known for 1 of 3 episodes."]
+    assert notes == ["Success is left out: 1 of 3 episodes lack it."]
 
 
 def test_latents_and_names_with_a_slash_are_refused(tmp_path: Path) -> None:

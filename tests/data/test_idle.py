@@ -164,8 +164,8 @@ def test_an_episode_that_stands_still_all_the_time_has_no_clips(open_with: Any) 
     source = MemorySource([60, 60], states=lambda index: resting(60, [(1, 60)] if index else []))
     dataset = open_with(source, idle=MOTION)
     assert {episode for episode, _ in starts(dataset)} == {0}
-    assert str(dataset.removed[-1]).startswith("1 episodes, 70 steps, ")
-    with pytest.raises(InputError, match=r"none of 1 episodes is left \(left out: idle 1\)"):
+    assert str(dataset.removed[-1]).startswith("1 episode, 70 steps, ")
+    with pytest.raises(InputError, match=r"none of 1 episode is left \(left out: idle 1\)"):
         open_with(MemorySource([60], states=lambda _: resting(60, [(1, 60)])), idle=MOTION)
 
 

@@ -176,7 +176,7 @@ def test_the_command_writes_it_beside_the_run_and_says_how_to_plan(
     out = tmp_path / "prior"
     assert main(["prior", str(whole_run), "--steps", "3", "--out", str(out)]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "of doing nothing" in said
+    assert "relative to no motion" in said
     assert "planning.prior=" in said
     assert main(["prior", str(tmp_path)]) == 2
 

@@ -18,7 +18,7 @@ from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_met
 from vjepa2_ac.reports.paper import write_tables
 from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 
-PROBES = ProbeOptions(sensitivity_clips=4, samples=10, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
+PROBES = ProbeOptions(ranking_clips=4, samples=10, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
 
 
 def written(folder: Path, model: object, *, clips: int = 12, seed: int = 0, **changes: object) -> Path:
@@ -169,7 +169,7 @@ def test_a_run_that_was_not_evaluated_is_named_with_the_way_out(tmp_path: Path) 
     [
         ({"by_clip": {"persistence": 0.5, "models": {}}}, "by_clip.persistence"),
         ({"rows": [{"key": 1}]}, "metrics that cannot be used"),
-        ({"format": 99}, "format: Input should be 4"),
+        ({"format": 99}, "format: Input should be 5"),
     ],
 )
 def test_damaged_metrics_are_named(tmp_path: Path, changes: dict[str, object], words: str) -> None:
@@ -200,7 +200,7 @@ def test_the_cost_of_wrong_actions_follows_from_the_errors_in_the_file(tmp_path:
     assert metrics.of("cost_of_actions.shuffled").value == pytest.approx(shuffled / true - 1, rel=1e-5)
     assert metrics.of("gap_of_actions.shuffled").value == pytest.approx((shuffled - true) / persistence, rel=1e-5)
     assert metrics.of("one_step.zero").value == pytest.approx(np.mean(errors["zero"]) / persistence, rel=1e-5)
-    assert metrics.answer.uses_actions.share == metrics.of("cost_of_actions.shuffled").value
+    assert metrics.summary.uses_actions.value == metrics.of("cost_of_actions.shuffled").value
 
 
 def test_a_run_of_an_older_version_is_compared(tmp_path: Path) -> None:

@@ -370,7 +370,7 @@ def test_a_check_tries_the_place_and_leaves_nothing_there_or_here(
     stop_after(2, mirrored(make_config, tmp_path, "two"), reporter)
     before = bucket.names("bucket")
     train(config, reporter, check_only=True)
-    assert any(note.startswith("Going on from") for note in reporter.notes)
+    assert any(note.startswith("Resuming from") for note in reporter.notes)
     assert bucket.names("bucket") == before
     assert not Path(config.run_dir).exists()
 

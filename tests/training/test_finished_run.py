@@ -40,7 +40,7 @@ def content(folder: Path) -> dict[str, bytes]:
 def test_a_finished_run_is_left_as_it_is(make_config: MakeConfig, run: Path, reporter: SilentReporter) -> None:
     before = content(run)
     assert train(make_config(), reporter) == run
-    assert reporter.notes == ["Training is finished: all 6 steps are done (training.steps)."]
+    assert reporter.notes == ["Training is finished after 6 steps (training.steps)."]
     assert content(run) == before
     with pytest.raises(LoadedError):
         train(make_config(), reporter, check_only=True)

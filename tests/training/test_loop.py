@@ -259,7 +259,7 @@ def test_an_episode_may_be_left_out_within_a_run(make_config, reporter) -> None:
     assert not any("data has changed" in note for note in reporter.notes)
     train(make_config(training__steps=2, data__exclude=[broken]), reporter, check_only=True)
     reported = "\n".join(reporter.notes)
-    assert re.search("Going on from .*\nThe data has changed: [0-9]+ training clips instead of [0-9]+", reported)
+    assert re.search("Resuming from .*\nThe data has changed: [0-9]+ training clips instead of [0-9]+", reported)
 
 
 def test_a_run_whose_clock_jumps_to_and_fro_is_the_same_run(

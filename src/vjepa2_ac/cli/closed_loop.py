@@ -175,7 +175,7 @@ def _loaded(
 
     loaded = cli.load_planning_session(options)
     if watch is not None and watch.decoder is not None:
-        watch.decoder.require_fit(loaded.world_model, loaded.config.data.crop, subject=options.subject)
+        watch.decoder.require_fit(loaded.world_model, loaded.config.data, subject=options.subject)
         watch.decoder.to(loaded.world_model.device)
     steps = require_stride(loaded.config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
     how = SessionOptions(
@@ -311,14 +311,14 @@ def _in_their_world(options: argparse.Namespace, chosen: BenchmarkOptions, home:
 
 def _summary(benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> Summary:
     """Return the verdict of the closed loop, with the other verdicts that `evaluate` wrote for this checkpoint."""
-    from vjepa2_ac.evaluation.summary import ZERO_ACTION, Summary, not_measured
+    from vjepa2_ac.evaluation.summary import Summary, not_measured
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
     agent, trials = benchmark.agent, benchmark.trials
     how = _evaluate_command(options) or "`vjepa2-ac evaluate`"
     predicts, uses, ranks = (not_measured(name, how) for name in ("predicts", "uses actions", "ranks actions"))
     measured = f"{trials.task_name}, {trials.place}, {trials.model_steps} steps of {trials.seconds_per_step:.2f} s"
-    summary = Summary(agent.subject, measured, ZERO_ACTION, predicts, uses, ranks, benchmark.verdict)
+    summary = Summary(agent.subject, measured, predicts, uses, ranks, benchmark.verdict)
     if agent.checkpoint and (Path(agent.subject) / METRICS_FILE).is_file():
         evaluated = read_metrics(Path(agent.subject))
         if evaluated.about.checkpoint == agent.checkpoint:
@@ -378,7 +378,8 @@ def _agent(options: argparse.Namespace) -> Iterator[Agent]:
 
     if not cli.is_server(options.subject):
         decoder = cli.given_decoder(options)
-        yield agent_of_session(cli.load_planning_session(options), decoder)
+        session = cli.load_planning_session(options)
+        yield agent_of_session(session, decoder, in_our_world=options.world is None)
         return
     key = None if options.key_file is None else read_key(options.key_file)
     with PlanningClient(options.subject, key) as client:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError, shell_command
+from vjepa2_ac.errors import InputError, counted, shell_command
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
@@ -78,7 +78,8 @@ def _convert(options: argparse.Namespace) -> None:
 
     with cli.reporter() as reporter:
         episodes, steps = convert_to_lerobot(config.data, options.out, reporter)
-    cli.show(f"{episodes:,} episodes, {steps:,} steps. Next: {shell_command('init', options.out)}", files=[options.out])
+    written = f"{counted(episodes, 'episode')}, {counted(steps, 'step')}."
+    cli.show(f"{written} Next: {shell_command('init', options.out)}", files=[options.out])
 
 
 def _converter(options: argparse.Namespace) -> None:
@@ -201,8 +202,8 @@ def _inspect(options: argparse.Namespace) -> None:
 def _calibrate(options: argparse.Namespace) -> int:
     """Find how many control steps a model's step is, or its axes.
 
-    By its error over persistence at each stride. With --axes: how its axes lie to the robot's; status 1 where that
-    stays unknown.
+    By its error relative to persistence at each stride. With --axes: the rotation between its axes and the robot's;
+    status 1 where it cannot be measured.
     """
     config = cli.read_config(options.config, options.overrides, base=options.axes is None)
     if options.axes is not None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.cli.console.waiting import Work
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.storage.places import BUILTIN
 
 if TYPE_CHECKING:
@@ -81,7 +81,8 @@ def _explore(options: argparse.Namespace) -> int:
 
                 cli.show(files=[write_postcard(views, options.export, reporter.task("imagining", "futures"))])
                 return 0
-            about = f"{subject}, {len(explorer.episodes)} episodes; a step takes {views.step_seconds:.2f} s here"
+            episodes = counted(len(explorer.episodes), "episode")
+            about = f"{subject}, {episodes}; a step takes {views.step_seconds:.2f} s here"
         _serve(views, access, options, about)
     return 0
 

@@ -94,7 +94,8 @@ def command(commands: Commands, name: str, handler: Handler, example: str = "") 
     """
     text = inspect.getdoc(handler) or ""
     parser = commands.add_parser(name, help=text.partition("\n\n")[0], description=text)
-    parser.example, parser.epilog = example, "A default stands in brackets. Also: --plugin MODULE (docs/extending.md)."
+    parser.example = example
+    parser.epilog = "Defaults are shown in parentheses. Also: --plugin MODULE (docs/extending.md)."
     parser.set_defaults(handler=handler, parser=parser)
     add(parser, "--plugin MODULE", argparse.SUPPRESS, action="append", default=[])
     return parser

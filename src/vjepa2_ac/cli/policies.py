@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -120,24 +120,25 @@ def _score_chunks(options: argparse.Namespace, to_poses: Callable[[np.ndarray], 
     found = controller.score(read_image(options.start), state, changes)
     ranking = ranking_of_run(options.subject, session.checkpoint)
     blind = is_blind(ranking)
-    table = MetricsTable(f"Energy after {changes.shape[1]} model steps (now: {found.now:.4f})", ["chunk", "energy", ""])
+    title = f"Energy after {counted(changes.shape[1], 'model step')} (now: {found.now:.4f})"
+    table = MetricsTable(title, ["chunk", "energy", "relative to no motion"])
     for chunk in found.order.tolist():
         beside = found.energies[chunk] / found.doing_nothing - 1
         table.add_row(str(chunk), f"{found.energies[chunk]:.4f}", f"{beside:+.1%}")
-    table.add_row("doing nothing", f"{found.doing_nothing:.4f}", "")
+    table.add_row("no motion", f"{found.doing_nothing:.4f}", "+0.0%")
     notes = [f"Spread of the chunks: {found.spread:.1%} of the energy now."]
     if found.tied > 1:
-        notes.append(f"{found.tied} chunks share the lowest energy: the model sees no difference between them.")
+        notes.append(f"{found.tied} chunks share the lowest energy: the model does not distinguish them.")
     if ranking is None:
-        notes.append("Whether this model can tell actions apart is not known: `vjepa2-ac evaluate` measures it.")
+        notes.append("Action ranking of this model: not measured. `vjepa2-ac evaluate` measures it.")
     elif blind:
         notes.append(
-            f"No order: in validation {ranking.value:.0%} of other moves looked better than the true ones, where chance"
-            f" is {CHANCE:.0%}. These energies mean nothing."
+            f"These energies mean nothing: the action-ranking error in validation is {ranking.value:.0%}"
+            f" (0 % is best, chance {CHANCE:.0%})."
         )
     about = session.as_dict() | {"start": options.start, "chunks": str(options.chunks), "form": options.form}
     scores = found.as_dict(is_blind=blind) | {"energies": found.energies.tolist()}
-    scores["others_better"] = None if ranking is None else ranking.as_dict()
+    scores["action_ranking_error"] = None if ranking is None else ranking.as_dict()
     write_atomically(options.out, json_text(about | scores))
     cli.show(table, *notes, files=[options.out])
     return int(blind)
@@ -167,18 +168,17 @@ def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray]
             control_steps=options.control_steps,
             progress=reporter.task("scoring", "places"),
         )
-    title = f"Energy over that of doing nothing, at {found.places} places of {found.episodes} episodes"
+    title = f"Energy relative to no motion, {counted(found.places, 'frame')} of {counted(found.episodes, 'episode')}"
     table = MetricsTable(title, ["policy", "all chunks", "its best", "behind the one before"])
     for one in found.policies:
         table.add_row(one.name, str(one.mean), str(one.best), "" if one.behind is None else str(one.behind))
     table.add_row("demonstrated", str(found.demonstrated), "", "")
-    notes = [
-        f"Actions of other places look better than the true ones in {found.others_better:.0%} (chance {CHANCE:.0%})."
-    ]
+    share = f"{found.others_below_true:.0%} of the actions of other places"
+    notes = [f"{share} have a lower energy than the true ones (chance {CHANCE:.0%})."]
     if found.is_blind:
         notes.append("No order: the model cannot tell actions apart on these data, and these energies mean nothing.")
     if found.left_out:
-        notes.append(f"{found.left_out} places are left out: their episode ends before the goal.")
+        notes.append(f"Left out: {counted(found.left_out, 'frame')} whose episode ends before the goal.")
     about = session.as_dict() | {"policies": [str(file) for file in options.policies], "form": options.form}
     write_atomically(options.out, json_text(about | found.as_dict()))
     cli.show(table, *notes, files=[options.out])
@@ -232,14 +232,15 @@ def _monitor(options: argparse.Namespace) -> int:
                 options.threshold, Fingerprints.of(model), tokens=model.num_tokens, where="--threshold"
             )
         watched = list(watch_episodes(model, seen, wanted, reporter.task("watching", "episodes")))
-    note = f"An alarm is a surprise above {monitor.threshold:.4g}: of {len(monitor.scores)} held-out episodes of up to"
-    note += f" {monitor.steps} model steps. At most {monitor.false_alarms:.1%} of undisturbed ones have one."
+    of = f"{counted(len(monitor.scores), 'held-out episode')} of up to {counted(monitor.steps, 'model step')}"
+    note = f"An alarm is a surprise above {monitor.threshold:.4g}, calibrated on {of}. At most"
+    note += f" {monitor.false_alarms:.1%} of undisturbed episodes have an alarm."
     table = MetricsTable("Surprise, over the threshold", ["episode", "highest", "first alarm at control step"])
     alarms, most = 0, {one.name: one.scores(monitor.expected).max() for one in watched}
     for one in watched:
         first = one.first_alarm(monitor)
         alarms += first is not None
-        step = "" if first is None else str(one.steps[first])
+        step = "no alarm" if first is None else str(one.steps[first])
         table.add_row(one.name, f"{most[one.name] / monitor.threshold:.2f}", step)
     if watched:
         shown, crop = max(watched, key=lambda one: most[one.name]), session.config.data.crop
@@ -267,10 +268,10 @@ def _prior(options: argparse.Namespace) -> None:
     folder = options.out or Path(options.subject if run else config.run_dir) / "prior"
     with cli.reporter() as reporter:
         card = train_prior(config, folder, cli.record_of_options(PriorOptions, options), reporter)
+    text = "Error on held-out clips: not measured; it needs a test split."
     if found := card.held_out:
         true, others = (found[name]["value"] for name in ("true_goals", "goals_of_others"))
-        cli.show(
-            f"Its error on held-out clips is {true:.2f} of doing nothing; with goals of other clips {others:.2f}"
-            + (": it does not look at the goal." if others <= true else ".")
-        )
+        text = f"Error on held-out clips relative to no motion: {true:.2f}; with goals of other clips {others:.2f}."
+        text += " The prior ignores the goal." if others <= true else ""
+    cli.show(text)
     cli.show(f"The prior is in {folder}. Plan with it: {shlex.quote(f'planning.prior={folder}')} planning.samples=100")

@@ -113,7 +113,7 @@ def _init(options: argparse.Namespace) -> int:
     cli.show(*draft.costs, f"Written: {out}", *guessed)
     status = 0 if is_missing else _check(draft, out)
     if status:
-        cli.show(f"\nMend this first, then: {shell_command('data', 'check', out)}")
+        cli.show(f"\nFix these errors first, then: {shell_command('data', 'check', out)}")
     first = [(f"vjepa2-ac {_RECORD.format(path=path)}", "the data; half a minute on a core of its own")] * is_missing
     if not Path(model.path).exists() and (fetch := model.download):
         first.append((fetch[0], f"the model, once: {fetch[1]}"))
@@ -161,12 +161,12 @@ def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
     trial, steps = f"runs/{name}-trial", draft.config.training.steps
     short = (f"training.steps={_TRIAL_STEPS}", "validation.every=50", "checkpoint.every=50")
     of_trial = ", ".join(filter(None, (f"{_TRIAL_STEPS} steps", draft.time_of(_TRIAL_STEPS))))
-    of_run = draft.time_of(steps) or f"time not known before the trial: its time a step, times {steps:,}"
+    of_run = draft.time_of(steps) or f"{steps:,} times the trial's step time"
     return [
         (shell_command("train", out, "--check"), "everything that can fail, before the first step"),
         (shell_command("train", out, f"run_dir={trial}", *short), f"{of_trial}: does it learn, how long is a step?"),
         (shell_command("evaluate", trial), "against the base, on held-out episodes"),
-        (shell_command("train", out), f"the real run, {of_run}; the same command resumes it"),
+        (shell_command("train", out), f"the real run, {of_run}; repeat to resume"),
     ]
 
 
@@ -201,12 +201,12 @@ def _download(options: argparse.Namespace) -> None:
 
     It goes on where it stopped; its size is checked.
     """
-    from vjepa2_ac.cli.console.setup import published_notes, published_summary, published_table
+    from vjepa2_ac.cli.console.setup import PUBLISHED_NOTES, published_summary, published_table
     from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, download, find_published
     from vjepa2_ac.storage.places import literal
 
     if options.list:
-        cli.show(published_table(PUBLISHED), *published_notes())
+        cli.show(published_table(PUBLISHED), *PUBLISHED_NOTES)
         return
     known = find_published(options.name or OFFICIAL)
     path, url = options.to or Path("checkpoints") / known.file, options.url or known.url
@@ -219,14 +219,14 @@ def _download(options: argparse.Namespace) -> None:
 def _doctor(options: argparse.Namespace) -> int:
     """Say whether a run fits this GPU, or what this machine is.
 
-    The memory is estimated part by part, by a step on tensors without numbers: nothing is loaded. Exit status 0: it
+    The memory is estimated part by part, with a training step on fake tensors: no weights are loaded. Exit status 0: it
     fits, 1: it does not, 2: something cannot be used.
     """
     if options.report or options.config is None:
         from vjepa2_ac.cli.console.setup import report_lines
 
         for line in report_lines():
-            print(line)
+            cli.show(line)
         return 0
 
     from vjepa2_ac.config.loading import load_config
@@ -242,17 +242,13 @@ def _doctor(options: argparse.Namespace) -> int:
     from vjepa2_ac.training.cost.memory import USUAL_GPU, batch_bytes, estimate_memory, ways_to_fit
 
     sizes = base_sizes(config.model)
-    gpu, available = "a GPU of 24 GB (there is none here)", USUAL_GPU
+    gpu, available = None, USUAL_GPU
     if torch.cuda.is_available():
         device = torch.cuda.get_device_properties(torch.cuda.current_device())
         gpu, available = device.name, device.total_memory
     estimate = estimate_memory(config, sizes)
     needed = estimate.total(checkpointing=estimate.checkpointing)
-    cli.show(
-        f"PyTorch {torch.__version__}, CUDA {torch.version.cuda or 'not in this build'}",
-        *memory_lines(estimate),
-        verdict(needed, available, gpu, ways_to_fit(config, sizes, available)),
-    )
+    cli.show(verdict(needed, available, gpu, ways_to_fit(config, sizes, available)), *memory_lines(estimate))
     if unusual := config.adapter.out_of_line:
         cli.show(f"Warning: {unusual}.")
     try:
@@ -261,7 +257,7 @@ def _doctor(options: argparse.Namespace) -> int:
         cli.show(f"Warning: {error}")
     if not torch.cuda.is_available() and config.training.precision == "bf16" and (slow := slow_bf16()):
         cli.show(f"Without a GPU set training.precision=fp32 model.dtype=float32: in bfloat16 {slow}.")
-    cli.show(f"The data are looked at by: {shell_command('data', 'check', options.config, *options.overrides)}")
+    cli.show(f"To check the data: {shell_command('data', 'check', options.config, *options.overrides)}")
     return 0 if needed <= available else 1
 
 

@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError, shell_command
+from vjepa2_ac.errors import InputError, counted, shell_command
 from vjepa2_ac.process import is_first
 
 
@@ -79,7 +79,10 @@ def _train(options: argparse.Namespace) -> None:
     with TrainingConsole() as reporter:
         folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
     if is_first() and not options.check:
+        from vjepa2_ac.runs.loading import describe_selection
+
         cli.show(f"The run is in {folder}; see how good it is: {shell_command('evaluate', folder)}")
+        cli.show(describe_selection(folder))
 
 
 def _encode(options: argparse.Namespace) -> None:
@@ -106,7 +109,7 @@ def _encode(options: argparse.Namespace) -> None:
     if not encoded.is_finished:
         cli.show(f"This process has done its share; others are still at work on {encoded.folder}")
         return
-    episodes = f"{encoded.encoded:,} of {encoded.episodes:,} episodes"
+    episodes = f"{encoded.encoded:,} of {counted(encoded.episodes, 'episode')}"
     knobs = shlex.join(["data.source=latents", f"data.path={encoded.folder}"]) if options.out else "data.cache=auto"
     cli.show(
         *(f"left out: {name}: {reason}" for name, reason in encoded.broken.items()),
@@ -142,8 +145,7 @@ def _decoder(options: argparse.Namespace) -> None:
         cli.show("Everything is in place: data, model, folder and disk were checked; nothing was written.")
         return
     card = read_card(folder)
-    if card.held_out:
-        cli.show(held_out_table(card))
+    cli.show(held_out_table(card) if card.held_out else "Held-out frames: not measured; they need a test split.")
     cli.show(f"See what a model imagines: {shell_command('imagine', config.run_dir, '--decoder', folder)}")
 
 

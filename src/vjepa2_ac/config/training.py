@@ -140,9 +140,9 @@ class CheckpointConfig(Section):
     """Number of newest checkpoints that are kept."""
     keep_best: Annotated[Literal["ranking", "error", "off"], OFF, Affects.MEASURED] = "ranking"
     """By what the best checkpoint is selected; it is written and kept, and evaluated, exported and planned with unless
-    another is asked for. ranking: the fewest other moves that look better (`validation.ranking_clips`), and within half
-    a percent of them the lowest error; the base is a candidate, for a lower error may go with worse plans. error: the
-    rollout error over persistence at the last horizon. off: the newest counts."""
+    another is asked for. ranking: the lowest action-ranking error (`validation.ranking_clips`); among those within half
+    a percentage point, the lowest error; the base is a candidate, because a lower error may go with worse plans. error:
+    the rollout error over persistence at the last horizon. off: the newest counts."""
     remote: Place | None = None
     """Where the run is copied to during training: gs://bucket/folder, another URL of fsspec that can be written, or a
     folder. A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as here."""

@@ -150,6 +150,13 @@ class Coverage:
         return {"percentile": PERCENTILE, "changes": self.usual.tolist(), "narrow": self.narrow}
 
 
+def lines_of(coverage: Coverage | None) -> dict[str, str]:
+    """Return the results as text by name, the verdict last; a text that begins with "needs" was not measured."""
+    if coverage is None:
+        return {"coverage": "needs episodes with more consecutive steps than data.stride, found none"}
+    return {**coverage.lines, "coverage": coverage.verdict}
+
+
 def coverage_in(dataset: Dataset, *, episodes: int = 64) -> Coverage | None:
     """Return the coverage of actions by a sample of the episodes, read without frames; None: no step fits.
 

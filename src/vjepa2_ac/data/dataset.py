@@ -29,7 +29,7 @@ from vjepa2_ac.data.sources.indexed_source import open_source, spaces_of
 from vjepa2_ac.data.splits import held_out_by, members_of
 from vjepa2_ac.data.windows import Windows, clip_starts, drawn, require_stride, windows_of
 from vjepa2_ac.episode import POSE_WIDTHS, Batch, Clip, Episode, EpisodeSource, Progress, StepRanges, Widths
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import Spaces
 
 if TYPE_CHECKING:  # PyTorch is imported when clips are read
@@ -50,8 +50,8 @@ class Removed:
     windows: int | None  # clips; None while data.stride is auto
 
     def __str__(self) -> str:
-        clips = "" if self.windows is None else f", {self.windows:,} clips"
-        return f"{self.episodes:,} episodes, {self.steps:,} steps{clips}"
+        clips = "" if self.windows is None else f", {counted(self.windows, 'clip')}"
+        return f"{counted(self.episodes, 'episode')}, {counted(self.steps, 'step')}{clips}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +280,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     if not len(dataset.episodes):
         filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
         left_out = f" (left out: {filters})" if filters else ""
-        gone = f"none of {len(table) + len(table.problems)} episodes is left{left_out}"
+        gone = f"none of {counted(len(table) + len(table.problems), 'episode')} is left{left_out}"
         fix = "Look at data.exclude, data.outcome and data.idle" if filters else ""
         raise InputError(where=f"data.path: {config.path}", found=gone, fix=fix)
     logger.info("%s: %d episodes take part, %d steps of them", config.path, dataset.taking_part.sum(), kept.steps)

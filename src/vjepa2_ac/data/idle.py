@@ -15,7 +15,7 @@ from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, fingerprint_of, get_or_make, key_of
 from vjepa2_ac.data.selection import StepSelection, as_error, as_problem
 from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import POSE, rotation_angles
 from vjepa2_ac.storage.structured import read_json_object, shown
 
@@ -80,7 +80,7 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     listed = sum(name in lists for name in names)
     if not listed:
         first = next(iter(lists), "none at all")
-        found_there = f"none of the {len(table)} episodes; its first is {first}"
+        found_there = f"none of the {counted(len(table), 'episode')}; its first is {first}"
         needed = "the identities of the episodes" + (f", such as {names[0]}" if names else "")
         raise InputError(where=where, found=found_there, needed=needed, fix=another)
     found: list[Found] = []

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Int32, UInt64
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, NotATableError, identity_hash
 from vjepa2_ac.episode import StepRanges
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 logger = logging.getLogger(__name__)
@@ -294,7 +294,7 @@ def groups_of(
         from_source = split_by in table.labels
         reason = "the data set does not say it of" if from_source else "found nothing in the identities of"
         another = "choose another field" if from_source else "choose a pattern that fits every identity"
-        found = f"{reason} {len(lacking)} of {taking_part.sum()} episodes: {named(lacking)}"
+        found = f"{reason} {len(lacking)} of {counted(taking_part.sum(), 'episode')}: {named(lacking)}"
         fix = f"Leave these out with data.exclude, or {another}"
         raise InputError(where=f"data.split_by: {split_by}", found=found, fix=fix)
     hashes = {group: identity_hash(group) for group in groups if group}

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt64
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.index import EpisodeTable, Labels
+from vjepa2_ac.errors import counted
 
 SPLIT = "split"  # label of an episode: the name of its split in the data set
 
@@ -53,7 +54,7 @@ def describe_splits(table: EpisodeTable, config: DataConfig) -> str:
     if labels is None:
         return ""
     counts = np.bincount(labels.number[labels.number >= 0], minlength=len(labels.names)).tolist()
-    named = [f"{name} ({count:,} episodes)" for name, count in zip(labels.names, counts, strict=True)]
+    named = [f"{name} ({counted(count, 'episode')})" for name, count in zip(labels.names, counts, strict=True)]
     if not (held_out := held_out_by(table, config)):
         why = "data.splits is hash" if config.splits == "hash" else "no train beside val, validation or test"
         return f"drawn by hash from all of the data set's own, {', '.join(named)}: {why}"

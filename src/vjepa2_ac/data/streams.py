@@ -29,7 +29,7 @@ from torch.utils.data import Dataset as TorchDataset
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.episode import Batch
-from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.errors import UnreachableError, counted
 from vjepa2_ac.process import safe_imports, stop_request
 
 _T = TypeVar("_T")
@@ -277,7 +277,7 @@ def require_shared_memory(data: DataConfig, batch_bytes: float, processes: int =
     needed = processes * data.workers * data.prefetch * batch_bytes
     free = shutil.disk_usage(SHARED_MEMORY).free if SHARED_MEMORY.is_dir() else math.inf
     if needed > free:
-        text = f"{processes * data.workers} workers x {data.prefetch} batches of {_megabytes(batch_bytes)}"
+        text = f"{counted(processes * data.workers, 'worker')} x {data.prefetch} batches of {_megabytes(batch_bytes)}"
         text = f"{_megabytes(needed)}, for {text} in advance"
         raise UnreachableError(where=str(SHARED_MEMORY), found=f"{_megabytes(free)} free", needed=text, fix=_ROOM)
 

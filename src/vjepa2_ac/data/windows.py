@@ -19,7 +19,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import NAMED, StepSelection, named
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 
 logger = logging.getLogger(__name__)
 
@@ -101,16 +101,15 @@ def windows_of(
             `data.short_episodes` forbids short ones.
     """
     where, count = f"data.path: {config.path}", int(members.sum())
-    length = f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}"
+    length = f"{counted(config.clip_steps, 'step')} for a clip of {config.frames} frames at stride {config.stride}"
     short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
     short = short[np.argsort(table.id_rank[short])]
     names = tuple(table.identity(place) for place in short[: NAMED + 1].tolist())
     if len(short) and (config.short_episodes == "error" or len(short) == count):
         longest = int(short[np.argmax(table.num_steps[short])])
         found = f"{len(short)} of {count} {split} episodes are shorter than a clip; the longest of these,"
-        found += (
-            f" {table.identity(longest)}, has {table.num_steps[longest]} steps. Too short: {named(names, len(short))}"
-        )
+        found += f" {table.identity(longest)}, has {counted(table.num_steps[longest], 'step')}."
+        found += f" Too short: {named(names, len(short))}"
         skip = ", or set data.short_episodes: skip" if len(short) < count else ""
         raise InputError(where=where, found=found, needed=length, fix=f"Lower data.frames or data.stride{skip}")
     if len(short):

@@ -242,7 +242,6 @@ def _forecast(cache: LatentCache, left: Sequence[FramesToEncode], encoder: Encod
     cache.require_space(left)
     speed, frames = encoder.frames_per_second() * processes, frames_in(left)
     return (
-        f"A run would first encode {frames:,} of {cache.summary(())} as {cache.dataset.config.cache_dtype}, into"
-        f" {cache.folder}. At the {speed:.3g} frames/s of one chunk just timed that takes"
-        f" {timedelta(seconds=round(frames / speed))}"
+        f"A run would first encode {frames:,} of {cache.summary(left)}. At {speed:.3g} frames/s, measured on one chunk,"
+        f" this takes {timedelta(seconds=round(frames / speed))}. The cache is {cache.folder}"
     )

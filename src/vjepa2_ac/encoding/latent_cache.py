@@ -18,7 +18,7 @@ from vjepa2_ac.data.index import cache_folder, fingerprint_of
 from vjepa2_ac.data.sources.latents.cache_files import CACHE, EPISODES, KEPT, LatentFiles, bytes_per_frame, read_key
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, key_of_cache, require_own_folder
 from vjepa2_ac.encoding.pipeline import FramesToEncode
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.storage import free_bytes
 
 _GIGABYTE = 10**9
@@ -113,10 +113,9 @@ class LatentCache:
 
     def summary(self, left: Sequence[FramesToEncode]) -> str:
         """Return as text how large the whole is, and how much of it is left."""
-        frames = frames_in(self.wanted)
-        there = f"; {frames - frames_in(left):,} are there already, {frames_in(left):,} are left"
-        size = f"{frames:,} frames, {frames * self.bytes_per_frame / _GIGABYTE:.3g} GB"
-        return size + there if len(left) < len(self.wanted) else size
+        frames, num_left = frames_in(self.wanted), frames_in(left)
+        size = f"{counted(frames, 'frame')} ({frames * self.bytes_per_frame / _GIGABYTE:.3g} GB)"
+        return size if num_left == frames else f"{size}; {frames - num_left:,} cached, {num_left:,} to encode"
 
     def require_own(self) -> None:
         """Refuse a folder of another cache, or of other things.

@@ -23,7 +23,7 @@ from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.evaluation.evaluate_run import load_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
 from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, named_actions, read_actions
@@ -72,7 +72,7 @@ def imagine_image(
     _require_some(actions)
     model, config = session.world_model, session.config
     decoder = load_decoder(decoder_name)
-    decoder.require_fit(model, config.data.crop, subject=session.subject)
+    warnings = decoder.require_fit(model, config.data, subject=session.subject)
     decoder.to(model.device)
     space = measured_space(config.data, len(seen.state))
     _require_directions(space, where="--state")
@@ -99,6 +99,7 @@ def imagine_image(
         rollouts=tuple(Imagined("model", word, taken, imagined(taken)) for word, taken in chosen.items()),
         notes=(
             f"Times in the film suppose {_RATE_HZ:g} control steps in a second.",
+            *warnings,
             *worth_knowing(decoder.card, first, decoded_first),
         ),
     )
@@ -242,15 +243,15 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
         longest = int(lengths[dataset.episodes[members]].max(initial=0))
         if 0 < longest < clip:
             most = (longest - 1) // dataset.config.model_stride
-            found = f"{asked.steps} model steps, and the longest {asked.split} episode has {most}"
+            found = f"{counted(asked.steps, 'model step')}, and the longest {asked.split} episode has {most}"
             raise InputError(where="--steps", found=found, needed=f"{most} at most")
         windows = validation_windows(dataset, asked.split, clips=_SEARCHED)
         return max(windows, key=lambda window: _motion(dataset, *window))
     episode = _episode(dataset, asked.episode)
     start, last = asked.start or 0, int(lengths[episode]) - clip
     if not 0 <= start <= last:
-        needed = f"0 to {last}: a clip takes {clip} control steps" if last >= 0 else "a longer episode"
-        found, fix = f"{start}, in an episode of {lengths[episode]} steps", "Lower --steps or --start"
+        needed = f"0 to {last}: a clip takes {counted(clip, 'control step')}" if last >= 0 else "a longer episode"
+        found, fix = f"{start}, in an episode of {counted(lengths[episode], 'step')}", "Lower --steps or --start"
         raise InputError(where="--start", found=found, needed=needed, fix=fix)
     return episode, start
 
@@ -261,7 +262,7 @@ def _episode(dataset: Dataset, name: str) -> int:
     whole = table.find(name)
     found = [place for place in places if name in table.identity(place)] if whole is None else [whole]
     if len(found) != 1:
-        has, example = f"{len(found)} episodes with {name} in their name", table.identity((found or places)[0])
+        has, example = f"{counted(len(found), 'episode')} named *{name}*", table.identity((found or places)[0])
         raise InputError(where="--episode", found=has, needed=f"one such as {example}, or a part that only it has")
     return found[0]
 

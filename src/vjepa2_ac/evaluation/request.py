@@ -21,7 +21,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.data.windows import require_stride
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.settings import require_limits, with_taught_limits
 from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.folder import is_of_moved, is_run, read_run_config
@@ -56,10 +56,10 @@ SCORED = PlanningConfig(
 class ProbeOptions:
     """Options of the measurements beyond the errors; 0 clips: none."""
 
-    sensitivity_clips: int = 32
-    samples: int = 64  # other actions per clip, drawn in each of two ways
+    ranking_clips: int = 32
+    samples: int = 64  # alternative actions per move, drawn in each of two ways
     landscape_clips: int = 8
-    axis_clips: int = 32  # of the sensitivity's, from which axes are fitted; of poses in the base frame only
+    axis_clips: int = 32  # of those of the ranking, from which axes are fitted; of poses in the base frame only
     nodes: int = 9  # along each axis of a landscape
     reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
     examples: int = 4
@@ -129,7 +129,7 @@ def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
     if (processes := environment.get("WORLD_SIZE", "1")) != "1":
         needed = "one: only train, encode and evaluate share their work among processes"
         fix = "Start the command without torchrun or accelerate launch"
-        raise InputError(where="torchrun", found=f"{processes} processes", needed=needed, fix=fix)
+        raise InputError(where="torchrun", found=counted(int(processes), "process"), needed=needed, fix=fix)
 
 
 def _config_of(subject: str, asked: EvaluationOptions) -> Config:

@@ -102,7 +102,7 @@ class Explorer:
         Raises:
             InputError: Nobody knows which state follows from an action.
         """
-        self.world_model, self.contenders = subject.world_model, subject.contenders
+        self.world_model, self.contenders, self.notes = subject.world_model, subject.contenders, subject.notes
         self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
         if self.spaces.action.follows == "unknown":
             found = "commands of which nobody knows what they do to the state"

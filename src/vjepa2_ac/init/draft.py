@@ -13,6 +13,7 @@ from vjepa2_ac.config import Config, EncoderConfig, ModelConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.model import ModelSizes
+from vjepa2_ac.errors import counted
 from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.model.checkpoints.loading import base_sizes
@@ -69,7 +70,7 @@ class Machine:
     def about(self) -> str:
         """It in a line."""
         gpu = f"{self.gpu}, {self.room}" if self.gpu else "no GPU"
-        return f"{gpu}; {self.cores} cores; {self.free_bytes / GIGABYTE:.0f} GB of disk free"
+        return f"{gpu}; {counted(self.cores, 'core')}; {self.free_bytes / GIGABYTE:.0f} GB of disk free"
 
 
 def this_machine() -> Machine:
@@ -258,7 +259,7 @@ def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
         **{f"{split}_share": knob for split, knob in _shares(found).items() if split not in found.own_splits},
         **({"idle": found.idle} if found.idle and (found.usual_steps or _SHORT) >= _SHORT else {}),
         **({"cache": Knob("auto", why_cached)} if is_cached else {}),
-        "workers": Knob(workers, f"of {machine.cores} cores"),
+        "workers": Knob(workers, f"of {counted(machine.cores, 'core')}"),
     }
 
 
@@ -324,7 +325,7 @@ def _frames(found: FoundData, model: ModelChoice, stride: int) -> Knob:
     longest = 1 + (min(found.usual_steps // 2, found.short_steps) - 1) // stride
     frames = max(_LEAST_FRAMES, min(longest, frames))
     lengths = f"half of the episodes have {found.usual_steps} or more, one of ten at most {found.short_steps}"
-    return Knob(frames, f"a clip spans {(frames - 1) * stride + 1} steps; {lengths}")
+    return Knob(frames, f"a clip spans {counted((frames - 1) * stride + 1, 'step')}; {lengths}")
 
 
 def _shares(found: FoundData) -> dict[Split, Knob]:
@@ -334,7 +335,8 @@ def _shares(found: FoundData) -> dict[Split, Knob]:
         share = next(share for least, share in _SHARES if found.episodes > least or least == 0)
         count = max(1, round(share * found.episodes))
         enough = min(_MOST_TESTED, math.ceil(100 * (ENOUGH_EPISODES + 1) / found.episodes) / 100)
-        test_share, why = max(share, enough), f"about {count:,} of {found.episodes:,} episodes, drawn by a hash"
+        test_share = max(share, enough)
+        why = f"about {count:,} of {counted(found.episodes, 'episode')}, drawn by a hash"
     return {"validation": Knob(share, why), "test": Knob(test_share, "for `evaluate`; never seen in training")}
 
 

@@ -14,7 +14,7 @@ from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.data.files import EpisodeFiles
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled, list_by_template, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
-from vjepa2_ac.errors import UserError
+from vjepa2_ac.errors import UserError, counted
 from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
 from vjepa2_ac.init.poses import Column, Range, Samples, find_pose, measured_columns, vector_state
 from vjepa2_ac.storage.structured import json_object
@@ -65,7 +65,7 @@ def look_at_lerobot(path: str) -> FoundData:
         episodes=info.episodes,
         steps=info.frames,
         idle=idle_rule(has_velocities=velocity is not None) if pose else None,
-        about=(f"LeRobot {info.version}, {info.episodes:,} episodes at {info.fps:g} a second",)
+        about=(f"LeRobot {info.version}, {counted(info.episodes, 'episode')} at {info.fps:g} a second",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
     )
 

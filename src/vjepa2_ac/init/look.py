@@ -20,7 +20,7 @@ from vjepa2_ac.data.sources.lerobot.info import INFO
 from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
 from vjepa2_ac.data.splits import describe_splits, held_out_by
 from vjepa2_ac.episode import STATE_DIM, Progress
-from vjepa2_ac.errors import InputError, UserError, shell_command
+from vjepa2_ac.errors import InputError, UserError, counted, shell_command
 from vjepa2_ac.init.converters import way_by
 from vjepa2_ac.init.found import FoundData, Knob, idle_rule, pick_camera, plain
 from vjepa2_ac.init.lerobot import look_at_lerobot
@@ -61,7 +61,7 @@ def look_at_npz(path: str) -> FoundData:
         states="pose" if is_pose else "vector",
         episodes=len(files),
         idle=idle_rule(has_velocities="joint_velocities" in headers) if is_pose else None,
-        about=(f".npz, {len(files):,} episodes at {rate:g} a second, the first of {steps:,} steps",),
+        about=(f".npz, {counted(len(files), 'episode')} at {rate:g} a second, the first of {counted(steps, 'step')}",),
     )
 
 
@@ -75,6 +75,7 @@ def look_at_raw(path: str) -> FoundData:
     episodes = None if is_remote else len(find_episodes(path, _CONNECTIONS))
     if episodes == 0:
         raise InputError(where=path, found="no episode", needed="folders with trajectory.h5 and metadata_*.json")
+    size = "behind a URL" if episodes is None else counted(episodes, "episode")
     return FoundData(
         source="droid_raw",
         path=path,
@@ -82,7 +83,7 @@ def look_at_raw(path: str) -> FoundData:
         rate_hz=Knob(15.0, "DROID's"),
         episodes=episodes,
         idle={"rule": Knob("commands", "openpi's rule, on the commanded joint velocities")},
-        about=(f"raw DROID, {'behind a URL' if is_remote else f'{episodes:,} episodes'}, 15 steps a second",),
+        about=(f"raw DROID, {size}, 15 steps a second",),
     )
 
 

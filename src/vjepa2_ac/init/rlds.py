@@ -14,7 +14,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.episode import Record
 from vjepa2_ac.data.sources.rlds.shards import Shard, dataset_name, find_shards, open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Kind, span_at
-from vjepa2_ac.errors import InputError, MissingFileError, UserError
+from vjepa2_ac.errors import InputError, MissingFileError, UserError, counted
 from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
 from vjepa2_ac.init.poses import Column, Samples, find_pose, measured_columns, vector_state
 from vjepa2_ac.storage.structured import read_json_object
@@ -83,6 +83,7 @@ def look_at_rlds(path: str) -> FoundData:
     measured = measured_columns(columns)
     records = _sampled(shards, [*measured, *texts_of_episode])
     pose = _BRIDGE_POSE if is_bridge else find_pose(columns, _samples(records, measured), control_rate_hz=rate.value)
+    speed = f"{rate.value:g} steps a second{' (guessed)' * rate.is_guess}"
     return FoundData(
         source="rlds",
         path=path,
@@ -101,7 +102,7 @@ def look_at_rlds(path: str) -> FoundData:
         states="pose" if pose else "vector",
         episodes=episodes,
         idle=idle_rule(has_velocities=has_velocities) if pose else None,
-        about=(f"RLDS {name}, {episodes:,} episodes, {rate.value:g} steps a second{' (guessed)' * rate.is_guess}",)
+        about=(f"RLDS {name}, {counted(episodes, 'episode')}, {speed}",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
     )
 
@@ -115,7 +116,7 @@ def like_droid(path: str, episodes: int, title: str) -> FoundData:
         rate_hz=Knob(_DROID_RATE_HZ),
         episodes=episodes,
         idle={"rule": Knob("commands", "openpi's rule")},
-        about=(f"RLDS, {title}, {episodes:,} episodes, {_DROID_RATE_HZ:g} steps a second",),
+        about=(f"RLDS, {title}, {counted(episodes, 'episode')}, {_DROID_RATE_HZ:g} steps a second",),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.state_integration import apply_actions, states_along
 from vjepa2_ac.spaces import POSE, StateSpace
 
@@ -88,7 +88,7 @@ def changes_of_chunks(
         raise InputError(where="chunks", found=f"an array of the shape {found.shape}", needed=needed)
     if found.shape[1] < control_steps:
         needed = f"{control_steps} at least, which are one model step"
-        raise InputError(where="chunks", found=f"{found.shape[1]} control steps", needed=needed)
+        raise InputError(where="chunks", found=counted(found.shape[1], "control step"), needed=needed)
     now, given = torch.from_numpy(state), torch.from_numpy(found)
     if form == "deltas":
         targets = states_along(now, given, space)[:, 1:].numpy()

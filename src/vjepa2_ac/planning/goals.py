@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 
 from vjepa2_ac.config.planning import GoalsConfig
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.camera_check import require_contrast
 from vjepa2_ac.media.images import encode_png, read_image, require_image
 from vjepa2_ac.storage.files import folder_writer
@@ -137,7 +137,7 @@ class GoalProgress:
         now, is_last = energy(self.place), self.place == len(goals) - 1
         why = goal.why_reached(now, self.began)
         if not why and goal.at_most is not None and steps >= goal.at_most and not is_last:
-            why = f"its {goal.at_most} steps are over at energy {now:.4g}"
+            why = f"it ends after {counted(goal.at_most, 'step')}, at energy {now:.4g}"
             if self.began > 0 and math.isfinite(now):
                 why += f", {now / self.began:.0%} of {self.began:.4g}"
         if not why:

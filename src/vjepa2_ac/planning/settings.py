@@ -19,6 +19,7 @@ from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import CHANGES, MOVABLE, is_of_moved, is_run, read_run_config
 from vjepa2_ac.spaces import POSE, REACH_M, vector_states
+from vjepa2_ac.storage.places import NO_DATA
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
 logger = logging.getLogger(__name__)
@@ -53,7 +54,7 @@ def planning_settings(
         folder = Path(subject)
         its = with_taught_limits(read_run_config(folder, [*overrides, _ANY_TYPE]), folder)
     elif config is None:
-        plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
+        plain = {"run_dir": "none", "data": {"path": NO_DATA}, "model": {"base": subject, "dtype": dtype}}
         its = parse_config(plain, overrides, where="overrides")
     else:
         its = load_config(config, [*overrides, _ANY_TYPE])
@@ -158,8 +159,8 @@ def warn_beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
             name = f"planning.limits.{knob}"
             way_out = f"{name}=data stays within" if knob in {"xyz", "axes"} else f"lower {name}"
             found.append(
-                f"{name} leaves what {folder} was taught: {', '.join(beyond)}. In brackets: how far 99 % of its steps"
-                f" go. Beyond that the model guesses; {way_out}"
+                f"{name} exceeds the motions in the training data of {folder}: {', '.join(beyond)} (99th percentile of"
+                f" the data in parentheses). Predictions beyond it are unreliable; {way_out}"
             )
     for text in found:
         logger.warning(text)

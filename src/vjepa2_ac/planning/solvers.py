@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.search_space import SearchSpace
 
 _NARROWEST = 0.1  # of the usual standard deviation: a prior is not as sure as it says
@@ -37,7 +37,7 @@ class PlanStart:
             InputError: They have fewer model steps than a plan, or other numbers.
         """
         if samples.ndim != 3 or not len(samples) or samples.shape[1] < space.steps or samples.shape[2] != space.dim:
-            needed = f"one or more, of {space.steps} model steps or more and {space.dim} numbers"
+            needed = f"one or more, of {counted(space.steps, 'model step')} or more and {space.dim} numbers"
             raise InputError(where="samples of a policy", found=f"shape {tuple(samples.shape)}", needed=needed)
         steps = samples[:, : space.steps].float()
         decisions = reduce(

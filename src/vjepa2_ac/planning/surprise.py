@@ -11,7 +11,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.storage.structured import read_json_object, record_of
@@ -99,7 +99,7 @@ def conformal_threshold(scores: Float[Tensor, " episodes"], false_alarms: float)
     place = -int(-(count + 1) * (1.0 - false_alarms) // 1)
     if not 1 <= place <= count:
         needed = f"{int(-(-1 // false_alarms)) - 1} at least" if false_alarms > 0 else "a share above 0"
-        found = f"{count} held-out episodes for false alarms in {false_alarms:.1%}"
+        found = f"{counted(count, 'held-out episode')} for false alarms in {false_alarms:.1%}"
         fix = "Record more, raise data.test_share, or --false-alarms"
         raise InputError(where="--false-alarms", found=found, needed=needed, fix=fix)
     return float(torch.sort(scores).values[place - 1])

@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.errors import InputError, escaped
+from vjepa2_ac.errors import InputError, counted, escaped
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import merge_adapter, trainable_report
@@ -76,6 +76,7 @@ def export_run(
         raise InputError(where=str(folder), found=found, needed=needed, fix=fix)
     metrics = read_metrics(folder) if form == "hub" and (folder / METRICS_FILE).exists() else None
     run = load_run(folder, checkpoint, config)
+    run.warn_if_untrained()
     card = _card(run, folder, metrics) if form == "hub" else ""
     merge_adapter(run.world_model)  # also for the Hub: an adapter that makes it not finite is of no use
     require_finite(
@@ -131,7 +132,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         keep_trailing_newline=True,
     )
     code = lambda name: f"`{escaped(str(name)).replace('`', '_')}`"  # noqa: E731 - names are no markup in a span of code
-    environment.filters |= {"code": code, "count": _count, "ratio": _ratio}
+    environment.filters |= {"code": code, "count": counted, "ratio": _ratio}
     measured = None if metrics is None else _measured(metrics)
     front = ModelCardData(
         library_name="peft",
@@ -198,7 +199,3 @@ def _base_arguments(config: Config) -> str:
 
 def _ratio(row: Row | None) -> str:
     return "not measured" if row is None else str(row.estimate)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}{'s' * (number != 1)}"

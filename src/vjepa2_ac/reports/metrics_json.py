@@ -23,6 +23,19 @@ from vjepa2_ac.storage.structured import json_text
 
 METRICS_FILE = "metrics.json"
 FORMAT = 5  # incremented when a reader of the file would have to change
+_NEEDS = {  # parts of an evaluation: a word of the note that says why a part is missing, and what the part needs
+    "base": ("no base", "The comparison needs a base model; a model without one was evaluated."),
+    "spread": ("spread", "The spread is a variance over clips and needs two clips or more."),
+    "landscapes": ("energy landscapes", "They are measured by `vjepa2-ac evaluate --ranking-clips 32 --landscapes 8`."),
+    "planning": ("No plans", "Plans are measured by `vjepa2-ac evaluate --planning`; this takes a while."),
+    "examples": ("example clips", "They are drawn by `vjepa2-ac evaluate --examples 4`."),
+    "decoded": (
+        "decoded images",
+        "They need a decoder: train one with `vjepa2-ac decoder CONFIG`, then add `--decoder FOLDER`.",
+    ),
+    "training": ("metrics.jsonl", "They need `metrics.jsonl` of a run: this is a model, or the file is missing."),
+    "strides": ("strides", "Other strides are measured by `vjepa2-ac evaluate --calibrate`."),
+}
 
 
 @dataclass(frozen=True)
@@ -68,6 +81,17 @@ class Metrics:
         return next((row for row in self.rows if row.key == key and row.model == name), None)
 
 
+def not_measured(one: Evaluation) -> dict[str, str]:
+    """Return the parts of an evaluation that were not measured, with the reason of each."""
+    model = one.models[one.trained]
+    found = {**vars(one), **vars(model), **one.beside, "base": one.base, "spread": model.distribution}
+    return {
+        part: next((note for note in one.notes if word in note), needs)
+        for part, (word, needs) in _NEEDS.items()
+        if not found.get(part)
+    }
+
+
 def write_metrics(evaluation: Evaluation, path: Path) -> Path:
     """Write all metrics of an evaluation; the file is written atomically."""
     write_atomically(path, json_text(metrics_as_dict(evaluation)))
@@ -105,7 +129,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     about = {name: value for name, value in vars(one.about).items() if name != "space"}
     decoded, planning = one.decoded, {"three_steps_settings": SCORED}
     of_study = ("clips", "places", "demonstrated", "one_step_beyond", "three_steps_beyond", "settings")
-    of_model = ("role", "sensitivity", "ranking", "landscapes", "plans")  # what rows come from, but for errors
+    of_model = ("role", "ranking", "landscapes", "distribution", "plans")  # what rows come from, but for errors
     metrics = {
         "format": FORMAT,
         "summary": {**vars(summary), "sentence": summary.sentence},
@@ -124,6 +148,10 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "by_clip": {
             "persistence": one.errors.of("rollout", L1, "persistence"),
             "models": {name: model.errors.of("rollout") for name, model in one.models.items()},
+            "last_horizon": {
+                metric.name: {name: model.errors.of("rollout", metric)[:, -1] for name, model in one.models.items()}
+                for metric in one.metrics
+            },
             "one_step": {
                 name: {way: model.errors.of("teacher_forced", way=way).mean(1) for way in get_args(Way)}
                 for name, model in one.models.items()
@@ -138,6 +166,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "decoded": None if decoded is None else {"decoder": decoded.decoder, "notes": decoded.notes},
         **{name: found.as_dict() for name, found in one.beside.items()},
         "notes": one.notes,
+        "not_measured": not_measured(one),
     }
     plain: dict[str, Any] = to_jsonable_python(
         metrics, inf_nan_mode="null", fallback=lambda array: _rounded(array.tolist())

@@ -43,7 +43,7 @@ def rows_as_latex(rows: Sequence[Row]) -> str:
 
 
 def _tabular(columns: Sequence[str], tables: Iterable[RowTable]) -> str:
-    head = _line("", "by nothing or chance", *columns)
+    head = _line("", "persistence or chance", *columns)
     lines = [rf"\begin{{tabular}}{{l{'r' * (1 + len(columns))}}}", r"\toprule", head]
     for table in tables:
         title = table.title.translate(_ESCAPED)

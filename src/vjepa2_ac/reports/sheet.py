@@ -19,7 +19,7 @@ from vjepa2_ac.data.idle import runs_of
 from vjepa2_ac.data.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, Inspection, idle_runs, largest_change
 from vjepa2_ac.data.transforms import CropBox, crop_box
 from vjepa2_ac.episode import Progress, no_progress, short_names
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, written_figure
 
 _PLACES = 6000  # points of the map, at most
@@ -234,7 +234,7 @@ def _strip(part: Any, strip: Strip, control_rate_hz: float, fastest: float) -> N
     label.add_patch(Rectangle((0, 0), 0.03, 1, color=colour))
     label.text(0.08, 1.0, textwrap.fill(strip.name, 22, max_lines=5, placeholder="…"), va="top")
     label.text(0.08, 0.47, outcome, color=colour, size=9, weight="bold", va="top")
-    label.text(0.08, 0.37, f"{steps} steps, {steps / control_rate_hz:.1f} s", color=GREY, va="top")
+    label.text(0.08, 0.37, f"{counted(steps, 'step')}, {steps / control_rate_hz:.1f} s", color=GREY, va="top")
     film = grid[0, 1].subgridspec(1, len(strip.frames), wspace=0.03)
     for place, frame in enumerate(strip.frames):
         axes = part.add_subplot(film[place])

@@ -25,7 +25,7 @@ from pathlib import Path
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config
-from vjepa2_ac.errors import InputError, RefusedError, UnreachableError, UserError
+from vjepa2_ac.errors import InputError, RefusedError, UnreachableError, UserError, counted
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import (
     CHECKPOINTS,
@@ -234,7 +234,7 @@ def open_remote(
         return target
     if step is not None:
         return config
-    found = f"{place}: none of {len(further)} checkpoints is whole"
+    found = f"{place}: none of {counted(len(further), 'checkpoint')} is whole"
     fix = "To start the run anew, remove them, or set another checkpoint.remote"
     raise InputError(where=_KNOB, found=found, fix=fix)
 

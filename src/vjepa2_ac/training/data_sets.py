@@ -16,7 +16,7 @@ from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.selection import named
 from vjepa2_ac.data.splits import describe_splits
 from vjepa2_ac.episode import Batch
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.adapter.adapter_folder import read_card
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, Reporter
@@ -60,7 +60,7 @@ def _open_replay(replay: ReplayConfig, dataset: Dataset, reporter: Reporter) -> 
     places = np.flatnonzero(replayed.members("train") & np.isin(replayed.table.id_hash, hashes))
     if held_out := sorted(replayed.table.identity(int(place)) for place in places):
         reporter.note(
-            f"Warning: {len(held_out):,} episodes that the first data set holds out are replayed in training:"
+            f"Warning: {counted(len(held_out), 'episode')} that the first data set holds out are replayed in training:"
             f" {named(held_out)}. Add them to replay.data.exclude."
         )
     return replayed

@@ -28,7 +28,7 @@ from vjepa2_ac.distributed import (
     leave_processes,
     require_same,
 )
-from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.errors import UnreachableError, counted
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, newest_checkpoint, read_state
@@ -116,10 +116,10 @@ def _has_ended(opened: OpenRun, reporter: Reporter) -> bool:
 def _why_ended(config: Config, state: RunState) -> str:
     """Return why training ends at a step."""
     if state.step >= config.training.steps:
-        return f"Training is finished: all {config.training.steps:,} steps are done (training.steps)."
+        return f"Training is finished after {counted(config.training.steps, 'step')} (training.steps)."
     return (
         f"Training ends at step {state.step:,}: step {state.best_step:,} is the best, and"
-        f" {config.training.patience} validations after it were no better (training.patience)."
+        f" no better one followed in {counted(config.training.patience or 0, 'validation')} (training.patience)."
     )
 
 
@@ -176,7 +176,6 @@ def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, repor
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
     throughput = Throughput.of(run.config, run.world_model.sizes, device, processes)
-    reporter.note(str(throughput))
     reporter.started(run.state.step, training.steps)
     checkpoint, saved_s, saved_step = run.config.checkpoint, time.monotonic(), run.state.step
     every_s = math.inf if checkpoint.every_minutes is None else 60.0 * checkpoint.every_minutes

@@ -8,7 +8,9 @@ data_wait_share     share of the step's wall time spent waiting for the loader; 
 samples_per_second  clips, of all processes
 tokens_per_second   patch tokens of the frames of these clips
 mfu                 model FLOPs per second (`training.cost.flops`) over the ceiling: the rate of this device in a large
-                    matrix product in the run's precision, measured for a fraction of a second at the start
+                    matrix product in the run's precision, measured for a fraction of a second at the start. NaN (null)
+                    above 1: other programs used the device during that measurement, so the ceiling is not usable
+ceiling_tflops      this ceiling in 10^12 FLOPs per second, of all processes
 memory_gb           peak so far in 10^9 bytes: of PyTorch's allocator on CUDA, resident elsewhere
 """
 
@@ -40,7 +42,9 @@ from vjepa2_ac.training.cost.flops import clip_flops
 if TYPE_CHECKING:
     from vjepa2_ac.runs.trackers import Trackers
 
-MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "memory_gb"})
+MEASURED = frozenset(
+    {"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "ceiling_tflops", "memory_gb"}
+)
 """Metrics of the machine: they differ between identical runs."""
 
 _ERRORS = {
@@ -117,12 +121,12 @@ class Watch:
                 copying = "; copying the last frame would be better" if now > 1.0 > before else ""
                 text = f"the {name} is {now:.3f} of persistence's in the validation (before training {before:.3f})"
                 yield name + copying, text + copying
-        if _number(metrics, "action_rank_low") > _number(self._at_start, "action_rank_high"):  # intervals are apart
-            words = "predicts better and plans worse than the base" if better else "plans worse than the base"
-            rank, before = _number(metrics, "action_rank"), _number(self._at_start, "action_rank")
-            text = f"the model {words}: {rank:.1%} of other moves look better than the true one"
-            hint = "`vjepa2-ac data check` says how varied the motion of the data is"
-            yield "rank", f"{text} (before training {before:.1%}, chance 50 %). {hint}"
+        error = "action_ranking_error"
+        if _number(metrics, f"{error}_low") > _number(self._at_start, f"{error}_high"):  # intervals are apart
+            now, before = (100 * _number(row, error) for row in (metrics, self._at_start))
+            text = f"the action-ranking error is {now:.1f} % (before training {before:.1f} %, chance 50 %)"
+            text += ", although predictions are better than the base's" if better else ""
+            yield "rank", f"{text}. `vjepa2-ac data check` measures how diverse the motions of the data are"
 
     def _of_loss(self, loss: float) -> Iterator[tuple[str, str]]:
         if not math.isfinite(loss):  # a step without clips, or one that was refused
@@ -226,6 +230,7 @@ class Throughput:
             seconds: The step's wall time.
             waited_s: The part of it spent waiting for the loader.
         """
+        mfu = clips * self.flops_per_clip / seconds / self.ceiling
         if self.device.type == "cuda":
             peak_bytes = torch.cuda.max_memory_allocated(self.device)
         else:
@@ -234,15 +239,10 @@ class Throughput:
             "samples_per_second": clips / seconds,
             "tokens_per_second": clips * self.tokens_per_clip / seconds,
             "data_wait_share": min(1.0, waited_s / seconds),
-            "mfu": clips * self.flops_per_clip / seconds / self.ceiling,
+            "mfu": mfu if mfu <= 1.0 else math.nan,
+            "ceiling_tflops": self.ceiling / 1e12,
             "memory_gb": peak_bytes / 1e9,
         }
-
-    def __str__(self) -> str:
-        return (
-            f"A clip takes {self.flops_per_clip / 1e12:.3g} TFLOP; the ceiling for mfu is {self.ceiling / 1e12:.3g}"
-            f" TFLOP/s, measured on {self.device.type} now"
-        )
 
 
 class Update:

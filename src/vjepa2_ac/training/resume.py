@@ -16,7 +16,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.distributed import broadcast_object, broadcast_tensors, first_only, require_same
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import (
@@ -78,7 +78,7 @@ def restore(run: Run, reporter: Reporter) -> Run:
         dataset.broken.recall(before.broken)
         if (windows := len(dataset.windows("train"))) != before.windows:
             reporter.note(
-                f"The data has changed: {windows:,} training clips instead of {before.windows:,}."
+                f"The data has changed: {counted(windows, 'training clip')} instead of {before.windows:,}."
                 " From here on their order is another, and some may be seen twice in this epoch or not at all."
             )
     run.state = best_so_far(state, measured_on(run.config, run.dataset), reporter)
@@ -111,7 +111,7 @@ def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any]
     except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         fix = "Set back what was changed in the config; or delete this checkpoint, to use an older one"
         raise InputError(where=str(checkpoint), found=f"not the state of this run ({error})", fix=fix) from None
-    reporter.note(f"Going on from {checkpoint} ({state.step} of {run.config.training.steps} steps are done).")
+    reporter.note(f"Resuming from {checkpoint} (step {state.step:,} of {run.config.training.steps:,}).")
     return replace(state, run_id=state.run_id or run_id(run.folder)), moments
 
 
@@ -138,6 +138,7 @@ def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> 
         f"Validation measures something else than before (other: {', '.join(differing)}): the error"
         f" {state.best_error:.4g} of step {state.best_step}, the best so far, does not compare and no longer counts."
     )
+    state = replace(state, base_error=None, base_rank=None)
     return replace(state, best_step=None, best_error=None, best_rank=None, lowest_rank=None)
 
 
@@ -157,15 +158,15 @@ def micro_batches_of(config: Config, state: RunState, processes: int, reporter: 
         return asked
     micro_batches = state.clips_per_step // batch_size
     if micro_batches < processes:
-        found = f"{processes} processes, of which each computes {batch_size} clips at once"
-        needed = f"{micro_batches} at most, for the {state.clips_per_step} clips of a step of this run"
+        found = f"{counted(processes, 'process')}, of which each computes {counted(batch_size, 'clip')} at once"
+        needed = f"{micro_batches} at most, for the {counted(state.clips_per_step, 'clip')} of a step of this run"
         fix = "Start fewer; or set training.batch_size and training.accumulation to what each is to do, with"
         raise InputError(where="training.batch_size", found=found, needed=needed, fix=f"{fix} --allow-config-change")
     if micro_batches != asked:
         least, rest = divmod(micro_batches, processes)
         each = f"{least} or {least + 1}" if rest else f"{least}"
         reporter.note(
-            f"{processes} processes, before {state.processes}: {each} micro-batches of {batch_size} in each, so"
-            f" that a step has the same {state.clips_per_step} clips."
+            f"{counted(processes, 'process')}, before {state.processes}: {each} micro-batches of {batch_size} in each."
+            f" A step has {counted(state.clips_per_step, 'clip')}, as before."
         )
     return micro_batches

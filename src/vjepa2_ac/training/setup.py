@@ -168,7 +168,7 @@ def set_up(
     first_only(accelerator, lambda: require_same_base(config, world_model))
     extrinsics_for(world_model, clip)
     if decoder is not None:
-        decoder.require_fit(world_model, config.data.crop, subject=str(config.model.base or "the random model"))
+        decoder.require_fit(world_model, config.data, subject=str(config.model.base or "the random model"))
 
     _require_shared_memory(config, clip, world_model.sizes, accelerator)
     for replayed in others:

@@ -24,12 +24,12 @@ from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.setup import Run, encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
-RANK = "action_rank"  # checkpoint.keep_best ranking
+RANK = "action_ranking_error"  # checkpoint.keep_best ranking
 USED = 0.02  # share of error that wrong actions cost a model that uses them, at least
 _AT_ONCE = 64  # samples per batch: as many tokens as the clips of a small micro-batch
 _NOT_ASKED = (
-    "The base is not asked whether it is better than persistence: with fresh input heads it predicts little until they"
-    " are trained."
+    "Base against persistence: skipped; needs trained input heads, found fresh ones (the data have other widths than"
+    " the base)."
 )
 
 
@@ -51,9 +51,9 @@ def unused_actions(found: Validation) -> str:
     if cost >= USED:
         return ""
     return (
-        f"Warning: the actions of other clips raise the error by {cost:.1%} only (used: {USED:.0%} and more): the model"
-        " hardly uses them, and cannot plan. Look at the data's axes and stride (vjepa2-ac data check); from scratch,"
-        " docs/encoders.md says what else to try"
+        f"Warning: shuffled actions change the one-step error by {cost:+.1%} (expected: at least +{USED:.0%}). The"
+        " model ignores its actions and cannot be used for planning. Check the data's axes and stride (`vjepa2-ac data"
+        " check`); for training from scratch see docs/encoders.md"
     )
 
 

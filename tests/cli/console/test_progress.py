@@ -14,7 +14,7 @@ import vjepa2_ac
 from evaluation_results import ranking_of
 from vjepa2_ac.cli import main
 from vjepa2_ac.cli.console import progress as console_module
-from vjepa2_ac.cli.console import tables, training
+from vjepa2_ac.cli.console import tables
 from vjepa2_ac.cli.console.progress import ConsoleReporter, ProgressBar
 from vjepa2_ac.cli.console.training import TrainingConsole
 from vjepa2_ac.data.inspection.findings import Finding
@@ -31,8 +31,7 @@ def shown_on(monkeypatch: pytest.MonkeyPatch, *, terminal: bool) -> io.StringIO:
     shown = Console(
         file=written, force_terminal=terminal, width=140, highlight=False, soft_wrap=True, color_system=None
     )
-    for module in (console_module, training):
-        monkeypatch.setattr(module, "console", shown)
+    monkeypatch.setattr(console_module, "console", shown)
     return written
 
 
@@ -53,12 +52,43 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
     for step in (11, 12, 13, 14):
         now[0] += 4.5
         reporter.stepped(step, FIGURES)
-    validation, ranked, *lines = written.getvalue().splitlines()
-    assert validation.startswith("validation at step 10: one-step error/persistence 0.250")
-    assert ranked.startswith("  other moves that look better than the true one: 15.0% [")
-    words = "loss 0.5123  error/persistence 0.250  1.50 clips/s"
+    title, one_step, rollout, ranked, *lines = written.getvalue().splitlines()
+    assert title.startswith("validation at step 10, errors relative to persistence")
+    assert one_step == "  one-step error        0.250; with zero actions 1.000, with shuffled actions 1.000"
+    assert rollout == "  rollout error         0.500 after 1 model step, 0.500 after 3"
+    assert re.fullmatch(r"  action-ranking error  15 % \[\d+, \d+\] \(0 % is best, chance 50 %\)", ranked)
+    words = "loss 0.5123  one-step error 0.250 of persistence  1.50 clips/s"
     expected = [f"training 11/100  {words}  0:06:40 left", f"training 14/100  {words}  0:06:27 left"]
     assert lines == expected, "a line before 5 seconds, then one every 10"
+
+
+def test_a_validation_without_a_ranking_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = shown_on(monkeypatch, terminal=False)
+    TrainingConsole().validated(10, Validation(errors(), None))
+    assert "action-ranking error  not measured (needs validation.ranking_clips" in written.getvalue()
+
+
+COMMAND = "vjepa2-ac train my_robot.yaml run_dir=runs/trial training.steps=100 validation.every=50 checkpoint.every=50"
+LINES = {
+    "a sentence": "Warning: " + "shuffled actions change the error by 92 % only and " * 4,
+    "columns": "ok       coverage         " + "motions cover most of all directions " * 4,
+    "a command": f"  {COMMAND}   # {'100 steps and what they are for ' * 4}",
+    "a command at the end": f"{'The run is finished and evaluated. ' * 3}Next: {COMMAND}",
+    "a command in a sentence": f"{'Check axes and stride. ' * 3}`{COMMAND}` {'shows both of them ' * 4}",
+}
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_lines_have_at_most_100_columns_and_commands_stay_in_one_piece(name: str) -> None:
+    text = LINES[name]
+    lines = console_module.wrapped(text).splitlines()
+    assert len(lines) > 1
+    assert all(len(line) <= 100 or COMMAND in line for line in lines)
+    assert " ".join(" ".join(lines).split()) == " ".join(text.split()), "nothing is lost"
+    assert sum(COMMAND in line for line in lines) == text.count(COMMAND)
+    assert not any(line.lstrip().startswith("% ") for line in lines), "a number keeps its unit"
+    if name == "columns":
+        assert {len(line) - len(line.lstrip()) for line in lines[1:]} == {26}, "texts are in one column"
 
 
 @pytest.mark.parametrize(("share", "reported"), [(0.2, False), (0.35, True)])
@@ -126,7 +156,7 @@ def test_a_finding_has_its_colour_and_its_name_has_none(monkeypatch: pytest.Monk
     shown = console_module.PlainConsole(file=written, force_terminal=True, width=140, color_system="standard")
     monkeypatch.setattr(tables, "console", shown)
     tables.print_finding(Finding("error", "source", HOSTILE))
-    assert written.getvalue() == f"\x1b[31merror  \x1b[0m  source          {SHOWN}\n"
+    assert written.getvalue() == f"\x1b[31merror  \x1b[0m  source           {SHOWN}\n"
 
 
 def test_errors_warnings_and_words_on_the_command_line_are_shown_as_they_are(capsys) -> None:

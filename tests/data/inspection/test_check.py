@@ -95,7 +95,7 @@ def test_a_whole_set_is_looked_at_as_training_would(droid: Path) -> None:
 
 def test_an_empty_test_split_is_an_error_line_where_one_is_asked_for_as_training_refuses_it(droid: Path) -> None:
     in_one_group = {"split_by": "(episode|.)"}
-    for share, level in ((0.001, "error"), (0.0, "ok")):
+    for share, level in ((0.001, "error"), (0.0, "skipped")):
         findings = check_data(knobs(droid, test_share=share, validation_share=0.0, **in_one_group), clips=2)
         assert {finding.about: finding.level for finding in findings}["test"] == level
 

@@ -93,7 +93,7 @@ def test_what_belongs_together_gives_no_alarm(seed: int, space: StateSpace) -> N
             "half reversed",
             "warning",
             "agreement",
-            "6 of 12 episodes have frames that fit the states better in opposite",
+            "6 of 12 episodes fit better with the frames in opposite order",
         ),
         ("foreign", "warning", "agreement", "do not change when the robot moves"),
         ("stale poses", "warning", "stale poses", "while the frame changes"),

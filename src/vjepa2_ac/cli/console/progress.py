@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import timedelta
@@ -22,6 +24,24 @@ _FIRST_LINE_S, _LINE_EVERY_S = 4.0, 10.0
 _WIDE = 120  # columns that leave room for a long bar
 _BESIDE_A_CELL = 3  # a line and two spaces
 _WHOLE = 16  # characters: a longer word of a table, such as a path, may be divided
+_LONGEST_LINE = 100  # columns
+_COMMAND = r"(?<![\w/.-])(vjepa2-ac |(\S+ -m )?pip install )((?!   #).)*"
+_IN_ONE_PIECE = re.compile(rf"^ +|`[^`\n]*`|{_COMMAND}|(?<=\d) %", re.MULTILINE)
+_SPACE = "\ue000"  # stands for a space that is not broken
+
+
+def wrapped(text: str) -> str:
+    """Return a text in lines of at most 100 columns; a command, which may be pasted, stays on one line.
+
+    Further lines begin where the last column of the first one does: columns are two or more spaces apart.
+    """
+    width, lines = min(_LONGEST_LINE, console.width), []
+    for line in _IN_ONE_PIECE.sub(lambda found: found[0].replace(" ", _SPACE), text).split("\n"):
+        columns = re.match(r"(.{0,38} {2,})?", line.replace(_SPACE, " "))[0]  # type: ignore[index]  # always matches
+        indent = " " * (len(columns) if columns.strip() else len(columns) + 2)
+        style = textwrap.TextWrapper(width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+        lines += style.wrap(line) if len(line) > width else [line]
+    return "\n".join(lines).replace(_SPACE, " ")
 
 
 class PlainConsole(Console):
@@ -86,7 +106,7 @@ if not console.is_terminal:
 
 def show(*parts: str | Table, files: Iterable[str | Path] = ()) -> None:
     """Print texts and tables one below another, and the files that were written."""
-    for part in (*parts, *(f"  {file}" for file in files)):
+    for part in (*(wrapped(one) if isinstance(one, str) else one for one in parts), *(f"  {file}" for file in files)):
         console.print(part)
 
 
@@ -160,7 +180,7 @@ class ConsoleReporter(Reporter):
 
     def note(self, text: str) -> None:
         """Print a message."""
-        console.print(text)
+        console.print(wrapped(text))
 
     def task(self, title: str, unit: str = "") -> ProgressBar:
         """Begin another task; return its bar."""

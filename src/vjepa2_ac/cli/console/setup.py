@@ -16,16 +16,23 @@ from rich import box
 from rich.table import Table
 
 from vjepa2_ac import __version__
+from vjepa2_ac.errors import counted
 
 if TYPE_CHECKING:
     from vjepa2_ac.model.checkpoints.published import Published
     from vjepa2_ac.training.cost.memory import MemoryEstimate
 
 _MILLION, _GIGABYTE = 10**6, 10**9
+_LEAST_SHOWN = 500_000  # bytes: less would be shown as 0.000 GB
 _COLUMNS = ("holds", "family", "encoder", "pixels", "file", "licence", "encoder's key")
 UNTESTED = (
-    "Measured on tensors without numbers. On an H100 PyTorch's own peak was the same to 1 %; the CUDA context is"
-    " estimated."
+    "Estimated with fake tensors. On an H100 the estimate was within 1 % of the peak that PyTorch measured; the CUDA"
+    " allowance was not measured."
+)
+PUBLISHED_NOTES = (
+    "The column encoder has the number of parameters; pixels are the size of its images.",
+    "The licence is that of Meta's repository. Sizes with 'about' are estimates.",
+    "Meta publishes no hashes of these files: `download` checks their size.",
 )
 _INSTRUCTIONS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16", "asimd", "sve", "bf16")  # of products of matrices
 _SETTINGS = re.compile("(ACCELERATE|CUDA|GOMP|MKL|MUJOCO|NCCL|OMP|PYTORCH|TORCH|VJEPA2_AC)_.*|.*RANK|WORLD_SIZE")
@@ -34,24 +41,32 @@ _SETTINGS = re.compile("(ACCELERATE|CUDA|GOMP|MKL|MUJOCO|NCCL|OMP|PYTORCH|TORCH|
 def report_lines() -> Iterator[str]:
     """Yield what a bug report needs of this machine: versions, CPU, GPU, settings; no secret, no path.
 
-    What PyTorch sees comes last: importing it may be what fails.
+    PyTorch comes last, because its import may fail; the last line says what this machine can run.
     """
     root, about = Path(__file__).parents[4], Path("/proc/cpuinfo").read_text(encoding="utf-8")
     commit = _output(f"git -C {shlex.quote(str(root))} describe --always --dirty") if (root / ".git").exists() else ""
     yield f"vjepa2-ac {__version__} {commit}".rstrip()
     yield f"Python {platform.python_version()}, {platform.platform()}"
     name, has = re.search(r"model name\s*: (.*)", about), [one for one in _INSTRUCTIONS if one in about.split()]
-    yield f"CPU: {name[1] if name else platform.machine()}, {os.cpu_count()} cores, {' '.join(has)}"
+    yield f"CPU: {name[1] if name else platform.machine()}, {counted(os.cpu_count() or 1, 'core')}, {' '.join(has)}"
     asked = [line for line in requires("vjepa2-ac") or [] if not re.search("extra == .(data|dev|docs)", line)]
     yield f"Libraries: {', '.join(dict.fromkeys(_with_version(line) for line in asked))}"
     for key, value in sorted(os.environ.items()):
         if _SETTINGS.fullmatch(key):
             yield f"{key}={'(a path)' if '/' in value else value}"
-    yield f"GPU: {_output('nvidia-smi --query-gpu=name,memory.total,driver_version --format=csv,noheader') or 'none'}"
+    gpu = _output("nvidia-smi --query-gpu=name,memory.total,driver_version --format=csv,noheader")
+    yield f"GPU: {gpu or 'none'}"
 
     import torch
 
-    yield f"PyTorch: CUDA {torch.version.cuda}, sees {torch.cuda.device_count()} GPUs"
+    usable = counted(torch.cuda.device_count(), "usable GPU")
+    yield f"PyTorch: CUDA {torch.version.cuda or 'not in this build'}, {usable}"
+    if torch.cuda.is_available():
+        yield "A GPU is usable. Whether a run fits is not measured here: `vjepa2-ac doctor CONFIG` estimates it."
+    elif gpu:
+        yield "The GPU is not usable: install a PyTorch build whose CUDA version the driver supports."
+    else:
+        yield "CPU only: the demo runs here; fine-tuning the released model needs a GPU."
 
 
 def _output(command: str) -> str:
@@ -64,37 +79,37 @@ def _with_version(requirement: str) -> str:
     try:
         return f"{name} {version(name)}"
     except PackageNotFoundError:
-        return f"{name} (not here)"
+        return f"{name} (not installed)"
 
 
 def memory_lines(estimate: MemoryEstimate) -> list[str]:
-    """Return one line for every part, then both totals."""
+    """Return one line for every part of at least 0.001 GB, then both totals."""
     weights = estimate.parameters
-    lines = [f"  weights: encoder {weights.encoder:,}, predictor {weights.predictor:,}, trained {weights.trained:,}"]
-    lines += [f"  {name:<28}{size / _GIGABYTE:8.3f} GB  {about}" for name, size, about in estimate.parts]
+    counts = f"encoder {weights.encoder:,}, predictor {weights.predictor:,}, trained {weights.trained:,}"
+    lines = [f"Parameters: {counts}", "Estimated GPU memory, part by part (not all parts are needed at once):"]
+    parts = [part for part in estimate.parts if part[1] >= _LEAST_SHOWN]
+    lines += [f"  {name:<25}{size / _GIGABYTE:8.3f} GB  {about}" for name, size, about in parts]
     for checkpointing, word in ((False, "without"), (True, "with")):
         chosen = "  <- this config" if checkpointing == estimate.checkpointing else ""
         total = estimate.total(checkpointing=checkpointing) / _GIGABYTE
-        lines.append(f"  peak {word + ' checkpointing':<23}{total:8.3f} GB{chosen}")
+        lines.append(f"  peak {word + ' checkpointing':<20}{total:8.3f} GB{chosen}")
     return [*lines, UNTESTED]
 
 
-def verdict(needed: int, available: int, gpu: str, knobs: list[str] | None) -> str:
+def verdict(needed: int, available: int, gpu: str | None, knobs: list[str] | None) -> str:
     """Return whether the run fits, or what to change.
 
     Args:
         needed: Bytes at the peak.
         available: Bytes of the GPU.
-        gpu: Its name.
+        gpu: Its name; None: there is none on this machine.
         knobs: Changes that make it fit, or None if none do.
     """
-    room = f"{gpu}, {available / _GIGABYTE:.1f} GB"
-    if needed <= available:
-        return f"It fits on {room}, with {(available - needed) / _GIGABYTE:.1f} GB to spare."
-    short = f"It does not fit on {room}: {(needed - available) / _GIGABYTE:.1f} GB too much."
-    if knobs is None:
-        return f"{short} No knob makes it fit: it needs a larger GPU or a smaller model."
-    return f"{short} It would with {', '.join(knobs)}."
+    fits, size, room = needed <= available, f"{needed / _GIGABYTE:.1f} GB", f"{available / _GIGABYTE:.1f} GB"
+    text = f"{'Fits' if fits else 'Does not fit'}: the estimated peak is {size}; {gpu or 'a usual GPU'} has {room}."
+    if not fits:
+        text += f" It fits with {', '.join(knobs)}." if knobs else " It needs a larger GPU or a smaller model."
+    return text if gpu else f"{text}\nThis machine: not measured; it needs a GPU, PyTorch finds none."
 
 
 def published_table(published: Sequence[Published]) -> Table:
@@ -108,18 +123,6 @@ def published_table(published: Sequence[Published]) -> Table:
         pixels = str(one.image_size)
         table.add_row(one.name, one.holds, one.family, encoder, pixels, one.size, one.licence, one.key)
     return table
-
-
-def published_notes() -> list[str]:
-    """Return what the table does not say, a line each."""
-    encoders = (
-        "Beside an encoder: its parameters, and the key of its weights in the file; pixels are those of its images."
-    )
-    return [
-        encoders,
-        "The licence is that of Meta's repository. Sizes with 'about' are estimates.",
-        "Meta publishes no hashes of these files: what is checked is the size.",
-    ]
 
 
 def published_summary(one: Published, url: str) -> str:

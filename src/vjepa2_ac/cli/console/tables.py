@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.table import Table
-from rich.text import Text
 
-from vjepa2_ac.cli.console.progress import MetricsTable, console
+from vjepa2_ac.cli.console.progress import MetricsTable, console, wrapped
+from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import Row, sections
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE
@@ -39,7 +39,7 @@ def row_tables(rows: Sequence[Row], title: str) -> list[Table]:
     for columns, group in groupby(sections([row for row in rows if not row.detail]), lambda one: one.columns):
         shared = list(group)
         with_chance = any(chance for section in shared for _, chance, _ in section.lines)
-        head = ["", *(["by nothing or chance"] if with_chance else []), *columns]
+        head = ["", *(["persistence or chance"] if with_chance else []), *columns]
         table = MetricsTable("" if tables else f"{title} ({sure})", head)
         for section in shared:
             table.add_section()
@@ -57,7 +57,10 @@ def plan_table(answer: PlanResult) -> Table:
     if is_pose:
         turn = ["turn (degrees)"] * turns
         names = ["dx (cm)", "dy (cm)", "dz (cm)", *turn, "gripper", "then x, y, z (m)", "gripper"]
-    table = MetricsTable(f"Plan: {answer.decision.why}", ["step", *names], labelled=False)
+    why, steps = answer.decision.why, len(answer.actions)
+    has_plan = answer.decision.plan is not None and why != "no finite energy"
+    title = f"Plan of {steps} model step{'s' * (steps != 1)}" if has_plan else f"Zero action: {why}"
+    table = MetricsTable(title, ["step", *names], labelled=False)
     for step, (action, after) in enumerate(zip(answer.actions, answer.states[1:], strict=True), start=1):
         if is_pose:
             way = [f"{value * 100:+.2f}" for value in action[POSE.position]]
@@ -77,8 +80,8 @@ def goals_table(made: MadeGoals) -> Table:
     table = MetricsTable(f"Goals of {made.recording.name} (at least and at most: model steps)", columns)
     for place, (key, goal) in enumerate(zip(made.keys, made.goals, strict=True)):
         name = f"{place + 1} {goal.name}".strip()
-        row = [name, str(key.frame), str(goal.at_least), "" if goal.at_most is None else str(goal.at_most)]
-        row += ["" if goal.share is None else f"{goal.share:g}", goal.gripper or ""]
+        row = [name, str(key.frame), str(goal.at_least), "no limit" if goal.at_most is None else str(goal.at_most)]
+        row += ["not used" if goal.share is None else f"{goal.share:g}", goal.gripper or "default"]
         if made.course is not None:
             began, before = made.course.began[place], made.course.step_before[place]
             row += [f"{began:.4g}", f"{before:.4g}" + (f" ({before / began:.0%})" if began > 0 else "")]
@@ -111,8 +114,8 @@ def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
     """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
     trials = benchmark.trials
     table = MetricsTable(
-        f"{trials.task_name} in {trials.place}: {trials.episodes} problems of seed {trials.seed},"
-        f" {trials.model_steps} steps of {trials.seconds_per_step:.2f} s (95 % interval over episodes)",
+        f"{trials.task_name} in {trials.place}: {counted(trials.episodes, 'problem')} of seed {trials.seed},"
+        f" {counted(trials.model_steps, 'step')} of {trials.seconds_per_step:.2f} s (95 % interval over episodes)",
         ["", f"{trials.criterion} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
     )
     for result in benchmark.results:
@@ -134,9 +137,9 @@ def benchmark_notes(benchmark: ClosedLoopBenchmark) -> tuple[str, ...]:
         unusual = {why: number for why, number in result.why_counts.items() if why not in _USUAL}
         if unusual:
             counts = ", ".join(f"{why} {number}" for why, number in unusual.items())
-            notes.append(f"{result.policy}: of {result.seconds.size} decisions {counts}")
+            notes.append(f"{result.policy}: of {counted(result.seconds.size, 'decision')} {counts}")
         if result.unreachable.any():
-            notes.append(f"{result.policy}: {result.unreachable.sum()} commands led out of the arm's reach")
+            notes.append(f"{result.policy}: {counted(result.unreachable.sum(), 'command')} led out of the arm's reach")
     return tuple(notes)
 
 
@@ -144,7 +147,8 @@ def held_out_table(card: DecoderCard) -> Table:
     """Return a table of how well the decoder shows frames of held-out episodes, beside what needs no network."""
     held_out = card.held_out
     table = MetricsTable(
-        f"{held_out['frames']:,} frames of {held_out['episodes']:,} held-out episodes (95 % interval over episodes)",
+        f"{counted(held_out['frames'], 'frame')} of {counted(held_out['episodes'], 'held-out episode')}"
+        " (95 % interval over episodes)",
         ["", "PSNR, dB", "SSIM"],
     )
     for name, label in _DECODERS.items():
@@ -159,15 +163,17 @@ def _estimate(values: dict[str, float | None]) -> Estimate:
 
 def print_finding(finding: Finding) -> None:
     """Print one line of `data check`."""
-    level = Text(f"{finding.level:<7}", style=_COLOURS[finding.level])
-    console.print(level, console.render_str(f"{finding.about:<16}{finding.text}"), sep="  ")
+    text = console.render_str(wrapped(f"{finding.level:<7}  {finding.about:<15}  {finding.text}"))
+    text.stylize(_COLOURS[finding.level], 0, 7)
+    console.print(text)
 
 
 def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
     """Return the output of `data index`."""
-    lines = [f"{len(table):,} episodes, {int(table.num_steps.sum()):,} steps; opened in {seconds:.2f} s"]
+    steps = counted(int(table.num_steps.sum()), "step")
+    lines = [f"{counted(len(table), 'episode')}, {steps}; opened in {seconds:.2f} s"]
     if table.problems:
-        lines.append(f"{len(table.problems):,} broken episodes; the first: {table.problems[0].where}")
+        lines.append(f"{counted(len(table.problems), 'broken episode')}; the first: {table.problems[0].where}")
     for path in dict.fromkeys(watch.files):
         size = f"{path.stat().st_size / 1e6:.2f} MB" if path.is_file() else "could not be kept"
         lines.append(f"  {path}  {size}")
@@ -195,9 +201,9 @@ def variants_table(
     """Return the table of `data check --model` and of `data calibrate`: a row for each variant of the same clips."""
     table = MetricsTable(f"{title} (95 % interval over episodes)", ["variant", "error / persistence", *columns])
     for one in results:
-        moved = "" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
+        moved = "not measured" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
         cells = {
-            "difference": str(one.difference or ""),
+            "difference": str(one.difference or "reference"),
             "error": f"{one.error:.4f}",
             "persistence": f"{one.persistence:.4f}",
             "moves by": moved,

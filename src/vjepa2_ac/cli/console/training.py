@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from vjepa2_ac.cli.console.progress import ConsoleReporter, console
+from vjepa2_ac.cli.console.progress import ConsoleReporter, show
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, Validation
+from vjepa2_ac.evaluation.summary import interval_of, percent
 
 _MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
 
@@ -35,19 +36,18 @@ class TrainingConsole(ConsoleReporter):
         self._bar(step, self._steps, "  ".join(word for word in words if word))
 
     def validated(self, step: int, found: Validation) -> None:
-        """Print a line of the validation's metrics."""
+        """Print the validation's metrics; metrics.jsonl has them for every horizon."""
         errors = found.errors
         true, zero, shuffled = (one_step_over_persistence(errors, actions).value for actions in ACTIONS)
-        self._validation = f"error/persistence {true:.3f}"
-        horizons = "  ".join(f"{h}: {r.value:.3f}" for h, r in enumerate(over_persistence(errors, "rollout"), start=1))
-        console.print(
-            f"validation at step {step}: one-step error/persistence {true:.3f}"
-            f" (zero actions {zero:.3f}, shuffled {shuffled:.3f});"
-            f" rollout by horizon  {horizons}"
-        )
+        rollout = [one.value for one in over_persistence(errors, "rollout")]
+        self._validation = f"one-step error {true:.3f} of persistence"
+        rank = "not measured (needs validation.ranking_clips and clips in which the robot moves)"
         if found.ranking is not None:
-            ranking = found.ranking
-            console.print(
-                f"  other moves that look better than the true one: {ranking.rank:.1%} (chance 50 %), in a box"
-                f" {ranking.box.value:.1%}, in other directions {ranking.shell.value:.1%}"
-            )
+            measured = found.ranking.rank
+            rank = f"{percent(measured.value)} % {interval_of(measured)} (0 % is best, chance 50 %)"
+        show(
+            f"validation at step {step:,}, errors relative to persistence (1: copying the last frame)",
+            f"  one-step error        {true:.3f}; with zero actions {zero:.3f}, with shuffled actions {shuffled:.3f}",
+            f"  rollout error         {rollout[0]:.3f} after 1 model step, {rollout[-1]:.3f} after {len(rollout)}",
+            f"  action-ranking error  {rank}",
+        )

@@ -16,7 +16,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.sources.lerobot.info import INFO
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.episode import Episode
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.reporter import INDEXING, Reporter
 
 STATE, ACTION, SUCCESS, CAMERA = "observation.state", "action", "is_episode_successful", "observation.images."
@@ -48,7 +48,7 @@ def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> 
     episodes = np.flatnonzero(dataset.taking_part).tolist()
     is_known = dataset.table.success[episodes] >= 0
     if is_known.any() and not is_known.all():
-        reporter.note(f"Success is left out: it is not known for {(~is_known).sum()} of {len(episodes)} episodes.")
+        reporter.note(f"Success is left out: {(~is_known).sum()} of {counted(len(episodes), 'episode')} lack it.")
     progress, spaces = reporter.task("writing episodes"), dataset.spaces
     names = {STATE: spaces.state.names, ACTION: spaces.action.names}
     with (

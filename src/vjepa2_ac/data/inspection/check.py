@@ -15,17 +15,17 @@ from jaxtyping import Float
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import ENOUGH_DIRECTIONS, Coverage, coverage_in
+from vjepa2_ac.data.coverage import ENOUGH_DIRECTIONS, Coverage, coverage_in, lines_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.excerpts import check_excerpts
-from vjepa2_ac.data.inspection.findings import Finding, Level, counted, first_case
+from vjepa2_ac.data.inspection.findings import Finding, Level, first_case
 from vjepa2_ac.data.inspection.motion import check_motion, duplicates_finding
 from vjepa2_ac.data.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.sources.indexed_source import FramesByStep
 from vjepa2_ac.data.splits import describe_splits, held_out_by
 from vjepa2_ac.episode import Batch, Progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.media.video import is_same_rate
 from vjepa2_ac.spaces import POSE, POSES, Spaces, rotation_angles
@@ -58,9 +58,9 @@ def check_data(
     started = time.perf_counter()
     dataset = open_dataset(config, progress=progress)
     config, seconds = dataset.config, time.perf_counter() - started
-    steps = int(dataset.table.num_steps.sum())
+    size = f"{counted(len(dataset.table), 'episode')}, {counted(int(dataset.table.num_steps.sum()), 'step')}"
     yield Finding("ok", "source", f"{config.source} data at {config.path}, camera {', '.join(config.cameras)}")
-    yield Finding("ok", "index", f"{len(dataset.table):,} episodes, {steps:,} steps (opened in {seconds:.1f} s)")
+    yield Finding("ok", "index", f"{size} (opened in {seconds:.1f} s)")
     if config.stride == "auto":
         dataset = at_some_stride(dataset)
         yield Finding("ok", "stride", f"auto; this check uses the smallest candidate, {dataset.config.stride}")
@@ -68,8 +68,7 @@ def check_data(
     yield from _check_clips(dataset, seed=seed, batch_size=batch_size, clips=clips)
     yield from _check_video_rates(dataset)
     yield from check_motion(dataset)
-    if coverage := coverage_in(dataset):
-        yield from coverage_findings(coverage)
+    yield from coverage_findings(coverage_in(dataset))
     yield from check_excerpts(dataset)
 
 
@@ -90,7 +89,7 @@ def _check_selection(dataset: Dataset) -> Iterator[Finding]:
         except InputError as error:
             if split == "train":
                 raise
-            level: Level = "error" if share else "ok"  # training opens validation, and test if it has a share
+            level: Level = "error" if share else "skipped"  # training opens validation, and test if it has a share
             yield Finding(level, split, f"{shorten(error.found, _LONGEST, placeholder=' …')}. {error.fix}")
             continue
         short = f"; {counted(len(windows.short), 'episode')} shorter than a clip" if len(windows.short) else ""
@@ -121,7 +120,7 @@ def _check_test_split(dataset: Dataset) -> Iterator[Finding]:
             yield Finding("warning", "test", f"{text}. With data.test_share={percent / 100:g} the split has {test}")
             return
     whole = int((dataset.taking_part & is_long_enough).sum())
-    fix = f"No data.test_share of {whole} episodes leaves enough for training. Record more episodes"
+    fix = f"No data.test_share of {counted(whole, 'episode')} leaves enough for training. Record more episodes"
     yield Finding("warning", "test", f"{text}. {fix}")
 
 
@@ -150,12 +149,13 @@ def _check_clips(dataset: Dataset, *, seed: int, batch_size: int, clips: int) ->
         return
     yield from batch_findings(read, dataset.spaces)
     rate = sum(len(batch.starts) for batch in batches[1:]) / max(rest_s, 1e-9)
-    speed = f"the first batch of {batch_size} clips took {first_s:.2f} s, the next ones {rate:.1f} clips/s"
-    yield Finding("ok", "timing", f"{speed} with {dataset.config.workers} loader processes")
+    speed = f"the first batch of {counted(batch_size, 'clip')} took {first_s:.2f} s, the next ones {rate:.1f} clips/s"
+    yield Finding("ok", "timing", f"{speed} with {counted(dataset.config.workers, 'loader process')}")
     if storage.is_url(dataset.config.path):
         fetched = sum(batch.bytes_fetched for batch in batches)
         count = sum(len(batch.starts) for batch in read)
-        yield Finding("ok", "network", f"{fetched / count / 1e3:,.0f} kB fetched per clip (mean of {count} clips)")
+        text = f"{fetched / count / 1e3:,.0f} kB fetched per clip (mean of {counted(count, 'clip')})"
+        yield Finding("ok", "network", text)
 
 
 def batch_findings(batches: Sequence[Batch], spaces: Spaces = POSES) -> Iterator[Finding]:
@@ -256,7 +256,7 @@ def _pose_findings(
     yield first_case(
         "gripper",
         f"{closed.min():.2f} to {closed.max():.2f} (0 open, 1 closed)",
-        (np.ptp(closed) == 0, "warning", f"the gripper never moves in {clips} clips. Check that the state contains it"),
+        (np.ptp(closed) == 0, "warning", f"it never moves in {counted(clips, 'clip')}. Check that the state has it"),
         (closed.max() < _OPEN, "warning", "the gripper never closes. Check that it is 0 to 1, not a width in metres"),
     )
     moved = POSE.shown_size(actions)
@@ -274,10 +274,10 @@ def _percentiles(values: Float[np.ndarray, " pairs"], form: str) -> str:
     return ", ".join(f"{value:{form}} ({at} %)" for value, at in zip(numbers, PERCENTILES, strict=True))
 
 
-def coverage_findings(coverage: Coverage) -> Iterator[Finding]:
+def coverage_findings(coverage: Coverage | None) -> Iterator[Finding]:
     """Yield whether the motion is diverse enough to plan with."""
-    unless_narrow: Level = "ok" if coverage.is_known else "skipped"
-    is_low = coverage.is_known and coverage.metrics.get("directions", 1.0) < ENOUGH_DIRECTIONS
-    levels: dict[str, Level] = {"directions": "warning" if is_low else unless_narrow}
-    yield from (Finding(levels.get(name, "ok"), name, text) for name, text in coverage.lines.items())
-    yield Finding("warning" if coverage.narrow else unless_narrow, "coverage", coverage.verdict)
+    metrics, narrow = (coverage.metrics, coverage.narrow) if coverage else ({}, "")
+    is_low = {"directions": metrics.get("directions", 1.0) < ENOUGH_DIRECTIONS, "coverage": bool(narrow)}
+    for name, text in lines_of(coverage).items():
+        level: Level = "skipped" if text.startswith("needs") else "warning" if is_low.get(name) else "ok"
+        yield Finding(level, name, text)

@@ -25,6 +25,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.coverage import read_each, sample_of
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.inspection.findings import Finding, Level
+from vjepa2_ac.errors import counted
 from vjepa2_ac.spaces import POSE, StateSpace
 
 EPISODES, _EPISODES_AT_URL = 24, 12  # an episode of DROID is about 5 MB
@@ -241,7 +242,7 @@ def _agreement(
     fitting, reverse = own[:, best], turned[:, int(turned.mean(axis=0).argmax())]
     unshifted = own[:, lags.index(0)]
     limit, lag = chance + _SURE * foreign.std(ddof=1), lags[best]
-    measure = f"rank correlation of frame change and motion over {len(pairs)} episodes:"
+    measure = f"rank correlation of frame change and motion over {counted(len(pairs), 'episode')}:"
     text = f"{measure} {mean[best]:.2f}, with another episode's frames {chance:.2f}"
     if reverse.mean() > limit and _surely_above(reverse, fitting):
         text = f"{measure} {reverse.mean():.2f} with the frames reversed, {mean[best]:.2f} as recorded"
@@ -253,7 +254,7 @@ def _agreement(
             return Finding("warning", "agreement", f"frames do not change when the robot moves ({text}). {fix}")
         needed = "needs more episodes or more motion to decide whether frames and states belong together"
         return Finding("skipped", "agreement", f"{needed} ({text})")
-    steps = "1 step" if abs(lag) == 1 else f"{abs(lag)} steps"
+    steps = counted(abs(lag), "step")
     shift = f"{steps} {'late' if lag > 0 else 'early'}"
     is_more = mean[best] - unshifted.mean() > _GAIN * (mean[best] - chance)
     if abs(lag) >= min(2, stride) and is_more and _surely_above(fitting, unshifted):
@@ -264,7 +265,7 @@ def _agreement(
         return Finding(level, "agreement", f"{by}; {text}. {fix}")
     backwards = int((reverse - fitting > _BACKWARDS).sum())
     if backwards > _BACKWARDS * len(pairs):
-        text = f"{backwards} of {len(pairs)} episodes have frames that fit the states better in opposite order ({text})"
+        text = f"{backwards} of {counted(len(pairs), 'episode')} fit better with the frames in opposite order ({text})"
         return Finding("warning", "agreement", f"{text}. Check the order in time of both")
     text += f"; it is highest for frames that are {shift}" if lag else ""
     return Finding("ok", "agreement", f"frames change when the robot moves ({text})")

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from vjepa2_ac.errors import counted
+
 Level = Literal["ok", "warning", "error", "skipped"]
 
 
@@ -27,11 +29,6 @@ def first_case(about: str, text: str, *cases: tuple[bool, Level, str]) -> Findin
     """Return the finding of the first case that holds, with its level and explanation; `ok` if none holds."""
     level, words = next(((level, words) for holds, level, words in cases if holds), ("ok", ""))
     return Finding(level, about, f"{text}: {words}" if words else text)
-
-
-def counted(number: int, noun: str) -> str:
-    """Return a number with its noun: "1 episode", "1,200 episodes"."""
-    return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
 def findings_as_dict(findings: Sequence[Finding]) -> dict[str, Any]:

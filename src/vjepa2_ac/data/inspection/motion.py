@@ -15,11 +15,12 @@ from vjepa2_ac.data.coverage import PERCENTILE, ReadEpisode, find_duplicates, re
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import MEANS, SPANS
 from vjepa2_ac.data.inspection.excerpts import BLANK, is_still, num_excerpts, small_grey
-from vjepa2_ac.data.inspection.findings import Finding, Level, counted, first_case
+from vjepa2_ac.data.inspection.findings import Finding, Level, first_case
 from vjepa2_ac.data.poses import num_rotation_numbers
 from vjepa2_ac.data.rotation_formats import MIN_JUMPS, rotation_speeds, smoother_format
 from vjepa2_ac.data.selection import named
 from vjepa2_ac.data.sources.indexed_source import IndexedSource
+from vjepa2_ac.errors import counted
 from vjepa2_ac.spaces import POSE, step_sizes
 
 _EPISODES, _EPISODES_AT_URL = 200, 12
@@ -104,7 +105,7 @@ def scale_finding(dataset: Dataset) -> Finding:
     if change[0] < max(_SEPARATION * noise, np.log(_SCALE)) or np.linalg.norm(change[1:]) > _SAME_SHAPE:
         return Finding("ok", "scale", f"no group of episodes has positions at another scale ({compared})")
     example, factor = dataset.table.identity(int(members[len(near)])), np.exp(change[0])
-    text = f"{len(far):,} episodes, such as {example}, have positions and motions {factor:.2f} times as large"
+    text = f"{counted(len(far), 'episode')}, such as {example}, have positions and motions {factor:.2f} times as large"
     return Finding("warning", "scale", f"{text} as the other {len(near):,} ({compared}). Check the unit of both groups")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,11 +12,19 @@ from jaxtyping import Bool, Float
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import Coverage, Duplicates, ReadEpisode, coverage_by, find_duplicates, read_sample
+from vjepa2_ac.data.coverage import (
+    Coverage,
+    Duplicates,
+    ReadEpisode,
+    coverage_by,
+    find_duplicates,
+    lines_of,
+    read_sample,
+)
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import rotation_angles
 
 PERCENTILES = (10, 50, 90, 99)
@@ -140,11 +149,10 @@ class Inspection:
         hours, success, copies = values["hours"], values["success_share"], self.duplicates.copies
         lasting = f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
         lengths = " / ".join(map(str, values["length_percentiles_0_10_50_90_100"]))
-        splits = ", ".join(
-            f"{name} {one['windows']:,} clips in {one['episodes']:,} episodes" for name, one in values["splits"].items()
-        )
+        sizes = {name: (counted(one["windows"], "clip"), one["episodes"]) for name, one in values["splits"].items()}
+        splits = ", ".join(f"{name} {clips} in {counted(count, 'episode')}" for name, (clips, count) in sizes.items())
         removed = ", ".join(f"{one.name} {one}" for one in self.dataset.removed if one.episodes or one.steps)
-        known = f"of {values['success_known_of']:,} episodes of which it is known"
+        known = f"of {counted(values['success_known_of'], 'episode')} of which it is known"
         ranges = [f"{low:.2f} to {high:.2f}" for low, high in self.ranges]
         how = f", joined by {config.join_actions}" if config.join_actions else ""
         about_states = {
@@ -163,13 +171,13 @@ class Inspection:
             "steps": f"{values['steps']:,} at {values['control_rate_hz']:g} per second: {lasting}",
             "length": f"{lengths} steps (least, 10 %, median, 90 %, most)",
             "cameras": f"{', '.join(values['cameras'])}; used: {', '.join(values['camera'])}",
-            "success": "not known" if success is None else f"{success:.1%} {known}",
-            "left out": removed or "nothing",
+            "success": "not recorded" if success is None else f"{success:.1%} {known}",
+            "left out": removed or "no episodes and no steps",
             "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
             "duplicates": f"{self.duplicates}{'; inspect.json lists the copies' if copies else ''}",
-            "sample": f"{len(self.sample):,} episodes, for what follows",
+            "sample": f"{counted(len(self.sample), 'episode')}, for what follows",
             **about_states,
-            **({} if self.coverage is None else {**self.coverage.lines, "coverage": self.coverage.verdict}),
+            **{name: re.sub("^needs", "not measured: needs", text) for name, text in lines_of(self.coverage).items()},
         }
 
 

@@ -19,7 +19,7 @@ from vjepa2_ac.data.files import EpisodeFiles, connections_to, in_parallel
 from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, StatesSummary, labels_of, nul_error
 from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.episode import EpisodeInfo, EpisodeSource, Progress, Widths, no_progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import CAMERA_POSE, POSE, POSE_CHANGE, Spaces, StateSpace, vector_states
 
 logger = logging.getLogger(__name__)
@@ -212,4 +212,4 @@ def require_as_indexed(found: int, info: EpisodeInfo, where: str) -> None:
     """
     if found != info.num_steps:
         needed, fix = f"the {info.num_steps} that were indexed", "Do not change files while a run reads them"
-        raise InputError(where=where, found=f"{found} steps", needed=needed, fix=fix)
+        raise InputError(where=where, found=counted(found, "step"), needed=needed, fix=fix)

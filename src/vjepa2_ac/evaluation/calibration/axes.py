@@ -28,6 +28,7 @@ from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.distributed import make_accelerator, shared
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.action_use import RolloutStart, evaluate_actions, start_of
 from vjepa2_ac.evaluation.calibration.variants import load_named
 from vjepa2_ac.evaluation.measure import Predictor
@@ -101,7 +102,7 @@ class AxisFit:
             f"Turned by {yaw.value:+.1f} degrees about {place}{between}, what the robot does is predicted best:"
             f" squared error {self.error} of that without a turn. The fit of inferred moves has yaw"
             f" {self.fitted_yaw_degrees.value:+.1f}, gain {self.gain}, condition {self.condition}"
-            f" ({self.pairs} pairs of {self.episodes} episodes, off by {self.residual_cm.value:.1f} cm on average)."
+            f" ({self.pairs} pairs of {counted(self.episodes, 'episode')}, mean error {self.residual_cm.value:.1f} cm)."
         )
         return text if self.problem is None else f"{text} Not to plan by: {self.problem}."
 

@@ -18,13 +18,12 @@ from jaxtyping import Float
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.inspection.findings import counted
 from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Episode, Progress, no_progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.evaluation.calibration.variants import (
     Encode,
     ReadOnce,
@@ -218,7 +217,7 @@ def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarra
 
 
 def _steps(shift: int) -> str:
-    return "1 step" if abs(shift) == 1 else f"{abs(shift)} steps"
+    return counted(abs(shift), "step")
 
 
 def shifted(episode: Episode, *, late: int) -> Episode:

@@ -27,7 +27,7 @@ from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_same_encoder, require_widths
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, EpisodeSource, LatentBatch, Progress, StepRanges, no_progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.evaluation.measure import ONE_STEP, ClipSample, Predictor, measured
 from vjepa2_ac.evaluation.result import L1, Row
 from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
@@ -261,7 +261,7 @@ class Calibration:
             words += f"; {-difference.value:.3f} below stride {_by_ratio(self.results)[1]}"
             if difference.has_interval:
                 words += f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
-            words += "" if self.is_certain else f": not certain on {best.episodes} episodes, try more"
+            words += "" if self.is_certain else f": not certain on {counted(best.episodes, 'episode')}, try more"
         if best.ratio.value >= 1:
             return f"{words}. At no stride is the model better than doing nothing: does it fit this data at all?"
         return f"{words}."
@@ -407,5 +407,6 @@ def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[
     needed = min(_EPISODES_NEEDED, max(fitting.values()))
     for stride, episodes in fitting.items():
         if episodes < needed:
-            reasons[stride] = f"a clip of {views[stride].config.clip_steps} control steps fits into 1 episode only"
+            steps = counted(views[stride].config.clip_steps, "control step")
+            reasons[stride] = f"a clip of {steps} fits into 1 episode only"
     return [stride for stride in fitting if stride not in reasons], dict(sorted(reasons.items()))

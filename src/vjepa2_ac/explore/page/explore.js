@@ -316,8 +316,8 @@ function draw({ header, pictures }) {
   swap(part("large", truth), pictures.get("truth"));
   swap(part("small", truth), pictures.get("given"));
   truth.dataset.truth = header.truth ?? "";
-  part("empty", truth).textContent = "Nobody knows: the recording went another way.";
-  const how = { simulated: "simulated", recorded: "recorded" }[/** @type {string} */ (header.truth)] ?? "unknown";
+  part("empty", truth).textContent = "Not available: your actions differ from the recorded ones.";
+  const how = { simulated: "simulated", recorded: "recorded" }[/** @type {string} */ (header.truth)] ?? "not available";
   part("label", truth).textContent = `truth, ${how}`;
   part("about", truth).textContent = header.note || `the given frame, at control step ${header.start}`;
   swap(part("goal-picture"), pictures.get("goal"));
@@ -341,7 +341,7 @@ function sentence(header, text, verdicts) {
       `${one.id} error ${value(one.error)}${verdicts[number] && ` (${verdicts[number]})`}`,
   );
   const { name } = hello.episodes[header.episode];
-  const known = header.copying === null ? "what is true is unknown" : `${errors.join(", ")}, copying ${value(header.copying)}`;
+  const known = header.copying === null ? "ground truth not available" : `${errors.join(", ")}, copying ${value(header.copying)}`;
   say(header.actions.length ? `${text}: ${known}. ${header.note}` : `${name}, control step ${header.start}: the given frame.`);
 }
 
@@ -351,10 +351,10 @@ function hint(verdicts) {
   if (verdict) seen.add(verdict);
   const [does, fails] = [seen.has("understood"), seen.has("not understood")];
   const first = hello.is_pose ? "Press W, A, S, D …" : "Press + or − of a number:";
-  let text = `${first} what does the model think happens?`;
-  if (does && fails) text = "You have seen an action that it understands, and one that it does not. Where is the border?";
-  else if (does) text = "It understands that. Now find what it does not: the gripper (C), a turn (Q), a longer step, many steps.";
-  else if (seen.size) text = "Now find an action that it understands: other directions, longer steps, or the recorded one (N).";
+  let text = `${first} what does the model predict?`;
+  if (does && fails) text = "Try smaller and larger steps to find where the predictions break down.";
+  else if (does) text = "This action is predicted well. Try others: the gripper (C), a turn (Q), a longer step, many steps.";
+  else if (seen.size) text = "Find an action that is predicted well: other directions, longer steps, or the recorded one (N).";
   part("hint").textContent = text;
 }
 
@@ -486,7 +486,7 @@ function drawMaps(header, action) {
   part("maps").classList.remove("old");
   part("maps").replaceChildren(...header.maps.map((/** @type {any} */ one) => energyMap(one, action)));
   const lowest = Math.min(...header.maps.flatMap((/** @type {any} */ one) => one.energy.flat()));
-  part("maps-text").textContent = `Energy ${value(header.now)} if nothing is done, ${value(lowest)} at best (ringed). A click acts.`;
+  part("maps-text").textContent = `Energy ${value(header.now)} if nothing is done, ${value(lowest)} at best (ringed). Click a cell to execute its action.`;
   if (which >= 0) part("maps").children[which]?.querySelector(`[data-cell="${cell}"]`)?.focus();
 }
 
@@ -562,6 +562,8 @@ function setUp(header) {
   part("lost").hidden = true;
   const step = hello.step_seconds ? `, a step of imagination ${hello.step_seconds.toFixed(2)} s` : "";
   part("subject").textContent = `${hello.subject} on ${hello.device}${step}`;
+  part("notes").textContent = hello.notes.join(" ");
+  part("notes").hidden = !hello.notes.length;
   part("episode").replaceChildren(
     ...hello.episodes.map(({ name, full }, /** @type {number} */ value) => make("option", { value, title: full }, name)),
   );

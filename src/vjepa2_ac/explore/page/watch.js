@@ -92,7 +92,7 @@ function drawEnergies() {
   });
   part("energies").replaceChildren(...shapes);
   const now = past[past.length - 1]?.energy.now;
-  part("energies").setAttribute("aria-label", `Energy over ${past.length} decisions, now ${now === null ? "unknown" : now?.toFixed(3)}`);
+  part("energies").setAttribute("aria-label", `Energy over ${past.length} decisions, now ${now === null ? "not measured" : now?.toFixed(3)}`);
 }
 
 async function stop() {

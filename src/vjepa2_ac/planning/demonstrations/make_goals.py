@@ -22,7 +22,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.episode import FrameReader, Progress, no_progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.film import spread_with_ends
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import read_frames, read_header
@@ -150,7 +150,7 @@ def frame_of_episode(config: DataConfig, place: str) -> UInt8[np.ndarray, "heigh
     episode = dataset.source.read(number_of_episode(dataset, name))
     count = len(episode.states)
     if step and int(step) >= count:
-        found = f"an episode of {count} steps"
+        found = f"an episode of {counted(count, 'step')}"
         raise InputError(where=f"--goal-from {place}", found=found, needed="one of them, from 0")
     return np.asarray(episode.read_frames([int(step) if step else count - 1])[0])
 

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.transforms import Crop, crop_box, view
+from vjepa2_ac.errors import counted
 from vjepa2_ac.media.figure import BLUE, GREY, ORANGE, RED, headline, written_figure
 from vjepa2_ac.media.film import MEANING, Kind, show_framed
 from vjepa2_ac.planning.decision import PlanResult, summarize
@@ -212,9 +213,9 @@ def _caption(made: MadeGoals, place: int) -> str:
     if not place:
         return "the start, frame 0"
     goal, key = made.goals[place - 1], made.keys[place - 1]
-    steps = f"{goal.at_least} model steps or more"
+    steps = f"{counted(goal.at_least, 'model step')} or more"
     if goal.at_most is not None:
-        steps = f"{goal.at_least} to {goal.at_most} model steps"
+        steps = f"{goal.at_least} to {counted(goal.at_most, 'model step')}"
     lines = [f"goal {place}: {goal.name}" if goal.name else f"goal {place}", f"frame {key.frame}, {steps}"]
     lines.append(f"gripper {goal.gripper or 'as planning.limits say'}")
     if made.course is not None:

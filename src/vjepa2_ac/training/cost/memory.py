@@ -53,17 +53,17 @@ class MemoryEstimate:
 
     parameters: Parameters
     checkpointing: bool  # as the config requests
-    encoder_weights: int = _part("encoder, frozen", "in model.dtype; none where latents come from a cache")
-    predictor_weights: int = _part("predictor, frozen", "in model.dtype; none if all of it is trained")
-    trained: int = _part("trained", "float32")
+    encoder_weights: int = _part("encoder weights", "frozen, in model.dtype; none where latents are cached")
+    predictor_weights: int = _part("predictor weights", "frozen, in model.dtype; none with full fine-tuning")
+    trained: int = _part("trained weights", "float32")
     gradients: int = _part("gradients", "float32")
-    moments: int = _part("optimizer", "AdamW's two moments; adamw_8bit: in 8 bits where a tensor has 4,096 elements")
-    arriving: int = _part("next batch", "on its way while this one is computed; as if of the model's size")
+    moments: int = _part("optimizer state", "two moments of AdamW; 8 bits each with adamw_8bit")
+    arriving: int = _part("prefetched batch", "the next batch, at the model's resolution")
     latents: int = _part("latents", "of training.batch_size clips, float32")
-    encoding: int = _part("encoder, at work", "on model.encode_chunk frames at once; before the predictor")
+    encoding: int = _part("encoder activations", "of model.encode_chunk frames; before the predictor runs")
     step: StepBytes  # the predictor's
-    validating: int = _part("validation", "instead of all that: clips, keys and values of their rollout")
-    caching: int = _part("encoding the cache", "before all that: the encoder alone")
+    validating: int = _part("validation", "clips, keys and values; not during training steps")
+    caching: int = _part("encoding the cache", "the encoder alone, before training")
 
     @property
     def parts(self) -> Iterator[tuple[str, int, str]]:
@@ -72,10 +72,10 @@ class MemoryEstimate:
             if "part" in one.metadata:
                 name, about = one.metadata["part"]
                 yield name, getattr(self, one.name), about
-        yield "predictor, at work", self.step.stored, "forward, losses and backward, without checkpointing"
-        yield "the same, checkpointed", self.step.checkpointed, "inputs of blocks, and one block computed again"
-        yield "copies", self.step.casts, "of adapters in training.precision"
-        yield "CUDA, cuBLAS, holes", ALLOWANCE, "an allowance, not computed"
+        yield "predictor activations", self.step.stored, "forward, losses, backward; without checkpointing"
+        yield "the same, checkpointed", self.step.checkpointed, "block inputs, and one block recomputed"
+        yield "adapter copies", self.step.casts, "in training.precision"
+        yield "CUDA allowance", ALLOWANCE, "CUDA context, cuBLAS, fragmentation: assumed, not computed"
 
     @property
     def standing(self) -> int:

@@ -23,7 +23,7 @@ from vjepa2_ac.data.files import DEEPEST, in_parallel, list_folder
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key, key_of, summary_of
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Scanned, require_as_indexed
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
-from vjepa2_ac.errors import InputError, require_library
+from vjepa2_ac.errors import InputError, counted, require_library
 from vjepa2_ac.media.video import frame_times, read_frames, read_header
 from vjepa2_ac.spaces import POSE, zero_steps
 from vjepa2_ac.storage import FileInfo
@@ -182,7 +182,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         steps = len(found["pose"])
         for serial, count in place.frames.items():
             if abs(steps - count) > 1:
-                wrong, needed = f"{steps} steps, but {count} frames in {serial}.mp4", "a frame for every step"
+                wrong, needed = f"{counted(steps, 'step')}, but {count} frames in {serial}.mp4", "one for each step"
                 raise InputError(where=path, found=wrong, needed=f"{needed}; the last one may be missing", fix=_FIX)
         if self._config.pose_frame == "camera" and not found.keys() >= set(serials):
             needed, fix = "observation/camera_extrinsics of the camera", "Set data.pose_frame: base"
@@ -229,7 +229,7 @@ def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[st
         raise zero_steps(where)
     for name, values in found.items():
         if len(values) != steps:
-            raise InputError(where=f"{where}: {name}", found=f"{len(values)} of {steps} steps", fix=_FIX)
+            raise InputError(where=f"{where}: {name}", found=f"{len(values)} of {counted(steps, 'step')}", fix=_FIX)
     return found
 
 

@@ -18,7 +18,7 @@ from vjepa2_ac.data.sources.indexed_source import IndexedSource, measured_space
 from vjepa2_ac.data.sources.latents.cache_files import FIX, OPTIONAL, LatentFiles, read_key, read_tables
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, clip_parts
 from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import vector_states
 
 
@@ -102,7 +102,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         table, opened = self._open()
         numbers = np.unique(episodes).tolist()
         if missing := opened.files.episodes_without_file(numbers, self.cameras):
-            such = f"{len(missing)} of {len(numbers)} episodes, such as {table.identity(missing[0])}"
+            such = f"{len(missing)} of {counted(len(numbers), 'episode')}, such as {table.identity(missing[0])}"
             fix = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
             fix += " episodes out (data.outcome, data.exclude)"
             raise InputError(where=self._config.path, found=f"no latents of {such}", fix=fix)

@@ -13,7 +13,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.index import UNKNOWN, EpisodeTable, hash_of_bytes
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled
 from vjepa2_ac.data.sources.lerobot.parquet import read_table
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.video import VideoHeader
 from vjepa2_ac.spaces import zero_steps
 from vjepa2_ac.storage.block_file import BlockCachedFile
@@ -110,7 +110,7 @@ def read_episodes(
     numbers = {row.index for row in rows}
     if len(numbers) != len(rows) or len(rows) != info.episodes:
         where = storage.join(info.root, tables[0] if tables else "meta")
-        found = f"{len(rows)} episodes, of {len(numbers)} numbers"
+        found = f"{counted(len(rows), 'episode')}, of {len(numbers)} numbers"
         needed = f"{info.episodes} of as many numbers, says {info.where}"
         raise InputError(where=where, found=found, needed=needed, fix=_FIX_TABLES)
     return rows

@@ -31,7 +31,7 @@ from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, list_by_template, m
 from vjepa2_ac.data.sources.lerobot.parquet import EPISODE, Columns, ParquetRows
 from vjepa2_ac.data.splits import with_own_splits
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_image, stack_frames
 from vjepa2_ac.media.video import Clock, read_frames, read_header, video_library
 from vjepa2_ac.spaces import require_finite
@@ -202,7 +202,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         if images is None:
             all_images = read_all()
             if len(all_images) != row.length:
-                found, needed = f"{len(all_images)} images", f"one for each of {row.length} steps"
+                found, needed = f"{len(all_images)} images", f"one for each of {counted(row.length, 'step')}"
                 raise InputError(where=where, found=found, needed=needed)
             if int(self.infos().texts[_DATA_BYTES]) <= self._config.disk_cache.limit_gb * 1e9:
                 self._files.cache.write_parts(entry, all_images)

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.tfrecord import Kind, encode_example, write_record
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 
 CAMERAS = ("exterior_image_1_left", "exterior_image_2_left", "wrist_image_left")
 
@@ -94,7 +94,7 @@ def write_droid_rlds(
     with storage.folder_writer(folder, _INFO) as partial:
         counts, num_bytes, sizes = _write_shards(partial, episodes, shards)
         if min(counts) == 0:
-            found, needed = f"{sum(counts)} episodes", f"at least one for each of {shards} shards"
+            found, needed = counted(sum(counts), "episode"), f"at least one for each of {shards} shards"
             raise InputError(where=str(folder), found=found, needed=needed)
         texts = {
             _FEATURES: json.dumps(_features_json(sizes), indent=4, sort_keys=True),

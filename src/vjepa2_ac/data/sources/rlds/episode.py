@@ -39,7 +39,7 @@ from vjepa2_ac.data.sources.rlds.tfrecord import (
     span_at,
 )
 from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress
-from vjepa2_ac.errors import InputError, did_you_mean
+from vjepa2_ac.errors import InputError, counted, did_you_mean
 from vjepa2_ac.spaces import require_finite, zero_steps
 
 IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
@@ -242,7 +242,7 @@ def commands_of(
 def _of_every_step(record: Record, name: str, steps: int, where: str) -> Float[np.ndarray, "steps width"]:
     values = np.asarray(record.values(name, *_NUMBERS), np.float64)
     if len(values) == 0 or len(values) % steps:
-        found, needed = f"{len(values)} numbers", f"as many for each of {steps} steps"
+        found, needed = f"{len(values)} numbers", f"as many for each of {counted(steps, 'step')}"
         raise InputError(where=f"{where}: {name}", found=found, needed=needed)
     return values.reshape(steps, -1)
 

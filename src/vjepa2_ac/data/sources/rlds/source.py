@@ -30,7 +30,7 @@ from vjepa2_ac.data.sources.rlds.shards import NEEDED, Shard, find_shards, open_
 from vjepa2_ac.data.sources.rlds.tfrecord import NotAnExampleError, Place, Read, RecordSpan, item_places, require_intact
 from vjepa2_ac.data.splits import with_own_splits
 from vjepa2_ac.episode import Episode, Progress, StepRanges
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_images
 from vjepa2_ac.storage.remote import read_neighbours
 
@@ -247,6 +247,6 @@ def _places_of(read: Read, feature: Place, num_steps: int, where: str) -> list[P
         raise InputError(where=where, found=str(error), needed="a list of images") from None
     if len(places) != num_steps:
         found = f"{len(places)} images" if len(places) < num_steps else "more images"
-        needed = f"one for each of the {num_steps} steps"
+        needed = f"one for each of the {counted(num_steps, 'step')}"
         raise InputError(where=where, found=found, needed=needed)
     return places
