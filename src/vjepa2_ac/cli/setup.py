@@ -93,6 +93,7 @@ def _init(options: argparse.Namespace) -> int:
 
     if options.model is not None:
         (find_encoder_path if form == "scratch" else find_base)(options.model)
+    Work.begin("looking at the data")
     is_missing = path == _SIMULATED and not Path(path).exists()
     found = simulated(path) if is_missing else look_at(path, _LOOKED_AT_AS.get(form or "", form))
 
