@@ -111,13 +111,18 @@ def test_a_time_that_was_not_measured_is_not_claimed() -> None:
 
 
 def next_of_evaluate(
-    words: str, *, checkpoint: str = "step-00000008 (the newest)", needs: str = "", predicts: str = "yes"
+    words: str,
+    *,
+    checkpoint: str = "step-00000008 (the newest)",
+    needs: str = "",
+    predicts: str = "yes",
+    is_base: bool = False,
 ) -> list[str]:
     """Return the lines that `evaluate` prints for an evaluation of these words."""
     options, reporter = parse(["evaluate", *shlex.split(words)]), ConsoleReporter()
     reporter.seconds["action ranking, adapter"] = 2.0
     ranking = SimpleNamespace(ranks=np.zeros(10), samples=50)
-    about = SimpleNamespace(subject=options.subjects[0], checkpoint=checkpoint, data=__file__)
+    about = SimpleNamespace(subject=options.subjects[0], checkpoint=checkpoint, data=__file__, is_base=is_base)
     verdicts = {"predicts": SimpleNamespace(needs=needs, conclusion=predicts), "plans": None}
     summary = SimpleNamespace(**verdicts, uses_actions=SimpleNamespace(conclusion="yes"))
     adapter = SimpleNamespace(ranking=ranking)
@@ -148,6 +153,7 @@ def test_what_comes_before_planning_keeps_the_data(tmp_path: Path) -> None:
     assert next_of_evaluate(given, predicts="no") == [check], "a moved base cannot be named there"
     assert next_of_evaluate(f"runs/a --data '{other}' --out out", predicts="no") == [f"{check} --model runs/a"]
     assert next_of_evaluate("runs/a", predicts="no") == ["Next: vjepa2-ac data check runs/a/config.yaml --model runs/a"]
+    assert next_of_evaluate("runs/a", is_base=True) == next_of_evaluate("runs/a", predicts="no")
     expected = f"train '{other}' model.base=my.pt"
     assert next_of_evaluate(f"my.pt --data '{other}' --out out", checkpoint="") == [f"Next: vjepa2-ac {expected}"]
     assert parse(shlex.split(expected)).overrides == ["model.base=my.pt"]

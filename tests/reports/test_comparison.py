@@ -53,7 +53,12 @@ def of_runs(found: Comparison, **runs: tuple[float | None, float, int]) -> Compa
     measured, curves = {}, {}
     for name, (rank, error, step) in runs.items():
         ranks = replace(one.summary.ranks_actions, value=rank)
-        about = replace(one.about, checkpoint=f"step-{step:08d} (as asked for)", checkpoint_path=f"run/step-{step:08d}")
+        about = replace(
+            one.about,
+            checkpoint=f"step-{step:08d} (as asked for)",
+            checkpoint_path=f"run/step-{step:08d}",
+            is_base=not step,
+        )
         measured[name] = replace(one, summary=replace(one.summary, ranks_actions=ranks), about=about)
         curves[name] = (*curve[:-1], replace(curve[-1], value=error))
     rows = [row for row in found.rows if row.key == "gain_over_first"]

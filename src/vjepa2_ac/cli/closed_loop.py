@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.cli.console.waiting import begin_work
+from vjepa2_ac.cli.console.waiting import Work
 from vjepa2_ac.cli.next_command import next_simulation, option_words
 from vjepa2_ac.errors import InputError, shell_command
 
@@ -191,9 +191,9 @@ def _loaded(
     session = Session(controller, kept, how)
     about = metadata_of(loaded, session)
     told = about if options.metadata == "full" else roboarena_metadata(session)
-    begin_work("the first decision")
+    Work.begin("the first decision")
     cli.show(in_words(about, options.subject), f"a first decision took {warm_up(controller):.1f} s")
-    begin_work("")
+    Work.begin("")
     if options.record is not None:
         about = {**about, "overrides": options.overrides, "config": options.config, **loaded.as_dict()}
         session.recorder = Recorder(options.record, about, int(_GB * options.record_gb))
@@ -335,12 +335,13 @@ def _next(summary: Summary, benchmark: ClosedLoopBenchmark, options: argparse.Na
     if cli.is_server(options.subject):
         return [f"Next: your robot's client at {options.subject} (docs/serving.md)"]
     command = _evaluate_command(options)
-    if command and summary.predicts.value is not None:
-        command = shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
-        command *= not any(map(is_of_moved, options.overrides))
     if benchmark.verdict.conclusion == "yes" and (summary.predicts.value is not None or not command):
         words = option_words(options, "checkpoint", "config", "goals", "plugin")
         command = shell_command("serve", options.subject, *words, *options.overrides)
+    elif command and summary.predicts.value is not None:
+        if any(map(is_of_moved, options.overrides)):  # `data calibrate` needs the base in its place
+            return []
+        command = shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
     return [f"Next: {command}"] * bool(command)
 
 

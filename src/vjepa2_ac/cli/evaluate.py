@@ -135,7 +135,9 @@ def _next(measured: Evaluated, options: argparse.Namespace, reporter: ConsoleRep
     if not about.checkpoint:
         is_other = cli.read_config(config).model.base not in {None, about.subject}
         words = ["train", config, *[f"model.base={about.subject}"] * is_other]
-    elif not summary.predicts.needs and "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}:
+    elif not summary.predicts.needs and (
+        about.is_base or "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}
+    ):
         words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
     elif not summary.predicts.needs:
         if summary.plans is None and (lines := _next_closed_loop(measured, settings, options, reporter)):
@@ -163,8 +165,12 @@ def _next_closed_loop(
     except (OSError, UserError):
         return []
     domain = recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
-    if (ranking := evaluation.models[evaluation.trained].ranking) is not None:
-        seconds = reporter.seconds[f"action ranking, {evaluation.trained}"] * int(os.environ.get("WORLD_SIZE", "1"))
+    seconds, ranking = (
+        reporter.seconds.get(f"action ranking, {evaluation.trained}"),
+        evaluation.models[evaluation.trained].ranking,
+    )
+    if ranking is not None and seconds is not None:
+        seconds *= int(os.environ.get("WORLD_SIZE", "1"))
         prediction_s = seconds / (len(ranking.ranks) * (1 + 2 * ranking.samples))
     problems = BenchmarkOptions(task=recorded.task or "reach")
     words = ["--task", problems.task, "--domain", domain, *option_words(options, "checkpoint", "plugin"), *settings]

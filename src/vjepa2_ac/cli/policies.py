@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -273,4 +274,4 @@ def _prior(options: argparse.Namespace) -> None:
         text = f"Error on held-out clips relative to the zero action: {true:.2f}; with goals of other clips {others:.2f}."
         text += " The prior ignores the goal." if others <= true else ""
     cli.show(text)
-    cli.show(f"The prior is in {folder}. Plan with it: planning.prior={folder} planning.samples=100")
+    cli.show(f"The prior is in {folder}. Plan with it: {shlex.quote(f'planning.prior={folder}')} planning.samples=100")

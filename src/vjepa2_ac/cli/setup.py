@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.cli.console.waiting import begin_work
+from vjepa2_ac.cli.console.waiting import Work
 from vjepa2_ac.errors import InputError, UnreachableError, UserError, shell_command
 from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.places import BUILTIN
@@ -93,6 +93,7 @@ def _init(options: argparse.Namespace) -> int:
 
     if options.model is not None:
         (find_encoder_path if form == "scratch" else find_base)(options.model)
+    Work.begin("looking at the data")
     is_missing = path == _SIMULATED and not Path(path).exists()
     found = simulated(path) if is_missing else look_at(path, _LOOKED_AT_AS.get(form or "", form))
 
@@ -273,7 +274,7 @@ def _demo(_options: argparse.Namespace) -> int:
     from vjepa2_ac.simulation.world.domains import load_mujoco
 
     load_mujoco()
-    begin_work("")  # each command shows its own
+    Work.begin("")  # each command shows its own
     commands = [
         _RECORD.format(path=_SIMULATED),
         f"train {BUILTIN}demo",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import shlex
 from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
@@ -109,7 +110,7 @@ def _encode(options: argparse.Namespace) -> None:
         cli.show(f"This process has done its share; others are still at work on {encoded.folder}")
         return
     episodes = f"{encoded.encoded:,} of {counted(encoded.episodes, 'episode')}"
-    knobs = f"data.source=latents data.path={encoded.folder}" if options.out else "data.cache=auto"
+    knobs = shlex.join(["data.source=latents", f"data.path={encoded.folder}"]) if options.out else "data.cache=auto"
     cli.show(
         *(f"left out: {name}: {reason}" for name, reason in encoded.broken.items()),
         f"{episodes}, {encoded.frames:,} frames, {encoded.bytes / 1e9:.3g} GB are in {encoded.folder}",

@@ -44,13 +44,13 @@ class Comparison:
     def __str__(self) -> str:
         """Return the checkpoint and the metrics of each run in columns, and the difference of the errors."""
         first, key = next(iter(self.measured.values())), f"rollout.{L1.name}.gain_over_base.{len(self.seconds)}"
-        has_base = all(one.of(key) or _step(one) == 0 for one in self.measured.values())
+        has_base = all(one.of(key) or one.about.is_base for one in self.measured.values())
         reference = "base model" if has_base else "persistence"
         lines = [_LINE.format(*head).rstrip() for head in (_WHAT, ("run", "checkpoint", reference, *_OF_WHAT), _BETTER)]
         for name, one in self.measured.items():
             gain, step = one.of(key), _step(one)
             error = self.curves[name][-1].value - 1 if not has_base else -gain.value if gain else 0.0
-            checkpoint = "none" if step is None else f"{step:,}" if step else "base model"
+            checkpoint = "base model" if one.about.is_base else "none" if step is None else f"{step:,}"
             used, rank = _number(one.summary.uses_actions), _number(one.summary.ranks_actions)
             numbers = (_shown(error, "+.1f"), _shown(used, "+.1f"), _shown(rank, ".1f"))
             lines.append(_LINE.format(name if len(name) <= 22 else f"…{name[-21:]}", checkpoint, *numbers))

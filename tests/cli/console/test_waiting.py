@@ -7,7 +7,7 @@ import pytest
 
 from vjepa2_ac.cli.console import waiting
 from vjepa2_ac.cli.console.progress import ConsoleReporter
-from vjepa2_ac.cli.console.waiting import begin_work, watch_silence
+from vjepa2_ac.cli.console.waiting import Work, watch_silence
 
 
 class Clock:
@@ -55,9 +55,9 @@ def test_each_work_is_named_after_five_seconds_of_silence_and_then_more_rarely(m
             encoding(100, 100)
             reporter.task("measuring")(2, 2)
             assert clock.after(5.0) == ["work after measuring: 5 s so far"]
-        begin_work("")
+        Work.begin("")
         assert clock.after(1000.0) == []
-    begin_work("nobody watches")
+    Work.begin("nobody watches")
     assert clock.after(1000.0) == []
 
 

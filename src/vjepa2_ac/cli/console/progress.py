@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextCol
 from rich.table import Column, Table
 from rich.text import Text
 
-from vjepa2_ac.cli.console.waiting import begin_work, count_line
+from vjepa2_ac.cli.console.waiting import Work
 from vjepa2_ac.errors import printable
 from vjepa2_ac.reporter import Reporter
 
@@ -134,11 +134,11 @@ class ProgressBar:
             self._bar.update(self._bar.task_ids[0], completed=done, words=words, left=self._left(done, now))
         elif not console.is_terminal and (done == total or now >= self._next_line):
             self._next_line = now + _LINE_EVERY_S
-            count_line()
+            Work.lines += 1
             console.print("  ".join(filter(None, (f"{self.title} {done}/{total}", words, self._left(done, now)))))
         if done >= total:
             self.close()
-            begin_work(f"work after {self.title}")
+            Work.begin(f"work after {self.title}")
 
     def close(self) -> None:
         """Restore the terminal."""
@@ -186,7 +186,7 @@ class ConsoleReporter(Reporter):
         """Begin another task; return its bar."""
         self._end()
         self._bar = ProgressBar(title, unit)
-        begin_work(title)
+        Work.begin(title)
         return self._bar
 
     def _end(self) -> None:
