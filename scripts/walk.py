@@ -55,7 +55,7 @@ FEW_STEPS = (
     " data.workers=0 training.batch_size=2"
     " training.accumulation=1 training.warmup_steps=0 training.allow_weak_base=true"
 )
-FEW_CLIPS = "--clips 4 --sensitivity-clips 2 --samples 8 --examples 1 --landscapes 1 --nodes 3 --axes 2"
+FEW_CLIPS = "--clips 4 --ranking-clips 2 --samples 8 --examples 1 --landscapes 1 --nodes 3 --axes 2"
 FEW_SAMPLES = "planning.samples=16 planning.iterations=1"
 SHORTER = {  # by the first words of a command
     "train": FEW_STEPS,

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from jaxtyping import install_import_hook
 
 import missing
+import shape_checks
 
-# Where arrays change shape, each call is checked while testing. In the other rooms it would double the suite's time
-# for what mypy proves already.
+# Where arrays change shape, each call with arrays is checked while testing. In the other packages it would double the
+# suite's time for what mypy proves already.
 CHECKED = [
     "vjepa2_ac.spaces",
     "vjepa2_ac.media.images",
@@ -25,7 +25,7 @@ CHECKED = [
 ]
 ABSENT = missing.absent(os.environ)
 if missing.SHAPES not in ABSENT:
-    _hook = install_import_hook(CHECKED, "beartype.beartype")
+    shape_checks.install(CHECKED, "beartype.beartype")
 if missing.is_installed("hypothesis"):
     from hypothesis import HealthCheck, settings
 
@@ -52,8 +52,11 @@ from simulated import clone, simulated  # noqa: E402, F401
 
 # Begun first, each by a process of its own: whoever comes to them last would work alone in the end.
 LONGEST = (
-    "test_notebook.py", "test_quickstart.py", "test_end_to_end.py", "test_memory.py", "test_page.py", "test_step.py",
-    "test_fake_gpu.py", "test_benchmark.py", "test_real_client.py", "test_site.py", "test_wheel.py",
+    "test_notebook.py", "test_quickstart.py", "test_step.py", "test_benchmark.py", "test_counterfactual.py",
+    "test_page.py", "test_memory.py", "test_end_to_end.py", "test_loop.py", "test_evaluate_run.py", "test_export.py",
+    "test_real_client.py", "test_encoder_file.py", "test_pairs_of_options.py", "test_compiled_planning.py",
+    "test_docs_troubleshooting.py", "test_sweeps.py", "test_signals.py", "test_fake_gpu.py", "test_site.py",
+    "test_wheel.py",
 )  # fmt: skip
 
 
@@ -108,6 +111,14 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _without_fsync() -> Iterator[None]:
+    """No test waits for a disk: what `fsync` protects from, the loss of power, happens in none."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _ordinary_scheduling() -> Iterator[None]:
     """No test leaves this process before all others (as SVT-AV1 does, as root): what it starts would starve them."""
@@ -117,20 +128,31 @@ def _ordinary_scheduling() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _undrawn() -> Iterator[Callable[..., None]]:
-    """Figures are composed, and stay empty but where `drawn` is asked for: drawing is half of an evaluation's time."""
+def _undrawn() -> Iterator[Callable[[pytest.MonkeyPatch], None]]:
+    """Figures are composed, strips with one column, and stay empty where `drawn` is not used.
+
+    Drawing is half of an evaluation's time.
+    """
     from matplotlib.figure import Figure
 
-    draw = Figure.draw
-    Figure.draw = lambda *_: None  # type: ignore[method-assign]
-    yield draw
-    Figure.draw = draw  # type: ignore[method-assign]
+    from vjepa2_ac.media import film
+
+    draw, columns = Figure.draw, film._MOST_COLUMNS
+
+    def draw_all(patch: pytest.MonkeyPatch) -> None:
+        patch.setattr(Figure, "draw", draw)
+        patch.setattr(film, "_MOST_COLUMNS", columns)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "draw", lambda *_: None)
+        patch.setattr(film, "_MOST_COLUMNS", 1)
+        yield draw_all
 
 
 @pytest.fixture
-def drawn(_undrawn: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+def drawn(_undrawn: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures have content."""
-    monkeypatch.setattr("matplotlib.figure.Figure.draw", _undrawn)
+    _undrawn(monkeypatch)
 
 
 @pytest.fixture(scope="session")

@@ -83,7 +83,7 @@ ORDERS: dict[str, list[str]] = {
     "reports": ["metrics_json", "comparison paper", "figures", "write imagined sheet", "export"],
     "cli": [
         "console",
-        "options",
+        "options next_command",
         "completion train",
         "data",
         "evaluate explore plan policies closed_loop setup",

@@ -56,7 +56,7 @@ def test_the_command_runs_and_writes_what_the_page_lists(
     words = shlex.split(shown)
     assert words[0] == "vjepa2-ac"
     assert main([*words[1:], "--out", str(tmp_path), "--nodes", "3"]) == 0
-    assert "planned" in capsys.readouterr().out
+    assert "Plan of 1 model step" in capsys.readouterr().out
     table = REFERENCE.split("## plan.json")[1].split("##")[0]
     named = set(re.findall(r"`([a-z_]+)`", "\n".join(row.split("|")[1] for row in table.splitlines() if "|" in row)))
     file = json.loads((tmp_path / "plan.json").read_text())

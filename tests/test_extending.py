@@ -213,7 +213,7 @@ def test_a_form_of_data_is_found_trained_on_and_measured_by_a_metric(at_home: Pa
     few += ["training.allow_weak_base=true", "validation.clips=2", "validation.ranking_clips=1"]
     trained = command("train", "own.yaml", *few, *plugin)
     assert trained.returncode == 0, trained.stderr
-    less = ["--clips", "2", "--sensitivity-clips", "0"]
+    less = ["--clips", "2", "--ranking-clips", "0"]
     measured = command("evaluate", "run", *plugin, *less)
     assert measured.returncode == 0, measured.stderr
     keys = {row["key"] for row in json.loads((at_home / "run/metrics.json").read_text())["rows"]}

@@ -69,7 +69,7 @@ def test_it_runs_as_it_is(tmp_path: Path) -> None:
         "builtin:sim-tiny on cpu",
         "of persistence",
         "Validation at step 40",
-        "lower than the base",
+        "lower than with the base model",
     ):
         assert words in printed, words
     apart, still = printed.split("On average ")[-1].split(" cm apart; not moving at all would be ")

@@ -39,6 +39,23 @@ def test_work_goes_on_when_its_reader_leaves(start: Start, tmp_path: Path) -> No
     assert (tmp_path / "done").read_text() == "", "a reader who left lost nothing"
 
 
+def test_a_silent_command_prints_on_stderr_what_it_does_and_ends_at_once(start: Start) -> None:
+    code = """
+    import time
+    from vjepa2_ac.cli.console import waiting
+    waiting._SILENT_S, waiting._CHECK_S = (0.1,), 0.01
+    with waiting.watch_silence():
+        print("{}")
+        time.sleep(0.4)
+    began = time.monotonic()
+sys.exit(time.monotonic() - began > 0.1)
+"""
+    ended = start(code, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    out, err = ended.communicate(timeout=60)
+    assert (ended.returncode, out) == (0, b"{}\n")
+    assert err.startswith(b"loading libraries and model: ")
+
+
 def command(*arguments: str, **streams: object) -> subprocess.CompletedProcess:
     code = f"import sys; from vjepa2_ac.cli import main; sys.exit(main({list(arguments)}))"
     return subprocess.run([sys.executable, "-c", code], check=False, timeout=120, stderr=subprocess.PIPE, **streams)

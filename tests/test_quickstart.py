@@ -41,7 +41,7 @@ def test_from_data_to_a_number_and_a_plan(
     walked = {" ".join(words) for words in commands_of(3)}
     for line in re.findall(r"^  (vjepa2-ac .*?)   #", told, re.M):
         assert line in walked, "init prints the page's commands"
-    assert "lower than the base's" in printed["vjepa2-ac evaluate runs/my_robot"]
+    assert "lower than with the base model" in printed["vjepa2-ac evaluate runs/my_robot"]
     for made in ("my_robot.yaml", "inspection", "runs/my_robot/report.html", "runs/my_robot/metrics.json", "merged"):
         assert (tmp_path / made).exists(), made
 

@@ -20,7 +20,7 @@ from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state, select_chec
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training import loop
 
-FEW = ["--clips=4", "--sensitivity-clips=2", "--samples=8", "--examples=1", "--landscapes=1", "--nodes=3", "--axes=2"]
+FEW = ["--clips=4", "--ranking-clips=2", "--samples=8", "--examples=1", "--landscapes=1", "--nodes=3", "--axes=2"]
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 
@@ -79,7 +79,7 @@ def test_a_sweep_that_is_stopped_goes_on_with_the_trial_that_was_open(
     for run, trial in zip(runs, done, strict=True):
         selected = step_of(select_checkpoint(run).path.name)
         rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] == "validation"]
-        assert trial.value == next(row["action_rank"] for row in rows if row["step"] == selected)
+        assert trial.value == next(row["action_ranking_error"] for row in rows if row["step"] == selected)
     assert f"in {min(zip(done, runs, strict=True), key=lambda one: one[0].value)[1]}" in capsys.readouterr().out
     assert all(command_line(["evaluate", str(run), *FEW]) == 0 for run in runs[:2])
     assert command_line(["compare", *map(str, runs[:2])]) == 0

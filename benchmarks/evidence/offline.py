@@ -59,7 +59,7 @@ def offline_figures(
     with patch.object(action_score, "SCORED", SCORED.model_copy(update=FEWER)):
         plans = metrics_of(study_of(starts, planning), measure_plans(model, starts, planning))
     return {
-        "moves that look better": ranking.rank.value,
+        "action-ranking error": ranking.rank.value,
         "energy spread, negative": -ranking.spread.value,
         "spread of latents, distance from 1": abs(distribution.spread[-1].value - 1),
         "latent MMD": distribution.mmd[-1].value,

@@ -42,7 +42,7 @@ MARKS = {  # of the short tables in a page
 TOLD = {  # offline figures in the short table
     "energy and distance over visited plans, negative": "energy and distance over visited plans",
     "cost of wrong actions, negative": "cost of shuffled actions",
-    "moves that look better": "**moves that look better**",
+    "action-ranking error": "**action-ranking error**",
     "Action Score, cm missed": "Action Score of three steps",
     "error over persistence, 3 steps": "error over persistence, 0.8 s ahead",
 }

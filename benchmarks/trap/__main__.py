@@ -57,7 +57,7 @@ def _run_all(runs: Sequence[Run], options: argparse.Namespace) -> int:
     def keep(cell: Cell, figures: dict[str, Any]) -> None:
         write_cells(options.out, read_cells(options.out) | {cell.name: figures})
         ends = [way[-1] for way in figures["distance_cm"]]
-        rank, error = (figures["validation"][key] for key in ("action_rank", "rollout_over_persistence_last"))
+        rank, error = (figures["validation"][key] for key in ("action_ranking_error", "rollout_over_persistence_last"))
         print(f"{cell.name}: error {error:.3f}, rank {rank:.3f}, {sum(ends) / len(ends):.1f} cm left", flush=True)
 
     failed = 0

@@ -63,9 +63,7 @@ OFFLINE: dict[str, tuple[str, int]] = {
     "rollout error / persistence, last horizon": ("rollout.l1.over_persistence.7", 1),
     "gap of zero actions, negated": ("gap_of_actions.zero", -1),
     "gap of shuffled actions, negated": ("gap_of_actions.shuffled", -1),
-    "change with the action, negated": ("sensitivity.change", -1),
-    "own steps: rank among others' actions": ("sensitivity.rank.clips", 1),
-    "own steps: rank in a box": ("sensitivity.rank.box", 1),
+    "moves: change with the action, negated": ("ranking.change", -1),
     "own steps: distance of the lowest energy": ("landscapes.distance", 1),
     "moves: rank in a box": ("ranking.box", 1),
     "moves: rank among other directions": ("ranking.shell", 1),
@@ -174,7 +172,7 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     home, step = Path(config.run_dir), str(cell.step)
     rows = [row for row in read_metrics_log(home / "metrics.jsonl") if row["kind"] == "validation"]
     (validated,) = (row for row in rows if row["step"] == cell.step)
-    probes = ProbeOptions(sensitivity_clips=24, samples=32, landscape_clips=4, axis_clips=0, nodes=5, examples=0)
+    probes = ProbeOptions(ranking_clips=24, samples=32, landscape_clips=4, axis_clips=0, nodes=5, examples=0)
     asked = EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes)
     with joined(config) as accelerator:
         evaluation = measure_subject(str(home), asked, accelerator)

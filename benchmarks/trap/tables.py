@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from runs import OFFLINE, Run, cells_of
+from runs import Run, cells_of
 from scipy.stats import rankdata
 
 from vjepa2_ac.intervals import share_of
@@ -22,7 +22,7 @@ REACHED_CM = 5.0
 ALL, FEWEST = "simulated arm, all changes", 9  # cells of a correlation
 GONE = {"contrast": "a loss term, `training.action_contrast`: measured at commit 6117de8, the last with the term"}
 """Cures that no longer can be run, whose measurements stay."""
-_SHOWN = ("rollout_over_persistence_last", "action_rank")
+_SHOWN = ("rollout_over_persistence_last", "action_ranking_error")
 
 
 def _selected(cells: list[Figures]) -> Figures:
@@ -126,7 +126,7 @@ def _correlations(cells: Sequence[Figures], draws: int = 1000) -> Iterator[str]:
     parts = {"all": runs, **parts}
     yield f"| offline figure, over {sum(map(len, runs))} checkpoints of {len(runs)} runs | {' | '.join(parts)} |"
     yield "|---" * (len(parts) + 1) + "|"
-    for name in OFFLINE:
+    for name in [name for name in cells[0]["offline"] if all(name in one["offline"] for one in cells)]:
         found = [_interval(part, name, draws) if len(part) > 1 else "" for part in parts.values()]
         yield f"| {name} | {' | '.join(found)} |"
 
@@ -186,7 +186,7 @@ def draw(cells: Sequence[Figures], path: Path) -> None:
     panels = figure.subplots(2, 3, sharex=True)
     shown: dict[str, Callable[[Figures], float]] = {
         "error / persistence": lambda one: one["validation"]["rollout_over_persistence_last"],
-        "others that look better": lambda one: one["validation"]["action_rank"],
+        "action-ranking error": lambda one: one["validation"]["action_ranking_error"],
         "cm left in closed loop": left_cm,
     }
     for row, motions in zip(panels, ("narrow", "varied"), strict=True):

@@ -26,7 +26,7 @@ from vjepa2_ac.runs.checkpoint import select_checkpoint, step_of
 from vjepa2_ac.runs.folder import METRICS
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 
-FIGURE = "action_rank"  # lower is better; or rollout_over_persistence_last
+FIGURE = "action_ranking_error"  # lower is better; or rollout_over_persistence_last
 SPACE = {  # any key of a config
     "training.learning_rate": FloatDistribution(1e-5, 1e-3, log=True),
     "adapter.rank": CategoricalDistribution([8, 16, 32]),

@@ -224,6 +224,7 @@ def load_run(
         found, fix = "an adapter without its run", "Name its base, too: load_model(BASE, adapter=FOLDER)"
         raise InputError(where=str(folder), found=found, needed="the folder of a run", fix=fix)
     run = loading.load_run(folder, str(checkpoint), loading.run_config_of(folder, overrides))
+    run.warn_if_untrained()
     run.world_model.to(place).eval()
     return run
 
@@ -307,7 +308,7 @@ def evaluate(
         checkpoint=str(checkpoint),
         data=data,
         out=None if out is None else Path(out),
-        probes=ProbeOptions() if probes else ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0),
+        probes=ProbeOptions() if probes else ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0),
     )
     return evaluate_subject(str(subject), asked)
 
@@ -329,8 +330,8 @@ class _Told(Reporter):
         from vjepa2_ac.evaluation.estimates import over_persistence
 
         by_horizon = ", ".join(f"{ratio.value:.3f}" for ratio in over_persistence(found.errors, "rollout"))
-        better = f"; action-ranking error {found.ranking.rank:.1%}" if found.ranking else ""
-        self._note(f"Validation at step {step}: error over persistence by horizon {by_horizon}{better}")
+        ranking = f"; action-ranking error {100 * found.ranking.rank.value:.1f} %" if found.ranking else ""
+        self._note(f"Validation at step {step}: error over persistence by horizon {by_horizon}{ranking}")
 
 
 def _device(device: Device) -> torch.device:

@@ -2,7 +2,10 @@
 
 Clips of one episode are correlated: resampling clips would make intervals too narrow. Plain percentiles of the
 resampled values are also too narrow with few episodes, so they are widened by the ratio of Student's t to the normal
-distribution.
+distribution: with n episodes the interval is from the quantile p to 1 - p of 2000 resampled values, where
+p = Phi(-sqrt(n / (n - 1)) t(0.975; n - 1)), Phi is the normal distribution and t the quantile of Student's t. Each
+value is computed from n episodes that `numpy.random.default_rng(0).integers(n, size=(2000, n))` draws, as indices into
+their sorted names.
 
 Source: Hesterberg (2015), What Teachers Should Know About the Bootstrap, the expanded percentile interval.
 """

@@ -49,10 +49,11 @@ class _Stream(io.FileIO):
     """A file descriptor, which stays open; writing never raises."""
 
     problem: OSError | None = None  # the first one
+    last_write = time.monotonic()  # of all of them
 
     def write(self, data: Any, /) -> int:
         """Write all bytes, or drop what cannot be written; return their number."""
-        left = memoryview(data)
+        left, _Stream.last_write = memoryview(data), time.monotonic()
         try:
             while left:
                 try:
@@ -96,6 +97,12 @@ def own_streams() -> Iterator[Callable[[], str]]:
     finally:
         for name in ours:
             setattr(sys, name, before[name])
+
+
+def silent_s() -> float:
+    """Return the seconds since this process printed something; 0 outside of `own_streams`."""
+    raw = getattr(sys.stderr, "buffer", None)
+    return time.monotonic() - _Stream.last_write if isinstance(raw, _Stream) else 0.0
 
 
 # ---- processes that this one starts ----

@@ -71,7 +71,7 @@ def test_two_processes_that_share_an_evaluation_find_the_same(
     whole_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (module,) = imported("shared_evaluation", monkeypatch)
-    module.main([str(whole_run), "--clips", "4", "--sensitivity-clips", "2", "--samples", "4", "--landscapes", "0"])
+    module.main([str(whole_run), "--clips", "4", "--ranking-clips", "2", "--samples", "4", "--landscapes", "0"])
     *_, last = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"\| 2 \| [\d.]+ \| [\d.]+ \| [\d.]+e-(0[6-9]|1\d) \||\| 2 \|.* 0.0e\+00 \|", last)
 

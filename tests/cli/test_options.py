@@ -27,7 +27,7 @@ CALIBRATE = ["data", "calibrate", "config.yaml"]
     [
         (EVALUATE, "--nodes", ["x", "2", "52", "3.5", ""], "a whole number from 3 to 51"),
         (EVALUATE, "--reach", ["x", "0", "1000", "nan", "-1"], "a number of cm above 0 and below 1000"),
-        (EVALUATE, "--sensitivity-clips", ["-1", "many"], "a whole number from 0 to 1000000000"),
+        (EVALUATE, "--ranking-clips", ["-1", "many"], "a whole number from 0 to 1000000000"),
         (EVALUATE, "--clips", ["0", "1e3", "100000000000"], "a whole number from 1 to 1000000000"),
         (CALIBRATE, "--frames", ["1", "257", "x"], "a whole number from 2 to 256"),
         (SIMULATE, "--seed", ["x", "-1", "2147483648"], "a whole number from 0 to 2147483647"),

@@ -1,7 +1,9 @@
 """`vjepa2-ac plan` writes a plan and its figure, or reports an error before anything is loaded."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from PIL import Image
 from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
+from vjepa2_ac.planning.decision import decide
 
 STATE = "0.4,0.0,0.3,3.1,0.0,0.1,0.2"
 QUICK = ["planning.samples=8", "planning.iterations=2", "planning.cem.elites=4", "--nodes", "0"]
@@ -57,18 +60,39 @@ def plan(here: Path, *more: str, subject: str = "model", state: str = STATE, goa
 
 def test_a_plan_its_image_a_table_and_words_come_out(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, file = plan(workshop, *QUICK, "--seed", "9", "--nodes", "3")
-    assert status == 0
+    assert status == bool(file["worse_than"])
     reported = capsys.readouterr().out
-    assert "Planning: 16 action sequences in 2 iterations, 1 model step each\n" in reported
+    assert "Planning: 16 action sequences in 2 iterations, 1 model step each.\n" in reported
     assert "planning 16/16" in reported
     assert "energy maps 27/27" in reported
-    assert "Plan: planned" in reported
+    assert "Plan of 1 model step\n" in reported
     assert "Goes" in reported
     assert str(workshop / "out" / "plan.png") in reported
     assert (workshop / "out" / "plan.png").is_file()
     assert (file["seed"], file["goals"], len(file["slices"])) == (9, [str(workshop / "goal.png")], 3)
     assert len(file["model"]["predictor"]) == 64
     assert plan(workshop, *QUICK, "--seed", "9")[1]["actions"] == file["actions"]
+
+
+@pytest.mark.usefixtures("no_figure")
+@pytest.mark.parametrize("still", [-1.0, 1e9])
+def test_a_plan_that_is_predicted_to_be_worse_is_said_first_and_ends_with_status_1(
+    workshop: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, still: float
+) -> None:
+    def decided(*given: Any, **how: Any) -> Any:
+        found = decide(*given, **how)
+        return replace(found, doing_nothing=still, decision=replace(found.decision, energy_now=1e9))
+
+    monkeypatch.setattr("vjepa2_ac.planning.decision.decide", decided)
+    status, file = plan(workshop, *QUICK)
+    lines = capsys.readouterr().out.splitlines()
+    (first,) = (line for line, after in zip(lines[1:], lines, strict=False) if after.startswith("planning 16/16"))
+    is_worse = still < 0
+    assert (status, file["worse_than"]) == (int(is_worse), ["zero action"] * is_worse)
+    assert first.startswith(
+        "The plan is predicted to be worse than the zero action: energy" if is_worse else "Plan of 1"
+    )
+    assert max(map(len, lines)) <= 100
 
 
 @pytest.mark.usefixtures("no_figure")
@@ -149,7 +173,7 @@ def test_a_decoder_shows_what_was_imagined_and_only_its_name_goes_into_the_file(
     )
     _, plain = plan(workshop, *QUICK)
     status, file = plan(workshop, *QUICK, "--decoder", str(folder))
-    assert status == 0
+    assert status < 2
     assert drawn[0] is None
     assert list(drawn[1].steps) == [1]
     assert file["decoder"] == {"name": str(folder), "encoder": tiny_model().encoder_fingerprint()}

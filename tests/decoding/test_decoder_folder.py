@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from run_fixtures import TINY
-from vjepa2_ac.config import ModelSizes
-from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, load_decoder, save_decoder
+from vjepa2_ac.config import DataConfig, ModelSizes
+from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, SIMULATED, WEIGHTS, load_decoder, save_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.storage.places import NO_DATA, SIMULATION_FILE
 
 
 @pytest.fixture
@@ -85,13 +86,36 @@ def test_a_folder_without_a_decoder_is_refused_with_the_command_that_makes_one(t
 
 def test_a_model_of_another_encoder_crop_or_size_is_refused(whole_decoder: Path, base_folder: Path) -> None:
     decoder, model = load_decoder(whole_decoder), WorldModel.from_pretrained(base_folder)
-    decoder.require_fit(model, "released", subject="run")
+    data, square = DataConfig(path=decoder.card.data), DataConfig(path=decoder.card.data, crop="square")
+    assert decoder.require_fit(model, data, subject="run") == ()
     other = WorldModel.random(ModelSizes.model_validate(TINY), seed=4)
     with pytest.raises(InputError, match=r"another encoder or crop than that of run.*vjepa2-ac decoder CONFIG"):
-        decoder.require_fit(other, "released", subject="run")
+        decoder.require_fit(other, data, subject="run")
     with pytest.raises(InputError, match=r"data\.crop released, not square"):
-        decoder.require_fit(model, "square", subject="run")
+        decoder.require_fit(model, square, subject="run")
     larger = WorldModel.random(ModelSizes.model_validate(TINY | {"image_size": 64}), seed=3)
     same = replace(decoder, card=replace(decoder.card, encoder=larger.encoder_fingerprint()))  # the same weights
     with pytest.raises(InputError, match="image size 32, not 64"):
-        same.require_fit(larger, "released", subject="run")
+        same.require_fit(larger, data, subject="run")
+
+
+def test_a_decoder_of_other_data_warns_with_both_data_sets(
+    whole_decoder: Path, base_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoder, model = load_decoder(whole_decoder), WorldModel.from_pretrained(base_folder)
+    own, (real, simulated) = Path(decoder.card.data), (tmp_path / "real", tmp_path / "simulated")
+    simulated.mkdir()
+    (simulated / SIMULATION_FILE).write_text("{}")
+    ours = replace(decoder, name="builtin:sim-tiny")
+    fits = {
+        (decoder, str(own)): True, (decoder, str(real)): False, (decoder, SIMULATED): False, (decoder, NO_DATA): True,
+        (ours, str(real)): False, (ours, str(simulated)): True, (ours, SIMULATED): True,
+    }  # fmt: skip
+    for (one, shown), is_own in fits.items():
+        said = one.require_fit(model, DataConfig(path=str(own)), subject="run", shown=shown)
+        learned = SIMULATED if one is ours else str(own)
+        warning = f"The decoder {one.name} was trained on {learned}, not on {shown}: its images may be wrong."
+        assert said == (() if is_own else (warning,))
+    monkeypatch.chdir(own.parent)
+    assert decoder.require_fit(model, DataConfig(path=own.name), subject="run") == (), "the same folder"
+    assert decoder.require_fit(model, DataConfig(path=str(real)), subject="run"), "by default the data of the config"

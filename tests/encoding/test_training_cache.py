@@ -117,7 +117,8 @@ def test_a_run_is_evaluated_from_its_cache_as_from_its_data(make_config, reporte
     changes = {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches"), "training__steps": 2}
     config = make_config(run_dir=str(tmp_path / "run"), data__cache="auto", **changes)
     train(config, reporter)
-    asked = EvaluationOptions(clips=6, probes=ProbeOptions(sensitivity_clips=2, samples=4, landscape_clips=1, nodes=3))
+    probes = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, axis_clips=0, nodes=3, examples=1)
+    asked = EvaluationOptions(clips=6, probes=probes)
     folder = next((tmp_path / "caches").iterdir())
     from_cache = evaluate_subject(str(tmp_path / "run"), asked).evaluation
     folder.rename(tmp_path / "elsewhere")

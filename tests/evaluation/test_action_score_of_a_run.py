@@ -20,7 +20,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.prior.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
 from vjepa2_ac.reports.write import evaluate_subject
 
-QUICK = {"sensitivity_clips": 0, "examples": 0}
+QUICK = {"ranking_clips": 0, "examples": 0}
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ from vjepa2_ac.evaluation.action_use import (
     evaluate_actions,
     grid_axes,
     measure_landscapes,
-    measure_sensitivity,
     moves_of,
     rank_actions,
     start_of,
@@ -23,8 +22,9 @@ from vjepa2_ac.evaluation.estimates import rank_difference
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import ActionRanking, Landscapes
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, vector_actions
-from worlds import DIM, TIME, Copier, Halfway, Oracle, clips_batch, moved
+from worlds import DIM, Copier, Halfway, Oracle, clips_batch, moved
 
 CLIPS, REACH, FEW, SAMPLES = 12, 0.075, 8, 40
 
@@ -55,9 +55,7 @@ def ranked(model: Predictor, batch: LatentBatch, samples: int = 40) -> ActionRan
 
 
 def pool_of(moves: list[RolloutStart], space: ActionSpace, samples: int) -> ActionPool:
-    return ActionPool(
-        np.stack([move.true for move in moves]), ["an episode"] * len(moves), space, ProbeOptions(samples=samples), 0
-    )
+    return ActionPool(np.stack([move.true for move in moves]), space, ProbeOptions(samples=samples))
 
 
 def test_a_move_is_the_longest_within_reach_there_and_back() -> None:
@@ -165,21 +163,12 @@ def test_what_others_are_drawn_does_not_depend_on_the_moves_beside_it() -> None:
     assert np.array_equal(whole.ranks[-2:], last.ranks)
 
 
-# ---- sensitivity -----------------------------------------------------------------------------------------------------
+# ---- energies --------------------------------------------------------------------------------------------------------
 
 
 def starts(step: int = 0) -> list[RolloutStart]:
     batch = clips_batch(FEW)
     return [replace(start_of(batch, clip, step), clip=clip) for clip in range(FEW)]
-
-
-def pool(
-    *, space: ActionSpace = POSE_CHANGE, reach: float = 0.075, samples: int = SAMPLES, seed: int = 0
-) -> ActionPool:
-    batch = clips_batch(FEW)
-    ids = tuple(name for name in batch.episode_ids for _ in range(TIME - 1))
-    probes = ProbeOptions(samples=samples, reach_cm=100 * reach, at_once=16)
-    return ActionPool(batch.actions.flatten(0, 1).double().numpy(), ids, space, probes, seed)
 
 
 def test_energy_and_change_are_the_distances_of_the_world() -> None:
@@ -193,49 +182,46 @@ def test_energy_and_change_are_the_distances_of_the_world() -> None:
     assert change[1] == pytest.approx(1.5 / DIM, abs=1e-5)
 
 
-def test_ranks_are_counted_by_hand() -> None:
-    """A model that sees the third of what an action does prefers others that are larger: as many as are drawn there."""
+def test_ranks_and_change_are_counted_by_hand() -> None:
+    """A model that predicts a third of an action's effect ranks larger actions first: as many as are drawn there."""
 
     class Third(Oracle):
         def predict(self, latents, actions, states, extrinsics=None):  # type: ignore[no-untyped-def]
             return super().predict(latents, actions / 3, states, extrinsics)
 
-    begun = starts()
-    found = measure_sensitivity(Third(), begun, pool(seed=4))
+    begun, probes = starts(), ProbeOptions(samples=SAMPLES, at_once=16)
+    found, pool = rank_actions(Third(), begun, POSE_CHANGE, probes, seed=4), pool_of(begun, POSE_CHANGE, SAMPLES)
+    changes, persistence = [], []
     for number, start in enumerate(begun):
-        generator = start.generator(4)
-        drawn = [pool().of_others(start, generator), pool().in_box(start, generator)]
-        for ranking, others in zip(found.rankings, drawn, strict=True):
+        generator, errors = start.generator(4), []
+        for drawn in (pool.in_box(start, generator), pool.on_shell(start, generator)):
             true = start.action[:DIM].double().numpy()
-            energies = np.abs(others[:, :DIM] / 3 - true).mean(axis=1)
-            if ranking is found.rankings[0]:  # what the box holds may be nothing that a robot does
-                changes = np.abs(others[:, :DIM] / 3 - true / 3).mean(axis=1) * 100
-                assert found.change_by_clip[number] * start.persistence == pytest.approx(changes.mean(), rel=1e-4)
-            assert ranking.rank[number] == pytest.approx((energies < np.abs(true / 3 - true).mean()).mean())
-    assert found.rankings[0].samples == SAMPLES
-    assert found.rankings[0].clips == tuple(range(FEW))
+            energies = np.abs(drawn[:, :DIM] / 3 - true).mean(axis=1)
+            errors.append((energies < np.abs(true / 3 - true).mean()).mean())
+            changes.append(np.abs(drawn[:, :DIM] / 3 - true / 3).mean() * 100)
+        persistence.append(start.persistence)
+        assert found.ranks[number] == pytest.approx(np.mean(errors))
+    assert found.change.value == pytest.approx(np.mean(changes[::2]) / np.mean(persistence), rel=1e-4), "in the box"
+    assert (found.samples, found.episode_ids) == (SAMPLES, tuple(start.episode_id for start in begun))
 
 
 def test_equal_energies_share_their_places() -> None:
-    found = measure_sensitivity(Copier(), starts(), pool())
-    for ranking in found.rankings:
-        assert set(ranking.rank) == {0.5}
-        assert ranking.top[1].value == pytest.approx(1 / (SAMPLES + 1))
-        assert ranking.top[10].value == pytest.approx(10 / (SAMPLES + 1))
+    found = ranked(Copier(), clips_batch(CLIPS))
+    assert set(found.ranks) == {0.5}
+    assert found.change == Estimate(0.0, 0.0, 0.0)
 
 
-def test_others_are_of_other_episodes_and_the_box_moves_only_the_hand() -> None:
-    start, drawing = starts()[0], pool(samples=500)
-    others = drawing.of_others(start, np.random.default_rng(0))
-    own = drawing.actions[np.array(drawing.episode_ids) == start.episode_id]
-    assert not (others[:, None] == own[None]).all(axis=2).any()
-    boxed = drawing.in_box(start, np.random.default_rng(0))
+def test_the_box_moves_only_the_hand() -> None:
+    begun = starts()
+    start, pool = begun[0], pool_of(begun, POSE_CHANGE, 500)
+    boxed = pool.in_box(start, np.random.default_rng(0))
     assert np.array_equal(boxed[:, 3:], np.tile(start.action[3:].double().numpy(), (500, 1)))
     assert 0.07 < np.abs(boxed[:, :3]).max() <= 0.075
     assert abs(boxed[:, :3].mean()) < 0.005
-    vectors = pool(space=vector_actions(7, "change"), samples=500).in_box(start, np.random.default_rng(0))
-    assert (np.abs(vectors).max(axis=0) <= np.abs(drawing.actions).max(axis=0)).all()
-    assert np.abs(vectors[:, 3:]).max() > 0.05
+    vectors = pool_of(begun, vector_actions(7, "change"), 500)
+    drawn = vectors.in_box(start, np.random.default_rng(0))
+    assert (np.abs(drawn).max(axis=0) <= np.abs(vectors.actions).max(axis=0)).all()
+    assert np.abs(drawn[:, 3:]).max() > 0.05
 
 
 def landscapes(model: Predictor, nodes: int = 7) -> Landscapes:

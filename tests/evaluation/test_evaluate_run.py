@@ -29,10 +29,10 @@ from vjepa2_ac.reports.write import Evaluated, evaluate_subject
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.training.loop import train
 
-PROBES = ProbeOptions(sensitivity_clips=3, samples=6, landscape_clips=1, nodes=3, examples=1)
-NONE = ProbeOptions(sensitivity_clips=0, examples=0)
-FEW = ["--sensitivity-clips", "0", "--examples", "1", "--clips", "5"]
-QUICK = ["--sensitivity-clips", "3", "--samples", "6", "--landscapes", "1", "--nodes", "3", "--examples", "1"]
+PROBES = ProbeOptions(ranking_clips=3, samples=6, landscape_clips=1, axis_clips=0, nodes=3, examples=1)
+NONE = ProbeOptions(ranking_clips=0, examples=0)
+FEW = ["--ranking-clips", "0", "--examples", "1", "--clips", "5"]
+QUICK = ["--ranking-clips=3", "--samples=6", "--landscapes=1", "--axes=0", "--nodes=3", "--examples=1"]
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def asked(**changes: Any) -> EvaluationOptions:
 def measured(config: Config) -> Evaluated:
     """The run's evaluation, which is in its folder, too: to be read only."""
     with one_thread():
-        return evaluate_subject(config.run_dir, asked())
+        return evaluate_subject(config.run_dir, asked(probes=replace(PROBES, axis_clips=3)))
 
 
 def written(config: Config, folder: Path, **data: object) -> str:
@@ -112,7 +112,7 @@ def test_figures_depend_on_neither_the_batch_size_nor_the_workers(config: Config
     one, other = figures_of(run), figures_of(tmp_path / "b")
     for name in ("base", "adapter"):
         assert rollout(one, name) == pytest.approx(rollout(other, name), rel=1e-5)
-        ranks = [metrics["models"][name]["sensitivity"]["rankings"][0]["rank"] for metrics in (one, other)]
+        ranks = [metrics["models"][name]["ranking"]["ranks"] for metrics in (one, other)]
         assert ranks[0] == ranks[1]
     assert one["clips"] == other["clips"]
 
@@ -139,7 +139,8 @@ def test_others_are_measured_on_the_same_latents(run: str, tmp_path: Path, base_
     assert rollout(metrics, "run") == pytest.approx(rollout(metrics, "adapter"), rel=1e-6)
     assert rollout(metrics, "model") == pytest.approx(rollout(metrics, "base"), rel=1e-6)
     assert rollout(metrics, "base") != rollout(metrics, "adapter")
-    assert evaluate_subject(run, asked(against=(str(base_folder),), out=tmp_path)).evaluation.base is None
+    asked_without = asked(against=(str(base_folder),), out=tmp_path, probes=NONE)
+    assert evaluate_subject(run, asked_without).evaluation.base is None
 
 
 def test_another_encoder_cannot_be_measured_on_these_latents(run: str, tmp_path: Path, base_folder: Path) -> None:

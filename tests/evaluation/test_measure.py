@@ -58,7 +58,7 @@ def test_a_validation_is_the_evaluation_of_the_same_clips_without_what_takes_lon
     errors = prediction_errors(Halfway(), in_batches(clips_batch(), 4))
     assert errors.arrays.keys() == {(way, mode, "l1") for way, mode in VALIDATED}
     assert ("zero", "rollout", "l1") not in errors.arrays
-    probes = ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0)
+    probes = ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0)
     found = evaluate([Contender("model", "trained", Halfway())], again(clips_batch()), about(), probes=probes)
     whole = found.models["model"].errors
     assert whole.episode_ids == errors.episode_ids

@@ -15,7 +15,7 @@ from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 
 LARGER = Metric("agreement", "agreement", "1 / (1 + L1)", lambda *pair: 1 / (1 + L1.of(*pair)), smaller_is_better=False)
 SMALLER = Metric("height", "height", "1 / (1 + L1), taken for an error", LARGER.of)
-PROBES = ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0)
+PROBES = ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0)
 
 
 def evaluated(trained: object, base: object, *more: Metric) -> Evaluation:

@@ -36,10 +36,10 @@ def test_rows_are_the_estimates() -> None:
     assert rows["one_step_gain.motion.moving", "adapter"] == (
         stratum_gain(adapter.errors, base.errors, WHOLE.strata[0])
     )
-    assert adapter.sensitivity is not None
     assert adapter.ranking is not None
     assert base.ranking is not None
-    assert rows["sensitivity.rank.clips", "adapter"] == adapter.sensitivity.rankings[0].mean_rank
+    assert rows["ranking.rank", "adapter"] == adapter.ranking.rank
+    assert rows["ranking.change", "adapter"] == adapter.ranking.change
     assert rows["ranking.difference_to_base", "adapter"] == rank_difference(adapter.ranking, base.ranking)
     assert {"plans.score", "plans_minus_base.missed_cm", "landscapes.sign.dx", "axes.gain", "spread.3"} <= {
         key for key, _ in rows

@@ -1,8 +1,11 @@
-"""The answer agrees with the numbers, and knows what it cannot know."""
+"""The summary states what was measured, draws the conclusions that follow, and fits a screen."""
 
 import json
+import math
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,13 +17,16 @@ from vjepa2_ac.evaluation.result import (
     L2,
     MODES,
     Evaluation,
+    Landscape,
+    Landscapes,
+    LatentDistribution,
     Metric,
     ModelResult,
     PredictionErrors,
 )
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.evaluation.summary import closed_loop, not_measured, with_closed_loop
-from vjepa2_ac.intervals import share_of
+from vjepa2_ac.evaluation.summary import Summary, closed_loop, not_measured, percent, summarize, with_closed_loop
+from vjepa2_ac.intervals import Estimate, mean_of, share_of
 from vjepa2_ac.spaces import POSE_CHANGE
 from worlds import about
 
@@ -67,66 +73,201 @@ def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
     )
 
 
-def asked(*models: ModelResult, episodes: int = 8) -> Answer:
-    found = evaluation(*models, episodes=episodes)
-    return summarize(found, rows_of(found))
+def summary_of(*models: ModelResult, episodes: int = 8, **changes: Any) -> Summary:
+    measured = replace(evaluation(*models, episodes=episodes), **changes)
+    return summarize(measured, rows_of(measured))
 
 
 @pytest.mark.parametrize(
-    ("base", "adapter", "noise", "word", "says"),
+    ("base", "adapter", "noise", "conclusion", "statement"),
     [
-        (1.0, 0.75, 0.02, "yes", "error 25 % lower than the base's, 1.5 s ahead"),
-        (0.8, 1.2, 0.0, "no", "error 50 % higher than the base's, 1.5 s ahead"),
-        (1.0, 0.998, 0.0, "no", "error 0.2 % lower than the base's, 1.5 s ahead"),
-        (1.0, 1.0, 0.0, "no", "error 0.0 % lower than the base's, 1.5 s ahead"),
-        (1.0, 0.98, 0.3, "not known yet", "than the base's"),
-        (1.6, 1.2, 0.0, "no", "error 20 % higher than doing nothing's, 1.5 s ahead"),
-        (None, 0.5, 0.02, "yes", "error 50 % lower than doing nothing's, 1.5 s ahead"),
+        (1.0, 0.75, 0.02, "yes", "error 25 % lower than with the base model, 1.5 s ahead"),
+        (0.8, 1.2, 0.0, "no", "error 50 % higher than with the base model, 1.5 s ahead"),
+        (1.0, 0.998, 0.0, "no", "error 0.2 % lower than with the base model, 1.5 s ahead"),
+        (1.0, 1.0, 0.0, "no", "error 0.0 % lower than with the base model, 1.5 s ahead"),
+        (1.0, 0.98, 0.3, "inconclusive", "than with the base model"),
+        (1.6, 1.2, 0.0, "no", "error 20 % higher than with persistence, 1.5 s ahead"),
+        (None, 0.5, 0.02, "yes", "error 50 % lower than with persistence, 1.5 s ahead"),
     ],
 )
-def test_it_predicts_better_where_it_clearly_beats_the_base_and_doing_nothing(
-    base: float | None, adapter: float, noise: float, word: str, says: str
+def test_better_prediction_needs_a_lower_error_than_the_base_model_and_persistence(
+    base: float | None, adapter: float, noise: float, conclusion: str, statement: str
 ) -> None:
-    of_base = [] if base is None else [model("base", base, noise=noise)]
-    found = asked(*of_base, model("adapter", adapter, noise=noise))
-    assert (found.predicts.word, says in found.predicts.says) == (word, True)
-    assert found.rival == ("doing nothing" if base is None else "the base")
+    base_model = [] if base is None else [model("base", base, noise=noise)]
+    summary = summary_of(*base_model, model("adapter", adapter, noise=noise))
+    assert summary.predicts.conclusion == conclusion
+    assert statement in summary.predicts.statement
+    assert summary.predicts.compared_with in summary.predicts.statement
+    denied = f"Prediction is not better than {summary.predicts.compared_with}. Check data, axes and stride first."
+    assert (summary.sentence == denied) == (conclusion == "no")
 
 
-def ranked(name: str, level: float, rank: float, **how: float) -> ModelResult:
-    """Return a model of an error and a share of moves that look better; the shares differ a little by clip."""
+def test_an_interval_has_the_direction_of_its_statement() -> None:
+    for adapter, word in ((0.9, "lower"), (1.1, "higher")):
+        predicts = summary_of(model("base", 1.0), model("adapter", adapter)).predicts
+        low, high = map(float, predicts.interval.strip("[]").split(","))
+        assert word in predicts.statement
+        assert 0 < low <= float(predicts.statement.split()[1]) <= high
+
+
+def ranked(name: str, level: float, rank: float, **changes: Any) -> ModelResult:
+    """Return a model with an error and an action-ranking error, which differs a little by clip."""
     ids = tuple(f"episode {clip % 8}" for clip in range(CLIPS))
-    return replace(model(name, level, **how), ranking=ranking_of(rank + 0.01 * np.sin(np.arange(CLIPS)), ids))
+    return replace(model(name, level, **changes), ranking=ranking_of(rank + 0.01 * np.sin(np.arange(CLIPS)), ids))
 
 
-@pytest.mark.parametrize(("rank", "word"), [(0.02, "yes"), (0.05, "no"), (0.1, "no")])
-def test_it_plans_better_where_fewer_other_moves_look_better_than_with_the_base(rank: float, word: str) -> None:
-    found = asked(ranked("base", 1.0, 0.05), ranked("adapter", 0.7, rank, shuffled=0.9))
-    assert (found.plans.word, found.plans.beside) == (word, "(base 5.0 %, chance 50 %)")
-    assert found.plans.says.endswith(" % of other moves look better than the true one")
-    assert found.plans.share == pytest.approx(rank, abs=0.002)
-    assert (found.sentence == "It predicts better than the base, but it does not plan better.") == (word == "no")
-    assert asked(ranked("model", 0.7, rank)).plans.word == "yes", "better than chance, where there is no base"
-    assert asked(ranked("model", 0.7, 0.6)).plans.word == "no"
-    assert asked(model("model", 0.7)).plans == not_measured("plans")
+@pytest.mark.parametrize(
+    ("base", "rank", "conclusion", "compared_with"),
+    [
+        (0.05, 0.02, "yes", "with the base model"),
+        (0.05, 0.05, "no", "with the base model"),
+        (0.05, 0.1, "no", "with the base model"),
+        (0.7, 0.6, "no", "chance"),
+        (None, 0.1, "yes", "chance"),
+        (None, 0.6, "no", "chance"),
+    ],
+)
+def test_better_action_ranking_needs_a_lower_error_than_chance_and_the_base_model(
+    base: float | None, rank: float, conclusion: str, compared_with: str
+) -> None:
+    base_model = [] if base is None else [ranked("base", 1.0, base)]
+    summary = summary_of(*base_model, ranked("adapter", 0.7, rank, shuffled=0.9))
+    ranks_actions = summary.ranks_actions
+    assert (ranks_actions.conclusion, ranks_actions.compared_with) == (conclusion, compared_with)
+    assert ranks_actions.value == pytest.approx(rank, abs=0.002)
+    assert ranks_actions.statement == f"action-ranking error {percent(ranks_actions.value)} %"
+    with_base = f"base model {percent(base + ranks_actions.value - rank)} %, " if base else ""
+    assert ranks_actions.reference == f"({with_base}chance 50 %)"
+    if rank > 0.5:
+        assert summary.uses_actions.conclusion == "no", "a model that ranks worse than chance is not sensitive to them"
+        assert summary.sentence == "Action ranking is worse than chance, so the model cannot be used for planning."
+    elif conclusion == "no":
+        assert summary.sentence == "Action ranking is not better than with the base model."
+    else:
+        assert summary.sentence.endswith(f"better action ranking than {compared_with}. Planning was not measured.")
 
 
-def test_actions_are_used_only_where_wrong_ones_cost_something() -> None:
-    deaf, listening = asked(model("model", 0.5)), asked(model("model", 0.5, shuffled=0.9))
-    assert (deaf.uses_actions.conclusion, listening.uses_actions.conclusion) == ("no", "yes")
-    assert deaf.sentence.startswith("It learned the scene, not the arm")
-    assert listening.uses_actions.says == "a wrong action costs 81 %"
+def test_the_third_line_is_action_ranking_until_a_closed_loop_was_measured(tmp_path: Path) -> None:
+    bare, measured = summary_of(model("model", 0.5)), summary_of(ranked("model", 0.5, 0.02, shuffled=0.9))
+    assert bare.ranks_actions == not_measured("ranks actions", "`vjepa2-ac evaluate --ranking-clips 32`")
+    shares = {name: share_of(count, 50) for name, count in {"m": 45, "random": 2, "oracle": 50}.items()}
+    plans = closed_loop(shares, "m", "oracle", 50, "reach")
+    (tmp_path / "closed_loop" / "reach-B").mkdir(parents=True)
+    file = tmp_path / "closed_loop" / "reach-B" / "closed_loop.json"
+    file.write_text(json.dumps({"about": {"checkpoint": "step 8"}, "verdict": asdict(plans)}))
+    for summary in (bare, measured):
+        planned = with_closed_loop(summary, tmp_path, "step 8")
+        assert [one.name for one in summary.verdicts] == ["predicts", "uses actions", "ranks actions"]
+        assert planned.verdicts == (*summary.verdicts[:2], plans)
+        assert with_closed_loop(summary, tmp_path, "step 9") == summary
+        assert with_closed_loop(summary, tmp_path / "no", "step 8") == summary
+        assert "plans" not in str(summary)
+    assert with_closed_loop(measured, tmp_path, "step 8").sentence.endswith(
+        "it solves more problems than the zero action and random actions."
+    )
+
+
+def test_sensitivity_to_actions_needs_a_higher_error_with_shuffled_actions() -> None:
+    ignoring, sensitive = summary_of(model("model", 0.5)), summary_of(model("model", 0.5, shuffled=0.9))
+    assert (ignoring.uses_actions.conclusion, sensitive.uses_actions.conclusion) == ("no", "yes")
+    assert ignoring.sentence.startswith("The model predicts typical motion and ignores the actions")
+    misled = summary_of(model("model", 0.9, shuffled=0.5))
+    assert misled.uses_actions.statement == "one-step error 45 % lower with shuffled actions"
+    assert misled.sentence.startswith("The error is lower with shuffled actions than with true ones.")
+    assert sensitive.uses_actions.statement == "one-step error 81 % higher with shuffled actions"
 
 
 @pytest.mark.parametrize("episodes", [1, 4])
-def test_of_too_few_episodes_nothing_is_known_but_what_shows_is_said(episodes: int) -> None:
-    found = asked(*(model(*one, episodes=episodes) for one in (("base", 1.0), ("adapter", 0.5))), episodes=episodes)
-    assert {one.word for one in found.questions} == {"not known yet"}
-    assert f"{episodes} held-out episode" in found.sentence
-    assert "5 would do" in found.sentence
-    assert "error 50 % lower" in found.sentence
-    assert "learned the scene, not the arm" in found.sentence
-    assert "[" not in str(found), "no interval that means nothing"
+def test_too_few_episodes_give_numbers_without_conclusions(episodes: int) -> None:
+    models = [model(*one, episodes=episodes) for one in (("base", 1.0), ("adapter", 0.5))]
+    summary = summary_of(*models, episodes=episodes)
+    assert [one.conclusion for one in summary.verdicts] == ["inconclusive", "inconclusive", "not measured"]
+    verb = "episode is" if episodes == 1 else "episodes are"
+    assert summary.sentence.startswith(f"{episodes} held-out {verb} too few for a conclusion; at least 5 are needed.")
+    assert summary.sentence.endswith("1.5 s ahead; one-step error 0.0 % higher with shuffled actions.")
+    assert "[" not in str(summary), "an interval over so few episodes means nothing"
+
+
+def test_a_measurement_of_fewer_episodes_than_the_evaluation_has_no_conclusion_alone() -> None:
+    adapter = ranked("adapter", 0.7, 0.6, shuffled=0.9)
+    few = replace(adapter, ranking=ranking_of(np.array([0.6, 0.6]), ("episode 1", "episode 2")))
+    summary = summary_of(few, episodes=8)
+    assert (summary.ranks_actions.conclusion, summary.ranks_actions.interval) == ("inconclusive", "")
+    assert summary.ranks_actions.reference == "(chance 50 %; 2 episodes are too few for a conclusion)"
+    assert summary.uses_actions.conclusion == "yes"
+    assert summary.sentence == "Inconclusive: action ranking. Measure more held-out episodes."
+    unclear = replace(summary, predicts=replace(summary.predicts, conclusion="inconclusive"))
+    assert unclear.sentence == "Inconclusive: prediction, action ranking. Measure more held-out episodes."
+
+
+def with_spread(result: ModelResult, spread: float) -> ModelResult:
+    estimates = (Estimate(spread, spread, spread),) * HORIZON
+    distribution = LatentDistribution(estimates, estimates, (0.5,) * HORIZON, (spread,) * HORIZON, (1.0,) * HORIZON)
+    return replace(result, distribution=distribution)
+
+
+@pytest.mark.parametrize("with_base", [True, False])
+@pytest.mark.parametrize("level", [0.5, 0.995, 1.2])
+@pytest.mark.parametrize("spread", [0.5, 0.895, 0.9, 0.95, 1.1])
+def test_blur_is_named_exactly_where_error_and_spread_both_fell(with_base: bool, level: float, spread: float) -> None:
+    adapter = with_spread(model("adapter", level, noise=0.0), spread)
+    base_model = [with_spread(model("base", 1.0, noise=0.0), 0.9)] * with_base
+    summary = summary_of(*base_model, adapter, copies=adapter.distribution)
+    before, name = (0.9, "base model") if with_base else (1.0, "true latents")
+    fell = level < 0.99 and spread < 0.99 * before
+    remark = f"(part of the gain may be blur: spread {spread:.2f}, {name} {before:.2f})"
+    assert summary.predicts.reference == (remark if fell else "")
+    weak = summary_of(
+        *base_model, with_spread(model("adapter", level, noise=0.0), math.nan), copies=adapter.distribution
+    )
+    assert not weak.predicts.reference, "there is no spread with one clip"
+
+
+def mapped(result: ModelResult, distance: float, sharpness: float, episodes: int = 8) -> ModelResult:
+    """Return a model with landscapes of a mean distance and sharpness, which differ a little by clip."""
+    rng, ids = np.random.default_rng(0), [f"episode {number}" for number in range(episodes)]
+    distances = distance + rng.uniform(-0.5, 0.5, episodes)
+    maps = tuple(
+        Landscape(name, 0, np.zeros((3, 2)), np.ones((2, 2, 2)), np.zeros(3), np.zeros(3), float(one))
+        for name, one in zip(ids, distances, strict=True)
+    )
+    level, none = mean_of(np.full(episodes, sharpness), ids), Estimate(math.nan, math.nan, math.nan)
+    statistics = (none,) * 3, (0.5,) * 3, (0,) * 3, 1.0
+    found = Landscapes(("dx", "dy", "dz"), "cm", maps, mean_of(distances, ids), level, 25.0, *statistics)  # type: ignore[arg-type]
+    return replace(result, landscapes=found)
+
+
+@pytest.mark.parametrize(
+    ("base", "adapter", "conclusion"),
+    [
+        ((13.8, 0.072), (20.3, 0.0086), "no"),  # measured with a released model and its adapter
+        ((20.3, 0.0086), (13.8, 0.072), "yes"),
+        ((30.0, 0.07), (27.0, 0.07), "no"),  # better than the base model, and worse than a random grid point
+        (None, (13.8, 0.072), "yes"),
+        (None, (27.0, 0.072), "no"),
+    ],
+)
+def test_a_better_landscape_needs_a_nearer_minimum_than_the_base_model_and_a_random_point(
+    base: tuple[float, float] | None, adapter: tuple[float, float], conclusion: str
+) -> None:
+    base_model = [] if base is None else [mapped(model("base", 1.0), *base)]
+    summary = summary_of(*base_model, mapped(model("adapter", 0.7, shuffled=0.9), *adapter))
+    verdict = summary.landscape
+    assert verdict is not None
+    assert summary.verdicts[3] == verdict
+    assert (verdict.conclusion, verdict.unit, verdict.baseline) == (conclusion, "cm", 25.0)
+    assert verdict.value == pytest.approx(adapter[0], abs=0.5)
+    assert verdict.statement == f"energy minimum {verdict.value:.1f} cm from the true action"
+    of_base = [] if base is None else [f"base model {verdict.value - adapter[0] + base[0]:.1f} cm", f"{base[1]:g}"]
+    assert verdict.reference == (
+        f"(random point 25.0 cm; sharpness {adapter[1]:g})"
+        if base is None
+        else f"({of_base[0]}; random point 25.0 cm; sharpness {adapter[1]:g}, base model {of_base[1]})"
+    )
+    few = summary_of(mapped(model("adapter", 0.7), *adapter, episodes=1)).landscape
+    assert few is not None
+    assert few.conclusion == "inconclusive"
+    assert few.reference.endswith("; 1 episode is too few for a conclusion)")
 
 
 def by(l1: float, others: float, *, noise: float = 0.02) -> dict[Metric, np.ndarray]:
@@ -142,53 +283,56 @@ def with_errors(found: Evaluation, name: str, true: dict[Metric, np.ndarray]) ->
     return replace(found, models={**found.models, name: changed})
 
 
-def test_it_is_said_where_l2_contradicts_l1() -> None:
-    found = evaluation(model("base", 0.95), model("adapter", 0.8))
-    assert not summarize(found, rows_of(found)).predicts.reference
-    denied = with_errors(found, "adapter", by(0.8, 1.25))
-    assert summarize(denied, rows_of(denied)).predicts.reference == "(by l2 32 % higher)"
+def test_another_metric_that_contradicts_l1_is_named() -> None:
+    agreed = evaluation(model("base", 0.95), model("adapter", 0.8))
+    assert not summarize(agreed, rows_of(agreed)).predicts.reference
+    denied = with_errors(agreed, "adapter", by(0.8, 1.25))
+    assert re.fullmatch(r"\(by L2 32 % worse \[\d+, \d+\]\)", summarize(denied, rows_of(denied)).predicts.reference)
 
 
 @pytest.mark.parametrize(
-    ("solved", "problems", "oracle", "word", "why"),
+    ("solved", "problems", "oracle", "conclusion", "needs"),
     [
         (45, 50, 50, "yes", ""),
         (2, 50, 50, "no", ""),
-        (5, 50, 50, "not known yet", ""),
-        (45, 50, 3, "not known yet", "The oracle itself solves 6.0 %"),
-        (1, 1, 1, "not known yet", "1 episode of reach cannot show anything"),
+        (5, 50, 50, "inconclusive", ""),
+        (45, 50, 3, "inconclusive", "The oracle solves only 6.0 % of these problems"),
+        (1, 1, 1, "inconclusive", "1 problem is too few for a conclusion"),
+        (2, 2, 2, "inconclusive", "2 problems are too few for a conclusion"),
     ],
 )
-def test_a_closed_loop_is_held_against_chance_and_knows_when_it_shows_nothing(
-    solved: int, problems: int, oracle: int, word: str, why: str
+def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
+    solved: int, problems: int, oracle: int, conclusion: str, needs: str
 ) -> None:
     counts = {"adapter": solved, "do nothing": 0, "random": min(2, problems - 1), "oracle": oracle}
     shares = {name: share_of(count, problems) for name, count in counts.items()}
-    found = closed_loop(shares, "adapter", "oracle", problems, "reach")
-    assert (found.word, found.why.startswith(why), bool(found.why)) == (word, True, bool(why))
-    assert f"of {problems} problems of reach" in found.says
-
-
-def test_a_closed_loop_of_the_same_checkpoint_answers_for_the_plans(tmp_path: Path) -> None:
-    found = asked(model("model", 0.5))
-    shares = {name: share_of(count, 50) for name, count in {"m": 45, "random": 2, "oracle": 50}.items()}
-    measured = closed_loop(shares, "m", "oracle", 50, "reach")
-    (tmp_path / "closed_loop" / "reach-B").mkdir(parents=True)
-    file = tmp_path / "closed_loop" / "reach-B" / "closed_loop.json"
-    file.write_text(json.dumps({"about": {"checkpoint": "step 8"}, "plans": asdict(measured)}))
-    assert with_closed_loop(found, tmp_path, "step 8").plans == measured
-    assert with_closed_loop(found, tmp_path, "step 9") == with_closed_loop(found, tmp_path / "no", "step 8") == found
+    plans = closed_loop(shares, "adapter", "oracle", problems, "reach")
+    assert plans.conclusion == conclusion
+    assert plans.needs.startswith(needs)
+    assert bool(plans.needs) == bool(needs)
+    assert plans.statement.endswith(f"of {problems} reach problem{'s' * (problems > 1)}")
 
 
 @pytest.mark.parametrize("episodes", [1, 8])
-@pytest.mark.parametrize("others", [0.6, 0.9])
-@pytest.mark.parametrize("rank", [0.02, 0.1])
-def test_an_answer_fits_a_screen_whatever_it_is(episodes: int, others: float, rank: float) -> None:
-    pair = ranked("base", 1.0, 0.05), ranked("adapter", 0.6, rank, shuffled=others)
-    found = evaluation(*pair, episodes=episodes)
-    found = replace(found, about=replace(found.about, subject="runs/a-kitchen-with-a-name-that-is-long-enough-to-wrap"))
-    text = summarize(found, rows_of(found))
-    lines = str(text).splitlines()
-    assert len(lines) <= 12
+@pytest.mark.parametrize("with_base", [True, False])
+@pytest.mark.parametrize("level", [0.6, 2.7])
+@pytest.mark.parametrize(("shuffled", "rank", "distance"), [(0.6, 0.02, 1.0), (0.9, 0.7, 12.3), (4.0, 0.1, 123.4)])
+def test_every_summary_fits_a_screen_and_has_whole_sentences(
+    episodes: int, with_base: bool, level: float, shuffled: float, rank: float, distance: float
+) -> None:
+    models = [ranked("base", 1.0, 0.05)] * with_base + [ranked("adapter", level, rank, shuffled=shuffled, noise=0.1)]
+    spread = [with_spread(one, 0.9 if one.role == "base" else 0.8) for one in models]
+    measured = evaluation(*(mapped(one, distance, 0.0086, episodes) for one in spread), episodes=episodes)
+    subject = f"runs/{'a-kitchen-with-a-name-that-is-long-enough-to-wrap-' * 2}"
+    measured = replace(measured, about=replace(measured.about, subject=subject), copies=spread[0].distribution)
+    measured = with_errors(measured, "adapter", by(level, abs(2 - level)))
+    summary = summarize(measured, rows_of(measured))
+    lines = str(summary).splitlines()
+    assert len(lines) <= 18, "three of them are the long name and the clips"
     assert max(map(len, lines)) <= 80
-    assert len(text.sentence.split()) <= 40
+    assert lines[2] == f"24 clips, {episodes} held-out episode{'s' * (episodes > 1)}"
+    assert len(summary.sentence.split()) <= 40
+    assert re.fullmatch(r"[A-Z0-9].*\.", summary.sentence)
+    assert not any(re.match(r" *(%|cm|s)( |$)", line) for line in lines), "a unit without its number"
+    assert "-0.0" not in str(summary).replace("-0.0086", "")
+    assert "nan" not in str(summary)

@@ -8,8 +8,9 @@ import pytest
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml, parse_config
 from vjepa2_ac.init import draft
-from vjepa2_ac.init.draft import Machine, choose_model, duration, make_draft
+from vjepa2_ac.init.draft import Machine, choose_model, make_draft
 from vjepa2_ac.init.found import FoundData, Knob, plain
+from vjepa2_ac.reporter import duration
 from vjepa2_ac.storage.structured import parse_yaml
 
 GB = 10**9

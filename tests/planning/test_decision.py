@@ -1,6 +1,7 @@
 """Decisions: their values, their file and their summary agree."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,15 @@ from decisions import QUICK, STATE, asked, image
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.decision import PlanRequest, PlanResult, axes_at_limit, decide, summarize, write_plan
+from vjepa2_ac.planning.decision import (
+    PlanRequest,
+    PlanResult,
+    axes_at_limit,
+    decide,
+    summarize,
+    warn_of_plan,
+    write_plan,
+)
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.goals import equal_durations, timed
 
@@ -88,9 +97,25 @@ def test_the_file_holds_the_decision(tmp_path: Path) -> None:
     np.testing.assert_allclose(second["dz"], found.slices[1].up)
 
 
+@pytest.mark.parametrize("still", [0.5, 1.0, 2.0, np.nan])
+@pytest.mark.parametrize("now", [0.8, 1.25])
+def test_a_plan_is_called_worse_than_exactly_the_lower_energies(tmp_path: Path, still: float, now: float) -> None:
+    found = asked(nodes=0)
+    energy = found.decision.plan.energy
+    decision = replace(found.decision, energy_now=now * energy)
+    found = replace(found, doing_nothing=still * energy, decision=decision)
+    worse = [name for name, share in (("zero action", still), ("current frame", now)) if share < 1.0]
+    assert read(found, tmp_path)["worse_than"] == list(found.worse_than) == worse
+    said = {
+        "zero action": f"zero action: energy {energy:.4f} against {energy / 2:.4f} (+100 %).",
+        "current frame": f"current frame: energy {energy:.4f} against {0.8 * energy:.4f} (+25 %).",
+    }
+    assert warn_of_plan(found) == tuple(f"The plan is predicted to be worse than the {said[name]}" for name in worse)
+
+
 def test_at_the_goal_nothing_is_done_and_the_summary_says_so(tmp_path: Path) -> None:
     found = asked(7, start=7)
-    assert summarize(found).startswith("Does nothing: what the model sees now")
+    assert summarize(found).startswith("Zero action: the current frame has the latents of the goal")
     file = read(found, tmp_path)
     assert file["why"] == "at the goal"
     assert not np.any(file["actions"])
@@ -114,10 +139,10 @@ def test_goals_without_a_part_in_the_plan_are_named() -> None:
     last = asked(100, 101)
     assert last.decision.goals == (0, 1)
     assert last.unused_goals == (0,)
-    assert "goal 1" in summarize(last)
+    assert "Goal 1 does not affect this plan" in summarize(last)
     summed = asked(100, 101, energy=EnergyConfig(steps="sum"))
     assert summed.unused_goals == ()
-    assert "goal" not in summarize(summed)
+    assert "oal" not in summarize(summed)
     assert asked(100, 101, 102, energy=EnergyConfig(steps="sum")).unused_goals == (2,)
 
 
@@ -128,11 +153,11 @@ def test_goals_share_the_horizon_by_default() -> None:
 
 def test_what_a_person_should_know_of_a_plan_is_said() -> None:
     found = asked(limits=LimitsConfig(xyz=(0.05, 0.0, 0.05)))
-    assert "better than doing nothing" not in summarize(found)
+    assert "better than the zero action" not in summarize(found)
     found.actions[0, :3] = (-0.0495, 0.0, 0.048)
     assert axes_at_limit(found) == ["dx"]
-    object.__setattr__(found, "doing_nothing", -1.0)
-    for said in ("at its limit along dx (", "None of the evaluated actions is predicted to be better"):
+    object.__setattr__(found, "doing_nothing", found.decision.plan.energy)
+    for said in ("at its limit along dx (", "No evaluated action sequence is predicted to be better"):
         assert said in summarize(found)
     ticks = iter(range(1000))
     controller = Controller(tiny_model(), QUICK.model_copy(update={"budget_s": 4.0}))

@@ -99,7 +99,9 @@ MORE: dict[str, Any] = {
     "mask": {},
     "samples of a policy": {},
 }
-# Options that change numbers of a search only: their pairs are tried many at a time, all others one by one.
+# Options without which a decision does more: their pairs are tried one by one, those of all others three at a time.
+ALONE = {"budget_s", "replan", "samples of a policy"}
+# Options that change numbers of a search only: their pairs are tried many at a time.
 NUMBERS = {
     *("samples", "iterations", "start_std", "gripper_start_std", "prior_steps", "energy.distance", "goals.share"),
     *("energy.samples_at_once", "limits.xyz", "limits.ball", "limits.radius", "limits.rotation", "limits.axes"),
@@ -276,14 +278,20 @@ def test_every_pair_of_options_works_or_is_refused_before_the_first_decision(sce
 
 
 def groups(together: dict[str, set[str]]) -> Iterator[list[str]]:
-    """Yield options that go together: each pair without numbers, then groups that cover all other pairs."""
-    left = [frozenset(pair) for pair in combinations(together, 2) if pair[1] in together[pair[0]]]
-    yield from (sorted(pair) for pair in left if not pair & NUMBERS)
-    left = [pair for pair in left if pair & NUMBERS]
+    """Yield options that go together, so that each pair is in a group: with numbers in large ones, others in small."""
+    pairs = [frozenset(pair) for pair in combinations(together, 2) if pair[1] in together[pair[0]]]
+    yield from (sorted(pair) for pair in pairs if pair & ALONE and not pair & NUMBERS)
+    yield from covering([pair for pair in pairs if not pair & (ALONE | NUMBERS)], together, at_most=3)
+    yield from covering([pair for pair in pairs if pair & NUMBERS], together, at_most=len(together))
+
+
+def covering(left: list[frozenset[str]], together: dict[str, set[str]], *, at_most: int) -> Iterator[list[str]]:
+    """Yield groups of options that go together and cover these pairs."""
     while left:
         group = sorted(left[0])
-        for name in sorted(together, key=lambda name: -sum(name in pair for pair in left)):
-            if all(name in together[one] for one in group):
+        names = {name for pair in left for name in pair}
+        for name in sorted(names, key=lambda name: (-sum({name, one} in left for one in group), name)):
+            if len(group) < at_most and all(name in together[one] for one in group):
                 group.append(name)
         left = [pair for pair in left if not pair <= {*group}]
         yield group

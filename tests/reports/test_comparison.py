@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,13 @@ import pytest
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.reports.comparison import compare
+from vjepa2_ac.reports.comparison import Comparison, compare
 from vjepa2_ac.reports.figures.evaluation import plot_comparison
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
 from vjepa2_ac.reports.paper import write_tables
 from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 
-PROBES = ProbeOptions(sensitivity_clips=4, samples=10, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
+PROBES = ProbeOptions(ranking_clips=4, samples=10, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
 
 
 def written(folder: Path, model: object, *, clips: int = 12, seed: int = 0, **changes: object) -> Path:
@@ -40,9 +41,89 @@ def test_runs_are_compared_with_the_first_one_pair_by_pair(tmp_path: Path) -> No
     assert [one.value for one in found.curves["half"]] == pytest.approx([0.5] * 4, rel=1e-4)
     assert found.notes == ()
     assert found.title.endswith(" episodes")
-    assert found.best == "half"
-    assert max(map(len, str(found).splitlines())) <= 80
+    shown = str(found).splitlines()
+    assert shown[0].startswith("2 runs on the same 12 clips, ")
+    assert shown[-1].startswith("The error of nothing is 100 % higher than that of half (95 % CI 100 to 100 %, n = ")
     assert plot_comparison(found, tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+
+
+def of_runs(found: Comparison, **runs: tuple[float | None, float, int]) -> Comparison:
+    """Return a comparison of runs with these action-ranking errors, last errors over persistence, and steps."""
+    one, curve = next(iter(found.measured.items()))[1], next(iter(found.curves.values()))
+    measured, curves = {}, {}
+    for name, (rank, error, step) in runs.items():
+        ranks = replace(one.summary.ranks_actions, value=rank)
+        about = replace(one.about, checkpoint=f"step-{step:08d} (as asked for)", checkpoint_path=f"run/step-{step:08d}")
+        measured[name] = replace(one, summary=replace(one.summary, ranks_actions=ranks), about=about)
+        curves[name] = (*curve[:-1], replace(curve[-1], value=error))
+    rows = [row for row in found.rows if row.key == "gain_over_first"]
+    gains = tuple(replace(rows[0], model=name) for name in list(runs)[1:])
+    return replace(
+        found, measured=measured, curves=curves, rows=gains, folders={name: Path("my runs", name) for name in runs}
+    )
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    folder = tmp_path_factory.mktemp("two")
+    return compare([written(folder / "half", Halfway()), written(folder / "nothing", Copier())])
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ((0.40, 0.7, 100), (0.30, 0.9, 200), "export 'my runs/b' b-merged --checkpoint 200"),  # ranking decides
+        ((0.30, 0.9, 100), (0.304, 0.7, 200), "export 'my runs/b' b-merged --checkpoint 200"),  # as good as equal
+        ((0.30, 0.9, 100), (0.306, 0.7, 200), "export 'my runs/a' a-merged --checkpoint 100"),
+        ((0.40, 0.7, 100), (0.30, 0.9, 0), "No run is recommended: b, with the lowest action-ranking error, was not"),
+        ((0.40, 0.7, 100), (None, 0.9, 200), "No run is recommended: the action-ranking error of b was not measured."),
+    ],
+)
+def test_a_run_is_recommended_as_checkpoints_are_selected(two: Comparison, first, second, expected: str) -> None:
+    assert expected in of_runs(two, a=first, b=second).next_command
+
+
+def test_no_run_is_recommended_without_a_conclusion(two: Comparison) -> None:
+    found = of_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
+    summary = found.measured["b"].summary
+    few = replace(summary, predicts=replace(summary.predicts, needs="1 held-out episode is too few."))
+    measured = dict(found.measured) | {"b": replace(found.measured["b"], summary=few)}
+    assert replace(found, measured=measured).next_command == "No run is recommended: 1 held-out episode is too few."
+
+
+def test_columns_of_the_comparison_align_whatever_names_and_numbers_are(two: Comparison) -> None:
+    numbers = {"a" * 60: (0.5, 123.4, 123_456), "b": (None, 0.7, 0), "lora of a base": (0.014, 0.1, 8)}
+    text = str(of_runs(two, **numbers))
+    assert max(map(len, text.splitlines())) <= 100
+    _, *lines = text.partition("\nThe error")[0].splitlines()
+    assert lines[1].split()[:2] == ["run", "checkpoint"]
+    ends = [match.end() for match in re.finditer(r"\S+( \S+)*", lines[2])]
+    for line in lines[3:]:
+        assert [match.end() for match in re.finditer(r"\S+( \S+)*", line)][2:] == ends
+        assert len(re.findall(r"[+-]?\d[\d,.]* %|not measured|base model|\d[\d,]*", line[24:])) == 4, "a number a cell"
+    assert "base model" in lines[4]
+
+
+@pytest.mark.parametrize(
+    ("gain", "sentence"),
+    [
+        ((0.04, 0.01, 0.07), "The error of b is 4.0 % lower than that of a (95 % CI 1.0 to 7.0 %, n = "),
+        ((-0.24, -0.26, -0.22), "The error of b is 24 % higher than that of a (95 % CI 22 to 26 %, n = "),
+        ((0.04, -0.01, 0.07), "The errors of b and a do not differ significantly."),
+    ],
+)
+def test_the_last_sentence_has_gain_interval_and_reference(two: Comparison, gain: tuple, sentence: str) -> None:
+    found = of_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
+    value, low, high = gain
+    rows = tuple(replace(row, value=value, low=low, high=high) for row in found.rows)
+    assert str(replace(found, rows=rows)).splitlines()[-1].startswith(sentence)
+
+
+def test_checkpoints_that_were_not_chosen_by_one_rule_are_pointed_out(tmp_path: Path) -> None:
+    runs = {"one": "step-00000100 (the newest)", "other": "step-00000800 (the best by action ranking)"}
+    folders = [written(tmp_path / name, Halfway(), checkpoint=text) for name, text in runs.items()]
+    expected = "Checkpoints were chosen differently: the newest (one), the best by action ranking (other)."
+    assert compare(folders).notes == (expected,)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +169,7 @@ def test_a_run_that_was_not_evaluated_is_named_with_the_way_out(tmp_path: Path) 
     [
         ({"by_clip": {"persistence": 0.5, "models": {}}}, "by_clip.persistence"),
         ({"rows": [{"key": 1}]}, "metrics that cannot be used"),
-        ({"format": 99}, "format: Input should be 4"),
+        ({"format": 99}, "format: Input should be 5"),
     ],
 )
 def test_damaged_metrics_are_named(tmp_path: Path, changes: dict[str, object], words: str) -> None:
@@ -119,7 +200,7 @@ def test_the_cost_of_wrong_actions_follows_from_the_errors_in_the_file(tmp_path:
     assert metrics.of("cost_of_actions.shuffled").value == pytest.approx(shuffled / true - 1, rel=1e-5)
     assert metrics.of("gap_of_actions.shuffled").value == pytest.approx((shuffled - true) / persistence, rel=1e-5)
     assert metrics.of("one_step.zero").value == pytest.approx(np.mean(errors["zero"]) / persistence, rel=1e-5)
-    assert metrics.answer.uses_actions.share == metrics.of("cost_of_actions.shuffled").value
+    assert metrics.summary.uses_actions.value == metrics.of("cost_of_actions.shuffled").value
 
 
 def test_a_run_of_an_older_version_is_compared(tmp_path: Path) -> None:

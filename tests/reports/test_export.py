@@ -21,7 +21,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import Row
-from vjepa2_ac.evaluation.summary import not_measured
+from vjepa2_ac.evaluation.summary import Summary, not_measured
 from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.checkpoints.loading import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -38,8 +38,8 @@ ROWS = [
     Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "adapter", 0.7),
 ]
 EVALUATED = {
-    "format": 4,
-    "answer": asdict(Answer("somewhere/run, step 2", "8 clips", "the base", *map(not_measured, ("a", "b", "c")))),
+    "format": 5,
+    "summary": asdict(Summary("somewhere/run, step 2", "8 clips", *(not_measured(name, "evaluate") for name in "abc"))),
     "trained": "adapter",
     "base": "base",
     "about": {
@@ -54,7 +54,7 @@ EVALUATED = {
 
 
 Trained = Callable[..., Path]
-QUICK = ["--clips", "4", "--sensitivity-clips", "2", "--samples", "4", "--landscapes", "1", "--nodes", "3"]
+QUICK = ["--clips=4", "--ranking-clips=2", "--samples=4", "--landscapes=1", "--axes=0", "--nodes=3", "--examples=1"]
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +265,7 @@ def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied
     (run / METRICS_FILE).write_text(json.dumps({**measured, "about": {**about, "checkpoint_path": old}}))
     assert main(["export", str(run), str(tmp_path / "hub"), "--to", "hub"]) == 0
     card = (tmp_path / "hub" / CARD).read_text()
-    assert measured["answer"]["predicts"]["says"] in card
+    assert measured["summary"]["predicts"]["statement"] in " ".join(card.split())
     assert "another checkpoint**: `step-00000001`, not `step-00000002`" in card
     assert "model-index" not in card, "results of another checkpoint are not those of this adapter"
 

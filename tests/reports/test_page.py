@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import io
 import re
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from html.parser import HTMLParser
 from importlib import resources
 from xml.etree import ElementTree as ET
@@ -19,14 +19,15 @@ from evaluation_results import decoded_strips, evaluation, page_of
 from planned import with_plans
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.evaluation.summary import summarize
+from vjepa2_ac.evaluation.summary import Verdict, summarize
+from vjepa2_ac.reports import write
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.reports.write import LONGEST_S, MOST_BYTES, MOST_CLIPS, bar_of, film_of, report_page
 
-pytestmark = pytest.mark.usefixtures("drawn")
-
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;]]>{}\u202e\x00\ud800é"
-SOLVED = Question("plans", "no", "solves 4 % of 50 problems of reach", 0.04, "[0, 10]", "(zero 6 %)", against=0.06)
+SOLVED = Verdict(
+    "plans", "no", "solves 4.0 % of 50 reach problems", 0.04, 0.01, 0.1, reference="(random 6.0 %)", baseline=0.06
+)
 
 
 class Page(HTMLParser):
@@ -46,12 +47,28 @@ class Page(HTMLParser):
         self.shown += data
 
 
-@cache
-def usual() -> tuple[Evaluation, str, Page]:
-    """Return an evaluation of which everything was measured, its page, and that in pieces."""
+Usual = tuple[Evaluation, str, Page]
+
+
+@pytest.fixture(scope="module")
+def usual(_undrawn: Callable[[pytest.MonkeyPatch], None]) -> Usual:
+    """An evaluation of which everything was measured, its page with figures that have content, and that in pieces."""
     one = decoded_strips(with_plans(evaluation(others=("runs/other",))))
-    html = page_of(one)
+    with pytest.MonkeyPatch.context() as patch:
+        _undrawn(patch)
+        html = page_of(one)
     return one, html, Page(html)
+
+
+def leave_figures_empty(patch: pytest.MonkeyPatch) -> None:
+    """Give a page all of its images without content: text and tables are the same."""
+    patch.setattr(write, "svg_of", lambda *_: "data:image/svg+xml;base64,")
+    patch.setattr(write, "draw_strip", lambda _: np.zeros((8, 8, 3), np.uint8))
+
+
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_figures_empty(monkeypatch)
 
 
 def images(html: str) -> list[bytes]:
@@ -59,30 +76,42 @@ def images(html: str) -> list[bytes]:
     return [base64.b64decode(one) for one in re.findall('base64,([^"]*)"', html)]
 
 
-def test_the_first_screen_gives_the_answer_of_the_console_and_four_other_numbers() -> None:
-    for one, changes in ((usual()[0], {}), (evaluation(episodes=2, clips=8), {"plans": SOLVED})):
-        found = replace(summarize(one, rows_of(one)), **changes)
-        first = report_page(one, found).partition("<details")[0]
+@pytest.mark.usefixtures("without_figures")
+def test_the_first_screen_shows_the_summary_of_the_console_and_numbers_that_it_does_not_have(usual: Usual) -> None:
+    for one, changes in ((usual[0], {}), (evaluation(episodes=2, clips=8), {"plans": SOLVED})):
+        summary = replace(summarize(one, rows_of(one)), **changes)
+        first = report_page(one, summary).partition("<details")[0]
         shown = " ".join(Page(re.sub("<[^>]*>", " ", first.partition("</style>")[2])).shown.split())
-        assert not [word for word in str(found).split() if word not in shown]
-        assert found.sentence in shown
-        assert ("<dt>other moves" in first) == bool(changes), "a tile repeats the answer"
-        assert len(set(re.findall("<dt>(.*?)</dt>", first))) == first.count("<dt>") == 4
+        assert not [word for word in str(summary).split() if word not in shown]
+        assert summary.sentence in shown
+        assert first.count("<li") == len(summary.verdicts) == 4
+        assert ("<dt>action-ranking error" in first) == bool(changes), "a tile repeats a verdict"
+        tiles = re.findall("<dt>(.*?)</dt>", first)
+        assert len(set(tiles)) == len(tiles) == 3 + bool(changes)
+        assert first.count("is better)") + first.count("1 = as varied as the truth; lower = smoother") == len(tiles)
 
 
-def test_a_bar_puts_a_number_its_interval_and_what_it_is_held_against_in_their_order() -> None:
-    for share, against in ((0.3, 0.0), (-0.3, 0.0), (0.3, 0.5), (0.7, 0.5)):
-        asked = Question("plans", "yes", "", share, f"[{100 * share - 4}, {100 * share + 5}]", against=against)
-        bar = bar_of(asked)
+def test_a_bar_shows_a_number_its_interval_and_its_baseline_in_their_order() -> None:
+    for value, baseline in ((0.3, 0.0), (-0.3, 0.0), (0.3, 0.5), (0.7, 0.5)):
+        verdict = Verdict("plans", "yes", "", value, value - 0.04, value + 0.05, baseline=baseline)
+        bar = bar_of(verdict)
         assert 0 < min(bar.values()) < max(bar.values()) < 100
         assert bar["low"] < bar["point"] < bar["high"]
-        assert (bar["against"] < bar["low"]) == (against < share)
-        assert len(set(bar_of(replace(asked, interval="")).values())) == 2
-    assert not bar_of(replace(asked, share=None))
+        assert (bar["against"] < bar["low"]) == (baseline < value)
+        assert len(set(bar_of(replace(verdict, low=None, high=None)).values())) == 2
+    assert not bar_of(replace(verdict, value=None))
 
 
-def test_all_but_the_first_screen_is_folded_and_no_table_stands_beside_the_figures_of_its_part() -> None:
-    _, html, _ = usual()
+def test_the_bar_of_the_landscape_is_in_centimetres(usual: Usual) -> None:
+    html = usual[1]
+    landscape = html.partition("<strong>landscape</strong>")[2].partition("</li>")[0]
+    assert re.search(r">\d+\.\d cm</small>", landscape)
+
+
+def test_all_but_the_first_screen_is_folded_and_no_table_stands_beside_the_figures_of_its_part(
+    usual: Usual,
+) -> None:
+    _, html, _ = usual
     first, *parts = re.split("\n<details id=", html)
     assert len(parts) == html.count("<summary><h2>") > 10
     assert "<details open" not in html
@@ -92,10 +121,13 @@ def test_all_but_the_first_screen_is_folded_and_no_table_stands_beside_the_figur
         assert -1 in {figures, tables} or figures < part.find("<details>") < tables
 
 
-def test_the_film_shows_the_clip_in_which_the_models_differ_most_and_is_short_and_small() -> None:
+def test_the_video_shows_the_clip_with_the_median_error_and_is_short_and_small() -> None:
     one = decoded_strips(evaluation(frames=16), size=256)
-    film, strips = film_of(one), one.decoded.strips
-    assert film.clip is strips[1]
+    best = replace(one.decoded.strips[0], why="best")
+    one = replace(one, decoded=replace(one.decoded, strips=(best, one.decoded.strips[1])))
+    film = film_of(one)
+    assert film.clip.why == "median"
+    assert film.clip is one.decoded.strips[1]
     frames, times = [], []
     for file in images(f'{film.url}"{film.still}"'):
         assert len(file) <= MOST_BYTES
@@ -108,6 +140,7 @@ def test_the_film_shows_the_clip_in_which_the_models_differ_most_and_is_short_an
             assert np.abs(shown[:256, place * 264 : place * 264 + 256] - true).mean() < 4
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_of_many_episodes_the_best_and_the_worst_are_shown_by_short_names() -> None:
     one = evaluation(episodes=40, clips=80)
     html = page_of(one)
@@ -132,8 +165,10 @@ def named(name: str) -> Evaluation:
     )
 
 
-def test_no_name_can_change_the_page_but_for_its_text() -> None:
+@pytest.mark.usefixtures("drawn")
+def test_no_name_can_change_the_page_but_for_its_text(monkeypatch: pytest.MonkeyPatch) -> None:
     html = page_of(named(HOSTILE))
+    leave_figures_empty(monkeypatch)
     harmless, hostile = Page(page_of(named("a/b"))), Page(html)
     without_breaks = [[one for one in page.elements if one[0] != "wbr"] for page in (harmless, hostile)]
     assert [tag for tag, _ in without_breaks[0]] == [tag for tag, _ in without_breaks[1]]
@@ -147,17 +182,19 @@ def test_no_name_can_change_the_page_but_for_its_text() -> None:
             assert not tags & {"script", "foreignObject", "a"}
 
 
-def test_the_page_refers_to_nothing_but_itself_and_is_the_same_each_time() -> None:
-    one, html, page = usual()
+@pytest.mark.usefixtures("drawn")
+def test_the_page_refers_to_nothing_but_itself_and_is_the_same_each_time(usual: Usual) -> None:
+    one, html, page = usual
     links = [one[key] or "" for _, one in page.elements for key in ("href", "src", "srcset") if key in one]
     assert all(link.startswith("data:image/") for link in links)
     assert not re.search(r"https?:|//\w|@import|url\(|\bon\w+=|javascript:", re.sub(r"base64,[^\"]*", "", html))
     assert page_of(one) == html
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_page_stays_small_whatever_was_measured() -> None:
     rng = np.random.default_rng(0)
-    one = evaluation(frames=16, size=512)
+    one = evaluation(frames=16, size=256)
     noise = rng.integers(0, 256, size=one.examples[0].frames.shape, dtype=np.uint8)
     curve = TrainingCurve("loss", tuple(range(5_000)), tuple(map(float, range(5_000))))
     html = page_of(replace(one, examples=(replace(one.examples[0], frames=noise),) * 6, training=(curve,) * 4))
@@ -167,22 +204,24 @@ def test_the_page_stays_small_whatever_was_measured() -> None:
 
 def test_what_was_not_measured_is_named_with_the_reason() -> None:
     one = evaluation(with_base=False)
-    adapter = replace(one.models["adapter"], sensitivity=None, landscapes=None, distribution=None)
+    adapter = replace(one.models["adapter"], ranking=None, landscapes=None, distribution=None)
     bare = replace(one, models={"adapter": adapter}, examples=(), training=(), strata=(), episodes=(), copies=None)
-    noted = replace(bare, notes=("--sensitivity-clips is 0: no energy landscapes.",))
+    noted = replace(bare, notes=("--ranking-clips is 0: no energy landscapes.",))
     shown = Page(page_of(noted)).shown
     for what in (
         "Compared with the base", "Energy landscapes", "Example clips", "Training curves", "Other strides",
         "Spread of the predictions", "Decoded images", "Plans beside demonstrations",
     ):  # fmt: skip
         assert f"{what}: not measured." in shown
-    assert "Energy landscapes: not measured. --sensitivity-clips is 0: no" in shown
+    assert "Energy landscapes: not measured. --ranking-clips is 0: no" in shown
+    assert "`" not in shown, "a command is shown as code"
     written = metrics_as_dict(noted)["not_measured"]
     assert len(written) == 8
-    assert all(reason in shown for reason in written.values()), "the page and metrics.json give the same reasons"
-    assert "No film: vjepa2-ac evaluate runs/kitchen --decoder FOLDER" in shown
+    assert all(reason.replace("`", "") in shown for reason in written.values()), "page and metrics.json agree"
+    assert "No video: vjepa2-ac evaluate runs/kitchen --decoder FOLDER" in shown
 
 
+@pytest.mark.usefixtures("drawn")
 def test_one_episode_has_no_intervals_and_nothing_is_written_as_nan_even_without_photographs() -> None:
     one = evaluation(episodes=1)
     html = page_of(replace(one, examples=tuple(replace(example, frames=None) for example in one.examples)))
@@ -190,8 +229,8 @@ def test_one_episode_has_no_intervals_and_nothing_is_written_as_nan_even_without
     assert html.count("data:image/webp") == len(one.examples)
 
 
-def test_images_are_described_tables_have_captions_and_headings_do_not_jump() -> None:
-    _, html, page = usual()
+def test_images_are_described_tables_have_captions_and_headings_do_not_jump(usual: Usual) -> None:
+    _, html, page = usual
     levels = "".join(tag[1] for tag, _ in page.elements if re.fullmatch("h[1-6]", tag))
     assert re.fullmatch("1(2+3*)+", levels)
     assert all(attributes.get("alt") for tag, attributes in page.elements if tag == "img")

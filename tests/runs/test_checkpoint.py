@@ -451,13 +451,11 @@ def test_a_damaged_one_is_not_used_in_place_of_what_was_asked_for(run: Path) -> 
             select_checkpoint(run, by)
 
 
-def test_a_base_that_is_better_than_all_is_selected_and_called_so(tmp_path: Path) -> None:
+def test_a_base_that_is_better_than_all_is_selected(tmp_path: Path) -> None:
     for step in (0, 10):
         state = RunState(step, best_step=0, best_error=0.9, best_rank=0.03)
         write_checkpoint(tmp_path / "checkpoints", state, write_weights, keep=9)
-    assert str(select_checkpoint(tmp_path)) == (
-        "step-00000000 (the base: none of its checkpoints is better by action ranking)"
-    )
+    assert str(select_checkpoint(tmp_path)) == "step-00000000 (the best by action ranking)"
 
 
 def test_without_validations_there_is_no_best_and_without_checkpoints_nothing(tmp_path: Path) -> None:

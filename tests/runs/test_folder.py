@@ -43,7 +43,7 @@ lock.take()
 print("held", flush=True)
 sys.stdin.read()
 """
-ASKED = EvaluationOptions(clips=4, probes=ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0))
+ASKED = EvaluationOptions(clips=4, probes=ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0))
 
 
 class KilledError(BaseException):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -28,8 +27,6 @@ from vjepa2_ac.evaluation.result import (
     Mode,
     ModelResult,
     PredictionErrors,
-    Ranking,
-    Sensitivity,
     Stratum,
     TrainingCurve,
     Way,
@@ -73,21 +70,11 @@ def _predicted(
     return {(way, mode, L1.name): values for mode, values in by_mode.items()} | of_l2
 
 
-def _sensitivity(rng: np.random.Generator, ids: tuple[str, ...], skill: float) -> Sensitivity:
-    rank = rng.beta(1.0, 1.0 + 3 * skill, size=len(ids))
-    change = np.abs(rng.normal(0.1 + 0.2 * skill, 0.05, size=len(ids)))
-
-    def ranking(drawn_from: Any) -> Ranking:
-        top = {k: mean_of((rank < k / 65).astype(np.float64), ids) for k in (1, 5)}
-        return Ranking(drawn_from, 64, tuple(range(len(ids))), rank, mean_of(rank, ids), top)
-
-    return Sensitivity(mean_of(change, ids), change, (ranking("clips"), ranking("box")))
-
-
 def ranking_of(ranks: np.ndarray, ids: tuple[str, ...]) -> ActionRanking:
     """Return a ranking of these moves, the same in the box and on the shell."""
     rank = mean_of(ranks, ids)
-    return ActionRanking(64, 0.075, ids, ranks, rank, rank, rank, mean_of(0.2 - 0.3 * ranks, ids))
+    change = mean_of(0.2 - 0.3 * ranks, ids)
+    return ActionRanking(64, 0.075, ids, ranks, rank, rank, rank, change, change)
 
 
 def _landscape(rng: np.random.Generator, episode_id: str, off: float) -> Landscape:
@@ -106,7 +93,8 @@ def _landscapes(rng: np.random.Generator, ids: tuple[str, ...], off: float) -> L
     maps = tuple(_landscape(rng, name, off) for name in ids[:5])
     distance = mean_of(np.array([one.distance for one in maps]), ids[:5])
     signs = tuple(mean_of(np.array([1.0, 1.0, 0.0, 1.0, 1.0]), ids[:5]) for _ in range(3))
-    return Landscapes(("dx", "dy", "dz"), "cm", maps, distance, 8.1, signs, (0.5, 0.5, 0.5), (5, 5, 0), 1.25)  # type: ignore[arg-type]
+    sharpness = mean_of(np.array([np.ptp(one.energy) / one.energy.mean() for one in maps]), ids[:5])
+    return Landscapes(("dx", "dy", "dz"), "cm", maps, distance, sharpness, 8.1, signs, (0.5, 0.5, 0.5), (5, 5, 0), 1.25)  # type: ignore[arg-type]
 
 
 def _axes(ids: tuple[str, ...], degrees: float) -> AxisFit:
@@ -121,7 +109,8 @@ def _axes(ids: tuple[str, ...], degrees: float) -> AxisFit:
 def _distribution(rng: np.random.Generator, ids: tuple[str, ...], spread: float, horizon: int) -> LatentDistribution:
     levels = [spread ** (h / horizon) + 0.1 * rng.standard_normal(len(ids)) for h in range(1, horizon + 1)]
     spreads = tuple(mean_of(level, ids) for level in levels)
-    return LatentDistribution(spreads, tuple(mean_of(1 - level, ids) for level in levels), (0.04,) * horizon)
+    mmd, variance = tuple(mean_of(1 - level, ids) for level in levels), tuple(2 * one.value for one in spreads)
+    return LatentDistribution(spreads, mmd, (0.04,) * horizon, variance, (2.0,) * horizon)
 
 
 def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, models: list[str], size: int) -> Example:
@@ -185,7 +174,6 @@ def evaluation(
             name,
             {"base": "base", "adapter": "trained"}.get(name, "other"),  # type: ignore[arg-type]
             PredictionErrors(ids, arrays),
-            _sensitivity(rng, ids, skill),
             _landscapes(rng, ids, 4 - 3 * skill),
             ranking=ranking_of(0.3 * (1 - skill) + 0.1 * rng.random(len(ids)), ids),
             beside={"axes": _axes(ids, degrees=60 - 60 * skill)},

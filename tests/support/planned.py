@@ -18,7 +18,7 @@ ONE_STEP = PlanningConfig(
     samples=200, iterations=12, limits=LimitsConfig(rotation=0.1), energy=EnergyConfig(samples_at_once=400)
 )
 FEW = ONE_STEP.model_copy(update={"samples": 40, "iterations": 3})
-PROBES = ProbeOptions(sensitivity_clips=0, examples=0, planning_clips=4, planning=ONE_STEP)
+PROBES = ProbeOptions(ranking_clips=0, examples=0, planning_clips=4, planning=ONE_STEP)
 QUICK = replace(PROBES, planning=FEW)  # where it does not matter how good a plan is
 
 

@@ -232,10 +232,10 @@ def test_a_loss_that_rises_far_above_its_lowest_is_reported_between_validations(
 
 
 def ranking(rank: float, low: float, high: float) -> dict[str, float]:
-    return {"action_rank": rank, "action_rank_low": low, "action_rank_high": high}
+    return {"action_ranking_error": rank, "action_ranking_error_low": low, "action_ranking_error_high": high}
 
 
-def test_a_model_that_predicts_better_and_plans_worse_is_warned_of_once(config: Config) -> None:
+def test_a_model_that_predicts_better_and_ranks_actions_worse_is_warned_of_once(config: Config) -> None:
     start = validation(0.9) | ranking(0.03, 0.02, 0.04)
     unsure, sure = validation(0.7) | ranking(0.05, 0.039, 0.07), validation(0.6) | ranking(0.06, 0.05, 0.07)
     found = warned(config, (0, start), (3, unsure), (6, sure), (9, sure))
@@ -251,7 +251,7 @@ def test_a_run_that_diverges_says_so_and_its_report_does_too(make_diverging, rep
     rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] == "warning"]
     assert rows, "it did not diverge: this test tests nothing"
     assert [f"Warning: {row['text']}" for row in rows] == reported
-    assert main(["evaluate", str(run), "--clips", "2", "--sensitivity-clips", "0", "--examples", "0"]) == 0
+    assert main(["evaluate", str(run), "--clips", "2", "--ranking-clips", "0", "--examples", "0"]) == 0
     notes = json.loads((run / "metrics.json").read_text())["notes"]
     assert f"In training, {rows[0]['text']}." in notes
     assert "before training" in (run / "report.html").read_text()

@@ -1,6 +1,7 @@
 """A robot with other states or actions than the base's: from its recordings to a trained model."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from vjepa2_ac.training.loop import train
 
 MakeConfig = Callable[..., Config]
 HEADS = ["action_encoder", "state_encoder"]
-PROBES = ProbeOptions(sensitivity_clips=2, samples=4, landscape_clips=1, nodes=3, examples=1)
+PROBES = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, axis_clips=0, nodes=3, examples=1)
 QUICK = EvaluationOptions(split="validation", clips=4, probes=PROBES)
 ROBOTS = {"14/14": Widths(14, 14), "8/7": Widths(8, 7), "7/8": Widths(7, 8)}
 
@@ -110,7 +111,7 @@ def test_what_it_learnt_is_a_base_that_the_same_robot_trains_on(
     folder = train(make_robot(training__steps=1, training__allow_weak_base=True, **second), again)
     assert not any("initialised anew" in note for note in again.notes)
     assert any("state encoder: the base's own" in note for note in again.notes)
-    evaluation = evaluate_subject(str(folder), QUICK).evaluation
+    evaluation = evaluate_subject(str(folder), replace(QUICK, checkpoint="newest")).evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     results = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), ClipSample(clips=4)).results
     assert [one.moved_cm for one in results.values()] == [None, None]
@@ -142,7 +143,7 @@ def test_vectors_as_wide_as_poses_keep_the_heads_and_must_prove_themselves(
         train(make_robot(widths, adapter__modules_to_save=[]), reporter)
     assert [note for note in reporter.notes if "encoder: the base's own" in note]
     folder = train(make_robot(widths, training__allow_weak_base=True, training__steps=1), reporter)
-    evaluation = evaluate_subject(str(folder), QUICK).evaluation
+    evaluation = evaluate_subject(str(folder), replace(QUICK, checkpoint="newest")).evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     assert export_run(folder, tmp_path / "official.pt", "official").path.is_file()
 

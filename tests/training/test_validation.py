@@ -13,7 +13,8 @@ from vjepa2_ac.data.windows import spread
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart
 from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state, select_checkpoint
+from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
+from vjepa2_ac.runs.loading import describe_selection
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
@@ -46,10 +47,12 @@ def test_each_validation_logs_the_ranking_with_intervals(make_config, reporter) 
     rows = validations(train(make_config(**EVERY_STEP, validation__ranking_samples=8), reporter))
     assert [row["step"] for row in rows] == list(range(7))
     for row in rows:
-        assert 0.0 <= row["action_rank"] <= 1.0
-        assert row["action_rank"] == pytest.approx((row["action_rank_box"] + row["action_rank_shell"]) / 2)
+        assert 0.0 <= row["action_ranking_error"] <= 1.0
+        assert row["action_ranking_error"] == pytest.approx(
+            (row["action_ranking_error_box"] + row["action_ranking_error_shell"]) / 2
+        )
         assert row["energy_spread"] > 0.0
-    assert len({row["action_rank"] for row in rows}) > 1
+    assert len({row["action_ranking_error"] for row in rows}) > 1
 
 
 def test_what_is_ranked_does_not_change_the_run(make_config, reporter, tmp_path) -> None:
@@ -59,7 +62,7 @@ def test_what_is_ranked_does_not_change_the_run(make_config, reporter, tmp_path)
     ]
     weights = [newest_checkpoint(folder / "checkpoints") / "adapter/adapter_model.safetensors" for folder in folders]
     assert weights[0].read_bytes() == weights[1].read_bytes()
-    assert "action_rank" not in validations(folders[1])[0]
+    assert "action_ranking_error" not in validations(folders[1])[0]
 
 
 def test_clips_that_cannot_be_read_are_replaced_in_the_ranking(make_config, reporter, monkeypatch) -> None:
@@ -94,14 +97,21 @@ def test_the_lowest_rank_is_selected_though_the_error_falls_on(make_config, repo
     ranks_are((0.9, 0.10), (0.8, 0.05), (0.7, 0.06), (0.6, 0.07), (0.5, 0.08), (0.4, 0.2), (0.3, 0.3))
     folder = train(make_config(**EVERY_STEP, checkpoint__keep=1), reporter)
     assert {path.name for path in (folder / "checkpoints").iterdir()} == {checkpoint_name(1), checkpoint_name(6)}
-    assert str(select_checkpoint(folder)) == "step-00000001 (the best by action ranking)"
+    assert describe_selection(folder) == (
+        "Selected checkpoint: step 1, the best by action ranking.\n"
+        "Action-ranking error: 5.0 % (base model 10.0 %, chance 50 %)."
+    )
 
 
 def test_a_base_that_is_never_beaten_is_selected(make_config, reporter, ranks_are) -> None:
     ranks_are((0.9, 0.01), *[(0.5, 0.02)] * 6)
     folder = train(make_config(**EVERY_STEP, checkpoint__keep=1), reporter)
     assert {path.name for path in (folder / "checkpoints").iterdir()} == {checkpoint_name(0), checkpoint_name(6)}
-    assert "the base: none of its checkpoints is better" in str(select_checkpoint(folder))
+    assert describe_selection(folder).splitlines() == [
+        "Selected checkpoint: step 0, the best by action ranking.",
+        "Action-ranking error: 1.0 % (chance 50 %).",
+        "The selected checkpoint is the base model: fine-tuning did not improve action ranking.",
+    ]
 
 
 def test_a_run_that_stops_after_its_base_was_saved_goes_on_as_if_it_had_not(

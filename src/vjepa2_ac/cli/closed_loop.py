@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
+from vjepa2_ac.cli.console.waiting import begin_work
+from vjepa2_ac.cli.next_command import next_simulation, option_words
 from vjepa2_ac.errors import InputError, shell_command
 
 if TYPE_CHECKING:
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from vjepa2_ac.evaluation.summary import Summary, Verdict
+    from vjepa2_ac.evaluation.summary import Summary
     from vjepa2_ac.explore.watch import WatchPage
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
@@ -173,7 +175,7 @@ def _loaded(
 
     loaded = cli.load_planning_session(options)
     if watch is not None and watch.decoder is not None:
-        watch.decoder.require_fit(loaded.world_model, loaded.config.data.crop, subject=options.subject)
+        watch.decoder.require_fit(loaded.world_model, loaded.config.data, subject=options.subject)
         watch.decoder.to(loaded.world_model.device)
     steps = require_stride(loaded.config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
     how = SessionOptions(
@@ -189,7 +191,9 @@ def _loaded(
     session = Session(controller, kept, how)
     about = metadata_of(loaded, session)
     told = about if options.metadata == "full" else roboarena_metadata(session)
+    begin_work("the first decision")
     cli.show(in_words(about, options.subject), f"a first decision took {warm_up(controller):.1f} s")
+    begin_work("")
     if options.record is not None:
         about = {**about, "overrides": options.overrides, "config": options.config, **loaded.as_dict()}
         session.recorder = Recorder(options.record, about, int(_GB * options.record_gb))
@@ -206,7 +210,6 @@ def _simulate(options: argparse.Namespace) -> int:
         _refuse(options, ("task", "domain"), needed="none: the world has its own")
     elif options.world_timeout is not None:
         raise InputError(where="--world-timeout", found="no --world", needed="the program that it applies to")
-    options.domain = options.domain or "A"
     if options.subject == "record":
         _refuse(options, _OF_A_MODEL, needed="a model that steers")
         return _record(options)
@@ -224,6 +227,7 @@ def _record(options: argparse.Namespace) -> int:
         raise InputError(where="simulate record", found=str(error), needed="a folder of this machine") from None
     if options.world is not None:
         return _record_world(options, target)
+    options.domain = options.domain or "A"
     cli.require_new_place(target)
 
     from vjepa2_ac.simulation.recording.record import RecordingSpec, default_steps, record_dataset
@@ -266,7 +270,6 @@ def _run_benchmark(options: argparse.Namespace) -> int:
         raise InputError(where="--sub-goals alike", found=options.subject, needed=needed)
     if not cli.is_server(options.subject):
         _refuse(options, ("key_file",), needed="a server: ws://HOST:PORT")
-        options.checkpoint = options.checkpoint or "selected"
         cli.require_to_plan(options)
     else:
         _refuse(options, ("checkpoint", "config", "decoder", "overrides"), needed="the model itself; not its server")
@@ -282,8 +285,8 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     if options.all:
         name = f"{options.subject}: checkpoint {checkpoint}" if checkpoint else options.subject
         cli.show(name, benchmark_table(benchmark), files=files)
-    summary = _summary(benchmark)
-    cli.show(*benchmark_notes(benchmark), str(summary), f"Next: {_next(summary, benchmark.verdict, options)}")
+    summary = _summary(benchmark, options)
+    cli.show(*benchmark_notes(benchmark), str(summary), *_next(summary, benchmark, options))
     cli.show(*(f"Film: {file}" for file in files[1:2]))
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
 
@@ -306,16 +309,16 @@ def _in_their_world(options: argparse.Namespace, chosen: BenchmarkOptions, home:
         return run_world_benchmark(agent, env, chosen, options.out or home / name, reporter)
 
 
-def _summary(benchmark: ClosedLoopBenchmark) -> Summary:
+def _summary(benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> Summary:
     """Return the verdict of the closed loop, with the other verdicts that `evaluate` wrote for this checkpoint."""
-    from vjepa2_ac.evaluation.summary import ZERO_ACTION, Summary, not_measured
+    from vjepa2_ac.evaluation.summary import Summary, not_measured
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
     agent, trials = benchmark.agent, benchmark.trials
-    how = "`vjepa2-ac evaluate`" if cli.is_server(agent.subject) else shell_command("evaluate", agent.subject)
+    how = _evaluate_command(options) or "`vjepa2-ac evaluate`"
     predicts, uses, ranks = (not_measured(name, how) for name in ("predicts", "uses actions", "ranks actions"))
     measured = f"{trials.task_name}, {trials.place}, {trials.model_steps} steps of {trials.seconds_per_step:.2f} s"
-    summary = Summary(agent.subject, measured, ZERO_ACTION, predicts, uses, ranks, benchmark.verdict)
+    summary = Summary(agent.subject, measured, predicts, uses, ranks, benchmark.verdict)
     if agent.checkpoint and (Path(agent.subject) / METRICS_FILE).is_file():
         evaluated = read_metrics(Path(agent.subject))
         if evaluated.about.checkpoint == agent.checkpoint:
@@ -323,18 +326,46 @@ def _summary(benchmark: ClosedLoopBenchmark) -> Summary:
     return summary
 
 
-def _next(summary: Summary, plans: Verdict, options: argparse.Namespace) -> str:
-    """Return the command that follows from the verdicts of a closed loop."""
-    if plans.needs:
-        what = ("--task", options.task or "reach") if options.world is None else ("--world", options.world)
-        return shell_command("simulate", options.subject, *what, "--episodes", 50)
+def _next(summary: Summary, benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> list[str]:
+    """Return the command that follows from the verdicts of a closed loop, as lines; none if no command does."""
+    from vjepa2_ac.runs.folder import is_of_moved
+
+    if benchmark.verdict.needs:
+        return _next_benchmark(benchmark, options)
     if cli.is_server(options.subject):
-        return f"your robot's client at {options.subject} (docs/serving.md)"
-    if summary.predicts.value is None:
-        return shell_command("evaluate", options.subject)
-    if plans.conclusion == "yes":
-        return shell_command("serve", options.subject)
-    return shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
+        return [f"Next: your robot's client at {options.subject} (docs/serving.md)"]
+    command = _evaluate_command(options)
+    if command and summary.predicts.value is not None:
+        command = shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
+        command *= not any(map(is_of_moved, options.overrides))
+    if benchmark.verdict.conclusion == "yes" and (summary.predicts.value is not None or not command):
+        words = option_words(options, "checkpoint", "config", "goals", "plugin")
+        command = shell_command("serve", options.subject, *words, *options.overrides)
+    return [f"Next: {command}"] * bool(command)
+
+
+def _next_benchmark(benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> list[str]:
+    """Return the same command with more problems, and with more steps if the oracle needs them, as lines."""
+    import numpy as np
+
+    from vjepa2_ac.distributed import is_on_cpu
+    from vjepa2_ac.evaluation.summary import CHANCE
+
+    planning, trials, oracle = benchmark.agent.planning, benchmark.trials, benchmark.results[-1]
+    episodes, steps = max(50, trials.episodes), trials.model_steps * (1 + (oracle.success_rate.value < CHANCE))
+    changes = {"episodes": episodes} | ({"steps": steps} if steps != trials.model_steps else {})
+    prediction_s = float(np.median(benchmark.results[0].seconds)) / (sum(planning.sequences) * planning.horizon)
+    words = [options.subject, *option_words(options, **changes), *options.overrides]
+    on_cpu = not cli.is_server(options.subject) and is_on_cpu(cli.require_to_plan(options).training)
+    return next_simulation(words, planning, episodes * steps, prediction_s, on_cpu=on_cpu)
+
+
+def _evaluate_command(options: argparse.Namespace) -> str:
+    """Return the command that evaluates what was simulated; empty for what is no run, whose data are not known."""
+    from vjepa2_ac.runs.folder import is_of_moved, is_run
+
+    words = [*option_words(options, "checkpoint", "plugin"), *filter(is_of_moved, options.overrides)]
+    return shell_command("evaluate", options.subject, *words) if is_run(options.subject) else ""
 
 
 @contextmanager
@@ -346,7 +377,8 @@ def _agent(options: argparse.Namespace) -> Iterator[Agent]:
 
     if not cli.is_server(options.subject):
         decoder = cli.given_decoder(options)
-        yield agent_of_session(cli.load_planning_session(options), decoder)
+        session = cli.load_planning_session(options)
+        yield agent_of_session(session, decoder, in_our_world=options.world is None)
         return
     key = None if options.key_file is None else read_key(options.key_file)
     with PlanningClient(options.subject, key) as client:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
+from vjepa2_ac.cli.next_command import next_simulation, option_words
 from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.process import is_first
 
 if TYPE_CHECKING:
+    from vjepa2_ac.cli.console.progress import ConsoleReporter
     from vjepa2_ac.decoding.imagine import Imagination
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.reporter import Reporter
@@ -39,8 +43,8 @@ def add_evaluate(commands: cli.Commands) -> None:
     cli.add(group, "--lpips FILE", "weights for LPIPS of the decoded images (docs/decoding.md)", cli.as_path)
     cli.add(group, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", cli.as_path)
     group = parser.add_argument_group("use of the actions")
-    cli.add(group, "--sensitivity-clips N", "clips to try other actions on (32)", cli.whole_number(0))
-    cli.add(group, "--samples N", "other actions for each of them (64)", cli.count)
+    cli.add(group, "--ranking-clips N", "clips for the action-ranking error (32)", cli.whole_number(0))
+    cli.add(group, "--samples N", "alternative actions for each of them (64)", cli.count)
     cli.add(group, "--landscapes N", "those with a landscape (8)", cli.whole_number(0), dest="landscape_clips")
     cli.add(group, "--axes N", "clips of those to calibrate the axes by (32)", cli.whole_number(0), dest="axis_clips")
     cli.add(group, "--nodes N", "points of a landscape along each axis (9)", cli.whole_number(3, 51))
@@ -112,7 +116,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
             tables = row_tables(rows_of(measured.evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
-        cli.show(str(measured.summary), f"Next: {_next(measured, options.data)}")
+        cli.show(str(measured.summary), *_next(measured, options, reporter))
         film = "" if measured.evaluation.decoded is None else "film and "
         cli.show(f"Report with {film}all tables: {measured.report}")
     if len(evaluations) > 1:
@@ -120,26 +124,54 @@ def _evaluate(options: argparse.Namespace) -> None:
     leave_processes()
 
 
-def _next(measured: Evaluated, data: str | None) -> str:
-    """Return the command that follows from the summary."""
+def _next(measured: Evaluated, options: argparse.Namespace, reporter: ConsoleReporter) -> list[str]:
+    """Return the command that follows from the summary, as lines."""
+    from vjepa2_ac.runs.folder import is_of_moved
+
+    about, summary = measured.evaluation.about, measured.summary
+    settings = [*(options.plan_settings or ()), *options.overrides]
+    config = options.data or f"{about.subject}/config.yaml"
+    words = ["data", "check", config]
+    if not about.checkpoint:
+        is_other = cli.read_config(config).model.base not in {None, about.subject}
+        words = ["train", config, *[f"model.base={about.subject}"] * is_other]
+    elif not summary.predicts.needs and "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}:
+        words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
+    elif not summary.predicts.needs:
+        if summary.plans is None and (lines := _next_closed_loop(measured, settings, options, reporter)):
+            return lines
+        words = ["serve", about.subject, *option_words(options, "checkpoint"), *settings]
+    return [f"Next: {shell_command(*words, *option_words(options, 'plugin'))}"]
+
+
+def _next_closed_loop(
+    measured: Evaluated, settings: Sequence[str], options: argparse.Namespace, reporter: ConsoleReporter
+) -> list[str]:
+    """Return the command that tests a run in closed loop, as lines; none for data that `simulate record` did not make.
+
+    Its time follows from that of the action ranking.
+    """
+    from vjepa2_ac.distributed import is_on_cpu
+    from vjepa2_ac.planning.settings import planning_settings
+    from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
     from vjepa2_ac.simulation.recording.record import read_simulation
     from vjepa2_ac.simulation.world.domains import Domain
 
-    about, summary = measured.evaluation.about, measured.summary
-    if not about.checkpoint:
-        return shell_command("train", data)
-    if summary.predicts.needs:
-        return shell_command("data", "check", f"{about.subject}/config.yaml")
-    if "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}:
-        return shell_command("data", "check", f"{about.subject}/config.yaml", "--model", about.subject)
-    if summary.plans is not None:
-        return shell_command("serve", about.subject)
+    evaluation, prediction_s = measured.evaluation, None
     try:
-        recorded = read_simulation(Path(about.data).resolve(strict=True))
+        recorded = read_simulation(Path(evaluation.about.data).resolve(strict=True))
     except (OSError, UserError):
-        return shell_command("serve", about.subject)
-    domain = ("--domain", recorded.worlds.name) if isinstance(recorded.worlds, Domain) else ()
-    return shell_command("simulate", about.subject, "--task", recorded.task or "reach", *domain)
+        return []
+    domain = recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
+    if (ranking := evaluation.models[evaluation.trained].ranking) is not None:
+        seconds = reporter.seconds[f"action ranking, {evaluation.trained}"] * int(os.environ.get("WORLD_SIZE", "1"))
+        prediction_s = seconds / (len(ranking.ranks) * (1 + 2 * ranking.samples))
+    problems = BenchmarkOptions(task=recorded.task or "reach")
+    words = ["--task", problems.task, "--domain", domain, *option_words(options, "checkpoint", "plugin"), *settings]
+    config = planning_settings(evaluation.about.subject, overrides=settings)
+    decisions = problems.episodes * problems.model_steps
+    words, on_cpu = [evaluation.about.subject, *words], is_on_cpu(config.training)
+    return next_simulation(words, config.planning, decisions, prediction_s, on_cpu=on_cpu)
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
@@ -183,8 +215,7 @@ def _compare(options: argparse.Namespace) -> None:
 
     tables = row_tables(comparison.rows, comparison.title) if options.all else []
     files = [plot_comparison(comparison, options.out), *write_tables(comparison.rows, options.out)]
-    best = options.runs[list(comparison.summaries).index(comparison.best)]
-    cli.show(*tables, str(comparison), *comparison.notes, f"Next: {shell_command('export', best)}", files=files)
+    cli.show(*tables, str(comparison), *comparison.notes, comparison.next_command, files=files)
 
 
 def _imagine(options: argparse.Namespace) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
+from vjepa2_ac.cli.console.waiting import begin_work
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.storage.places import BUILTIN
 
@@ -90,6 +91,7 @@ def _serve(views: Views, access: Access, options: argparse.Namespace, about: str
     from vjepa2_ac.explore.server import serve_page
 
     def ready(url: str) -> None:
+        begin_work("")
         cli.show(about, f"The page: {url}{'' if access.key is None else '?key=KEY'}   (Ctrl-C ends it)")
         if not options.no_open and access.key is None and _has_window():
             webbrowser.open(url)
@@ -117,6 +119,7 @@ def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
         from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
         with tempfile.TemporaryDirectory() as folder:
+            begin_work("recording episodes of the simulated arm")
             path = Path(folder) / "data"
             record_dataset(path, RecordingSpec("A", seed=5), episodes=_EPISODES)
             shares = ["data.validation_share=0.1", "data.test_share=0.8"]

@@ -290,7 +290,7 @@ def load_planning_session(options: argparse.Namespace) -> PlanningSession:
     from vjepa2_ac.planning.session import load_to_plan
 
     say_places_elsewhere(options.subject)
-    how = {"checkpoint": options.checkpoint, "config": options.config, "overrides": options.overrides}
+    how = {"checkpoint": options.checkpoint or "selected", "config": options.config, "overrides": options.overrides}
     return load_to_plan(options.subject, **how)
 
 

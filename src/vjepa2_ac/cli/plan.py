@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
+from vjepa2_ac.cli.next_command import QUICK_SEQUENCES, QUICK_WORDS
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,7 +18,8 @@ if TYPE_CHECKING:
     from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.planning.goals import GoalFolder
 
-_QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # docs/planning.md says how good it is
+_QUICK = " ".join(QUICK_WORDS)
+_COLUMNS = 100
 _FILMS = (".mp4", ".m4v", ".mov")
 
 
@@ -70,7 +73,8 @@ def add_goals(commands: cli.Commands) -> None:
 def _plan(options: argparse.Namespace) -> int:
     """Plan actions from an image and a state to a goal image.
 
-    Written are plan.json, and an image of how the planner came to it. Status 1 where the model gives no finite energy.
+    Writes plan.json, and an image of the search. Exits with status 1 if the model gives no finite energy, or predicts
+    that the plan is worse than the zero action or than the current frame; the first line of the result then says so.
     """
     from vjepa2_ac.data.sources.indexed_source import measured_space
 
@@ -84,14 +88,14 @@ def _plan(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.cli.console.tables import plan_table
     from vjepa2_ac.evaluation.imagined_plan import imagine_plan
-    from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
+    from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, warn_of_plan, write_plan
     from vjepa2_ac.reports.figures.planning import PLAN_IMAGE, plot_plan
     from vjepa2_ac.storage import user_can_write
 
     decoder = cli.given_decoder(options)
     session = cli.load_planning_session(options)
     if decoder is not None:
-        decoder.require_fit(session.world_model, session.config.data.crop, subject=options.subject)
+        decoder.require_fit(session.world_model, session.config.data, subject=options.subject)
     request = PlanRequest(start, state, session.goals_of(goals), mask)
     with cli.reporter() as reporter:
         reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
@@ -105,19 +109,20 @@ def _plan(options: argparse.Namespace) -> int:
     with user_can_write(options.out):
         file = write_plan(found, about, options.out / PLAN_FILE)
         image = plot_plan(found, options.out / PLAN_IMAGE, imagined)
-    cli.show(plan_table(found), summarize(found), files=[file, image])
-    return int(found.decision.why == "no finite energy")
+    cli.show(*warn_of_plan(found), plan_table(found), textwrap.fill(summarize(found), _COLUMNS), files=[file, image])
+    return int(found.decision.why == "no finite energy" or bool(found.worse_than))
 
 
 def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     """Return what a search predicts, and on a CPU what is quicker."""
     count = sum(config.sequences)
-    text = f"Planning: {count:,} action sequences in {config.iterations} iteration{'s' * (config.iterations > 1)}"
+    text = f"Planning: {count:,} action sequence{'s' * (count != 1)}"
+    text += f" in {config.iterations} iteration{'s' * (config.iterations > 1)}"
     text += f", {config.horizon} model step{'s' * (config.horizon > 1)} each"
     if config.budget_s is not None:
         text += f", for {config.budget_s:g} s at most"
-    is_long = on_cpu and config.planner != "gradient" and count > _QUICK_SEQUENCES
-    return text + f". Quick, for a CPU: {_QUICK}" * is_long
+    is_long = on_cpu and config.planner != "gradient" and count > QUICK_SEQUENCES
+    return f"{text}." + f"\nQuick, for a CPU: {_QUICK}" * is_long
 
 
 def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

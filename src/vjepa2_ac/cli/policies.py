@@ -137,7 +137,7 @@ def _score_chunks(options: argparse.Namespace, to_poses: Callable[[np.ndarray], 
         )
     about = session.as_dict() | {"start": options.start, "chunks": str(options.chunks), "form": options.form}
     scores = found.as_dict(is_blind=blind) | {"energies": found.energies.tolist()}
-    scores["others_better"] = None if ranking is None else ranking.as_dict()
+    scores["action_ranking_error"] = None if ranking is None else ranking.as_dict()
     write_atomically(options.out, json_text(about | scores))
     cli.show(table, *notes, files=[options.out])
     return int(blind)
@@ -172,9 +172,8 @@ def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray]
     for one in found.policies:
         table.add_row(one.name, str(one.mean), str(one.best), "" if one.behind is None else str(one.behind))
     table.add_row("demonstrated", str(found.demonstrated), "", "")
-    notes = [
-        f"Actions of other places look better than the true ones in {found.others_better:.0%} (chance {CHANCE:.0%})."
-    ]
+    share = f"{found.others_below_true:.0%} of the actions of other places"
+    notes = [f"{share} have a lower energy than the true ones (chance {CHANCE:.0%})."]
     if found.is_blind:
         notes.append("No order: the model cannot tell actions apart on these data, and these energies mean nothing.")
     if found.left_out:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from vjepa2_ac import __version__, process
 from vjepa2_ac.cli import closed_loop, data, evaluate, explore, plan, policies, setup, train
+from vjepa2_ac.cli.console.waiting import watch_silence
 from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parsed
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
 from vjepa2_ac.process import EXIT_STATUS, StoppedError, is_first, tidy_end
@@ -54,7 +55,8 @@ def _run(arguments: Sequence[str] | None) -> int:
             from vjepa2_ac.config.loading import name_plugins
 
             name_plugins(options.plugin)
-        return handler(options) or 0
+        with watch_silence():
+            return handler(options) or 0
     except ModuleNotFoundError as error:  # most of those of extras are errors of their own
         library = (error.name or "vjepa2_ac").partition(".")[0]
         if library == "vjepa2_ac":

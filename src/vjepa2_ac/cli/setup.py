@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
+from vjepa2_ac.cli.console.waiting import begin_work
 from vjepa2_ac.errors import InputError, UnreachableError, UserError, shell_command
 from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.places import BUILTIN
@@ -256,7 +257,7 @@ def _doctor(options: argparse.Namespace) -> int:
         cli.show(f"Warning: {error}")
     if not torch.cuda.is_available() and config.training.precision == "bf16" and (slow := slow_bf16()):
         cli.show(f"Without a GPU set training.precision=fp32 model.dtype=float32: in bfloat16 {slow}.")
-    cli.show(f"To check the data: {shell_command('data', 'check', options.config)}")
+    cli.show(f"To check the data: {shell_command('data', 'check', options.config, *options.overrides)}")
     return 0 if needed <= available else 1
 
 
@@ -272,6 +273,7 @@ def _demo(_options: argparse.Namespace) -> int:
     from vjepa2_ac.simulation.world.domains import load_mujoco
 
     load_mujoco()
+    begin_work("")  # each command shows its own
     commands = [
         _RECORD.format(path=_SIMULATED),
         f"train {BUILTIN}demo",

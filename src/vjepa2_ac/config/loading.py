@@ -8,6 +8,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import message_of, parse_yaml
 
 _MOST_BYTES = 1_000_000  # no config needs more, and PyYAML reads 20 MB in a minute
+# A command reads the config of its run several times, and PyYAML needs 20 ms. `parse_config` copies the values.
+_parse_document = lru_cache(maxsize=8)(parse_yaml)
 _OF_A_RUN = ("run_id", "environment.json", "metrics.jsonl")  # next to the config of a run
 _PACKAGED = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "configs"
 
@@ -175,7 +178,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         raise InputError(where=str(path), found="a folder", needed="a config, which is a YAML file", fix=fix) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
-    values = parse_yaml(text, where=str(path))
+    values = _parse_document(text, where=str(path))
     if not isinstance(values, dict):
         found = "nothing" if values is None else f"a {type(values).__name__}"
         raise InputError(where=str(path), found=found, needed="a mapping of keys to values")

@@ -84,6 +84,7 @@ def marks_of(knobs: type[BaseModel]) -> Mapping[str, Affects]:
     return dict(_marks(knobs, None, "", ~Affects.NOTHING))
 
 
+@cache
 def mark_of(key: str, knobs: type[BaseModel]) -> Affects:
     """Return the mark of a knob, or of that which holds a value, such as data.fields.cameras.left.
 
@@ -93,7 +94,7 @@ def mark_of(key: str, knobs: type[BaseModel]) -> Affects:
         KeyError: There is no such knob.
     """
     wanted = f"{key}."
-    known = [(f"{name}.", mark) for name, mark in marks_of(knobs).items()]
+    known = ((f"{name}.", mark) for name, mark in marks_of(knobs).items())
     found = [mark for name, mark in known if name.startswith(wanted) or wanted.startswith(name)]
     if not found:
         raise KeyError(key)

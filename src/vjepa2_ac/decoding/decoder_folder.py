@@ -7,6 +7,7 @@ refused.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,17 +17,21 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac import __version__
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.model.base_model import ASSETS
 from vjepa2_ac.model.network.pretrained_folder import read_tensors, save_tensors
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.storage import folder_writer
-from vjepa2_ac.storage.places import BUILTIN
+from vjepa2_ac.storage.places import BUILTIN, NO_DATA, SIMULATION_FILE
 from vjepa2_ac.storage.structured import read_json_object, record_of
+
+logger = logging.getLogger(__name__)
 
 CARD, WEIGHTS, LINEAR = "decoder.json", "decoder.safetensors", "linear.safetensors"
 BUILTIN_DECODER = "decoder"  # the folder of a model of the package that holds its decoder
+SIMULATED = "frames of the simulated arm"
 
 _NEEDED = "the folder of a decoder, as `vjepa2-ac decoder` writes it"
 _FIX = "Copy the folder again, or train the decoder again"
@@ -71,11 +76,19 @@ class TrainedDecoder:
         """Return its name and its encoder's fingerprint, for a JSON of what it has shown."""
         return {"name": self.name, "encoder": self.card.encoder}
 
-    def require_fit(self, world_model: WorldModel, crop: str, *, subject: str) -> None:
-        """Refuse a model with another encoder than the decoder's, and frames that are cut otherwise (`data.crop`).
+    def require_fit(
+        self, world_model: WorldModel, data: DataConfig, *, subject: str, shown: str | None = None
+    ) -> tuple[str, ...]:
+        """Refuse a model with another encoder or crop; log and return a warning if the decoder has seen other data.
+
+        Args:
+            world_model: Its latents are decoded.
+            data: Its crop is that of the frames.
+            subject: What is decoded, for messages.
+            shown: The data set of the frames, by its path, or `SIMULATED`; None: that of `data`.
 
         Raises:
-            InputError: One of them is another.
+            InputError: The encoder or the crop differs.
         """
         card, shape, model = self.card, self.card.shape, world_model
         compared = (
@@ -83,13 +96,26 @@ class TrainedDecoder:
             ("dimensions", shape.dim, model.latent_dim),
             ("image size", shape.image_size, model.image_size),
             ("encoder", card.encoder, model.encoder_fingerprint()),
-            ("data.crop", card.crop, crop),
+            ("data.crop", card.crop, data.crop),
         )
         if differing := [f"{name} {ours}, not {theirs}" for name, ours, theirs in compared if ours != theirs]:
             found = f"the decoder of another encoder or crop than that of {subject} ({'; '.join(differing)})"
             needed = "one that was trained on the latents of both: others would be read wrongly"
             fix = "Train one with `vjepa2-ac decoder CONFIG`, on the config of this model"
             raise InputError(where=f"{self.where} {self.name}", found=found, needed=needed, fix=fix)
+        learned = SIMULATED if self.name.startswith(BUILTIN) else card.data
+        shown = shown or (NO_DATA if data.is_cache else data.path)
+        if shown == NO_DATA or _is_same_data(learned, shown):
+            return ()
+        warning = f"The decoder {self.name} was trained on {learned}, not on {shown}: its images may be wrong."
+        logger.warning(warning)
+        return (warning,)
+
+
+def _is_same_data(one: str, other: str) -> bool:
+    """Return whether two data sets are the same, or both show the simulated arm, by their `data.path`."""
+    are_simulated = (path == SIMULATED or Path(path, SIMULATION_FILE).is_file() for path in (one, other))
+    return Path(one).resolve() == Path(other).resolve() or all(are_simulated)
 
 
 def save_decoder(folder: Path, card: DecoderCard, decoder: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:

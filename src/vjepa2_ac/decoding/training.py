@@ -37,7 +37,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.pretrained_folder import first_not_finite
 from vjepa2_ac.process import StoppedError, StopRequest, stop_on_signals
-from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import read_torch, write_torch
 from vjepa2_ac.runs.folder import RunLock
 from vjepa2_ac.runs.metrics_log import MetricsLog
@@ -166,6 +166,7 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
         found, needed = "no frames of train episodes", "one episode or more that is as long as a clip"
         fix = "Lower data.validation_share or data.test_share"
         raise InputError(where=f"data.path: {config.data.path}", found=found, needed=needed, fix=fix)
+    reporter.task(LOADING)
     model = load_base(config.model, seed=config.seed)
     encoding, size, patch = encoding_of(model, config), model.image_size, model.sizes.patch_size
     if patch % UPSAMPLED or size < SMALLEST:

@@ -29,7 +29,7 @@ from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.storage import free_bytes
 
 Engine = Callable[[Config, LatentCache, Sequence[FramesToEncode], Reporter], None]  # encodes what is left
@@ -70,6 +70,7 @@ def encode_config(
     require_encodable(config)
     device = computing_device(config.training) if engine is None else torch.device("cpu")
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+    reporter.task(LOADING)
     model = load_base(config.model, seed=config.seed)
     cache = LatentCache.of(dataset, encoding_of(model, config), out)
     cache.require_own()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -16,12 +16,11 @@ from vjepa2_ac.distributed import gathered, shared
 from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.result import ActionRanking, Landscape, Landscapes, Ranking, Sensitivity
+from vjepa2_ac.evaluation.result import ActionRanking, Landscape, Landscapes
 from vjepa2_ac.intervals import Estimate, mean_of, ratio
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.spaces import POSE, ActionSpace, vector_states
 
-TOP = (1, 5, 10)
 _SAME = 1e-6  # relative difference below which energies are equal: rounding decides no rank
 _ROOM = 1.25  # extent of a landscape's grid relative to the largest true action
 _AXES = slice(0, 3)  # of the grid: of poses, the position
@@ -155,19 +154,11 @@ def _predict(
 
 @dataclass(frozen=True)
 class ActionPool:
-    """Actions of all clips, a pool to draw others from."""
+    """The true actions of all moves, which bound the alternatives for each of them."""
 
     actions: Float[np.ndarray, "count action_dim"]
-    episode_ids: Sequence[str]  # of each action
     space: ActionSpace
-    probes: ProbeOptions  # `samples` drawn per start from each source; the box extends by `reach_cm`, of poses only
-    seed: int  # a start gets the same actions whatever else is measured
-
-    def of_others(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
-        """Draw actions of other episodes, with replacement; of the same one if there is no other."""
-        others = np.flatnonzero(np.array(self.episode_ids) != start.episode_id)
-        chosen = generator.choice(others if len(others) else np.arange(len(self.actions)), size=self.probes.samples)
-        return np.asarray(self.actions[chosen])
+    probes: ProbeOptions  # `samples` drawn per move from each source; the box extends by `reach_cm`, for poses only
 
     def in_box(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
         """Draw uniformly: for poses (dx, dy, dz) in the box, the rest being true; for vectors every number."""
@@ -197,39 +188,6 @@ class ActionPool:
         return evaluated
 
 
-def measure_sensitivity(
-    model: Predictor, starts: Sequence[RolloutStart], pool: ActionPool, progress: Progress = no_progress
-) -> Sensitivity:
-    """Evaluate other actions from each start.
-
-    Args:
-        model: The predictor.
-        starts: One frame of each clip.
-        pool: The pool of other actions.
-        progress: Called with the number of finished starts.
-    """
-    (clips, box), (changes, _, persistence) = _places(model, starts, pool, (pool.of_others, pool.in_box), progress)
-    ids, samples = [start.episode_id for start in starts], pool.probes.samples
-
-    def ranking(drawn_from: Literal["clips", "box"], places: Float[np.ndarray, "clips 2"]) -> Ranking:
-        lower, same = places.T
-        among = {k: np.clip((k - lower) / (same + 1), 0.0, 1.0) for k in TOP if k <= samples}
-        return Ranking(
-            drawn_from=drawn_from,
-            samples=samples,
-            clips=tuple(start.clip for start in starts),
-            rank=_ranks(places, samples),
-            mean_rank=mean_of(_ranks(places, samples), ids),
-            top={k: mean_of(share, ids) for k, share in among.items()},
-        )
-
-    return Sensitivity(
-        change=ratio(changes, persistence, ids),
-        change_by_clip=changes / np.maximum(persistence, 1e-12),
-        rankings=(ranking("clips", clips), ranking("box", box)),
-    )
-
-
 def rank_actions(
     model: Predictor,
     moves: Sequence[RolloutStart],
@@ -239,20 +197,29 @@ def rank_actions(
     seed: int,
     progress: Progress = no_progress,
 ) -> ActionRanking:
-    """Rank the true action of each move among others in the box and on the shell.
+    """Rank the true action of each move among alternatives in the box and of the same length.
 
     Args:
         model: The predictor.
         moves: One or more; of vectors, the largest of each number bounds the box.
         space: Of the actions.
         probes: Their `reach_cm`, half the width of the box (of poses only), `samples` of each kind, and `at_once`.
-        seed: Of the other actions.
+        seed: Of the alternatives: a move gets the same ones whatever else is measured.
         progress: Called with the number of finished moves.
     """
     ids = tuple(move.episode_id for move in moves)
-    pool = ActionPool(np.stack([move.true for move in moves]), ids, space, probes, seed)
-    places, (_, spread, now) = _places(model, moves, pool, (pool.in_box, pool.on_shell), progress)
-    in_box, on_shell = _ranks(places, probes.samples)
+    pool = ActionPool(np.stack([move.true for move in moves]), space, probes)
+
+    def ranked(move: RolloutStart) -> tuple[float, ...]:
+        generator = move.generator(seed)
+        drawn = [move.true[None], pool.in_box(move, generator), pool.on_shell(move, generator)]
+        (true, *energies), (_, *changes) = evaluate_actions(model, move, np.concatenate(drawn), at_once=probes.at_once)
+        alternatives = np.reshape(energies, (2, -1))
+        is_same = np.abs(alternatives - true) <= _SAME * max(abs(true), 1e-12)
+        box, shell = np.where(is_same, 0.5, alternatives < true).mean(axis=1)
+        return box, shell, np.mean(changes[: probes.samples]), alternatives[0].std(), move.persistence
+
+    in_box, on_shell, change, spread, now = np.array(shared(moves, ranked, progress)).T
     ranks = (in_box + on_shell) / 2
     return ActionRanking(
         samples=probes.samples,
@@ -263,39 +230,8 @@ def rank_actions(
         box=mean_of(in_box, ids),
         shell=mean_of(on_shell, ids),
         spread=ratio(spread, now, ids),
+        change=ratio(change, now, ids),
     )
-
-
-def _places(
-    model: Predictor,
-    starts: Sequence[RolloutStart],
-    pool: ActionPool,
-    draws: Sequence[Callable[[RolloutStart, np.random.Generator], np.ndarray]],
-    progress: Progress,
-) -> tuple[Float[np.ndarray, "draws starts 2"], Float[np.ndarray, "3 starts"]]:
-    """Evaluate the true action of each start among those of each draw.
-
-    Returns:
-        How many others have a lower energy and how many an equal one; of the first draw the mean change of the
-        prediction and the standard deviation of the energy, and the error of persistence.
-    """
-
-    def placed(start: RolloutStart) -> tuple[list[np.ndarray], tuple[float, float, float]]:
-        generator = start.generator(pool.seed)
-        drawn = [start.true[None], *(draw(start, generator) for draw in draws)]
-        energies, changes = evaluate_actions(model, start, np.concatenate(drawn), at_once=pool.probes.at_once)
-        own, others = energies[0], energies[1:].reshape(len(draws), -1)
-        same = np.abs(others - own) <= _SAME * max(abs(own), 1e-12)
-        numbers = changes[1 : 1 + pool.probes.samples].mean(), others[0].std(), start.persistence
-        return [((others < own) & ~same).sum(axis=1), same.sum(axis=1)], numbers
-
-    places, numbers = zip(*shared(starts, placed, progress), strict=True)
-    return np.moveaxis(np.array(places, dtype=np.float64), 2, 0), np.array(numbers).T
-
-
-def _ranks(places: Float[np.ndarray, "*draws starts 2"], samples: int) -> Float[np.ndarray, "*draws starts"]:
-    """Return the share of the others with a lower energy; equal ones count half."""
-    return np.asarray((places[..., 0] + places[..., 1] / 2) / samples)
 
 
 def measure_landscapes(

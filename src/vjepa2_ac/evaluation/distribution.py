@@ -94,6 +94,13 @@ class LatentSums:
         """The latents of each clip, averaged over tokens."""
         return np.concatenate(self._pooled)
 
+    def variances(self) -> tuple[float, ...]:
+        """Return the trace of the covariance over clips, by horizon."""
+        assert self._total is not None  # noqa: S101  # there are clips
+        clips = len(self.episode_ids)
+        traces = self.squares().sum(axis=1) / clips - (self._total / clips).square().sum(dim=1).numpy()
+        return tuple(traces.tolist())
+
     def squares(self) -> Float[np.ndarray, "horizon episodes"]:
         """Return the sum of squared distances of each episode to the origin, in the order of sorted names."""
         names, episode_of = np.unique(np.array(self.episode_ids), return_inverse=True)
@@ -115,7 +122,7 @@ def distribution_of(predicted: LatentSums, true: LatentSums) -> LatentDistributi
     """Return spread and, averaged over tokens, discrepancy of predicted latents against the true ones of the clips."""
     pairs = zip(predicted.pooled.swapaxes(0, 1), true.pooled.swapaxes(0, 1), strict=True)
     mmd, p_values = zip(*(discrepancy(one, other, true.episode_ids) for one, other in pairs), strict=True)
-    return LatentDistribution(spread_of(predicted, true), mmd, p_values)
+    return LatentDistribution(spread_of(predicted, true), mmd, p_values, predicted.variances(), true.variances())
 
 
 def spread_of(predicted: LatentSums, true: LatentSums) -> tuple[Estimate, ...]:

@@ -20,11 +20,9 @@ from vjepa2_ac.distributed import gathered
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_score import PlanningStart, measure_plans, planning_start, study_of
 from vjepa2_ac.evaluation.action_use import (
-    ActionPool,
     RolloutStart,
     gathered_starts,
     measure_landscapes,
-    measure_sensitivity,
     moves_of,
     rank_actions,
     start_of,
@@ -121,7 +119,7 @@ def evaluate(
         noise_floor=tuple(noise_floor(column, ids) for column in seen.true.pooled.swapaxes(0, 1)),
     )
     notes, width = [], seen.actions.shape[-1]
-    if probes.sensitivity_clips and probes.landscape_clips and width < 3:
+    if probes.ranking_clips and probes.landscape_clips and width < 3:
         notes.append(f"No energy landscapes: an action has {width} numbers, and a landscape is over three.")
     if probes.planning_clips and about.space.position is None:
         notes.append("No plans: they are poses' displacements, and the states here are plain numbers.")
@@ -166,7 +164,7 @@ def _collect(
     seen, actions = _Seen({name: [] for name in names}, sums, LatentSums(origins[0]), LatentSums(origins[0])), []
     probed, planned = (
         {clips.names[place] for place in spread(len(clips.names), count)}
-        for count in (probes.sensitivity_clips, probes.planning_clips if space.position is not None else 0)
+        for count in (probes.ranking_clips, probes.planning_clips if space.position is not None else 0)
     )
 
     def add(ids: Sequence[str], name: str, way: Way, mode: Mode, predicted: torch.Tensor) -> None:
@@ -225,12 +223,8 @@ def _measure(
         return reporter.task(f"{what}, {name}")
 
     if starts:
-        count, steps, width = seen.actions.shape
-        actions, ids = seen.actions.reshape(count * steps, width), [one for one in seen.ids for _ in range(steps)]
-        pool = ActionPool(actions, ids, space, probes, about.seed)
-        sensitivity = measure_sensitivity(model, starts, pool, progress("other actions"))
         ranking = rank_actions(model, seen.moves, space, probes, seed=about.seed, progress=progress("action ranking"))
-        found = replace(found, sensitivity=sensitivity, ranking=ranking)
+        found = replace(found, ranking=ranking)
     moving = [start for start in starts if clips.moving[start.clip].any()] or starts
     if moving and probes.landscape_clips and seen.actions.shape[-1] >= 3:
         chosen = [moving[place] for place in spread(len(moving), probes.landscape_clips)]

@@ -34,7 +34,7 @@ from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.prior.action_prior import load_prior
-from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.reporter import LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.loading import TrainedRun, load_run
@@ -82,11 +82,16 @@ def load_subject(
     run = load_run(Path(name), asked.checkpoint, config) if is_run(name) else None
     world_model = run.world_model if run else load_base(config.model.with_base(name), seed=config.seed)
     require_widths(world_model, dataset.widths, where=name)
+    notes: list[str] = []
+    if run is not None and run.note:
+        run.warn_if_untrained()
+        notes.append(run.note)
     if decoder is not None:
-        decoder.require_fit(world_model, config.data.crop, subject=name)
+        notes += decoder.require_fit(world_model, config.data, subject=name)
+    is_base = run is not None and run.is_base
     against = asked.against if asked.against is not None else (BASE,) * (run is not None)
+    against = tuple(other for other in against if other != BASE) if is_base else against  # it is measured once
     found: list[Contender] = []
-    notes: tuple[str, ...] = ()
     if BASE in against and config.model.base is None:
         if asked.against is not None:
             absent, needed = "a model without a base (model.base is not set)", "a base to compare with"
@@ -94,16 +99,17 @@ def load_subject(
     elif BASE in against and run is None:
         found.append(_contender(BASE, "base", _like(name, world_model, str(config.model.base), config, dataset.widths)))
     elif BASE in against and world_model.fresh_heads is not None:
-        notes = (_NO_BASE,)
+        notes.append(_NO_BASE)
     elif BASE in against:
         found.append(_contender(BASE, "base", world_model, partial(base_only, world_model)))
-    own = "adapter" if world_model.adaptation is not None and world_model.adaptation.kind == "lora" else "model"
+    is_adapter = world_model.adaptation is not None and world_model.adaptation.kind == "lora"
+    own = BASE if is_base else "adapter" if is_adapter else "model"
     for other in against:
         if other != BASE:
             taken = {each.name for each in found} | {own, BASE, PERSISTENCE, TRUE_FRAMES, *NEIGHBOURS}
             called = Path(other).name if Path(other).name not in taken else other
             found.append(_contender(called, "other", _like(name, world_model, other, config, dataset.widths)))
-    return Subject(run, world_model, (*found, _contender(own, "trained", world_model)), notes)
+    return Subject(run, world_model, (*found, _contender(own, "trained", world_model)), tuple(notes))
 
 
 def _contender(
@@ -160,6 +166,7 @@ def measure_subject(
     progress = reporter.task("looking through the data")
     dataset = first_of_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
+    reporter.task(LOADING)
     loaded = load_subject(subject, config, asked, dataset, decoder)
     run, world_model, contenders = loaded.run, loaded.world_model, loaded.contenders
     prior = (
@@ -267,4 +274,5 @@ def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Datase
         seed=config.seed,
         version=__version__,
         time=utc_now(),
+        is_base=run is not None and run.is_base,
     )

@@ -28,7 +28,7 @@ from vjepa2_ac.evaluation.evaluate_run import load_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
 from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, named_actions, read_actions
 from vjepa2_ac.planning.session import PlanningSession
-from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
 
 _RATE_HZ = 15.0  # of a robot, where nobody says: DROID's
@@ -72,7 +72,7 @@ def imagine_image(
     _require_some(actions)
     model, config = session.world_model, session.config
     decoder = load_decoder(decoder_name)
-    decoder.require_fit(model, config.data.crop, subject=session.subject)
+    warnings = decoder.require_fit(model, config.data, subject=session.subject)
     decoder.to(model.device)
     space = measured_space(config.data, len(seen.state))
     _require_directions(space, where="--state")
@@ -99,6 +99,7 @@ def imagine_image(
         rollouts=tuple(Imagined("model", word, taken, imagined(taken)) for word, taken in chosen.items()),
         notes=(
             f"Times in the film suppose {_RATE_HZ:g} control steps in a second.",
+            *warnings,
             *worth_knowing(decoder.card, first, decoded_first),
         ),
     )
@@ -186,6 +187,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     require_frames(config.data, to="show what is true")
     window = _window(dataset, asked)
+    reporter.task(LOADING)
     loaded = load_subject(subject, config, asked.evaluation, dataset, decoder)
     loaded.put_on(accelerator.device)
     decoder.to(accelerator.device)

@@ -56,10 +56,10 @@ SCORED = PlanningConfig(
 class ProbeOptions:
     """Options of the measurements beyond the errors; 0 clips: none."""
 
-    sensitivity_clips: int = 32
-    samples: int = 64  # other actions per clip, drawn in each of two ways
+    ranking_clips: int = 32
+    samples: int = 64  # alternative actions per move, drawn in each of two ways
     landscape_clips: int = 8
-    axis_clips: int = 32  # of the sensitivity's, from which axes are fitted; of poses in the base frame only
+    axis_clips: int = 32  # of those of the ranking, from which axes are fitted; of poses in the base frame only
     nodes: int = 9  # along each axis of a landscape
     reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
     examples: int = 4

@@ -150,6 +150,7 @@ class WrittenAbout:
     frames: int  # of a clip
     stride: int  # control steps per model step
     seconds_per_step: float
+    is_base: bool = field(default=False, kw_only=True)  # the checkpoint has the weights of the base model
 
 
 @dataclass(frozen=True)
@@ -200,46 +201,22 @@ class PredictionErrors:
 
 
 @dataclass(frozen=True)
-class Ranking:
-    """The rank of the true action among others by the L1 energy of a one-step prediction from one frame.
-
-    Equal energies share their rank. Chance: `mean_rank` 0.5, `top[k]` k / (samples + 1).
-    """
-
-    drawn_from: Literal["clips", "box"]  # the others: actions of other episodes, or uniform in a box
-    samples: int  # others per clip
-    clips: tuple[int, ...]  # the measured ones, as indices into Clips
-    rank: Float[np.ndarray, " ranked"]  # share of the others with lower energy: 0 best, 1 worst
-    mean_rank: Estimate
-    top: Mapping[int, Estimate]  # k -> how often the true action is among the k of lowest energy (of samples + 1)
-
-
-@dataclass(frozen=True)
-class Sensitivity:
-    """The dependence of the prediction on the action."""
-
-    change: Estimate  # mean L1 distance of the predictions with others' actions to the one with the true action,
-    # over the error of persistence; 0: the action is ignored
-    change_by_clip: Float[np.ndarray, " ranked"]
-    rankings: tuple[Ranking, ...]  # clips, then box
-
-
-@dataclass(frozen=True)
 class ActionRanking:
-    """The rank of the true action by energy among those that a planner would try: what planning needs of a model.
+    """The action-ranking error: the fraction of alternative actions with a lower energy than the true action.
 
     It is measured on moves (`action_use.moves_of`) that are as large as planned ones, forwards and backwards in time.
-    Chance: 0.5; a perfect model: 0. Two of the same moves may be compared pair by pair.
+    Chance: 0.5; a perfect model: 0. The errors of two models on the same moves may be compared pair by pair.
     """
 
-    samples: int  # others per move, in the box and on the shell
+    samples: int  # alternatives per move, in the box and on the shell
     reach: float  # half the width of the box along each of x, y, z, in metres
     episode_ids: tuple[str, ...]  # of each move
-    ranks: Float[np.ndarray, " moves"]  # mean of the two
-    rank: Estimate
+    ranks: Float[np.ndarray, " moves"]  # error of each move: mean of box and shell
+    rank: Estimate  # their mean
     box: Estimate  # among actions that are uniform in the box
     shell: Estimate  # among actions as long as the true one, in any direction: tells direction from "nothing moves"
-    spread: Estimate  # standard deviation of the energy over the box, over the energy now; 0: nothing to plan by
+    spread: Estimate  # standard deviation of the energy over the box, over the error of persistence; 0: flat
+    change: Estimate  # change of the prediction with actions of the box, over the same; 0: the action is ignored
 
 
 @dataclass(frozen=True)
@@ -315,6 +292,8 @@ class LatentDistribution:
     spread: tuple[Estimate, ...]  # 1: as varied as the truth
     mmd: tuple[Estimate, ...]  # squared, times 100, of latents averaged over tokens; NaN of one episode
     p_values: tuple[float, ...]  # of no difference, by sign flips; NaN of one episode
+    variance: tuple[float, ...]  # trace of the covariance over clips, of these latents
+    true_variance: tuple[float, ...]  # the same of the true latents: `spread` is the ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,7 +329,6 @@ class ModelResult:
     name: str  # base, adapter, model, or the name of another run
     role: Role
     errors: PredictionErrors  # those of persistence are the same for all models, which share the encoder
-    sensitivity: Sensitivity | None = None
     landscapes: Landscapes | None = None
     plans: Plans | None = None
     ranking: ActionRanking | None = None
@@ -422,7 +400,8 @@ class Evaluation:
     def title(self) -> str:
         """What was evaluated, for people: the name of a run with its step, or of a model."""
         step = self.about.checkpoint_path.rpartition("-")[2]
-        return f"{self.about.subject}, step {int(step)}" if step.isdecimal() else self.about.subject
+        base = " (the base model)" if self.about.is_base else ""
+        return f"{self.about.subject}, step {int(step)}{base}" if step.isdecimal() else self.about.subject
 
     @property
     def trained(self) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 from itertools import product
 from typing import Any
 
+from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.action_score import AXES, differences_of, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.estimates import (
     Curve,
@@ -33,12 +34,10 @@ from vjepa2_ac.evaluation.result import (
     Metric,
     Mode,
     Row,
-    Sensitivity,
 )
 from vjepa2_ac.intervals import Estimate
 
 MOST_HORIZONS = 8  # on a screen
-_TOP = 5  # likewise
 _MODES: dict[Mode, str] = {"rollout": "open loop", "teacher_forced": "teacher-forced"}
 _SIMILARITIES = {"psnr_db": ("PSNR (dB)", ".1f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".3f")}
 _REGIONS = {"whole": "whole image", "moving": "where something moves"}
@@ -66,9 +65,6 @@ def rows_of(evaluation: Evaluation) -> list[Row]:
         rows.add_comparison(mode, metric)
     rows.add_distributions()
     rows.add_one_steps()
-    for model in models:
-        if model.sensitivity is not None:
-            rows.add_sensitivity(model.name, model.sensitivity)
     for model in models:
         if model.ranking is not None:
             rows.add_ranking(model.name, model.ranking)
@@ -180,37 +176,26 @@ class _Rows(list[Row]):
             key = f"one_step_gain.{part.key}"
             self.line("One-step gain over the base", part.label, key, found, detail=True, **_GAIN)
 
-    def add_sensitivity(self, model: str, found: Sensitivity) -> None:
-        """Add the use of the actions at one step."""
-        group, change = "Use of the actions: others at one step from one frame", {model: found.change}
-        label = "change with the action / persistence"
-        self.line(group, label, "sensitivity.change", change, better="higher", chance=0.0)
-        for one in found.rankings:
-            where = "others' actions" if one.drawn_from == "clips" else "actions in a box"
-            label, key = f"{where} that look better", f"sensitivity.rank.{one.drawn_from}"
-            self.line(group, label, key, {model: one.mean_rank}, form=".1%", chance=0.5)
-            for k, share in one.top.items():
-                label, key = f"true action in the best {k} of {one.samples + 1}, {where}", f"top_{k}.{one.drawn_from}"
-                style: dict[str, Any] = {"better": "higher", "chance": k / (one.samples + 1), "detail": k != _TOP}
-                self.line(group, label, f"sensitivity.{key}", {model: share}, **style)
-
     def add_ranking(self, model: str, found: ActionRanking) -> None:
-        """Add the rank of the true action among those that a planner would try."""
-        group = "Moves as large as plans: how many others look better than the true one"
+        """Add the action-ranking error, and how much prediction and energy change with the action."""
+        group = "Action-ranking error: alternative actions with a lower energy than the true one"
         share: dict[str, Any] = {"form": ".1%", "chance": 0.5}
-        self.line(group, "other moves that look better", "ranking.rank", {model: found.rank}, **share)
-        self.line(group, "of those in a box", "ranking.box", {model: found.box}, **share)
-        self.line(group, "of those in other directions", "ranking.shell", {model: found.shell}, **share)
-        label, spread = "spread of the energy / energy now", {model: found.spread}
-        self.line(group, label, "ranking.spread", spread, better="higher", chance=0.0)
+        self.line(group, "of all alternatives", "ranking.rank", {model: found.rank}, **share)
+        self.line(group, "of those in the box", "ranking.box", {model: found.box}, **share)
+        self.line(group, "of those of the same length", "ranking.shell", {model: found.shell}, **share)
+        for key, label, one in (
+            ("change", "change of the prediction with the action / persistence", found.change),
+            ("spread", "spread of the energy / persistence", found.spread),
+        ):
+            self.line(group, label, f"ranking.{key}", {model: one}, better="higher", chance=0.0)
         base = None if self.base is None else self.base.ranking
         if base is not None and base is not found:
-            label, difference = "the same minus the base's", {model: rank_difference(found, base)}
+            label, difference = "of all alternatives, minus the base model's", {model: rank_difference(found, base)}
             self.line(group, label, "ranking.difference_to_base", difference, form="+.1%", chance=0.0, detail=True)
 
     def add_landscapes(self, model: str, found: Landscapes) -> None:
         """Add where the energy is lowest."""
-        group, label = f"Energy landscapes of {_clips(len(found.maps))}", "lowest energy to the true action"
+        group, label = f"Energy landscapes of {counted(len(found.maps), 'clip')}", "lowest energy to the true action"
         label += f", {found.unit}" if found.unit else ""
         style: dict[str, Any] = {"chance": found.chance_distance, "unit": found.unit}
         self.line(group, label, "landscapes.distance", {model: found.distance}, **style)
@@ -223,7 +208,7 @@ class _Rows(list[Row]):
         signs = zip(found.axis_names, found.sign_agreement, found.sign_chance, found.sign_clips, strict=True)
         for axis, agreement, chance, count in signs:
             if count:
-                label, right = f"its {axis} has the true sign ({_clips(count)})", {model: agreement}
+                label, right = f"its {axis} has the true sign ({counted(count, 'clip')})", {model: agreement}
                 self.line(group, label, f"landscapes.sign.{axis}", right, better="higher", chance=chance)
 
     def add_plans(self) -> None:
@@ -234,12 +219,12 @@ class _Rows(list[Row]):
         models = ways_of(self.evaluation)
         free = {"doing nothing": study.zero, "random": study.random, "within limits": study.within_limits}
         found = {name: metrics_of(study, plans) for name, plans in (free | models).items()}
-        group = f"Plans beside demonstrations, from {_clips(len(study.clips))}"
+        group = f"Plans beside demonstrations, from {counted(len(study.clips), 'clip')}"
         for key, (label, form, detail) in _PLANS.items():
             kind, _, axis = key.partition(".")
             count = int(signed_along(study, AXES.index(axis)).sum()) if kind == "signs" else None
             if count != 0:
-                label += "" if count is None else f" ({_clips(count)})"
+                label += "" if count is None else f" ({counted(count, 'clip')})"
                 style: dict[str, Any] = {"form": form, "detail": detail}
                 style["better"] = "higher" if kind in {"score", "signs"} else "lower"
                 self.line(group, label, f"plans.{key}", {name: one[key] for name, one in found.items()}, **style)
@@ -267,7 +252,3 @@ class _Rows(list[Row]):
                 shown = {self.evaluation.horizon} if reference == main else ()
                 better = "lower" if name == "lpips" else "higher"
                 self.curves(group, f"decoded.{metric}", curves, shown, form=form, better=better)
-
-
-def _clips(number: int) -> str:
-    return f"{number} clip{'s' * (number != 1)}"

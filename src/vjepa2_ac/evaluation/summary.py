@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import json
 import math
-import textwrap
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from textwrap import wrap
 from typing import Literal
 
 import numpy as np
 
+from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.estimates import over_persistence
 from vjepa2_ac.evaluation.result import L1, Evaluation, Row
 from vjepa2_ac.intervals import ENOUGH_EPISODES, Estimate
@@ -26,9 +29,9 @@ SAME_ERROR = 0.01  # relative; errors this close count as equal, whatever their 
 SAME_RANK = 0.005  # absolute; likewise for action-ranking errors
 CHANCE = 0.5  # action-ranking error of a model that ignores its actions
 CLOSED_LOOP_FILE = "closed_loop.json"  # in RUN/closed_loop/TASK-DOMAIN
-BASE, PERSISTENCE, ZERO_ACTION = "the base model", "persistence", "the zero action"  # what a verdict compares with
-_COLUMNS = 80
-_IGNORES_ACTIONS = "it predicts typical motion and ignores the actions"
+_BASE, _PERSISTENCE, _CHANCE = "with the base model", "with persistence", "chance"  # what a verdict compares with
+_COLUMNS, _NO_BREAK = 80, "\N{NO-BREAK SPACE}"
+_wrap = partial(wrap, break_on_hyphens=False)  # commands and paths have hyphens
 
 
 @dataclass(frozen=True)
@@ -37,24 +40,24 @@ class Verdict:
 
     name: str
     conclusion: Conclusion
-    statement: str  # what was measured, with one number
-    value: float | None = None  # this number; None: not measured
+    statement: str  # what was measured, with one number; a word gives its sign: "lower"
+    value: float | None = None  # this number with its sign; None: not measured
     low: float | None = None  # 95 % interval over episodes; None: there is none
     high: float | None = None
     unit: Literal["%", "cm", ""] = "%"  # of the number: % shows a fraction
     reference: str = ""  # numbers to compare with
-    leaning: Literal["yes", "no", ""] = ""  # the conclusion that the number alone, without its interval, would give
     needs: str = ""  # a sentence: why there is no conclusion, and what it needs
     baseline: float = 0.0  # value of a model that has learned nothing, or of the best competitor
+    compared_with: str = ""  # what decided the conclusion, as in "not better than with the base model"
 
     @property
     def interval(self) -> str:
-        """The interval as text, with as many digits as the number; empty without an interval."""
+        """The interval as text, with digits and direction of the statement's number; empty without an interval."""
         if self.value is None or self.low is None or self.high is None:
             return ""
         if self.unit == "%":
             return interval_of(Estimate(self.value, self.low, self.high))
-        return f"[{self.low:.1f}, {self.high:.1f}]"
+        return f"[{self.low:z.1f}, {self.high:z.1f}]"
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,6 @@ class Summary:
 
     subject: str  # with its checkpoint, as text
     measured: str  # number of clips and episodes, or the problems of a closed loop
-    compared_with: str  # BASE, PERSISTENCE or ZERO_ACTION
     predicts: Verdict
     uses_actions: Verdict
     ranks_actions: Verdict
@@ -79,83 +81,108 @@ class Summary:
     @property
     def sentence(self) -> str:
         """The verdicts in words, at most 40 of them."""
-        if needs := next((verdict.needs for verdict in self.verdicts if verdict.needs), ""):
-            return needs
         third = "planning" if self.plans else "action ranking"
         claims = {"prediction": self.predicts, "the use of the actions": self.uses_actions, third: self.verdicts[2]}
-        missing = [name for name, verdict in claims.items() if verdict.conclusion == "not measured"]
-        unclear = [name for name, verdict in claims.items() if verdict.conclusion == "inconclusive"]
-        if self.predicts.conclusion == "no":
-            return f"Prediction is not better than with {self.compared_with}. Check data, axes and stride first."
-        if self.uses_actions.conclusion == "no":
-            return f"{_IGNORES_ACTIONS.capitalize()}, so it cannot be used for planning."
-        if self.verdicts[2].conclusion == "no":
-            return f"{third.capitalize()} is not better than with {self._competitor}."
-        if unclear:
-            return f"Inconclusive: {' and '.join(unclear)}. Measure more held-out episodes or more problems."
-        if missing:
-            return f"Not measured: {' and '.join(missing)}."
-        better = f"Better prediction than with {self.compared_with}, sensitive to the actions"
-        if self.plans is None:
-            return f"{better}, better action ranking. Planning was not measured."
-        return f"{better}, and it solves more problems than {self._competitor}."
-
-    @property
-    def _competitor(self) -> str:
-        """What the third verdict compares with."""
+        if needs := next((verdict.needs for verdict in claims.values() if verdict.needs), ""):
+            return needs
+        for name, verdict in claims.items():
+            if verdict.conclusion == "no":
+                return self._denial(name, verdict)
+        if unclear := [name for name, verdict in claims.items() if verdict.conclusion == "inconclusive"]:
+            more = "problems" if unclear == ["planning"] else "held-out episodes"
+            return f"Inconclusive: {', '.join(unclear)}. Measure more {more}."
+        if missing := [name for name, verdict in claims.items() if verdict.conclusion == "not measured"]:
+            return f"Not measured: {', '.join(missing)}."
+        better = f"Better prediction than {self.predicts.compared_with}, sensitive to the actions"
         if self.plans is not None:
-            return "the zero action and random actions"
-        return "chance" if self.compared_with == PERSISTENCE else self.compared_with
+            return f"{better}, and it solves more problems than {self.plans.compared_with}."
+        return f"{better}, better action ranking than {self.ranks_actions.compared_with}. Planning was not measured."
+
+    @staticmethod
+    def _denial(claim: str, verdict: Verdict) -> str:
+        """Return the sentence on the first claim that was measured to be false."""
+        if verdict.name != "uses actions":
+            check = " Check data, axes and stride first." * (verdict.name == "predicts")
+            return f"{claim.capitalize()} is not better than {verdict.compared_with}.{check}"
+        if verdict.compared_with == _CHANCE:
+            return "Action ranking is worse than chance, so the model cannot be used for planning."
+        if verdict.high is not None and verdict.high < 0:
+            return "The error is lower with shuffled actions than with true ones. Check data, axes and stride first."
+        return "The model predicts typical motion and ignores the actions, so it cannot be used for planning."
 
     def __str__(self) -> str:
         gap = _COLUMNS - len(self.subject) - len(self.measured)
-        lines = [f"{self.subject}{' ' * gap if gap > 1 else chr(10)}{self.measured}"]
+        header = f"{self.subject}{' ' * gap}{self.measured}"
+        lines = [header] if gap > 1 else [*_wrap(self.subject, _COLUMNS), self.measured]
         width = max(len(verdict.conclusion) for verdict in self.verdicts)
         for verdict in self.verdicts:
             label = f"  {verdict.name:<13}  {verdict.conclusion:<{width}}  "
             room = _COLUMNS - len(label) - len(verdict.interval) - 1
-            statement, *more = textwrap.wrap(f"{verdict.statement} {verdict.reference}", room)
-            lines.append(f"{label}{statement:<{room}} {verdict.interval}".rstrip())
-            lines += (" " * len(label) + text for text in more)
-        return "\n".join([*lines, *textwrap.wrap(self.sentence, _COLUMNS)])
+            text = _with_fixed_units(f"{verdict.statement} {verdict.reference}")
+            first = _wrap(text, room)[0]
+            lines.append(f"{label}{first:<{room}} {verdict.interval}".rstrip())
+            rest = _wrap(text[len(first) :].lstrip(), _COLUMNS - len(label))
+            lines += (" " * len(label) + line for line in rest)
+        lines += _wrap(_with_fixed_units(self.sentence), _COLUMNS)
+        return "\n".join(lines).replace(_NO_BREAK, " ")
+
+
+def _with_fixed_units(text: str) -> str:
+    """Return a text in which no line break separates a number from its unit."""
+    return re.sub(r"(?<=\d) (?=%|cm\b|s\b)", _NO_BREAK, text)
 
 
 def summarize(evaluation: Evaluation, rows: Sequence[Row]) -> Summary:
     """Return the summary of an evaluation from its rows (`rows.rows_of`)."""
-    clips, base = evaluation.clips, evaluation.base
+    clips, model = evaluation.clips, evaluation.models[evaluation.trained]
     trained_rows = {row.key: row for row in rows if row.model == evaluation.trained}
-    base_rows = {row.key: row for row in rows if row.model == base}
+    base_rows = {row.key: row for row in rows if row.model == evaluation.base}
+    ranked = () if model.ranking is None else model.ranking.episode_ids
+    mapped = () if model.landscapes is None else [one.episode_id for one in model.landscapes.maps]
+    landscape = _landscape(trained_rows, base_rows)
+    ranks_actions = _of_enough(_ranks_actions(trained_rows, base_rows), ranked)
     summary = Summary(
         subject=evaluation.title,
-        measured=f"{len(clips)} clips, {clips.episodes} held-out episode{'s' * (clips.episodes != 1)}",
-        compared_with=PERSISTENCE if base is None else BASE,
-        predicts=_predicts(trained_rows, base_rows, evaluation.horizon, f"{evaluation.seconds_ahead:.1f} s ahead"),
-        uses_actions=_uses_actions(trained_rows),
-        ranks_actions=_ranks_actions(trained_rows, base_rows),
-        landscape=_landscape(trained_rows, base_rows),
+        measured=f"{counted(len(clips), 'clip')}, {counted(clips.episodes, 'held-out episode')}",
+        predicts=_predicts(evaluation, trained_rows, base_rows),
+        uses_actions=_uses_actions(trained_rows, ranks_actions),
+        ranks_actions=ranks_actions,
+        landscape=None if landscape is None else _of_enough(landscape, mapped),
     )
     return summary if clips.episodes >= ENOUGH_EPISODES else _too_few(summary, clips.episodes)
 
 
 def _too_few(summary: Summary, episodes: int) -> Summary:
     """Return a summary without conclusions, which states what the numbers alone show."""
-    shown = summary.predicts.statement
-    if summary.predicts.leaning == "yes" and summary.uses_actions.leaning == "no":
-        shown += f"; {_IGNORES_ACTIONS}"
-    few = f"{episodes} held-out episode{'s are' if episodes > 1 else ' is'} too few for a conclusion"
-    needs = f"{few}; at least {ENOUGH_EPISODES} are needed. So far: {shown}."
-
-    def without_conclusion(verdict: Verdict) -> Verdict:
-        conclusion: Conclusion = "inconclusive" if verdict.value is not None else "not measured"
-        return replace(verdict, conclusion=conclusion, low=None, high=None, needs=needs)
-
+    needs = (
+        f"{_are_too_few(episodes, 'held-out episode')}; at least {ENOUGH_EPISODES} are needed."
+        f" So far: {summary.predicts.statement}; {summary.uses_actions.statement}."
+    )
     return replace(
         summary,
-        predicts=without_conclusion(summary.predicts),
-        uses_actions=without_conclusion(summary.uses_actions),
-        ranks_actions=without_conclusion(summary.ranks_actions),
-        landscape=None if summary.landscape is None else without_conclusion(summary.landscape),
+        predicts=replace(_without_conclusion(summary.predicts), needs=needs),
+        uses_actions=_without_conclusion(summary.uses_actions),
+        ranks_actions=_without_conclusion(summary.ranks_actions),
+        landscape=None if summary.landscape is None else _without_conclusion(summary.landscape),
     )
+
+
+def _of_enough(verdict: Verdict, episode_ids: Sequence[str]) -> Verdict:
+    """Return a verdict on clips of these episodes: without conclusion if there are too few."""
+    episodes = len(set(episode_ids))
+    if not 0 < episodes < ENOUGH_EPISODES:
+        return verdict
+    few = f"{verdict.reference[:-1]}; {_are_too_few(episodes, 'episode')})"
+    return replace(_without_conclusion(verdict), reference=few)
+
+
+def _without_conclusion(verdict: Verdict) -> Verdict:
+    conclusion: Conclusion = "inconclusive" if verdict.value is not None else "not measured"
+    return replace(verdict, conclusion=conclusion, low=None, high=None)
+
+
+def _are_too_few(number: int, what: str) -> str:
+    return f"{counted(number, what)} {'is' if number == 1 else 'are'} too few for a conclusion"
 
 
 def not_measured(name: str, how: str) -> Verdict:
@@ -177,18 +204,20 @@ def spread_of_errors(evaluations: Sequence[Evaluation]) -> str:
     """Return as text how much the errors of several runs differ, at the longest horizon."""
     errors = [over_persistence(one.errors, "rollout")[-1].value for one in evaluations]
     mean = f"{np.mean(errors):.3f} (range {min(errors):.3f} to {max(errors):.3f})"
-    return f"{len(evaluations)} runs: mean error relative to persistence {mean}"
+    ahead = f"{evaluations[0].seconds_ahead:.1f} s ahead"
+    return f"{len(evaluations)} runs: mean error relative to persistence, {ahead}: {mean}"
 
 
 def percent(share: float) -> str:
     """Return a share in percent, with a digit more below 10."""
-    return f"{100 * share:.0f}" if abs(share) >= 0.0995 else f"{100 * share:.1f}"
+    return f"{100 * share:z.0f}" if abs(share) >= 0.0995 else f"{100 * share:z.1f}"
 
 
 def interval_of(share: Estimate) -> str:
-    """Return the interval of a share in percent, with as many digits as the share; empty without an interval."""
-    form = ".0f" if abs(share.value) >= 0.0995 else ".1f"
-    return f"[{100 * share.low:{form}}, {100 * share.high:{form}}]" if share.has_interval else ""
+    """Return the interval of a share's size, whose sign a word gives, in percent; empty without an interval."""
+    form = "z.0f" if abs(share.value) >= 0.0995 else "z.1f"
+    low, high = (share.low, share.high) if share.value >= 0 else (-share.high, -share.low)
+    return f"[{100 * low:{form}}, {100 * high:{form}}]" if share.has_interval else ""
 
 
 def conclusion_of(gain: Estimate, same: float) -> Conclusion:
@@ -199,34 +228,35 @@ def conclusion_of(gain: Estimate, same: float) -> Conclusion:
     return conclusions[gain.side(of=0.0)]
 
 
-def _verdict(name: str, conclusion: Conclusion, statement: str, estimate: Estimate) -> Verdict:
+def _verdict(name: str, conclusion: Conclusion, statement: str, estimate: Estimate, compared_with: str) -> Verdict:
     low, high = (estimate.low, estimate.high) if estimate.has_interval else (None, None)
-    return Verdict(name, conclusion, statement, estimate.value, low, high)
+    return Verdict(name, conclusion, statement, estimate.value, low, high, compared_with=compared_with)
 
 
-def _predicts(rows: Mapping[str, Row], base_rows: Mapping[str, Row], horizon: int, ahead: str) -> Verdict:
+def _predicts(evaluation: Evaluation, rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict:
     """Conclude from the L1 error of the longest rollout: yes needs less than the base model's and than persistence's.
 
     The reference names a falling spread (smoother predictions also have a lower error), and other metrics that
     disagree.
     """
+    horizon, ahead = evaluation.horizon, f"{evaluation.seconds_ahead:.1f} s ahead"
     error = rows[f"rollout.{L1.name}.over_persistence.{horizon}"].estimate
-    against_persistence = _verdict_on_gain(error.below(1.0), PERSISTENCE, ahead)
-    gain = rows.get(f"rollout.{L1.name}.gain_over_base.{horizon}")
-    blur = _blur(rows, base_rows, horizon)
-    if gain is None:
-        is_lower = against_persistence.leaning == "yes"
-        return replace(against_persistence, reference=f"({blur})" if blur and is_lower else "")
-    verdict = _verdict_on_gain(gain.estimate, BASE, ahead)
+    verdict = against_persistence = _verdict_on_gain(error.below(1.0), _PERSISTENCE, ahead)
+    gain, remarks = rows.get(f"rollout.{L1.name}.gain_over_base.{horizon}"), []
+    if gain is not None:
+        verdict = _verdict_on_gain(gain.estimate, _BASE, ahead)
+        remarks = [
+            f"by {metric.label} {_amount(other.estimate, 'better', 'worse')} {interval_of(other.estimate)}".rstrip()
+            for metric in evaluation.metrics
+            if (other := rows.get(f"rollout.{metric.name}.gain_over_base.{horizon}"))
+            and other.estimate.side(of=0.0) != gain.estimate.side(of=0.0)
+        ]
+    error_fell = verdict.value is not None and verdict.value > SAME_ERROR
+    if error_fell and (blur := _blur(rows, base_rows, horizon)):
+        remarks.append(blur)
     if verdict.conclusion == "yes" and against_persistence.conclusion != "yes":
-        return replace(against_persistence, reference=f"({verdict.statement} {verdict.interval})")
-    remarks = [
-        f"by {name} {_lower(row.estimate)}"
-        for name in dict.fromkeys(key.split(".")[1] for key in rows if key.startswith("rollout."))
-        if (row := rows.get(f"rollout.{name}.gain_over_base.{horizon}"))
-        and row.estimate.side(of=0.0) != gain.estimate.side(of=0.0)
-    ]
-    remarks += [blur] * (bool(blur) and verdict.leaning == "yes")
+        remarks.insert(0, f"{verdict.statement} {verdict.interval}")
+        verdict = against_persistence
     return replace(verdict, reference=f"({'; '.join(remarks)})" if remarks else "")
 
 
@@ -238,69 +268,71 @@ def _blur(rows: Mapping[str, Row], base_rows: Mapping[str, Row], horizon: int) -
     spread, before = rows[key].value, base_rows[key].value if key in base_rows else 1.0
     if spread >= before * (1 - SAME_ERROR):
         return ""
-    whose = "base model" if key in base_rows else "true latents"
-    return f"part of the gain may be blur: spread {spread:.2f}, {whose} {before:.2f}"
+    reference = "base model" if key in base_rows else "true latents"
+    return f"part of the gain may be blur: spread {spread:.2f}, {reference} {before:.2f}"
 
 
 def _verdict_on_gain(gain: Estimate, compared_with: str, ahead: str) -> Verdict:
-    leaning: Literal["yes", "no"] = "yes" if gain.value > SAME_ERROR else "no"
-    statement = f"error {_lower(gain)} than with {compared_with}, {ahead}"
-    return replace(_verdict("predicts", conclusion_of(gain, SAME_ERROR), statement, gain), leaning=leaning)
+    statement = f"error {_amount(gain, 'lower', 'higher')} than {compared_with}, {ahead}"
+    return _verdict("predicts", conclusion_of(gain, SAME_ERROR), statement, gain, compared_with)
 
 
-def _lower(gain: Estimate) -> str:
-    return f"{percent(abs(gain.value))} % {'lower' if gain.value >= 0 else 'higher'}"
+def _amount(change: Estimate, positive: str, negative: str) -> str:
+    """Return a relative change without its sign, which one of two words gives."""
+    return f"{percent(abs(change.value))} % {positive if change.value >= 0 else negative}"
 
 
-def _uses_actions(rows: Mapping[str, Row]) -> Verdict:
+def _uses_actions(rows: Mapping[str, Row], ranks_actions: Verdict) -> Verdict:
     """Conclude from the one-step error with shuffled actions; yes also needs an action-ranking error below chance."""
     cost, gap = (rows[f"{name}.shuffled"].estimate for name in ("cost_of_actions", "gap_of_actions"))
-    leaning: Literal["yes", "no"] = "yes" if gap.value > SAME_ERROR else "no"
-    conclusion, reference = conclusion_of(gap, SAME_ERROR), ""
-    if "ranking.rank" in rows and conclusion == "yes" and (rank := rows["ranking.rank"].estimate).side(CHANCE) != -1:
-        conclusion = "no" if rank.side(CHANCE) == 1 else "inconclusive"
-        reference = f"(but action-ranking error {percent(rank.value)} %, chance 50 %)"
-    change = "higher" if cost.value >= 0 else "lower"
-    statement = f"one-step error {percent(abs(cost.value))} % {change} with shuffled actions"
-    return replace(_verdict("uses actions", conclusion, statement, cost), reference=reference, leaning=leaning)
+    conclusion, reference, compared_with = conclusion_of(gap, SAME_ERROR), "", "with shuffled actions"
+    low, high = ranks_actions.low, ranks_actions.high
+    if conclusion == "yes" and low is not None and high is not None and high >= CHANCE:
+        conclusion, compared_with = "no" if low > CHANCE else "inconclusive", _CHANCE
+        reference = f"(but {ranks_actions.statement} {ranks_actions.interval}, chance 50 %)"
+    statement = f"one-step error {_amount(cost, 'higher', 'lower')} with shuffled actions"
+    return replace(_verdict("uses actions", conclusion, statement, cost, compared_with), reference=reference)
 
 
 def _ranks_actions(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict:
     """Conclude from the action-ranking error: yes needs less than the base model's and less than chance."""
     key = "ranking.rank"
     if key not in rows:
-        return not_measured("ranks actions", "evaluate --sensitivity-clips 32")
+        return not_measured("ranks actions", "`vjepa2-ac evaluate --ranking-clips 32`")
     rank = rows[key].estimate
     statement = f"action-ranking error {percent(rank.value)} %"
-    conclusion, reference = conclusion_of(rank.below(CHANCE), SAME_RANK), "chance 50 %"
+    conclusion, reference, compared_with = conclusion_of(rank.below(CHANCE), SAME_RANK), "chance 50 %", _CHANCE
     if (difference := rows.get("ranking.difference_to_base")) is not None:
         if conclusion == "yes":
-            conclusion = conclusion_of(difference.estimate.below(0.0), SAME_RANK)
+            conclusion, compared_with = conclusion_of(difference.estimate.below(0.0), SAME_RANK), _BASE
         reference = f"base model {percent(base_rows[key].value)} %, {reference}"
-    verdict = _verdict("ranks actions", conclusion, statement, rank)
+    verdict = _verdict("ranks actions", conclusion, statement, rank, compared_with)
     return replace(verdict, reference=f"({reference})", baseline=CHANCE)
 
 
 def _landscape(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict | None:
     """Conclude from the distance of the energy minimum to the true action: yes needs less than the base model's.
 
-    Without a base model it needs less than that of a random grid point. None: no landscapes were measured.
+    It also needs less than that of a random grid point. None: no landscapes were measured.
     """
     key, sharpness = "landscapes.distance", "landscapes.sharpness"
     if key not in rows:
         return None
-    distance, chance = rows[key].estimate, rows[key].chance or 0.0
-    unit = " cm" if rows[key].unit == "cm" else ""
-    conclusion = conclusion_of(distance.below(chance), 0.0)
-    compared = [f"random point {chance:.1f}{unit}", f"sharpness {rows[sharpness].value:.3f}"]
+    distance, chance, unit = rows[key].estimate, rows[key].chance or 0.0, rows[key].unit
+    conclusion, compared_with = conclusion_of(distance.below(chance), 0.0), _CHANCE
+    references = [f"random point {_with_unit(chance, unit)}", f"sharpness {rows[sharpness].value:.2g}"]
     if (difference := rows.get("landscapes.difference_to_base")) is not None:
         if conclusion == "yes":
-            conclusion = conclusion_of(difference.estimate.below(0.0), 0.0)
-        compared = [f"base model {base_rows[key].value:.1f}{unit}", *compared]
-        compared[-1] += f", base model {base_rows[sharpness].value:.3f}"
-    statement = f"energy minimum {distance.value:.1f}{unit} from the true action"
-    verdict = _verdict("landscape", conclusion, statement, distance)
-    return replace(verdict, reference=f"({'; '.join(compared)})", baseline=chance, unit="cm" if unit else "")
+            conclusion, compared_with = conclusion_of(difference.estimate.below(0.0), 0.0), _BASE
+        references.insert(0, f"base model {_with_unit(base_rows[key].value, unit)}")
+        references[-1] += f", base model {base_rows[sharpness].value:.2g}"
+    statement = f"energy minimum {_with_unit(distance.value, unit)} from the true action"
+    verdict = _verdict("landscape", conclusion, statement, distance, compared_with)
+    return replace(verdict, reference=f"({'; '.join(references)})", baseline=chance, unit="cm" if unit else "")
+
+
+def _with_unit(number: float, unit: str) -> str:
+    return f"{number:.1f} {unit}".rstrip()
 
 
 def closed_loop(shares: Mapping[str, Estimate], model: str, oracle: str, problems: int, task: str) -> Verdict:
@@ -321,8 +353,9 @@ def closed_loop(shares: Mapping[str, Estimate], model: str, oracle: str, problem
         solved = f"The oracle solves only {percent(reference.value)} % of these problems"
         needs = f"{solved}, so they cannot be used for comparison."
     elif problems < ENOUGH_EPISODES:
-        needs = f"{problems} problem{'s are' if problems > 1 else ' is'} too few for a conclusion; use --episodes 50."
-    others = ", ".join(f"{name} {100 * one.value:.0f} %" for name, one in shares.items() if name != model)
-    statement = f"solves {100 * share.value:.0f} % of {problems} {task} problem{'s' * (problems != 1)}"
-    verdict = _verdict("plans", "inconclusive" if needs else conclusion, statement, share)
+        needs = f"{_are_too_few(problems, 'problem')}; use --episodes 50."
+    others = ", ".join(f"{name} {percent(one.value)} %" for name, one in shares.items() if name != model)
+    statement = f"solves {percent(share.value)} % of {counted(problems, f'{task} problem')}"
+    competitors = "the zero action and random actions"
+    verdict = _verdict("plans", "inconclusive" if needs else conclusion, statement, share, competitors)
     return replace(verdict, reference=f"({others})", needs=needs, baseline=best.value)

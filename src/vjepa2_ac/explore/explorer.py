@@ -29,7 +29,7 @@ from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
-from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces
 
 _KEPT_STEPS = 128  # of each model, for undo and for other branches
@@ -102,7 +102,7 @@ class Explorer:
         Raises:
             InputError: Nobody knows which state follows from an action.
         """
-        self.world_model, self.contenders = subject.world_model, subject.contenders
+        self.world_model, self.contenders, self.notes = subject.world_model, subject.contenders, subject.notes
         self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
         if self.spaces.action.follows == "unknown":
             found = "commands of which nobody knows what they do to the state"
@@ -282,6 +282,7 @@ class ExploreOptions:
         accelerator = make_accelerator(config)
         dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
         require_frames(config.data, to="show what is true")
+        reporter.task(LOADING)
         loaded = load_subject(self.subject, config, self.evaluation, dataset, decoder)
         loaded.put_on(accelerator.device)
         decoder.to(accelerator.device)

@@ -66,6 +66,7 @@ def _tree(views: Views, progress: Progress, depth: int) -> dict[str, Any]:
     images = _fitting([shown for _, shown in map(found.__getitem__, paths)])
     content: dict[str, Any] = plain({
         "subject": views.subject,
+        "notes": views.explorer.notes,
         "episode": views.episode_names[first.episode],
         "tellers": [one.name for one in views.explorer.contenders[-2:]],
         "is_pose": views.explorer.spaces.state.is_base_pose,

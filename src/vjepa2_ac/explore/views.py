@@ -78,6 +78,7 @@ class Views:
         episode, goal = self._proposed
         told = {
             "subject": self.subject,
+            "notes": explorer.notes,
             "tellers": [{"id": one.name, "label": one.name} for one in explorer.contenders],
             "truth": "simulated" if self.truth.is_simulated else "recorded",
             "episodes": [

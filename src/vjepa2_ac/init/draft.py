@@ -18,6 +18,7 @@ from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.model.checkpoints.loading import base_sizes
 from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED
+from vjepa2_ac.reporter import duration
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.training.cost.flops import clip_flops, frame_flops
 from vjepa2_ac.training.cost.memory import GIGABYTE, USUAL_GPU, estimate_memory
@@ -70,14 +71,6 @@ class Machine:
         """It in a line."""
         gpu = f"{self.gpu}, {self.room}" if self.gpu else "no GPU"
         return f"{gpu}; {counted(self.cores, 'core')}; {self.free_bytes / GIGABYTE:.0f} GB of disk free"
-
-
-def duration(hours: float) -> str:
-    """Return a time for people: hours, or minutes."""
-    if hours >= 1:
-        return f"about {hours:,.1f} hours"
-    minutes = max(1, round(60 * hours))
-    return f"about {counted(minutes, 'minute')}"
 
 
 def this_machine() -> Machine:

@@ -16,6 +16,7 @@ import matplotlib as mpl
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from vjepa2_ac.storage import atomic_writer
@@ -87,9 +88,7 @@ def svg_of(draw: Callable[..., None], width: float, height: float, *given: Any) 
         warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a reader's fonts have it
         figure = new_figure(width, height, layout="constrained")
         draw(figure, *given)
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # it has been laid out: once is enough
-        figure.savefig(text, format="svg", metadata={"Date": None})
+        FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None})  # `savefig` would lay it out twice
     return f"data:image/svg+xml;base64,{base64.b64encode(text.getvalue().encode()).decode()}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -61,6 +62,13 @@ class PlanResult:
     def state_space(self) -> StateSpace:
         """What the numbers of a state are."""
         return self.controller.spaces.state
+
+    @property
+    def worse_than(self) -> dict[str, float]:
+        """Energies that are lower than the one predicted for the plan: of the zero action, and of the current frame."""
+        energy = math.nan if self.decision.plan is None else self.decision.plan.energy
+        others = {"zero action": self.doing_nothing, "current frame": self.decision.energy_now}
+        return {name: other for name, other in others.items() if energy > other}
 
     @property
     def unused_goals(self) -> tuple[int, ...]:
@@ -165,6 +173,7 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
         "seed": controller.seed,
         "crop": controller.crop,
         "why": decision.why,
+        "worse_than": list(answer.worse_than),
         "actions": answer.actions,
         "states": answer.states,
         "goal_of_each_step": decision.goals,
@@ -193,44 +202,66 @@ def summarize(answer: PlanResult) -> str:
     plan, why, now = answer.decision.plan, answer.decision.why, answer.decision.energy_now
     if why == "outside the workspace":
         return (
-            "Does nothing: the robot is farther outside planning.limits.workspace than an action leads. Move it back by"
-            " hand, or correct the box."
+            "Zero action: the robot is farther outside planning.limits.workspace than an action leads. Move the robot"
+            " back by hand, or correct the box."
         )
     if why == "at the goal" or plan is None:
-        return "Does nothing: what the model sees now is what it sees in the goal image."
+        return "Zero action: the current frame has the latents of the goal image."
     if why == "no finite energy":
         return (
-            "Does nothing: the model gives no finite energy for any of"
-            f" {plan.evaluations:,} action sequences. It is broken; another checkpoint may not be."
+            "Zero action: the model gives no finite energy for any of"
+            f" {plan.evaluations:,} action sequences. The model is broken; try another checkpoint."
         )
-    change, rounds = f" ({plan.energy / now - 1:+.0%})" if now else "", len(plan.iterations)
-    searched = f"{plan.evaluations:,} action sequences in {rounds} iteration{'s' * (rounds > 1)}"
+    rounds = len(plan.iterations)
+    searched = f"{_count(plan.evaluations, 'action sequence')} in {_count(rounds, 'iteration')}"
     found = [
         _motion(answer),
-        f"Energy {now:.4f} now, {plan.energy:.4f} predicted{change};",
-        f"{answer.doing_nothing:.4f} predicted when doing nothing.",
+        f"Energy {now:.4f} now, {plan.energy:.4f} predicted for the plan{_change(plan.energy, now)},",
+        f"{answer.doing_nothing:.4f} predicted for the zero action.",
         f"Planner {plan.planner}, seed {plan.seed}: {searched}, {answer.seconds['decision']:.2f} s.",
     ]
     if plan.stopped == "out of time":
         found.append(
             f"Time was up after {rounds} of {answer.controller.config.iterations} iterations: the best so far."
         )
-    if not plan.energy < answer.doing_nothing:
-        found.append("None of the evaluated actions is predicted to be better than doing nothing.")
+    if plan.energy == answer.doing_nothing:
+        found.append("No evaluated action sequence is predicted to be better than the zero action.")
     if at_limit := axes_at_limit(answer):
         knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
         found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
-    if answer.unused_goals and answer.question.durations:  # of others everybody knows that they come later
+    if answer.unused_goals and answer.question.durations:  # others are expected to come later
         unused = ", ".join(str(place + 1) for place in answer.unused_goals)
-        found.append(f"No part in this plan has goal {unused}: see durations, planning.horizon, planning.energy.steps.")
+        goals = f"Goal {unused} does" if len(answer.unused_goals) == 1 else f"Goals {unused} do"
+        found.append(f"{goals} not affect this plan: see durations, planning.horizon, planning.energy.steps.")
     return " ".join(found)
+
+
+def warn_of_plan(answer: PlanResult) -> tuple[str, ...]:
+    """Return a sentence on each energy that is lower than the one predicted for the plan."""
+    energy = math.nan if answer.decision.plan is None else answer.decision.plan.energy
+    return tuple(
+        f"The plan is predicted to be worse than the {name}:"
+        f" energy {energy:.4f} against {other:.4f}{_change(energy, other)}."
+        for name, other in answer.worse_than.items()
+    )
+
+
+def _change(energy: float, reference: float) -> str:
+    if not reference:
+        return ""
+    percent = 100 * (energy - reference) / abs(reference)
+    return f" ({percent:+.{0 if abs(percent) >= 10 else 1}f} %)"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'s' * (number != 1)}"
 
 
 def _motion(answer: PlanResult) -> str:
     space, change, steps = answer.state_space, answer.states[-1] - answer.states[0], len(answer.actions)
     shown = change[list(answer.controller.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
     names = [space.change_names[axis] for axis in answer.controller.shown_axes]
-    lasting = f"in {steps} model step{'s' * (steps > 1)}"
+    lasting = f"in {_count(steps, 'model step')}"
     if not space.is_pose:
         parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, shown, strict=True))
         more = ", ..." if len(answer.space.free) > len(names) else ""

@@ -36,7 +36,7 @@ class PlanningSession:
     config: Config  # of it: planning, seed, data.crop and data.stride are used
     subject: str  # the run or model as given
     checkpoint: str  # which one, as text; "" of a model
-    warnings: tuple[str, ...] = ()  # why its plans may leave what the run was taught
+    warnings: tuple[str, ...] = ()  # that it is untrained; why its plans may leave what the run was taught
 
     def controller(self, *, seed: int | None = None, extrinsics: Float[np.ndarray, " 6"] | None = None) -> Controller:
         """Return a controller with these settings.
@@ -111,7 +111,9 @@ def load_to_plan(
     require_type_of_weights(its.model, device)  # without autocast
     if is_run(subject):
         run = load_run(Path(subject), checkpoint, its)
+        run.warn_if_untrained()
         model, chosen, warnings = run.world_model, run.chosen, warn_beyond_taught(its, Path(subject))
+        warnings = (*([run.note] if run.note else []), *warnings)
         known = Fingerprints.of(model)
         merge_adapter(model)
         model.merged_from = known

@@ -6,20 +6,25 @@ Nothing is measured here: missing results have to be written by `vjepa2-ac evalu
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted, shell_command
 from vjepa2_ac.evaluation.result import L1, Row
-from vjepa2_ac.evaluation.summary import Summary, interval_of, percent
+from vjepa2_ac.evaluation.summary import Verdict, percent
 from vjepa2_ac.intervals import Estimate, bootstrapped
 from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
+from vjepa2_ac.runs.checkpoint import SAME_RANK, step_of
 
-_NAME, _CELL, _MOST_RUNS = 22, 16, 8  # columns of a name and of a verdict, and lines on a screen
+_LINE = "  {:<22}  {:>10}  {:>17}  {:>21}  {:>18}"  # of the columns, whose heads have three lines
+_WHAT = ("", "", "error vs", "one-step error", "action-ranking")
+_OF_WHAT = "with shuffled actions", "error, chance 50 %"
+_BETTER = ("", "", "(lower is better)", "(higher is better)", "(lower is better)")
 _SAME = ("split", "frames", "stride", "cameras")
 _SAME_LATENTS = 1e-3  # errors of persistence that differ by a larger share are of other latents
 
@@ -33,37 +38,55 @@ class Comparison:
     seconds: Float[np.ndarray, " horizon"]
     curves: Mapping[str, tuple[Estimate, ...]]  # run -> rollout error over persistence by horizon
     notes: tuple[str, ...]
-    summaries: Mapping[str, Summary]
-
-    @property
-    def best(self) -> str:
-        """The run whose error is clearly the lowest; else the first."""
-        clear = [row for row in self.rows if row.key == "gain_over_first" and row.estimate.side(of=0.0) == 1]
-        return max(clear, key=lambda row: row.value).model if clear else next(iter(self.summaries))
+    measured: Mapping[str, Metrics]
+    folders: Mapping[str, Path]
 
     def __str__(self) -> str:
-        """Return the verdicts on all runs, a line each, and how much better than the first one the best of them is."""
-        first, *others = self.summaries
-        gains = {row.model: row for row in self.rows if row.key == "gain_over_first"}
-        wide = min(max(map(len, self.summaries)), _NAME)
-        lines = [
-            f"{len(self.summaries)} runs on the same {self.summaries[first].measured}, {self.seconds[-1]:.1f} s ahead"
-        ]
-        lines.append(
-            "  " + " " * wide + "".join(f"  {question.name:<{_CELL}}" for question in self.summaries[first].verdicts)
-        )
-        for name, found in list(self.summaries.items())[:_MOST_RUNS]:
-            cells = [
-                f"{one.conclusion} {'' if one.value is None else f'{percent(one.value)} %'}" for one in found.verdicts
-            ]
-            lines.append(f"  {name[-wide:]:<{wide}}" + "".join(f"  {cell:<{_CELL}}" for cell in cells))
-        lines.append("  (error below the base's; cost of a wrong action; action-ranking error)")
-        best = max(others, key=lambda name: gains[name].value)
-        gain = gains[best].estimate
-        how = {1: "lower", -1: "higher", 0: "not clearly other"}[gain.side(of=0.0)]
-        share = "" if how == "not clearly other" else f" {percent(abs(gain.value))} %"
-        lines.append(f"The error of {best} is{share} {how} than that of {first} {interval_of(gain)}".rstrip() + ".")
-        return "\n".join(line.rstrip() for line in lines)
+        """Return the checkpoint and the metrics of each run in columns, and the difference of the errors."""
+        first, key = next(iter(self.measured.values())), f"rollout.{L1.name}.gain_over_base.{len(self.seconds)}"
+        has_base = all(one.of(key) or _step(one) == 0 for one in self.measured.values())
+        reference = "base model" if has_base else "persistence"
+        lines = [_LINE.format(*head).rstrip() for head in (_WHAT, ("run", "checkpoint", reference, *_OF_WHAT), _BETTER)]
+        for name, one in self.measured.items():
+            gain, step = one.of(key), _step(one)
+            error = self.curves[name][-1].value - 1 if not has_base else -gain.value if gain else 0.0
+            checkpoint = "none" if step is None else f"{step:,}" if step else "base model"
+            used, rank = _number(one.summary.uses_actions), _number(one.summary.ranks_actions)
+            numbers = (_shown(error, "+.1f"), _shown(used, "+.1f"), _shown(rank, ".1f"))
+            lines.append(_LINE.format(name if len(name) <= 22 else f"…{name[-21:]}", checkpoint, *numbers))
+        title = f"{len(self.measured)} runs on the same {first.summary.measured}, {self.seconds[-1]:.1f} s ahead"
+        return "\n".join([title, *lines, *textwrap.wrap(self._difference, 100)])
+
+    @property
+    def _difference(self) -> str:
+        """How the lowest error of the others differs from the first run's, as a sentence."""
+        gains = {row.model: row.estimate for row in self.rows if row.key == "gain_over_first"}
+        (first, measured), best = next(iter(self.measured.items())), max(gains, key=lambda name: gains[name].value)
+        if not (side := gains[best].side(of=0.0)):
+            return f"The errors of {best} and {first} do not differ significantly."
+        low, value, high = (percent(one) for one in sorted(map(abs, astuple(gains[best]))))
+        change = f"{value} % {'lower' if side > 0 else 'higher'}"
+        interval = f"95 % CI {low} to {high} %, n = {counted(measured.clips.episodes, 'episode')}"
+        return f"The error of {best} is {change} than that of {first} ({interval})."
+
+    @property
+    def next_command(self) -> str:
+        """The command that exports the best run by the rule of `checkpoint.keep_best`, or why no run is recommended.
+
+        The lowest action-ranking error wins; among those within `SAME_RANK` of it, the lowest prediction error.
+        """
+        ranks = {name: _number(one.summary.ranks_actions) for name, one in self.measured.items()}
+        equal = [name for name, rank in ranks.items() if rank <= min(ranks.values()) + SAME_RANK]
+        best = min(equal, key=lambda name: self.curves[name][-1].value, default="")
+        if missing := [name for name, rank in ranks.items() if math.isnan(rank)]:
+            why = f"the action-ranking error of {', '.join(missing)} was not measured."
+        elif not (why := self.measured[best].summary.predicts.needs) and not _step(self.measured[best]):
+            why = f"{best}, with the lowest action-ranking error, was not fine-tuned."
+        if why:
+            return f"No run is recommended: {why}"
+        folder = self.folders[best]
+        step = _step(self.measured[best])
+        return f"Next: {shell_command('export', folder, f'{folder.resolve().name}-merged', '--checkpoint', step)}"
 
 
 def compare(folders: Sequence[Path]) -> Comparison:
@@ -99,7 +122,8 @@ def compare(folders: Sequence[Path]) -> Comparison:
         seconds=about.seconds_per_step * np.arange(1, about.frames),
         curves={name: _curve(metrics) for name, metrics in measured.items()},
         notes=_notes(measured),
-        summaries={name: metrics.summary for name, metrics in measured.items()},
+        measured=measured,
+        folders=dict(zip(names, folders, strict=True)),
     )
 
 
@@ -135,6 +159,19 @@ def _last(metrics: Metrics) -> tuple[np.ndarray, np.ndarray]:
     return np.array(errors)[:, -1], np.array(persistence)[:, -1]
 
 
+def _number(verdict: Verdict) -> float:
+    return math.nan if verdict.value is None else verdict.value
+
+
+def _shown(share: float, form: str) -> str:
+    return "not measured" if math.isnan(share) else f"{round(100 * share, 1) + 0.0:{form}} %"
+
+
+def _step(metrics: Metrics) -> int | None:
+    """Return the optimizer steps of the measured checkpoint; None: a model, which has no checkpoints."""
+    return step_of(Path(metrics.about.checkpoint_path).name)
+
+
 def _curve(metrics: Metrics) -> tuple[Estimate, ...]:
     rows = (metrics.of(f"rollout.{L1.name}.over_persistence.{h}") for h in range(1, metrics.about.frames))
     return tuple(Estimate(math.nan, math.nan, math.nan) if row is None else row.estimate for row in rows)
@@ -148,6 +185,11 @@ def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
     if others:
         notes.append(
             f"Other latents than those of {first} (another encoder or crop): {', '.join(others)}; ratios compare."
+        )
+    ways = {name: one.about.checkpoint.partition(" (")[2].rstrip(")") for name, one in measured.items()}
+    if len(set(ways.values())) > 1:
+        notes.append(
+            f"Checkpoints were chosen differently: {', '.join(f'{way} ({name})' for name, way in ways.items())}."
         )
     plans = [one.planning for one in measured.values() if one.planning is not None]
     if len({f"{study.get('clips')} {study.get('places')}" for study in plans}) > 1:

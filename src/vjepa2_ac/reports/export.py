@@ -76,6 +76,7 @@ def export_run(
         raise InputError(where=str(folder), found=found, needed=needed, fix=fix)
     metrics = read_metrics(folder) if form == "hub" and (folder / METRICS_FILE).exists() else None
     run = load_run(folder, checkpoint, config)
+    run.warn_if_untrained()
     card = _card(run, folder, metrics) if form == "hub" else ""
     merge_adapter(run.world_model)  # also for the Hub: an adapter that makes it not finite is of no use
     require_finite(

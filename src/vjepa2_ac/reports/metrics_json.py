@@ -25,16 +25,16 @@ METRICS_FILE = "metrics.json"
 FORMAT = 5  # incremented when a reader of the file would have to change
 _NEEDS = {  # parts of an evaluation: a word of the note that says why a part is missing, and what the part needs
     "base": ("no base", "The comparison needs a base model; a model without one was evaluated."),
-    "spread": ("spread", "The spread is the variance over clips and needs two or more clips."),
-    "landscapes": ("energy landscapes", "Energy landscapes need clips that move and actions of three or more numbers."),
-    "planning": ("No plans", "Planning takes minutes and was not requested: vjepa2-ac evaluate --planning."),
-    "examples": ("example clips", "Example clips need a data set with frames."),
+    "spread": ("spread", "The spread is a variance over clips and needs two clips or more."),
+    "landscapes": ("energy landscapes", "They are measured by `vjepa2-ac evaluate --ranking-clips 32 --landscapes 8`."),
+    "planning": ("No plans", "Plans are measured by `vjepa2-ac evaluate --planning`; this takes a while."),
+    "examples": ("example clips", "They are drawn by `vjepa2-ac evaluate --examples 4`."),
     "decoded": (
         "decoded images",
-        "Decoded images need evaluate --decoder FOLDER, made by vjepa2-ac decoder.",
+        "They need a decoder: train one with `vjepa2-ac decoder CONFIG`, then add `--decoder FOLDER`.",
     ),
-    "training": ("metrics.jsonl", "Training curves need the metrics.jsonl of a run."),
-    "strides": ("strides", "Strides are compared by vjepa2-ac data calibrate."),
+    "training": ("metrics.jsonl", "They need `metrics.jsonl` of a run: this is a model, or the file is missing."),
+    "strides": ("strides", "Other strides are measured by `vjepa2-ac evaluate --calibrate`."),
 }
 
 
@@ -129,7 +129,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     about = {name: value for name, value in vars(one.about).items() if name != "space"}
     decoded, planning = one.decoded, {"three_steps_settings": SCORED}
     of_study = ("clips", "places", "demonstrated", "one_step_beyond", "three_steps_beyond", "settings")
-    of_model = ("role", "sensitivity", "ranking", "landscapes", "plans")  # what rows come from, but for errors
+    of_model = ("role", "ranking", "landscapes", "distribution", "plans")  # what rows come from, but for errors
     metrics = {
         "format": FORMAT,
         "summary": {**vars(summary), "sentence": summary.sentence},
@@ -148,6 +148,10 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "by_clip": {
             "persistence": one.errors.of("rollout", L1, "persistence"),
             "models": {name: model.errors.of("rollout") for name, model in one.models.items()},
+            "last_horizon": {
+                metric.name: {name: model.errors.of("rollout", metric)[:, -1] for name, model in one.models.items()}
+                for metric in one.metrics
+            },
             "one_step": {
                 name: {way: model.errors.of("teacher_forced", way=way).mean(1) for way in get_args(Way)}
                 for name, model in one.models.items()

@@ -1,6 +1,6 @@
 """The report of an evaluation: measured, and written as metrics.json, evaluation.png, and one HTML page.
 
-The page has the answer and a film first, then every number and its figure, folded; it needs no network and no script.
+The page shows the summary and a video first, then every number and plot, folded; it needs no network and no script.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from vjepa2_ac.distributed import first_only, joined
 from vjepa2_ac.episode import short_names
@@ -43,7 +43,6 @@ PLOT, REPORT = "evaluation.png", "report.html"
 MOST_CLIPS = 4  # example clips, and as many decoded ones
 _AT_EACH_END = 8  # episodes in a table
 _BYTES = 3_000_000  # of all clips together
-_MOST_TILES = 4
 _AT_AN_END = 10.0  # percent of the width of a bar, free on both sides
 LONGEST_S = 6.0  # of the film
 MOST_BYTES = 600_000  # likewise
@@ -54,7 +53,7 @@ _GREY, _PASSED = 170, (31, 111, 180)  # of gaps and bar, on white as well as on 
 _PARTS = {  # title, and how the keys of the rows begin; what it means stands in the template
     "errors": ("Error by horizon", r"(rollout|teacher_forced)\.\w+\.(over_pers|error)"),
     "base": ("Compared with the base", r"(rollout|teacher_forced)\.|one_step_gain"),
-    "actions": ("Use of the actions", "cost_of|gap_of|sensitivity|ranking|axes"),
+    "actions": ("Use of the actions", "cost_of|gap_of|ranking|axes"),
     "steps": ("Where it helps", "one_step"),
     "examples": ("Example clips", "$^"),
     "decoded": ("Decoded images", "decoded"),
@@ -105,9 +104,10 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
     )
     environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(visible, name.split("/")))
     environment.filters |= {"quote": shlex.quote, "bar": bar_of, "percent": percent, "interval": interval_of}
-    environment.filters["count"] = counted
+    environment.filters |= {"coded": coded, "count": counted}
+    environment.filters["figure"] = lambda row: f"{percent(row.value)} %" if row.better else f"{row.value:.2f}"
     environment.filters["baseline"] = lambda one: (
-        f"{one.baseline:.0%}" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
+        f"{percent(one.baseline)} %" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
     )
     return environment.get_template("report.html.jinja").render(
         evaluation=evaluation,
@@ -119,6 +119,14 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         short=short_names(evaluation.clips.episode_ids),
         style=Markup(resources.files("vjepa2_ac").joinpath("assets/report.css").read_text("utf-8")),  # noqa: S704
     )
+
+
+def coded(text: str) -> Markup:
+    """Return a text as HTML, with what is between backticks as code."""
+    parts = [escape(visible(part)) for part in text.split("`")]
+    if len(parts) % 2 == 0:  # a backtick without its partner
+        return Markup("`").join(parts)
+    return Markup("").join(Markup("<code>{}</code>").format(part) if n % 2 else part for n, part in enumerate(parts))
 
 
 def bar_of(verdict: Verdict) -> dict[str, float]:
@@ -151,23 +159,24 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
 
 
 def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> list[tuple[str, Row, Row | None]]:
-    """Return the most important shares that the answer does not give: label, the evaluated model's, the base's."""
+    """Return the most important rows that the summary does not show: label, the evaluated model's, the base model's."""
     last, ahead = evaluation.horizon, f"{evaluation.seconds_ahead:.1f} s ahead"
     labels = {
         f"rollout.{L1.name}.over_persistence.{last}": f"L1 error / persistence, {ahead}",
         "ranking.rank": "action-ranking error",
-        "sensitivity.rank.clips": "others' actions that look better",
-        "one_step.motion.moving": "one-step L1 error / persistence, moving",
-        f"spread.{last}": f"spread / that of the truth, {ahead}",
+        "one_step.motion.moving": "one-step L1 error / persistence, moving steps",
+        f"spread.{last}": f"spread of the predictions, {ahead}",
     }
-    given = {verdict.value for verdict in summary.verdicts}
-    known = {(row.key, row.model): row for row in rows if not math.isnan(row.value) and row.value not in given}
-    tiles = [
+    if evaluation.base is None:  # the first verdict is on this error
+        del labels[f"rollout.{L1.name}.over_persistence.{last}"]
+    if summary.plans is None:
+        del labels["ranking.rank"]
+    known = {(row.key, row.model): row for row in rows if not math.isnan(row.value)}
+    return [
         (label, known[key, evaluation.trained], known.get((key, evaluation.base or "")))
         for key, label in labels.items()
         if (key, evaluation.trained) in known
     ]
-    return tiles[:_MOST_TILES]
 
 
 def _episodes(scores: Sequence[EpisodeScore]) -> list[RowTable]:
@@ -203,7 +212,7 @@ def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
 
 
 class PageFilm(NamedTuple):
-    """One clip as a film. URLs are data: URLs."""
+    """One clip as a video. URLs are data: URLs."""
 
     url: str  # animated
     still: str  # its last frame
@@ -228,7 +237,7 @@ def film_of(evaluation: Evaluation) -> PageFilm | None:
     step = min(_STEP_S, (LONGEST_S - _FIRST_S - _LAST_S) / max(len(times) - 2, 1))
     shown = [_FIRST_S, *[step] * (len(times) - 2), _LAST_S]
     (url,), (still,) = webp_urls([frames], shown, at_most=MOST_BYTES), webp_urls([frames[-1:]], at_most=MOST_BYTES)
-    return PageFilm(url, still, ("what happened", *(f"the {name} imagines" for name in models)), strip)
+    return PageFilm(url, still, ("true frames", *(f"predicted by {name}" for name in models)), strip)
 
 
 def _frame(images: Sequence[Frame], passed: float) -> Frame:
@@ -284,6 +293,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
     asked = asked or EvaluationOptions()
     with joined(settle(subject, asked)) as accelerator:
         evaluation = measure_subject(subject, asked, accelerator, reporter=reporter)
+        reporter.task("writing report and figures")
         rows = rows_of(evaluation)
         summary, about = summarize(evaluation, rows), evaluation.about
         if about.checkpoint:

@@ -71,6 +71,8 @@ class RunState:
     best_error: Finite | None = None  # its rollout error
     best_rank: Finite | None = None  # its mean rank of the true action, if that selects
     lowest_rank: Finite | None = None  # of all validations
+    base_error: Finite | None = None  # rollout error before the first step
+    base_rank: Finite | None = None  # mean rank of the true action before the first step, if that selects
     measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.resume`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
     data: tuple[DataState, ...] = ()  # of its data set, and of the replayed one
@@ -89,14 +91,15 @@ class RunState:
         """
         if not math.isfinite(error) or (rank is not None and not math.isfinite(rank)):
             return self
+        state = self if self.step else replace(self, base_error=error, base_rank=rank)
         has_lower_error = self.best_error is None or error < self.best_error
         if rank is None:
-            return replace(self, best_step=self.step, best_error=error) if has_lower_error else self
+            return replace(state, best_step=self.step, best_error=error) if has_lower_error else state
         lowest = rank if self.lowest_rank is None else min(rank, self.lowest_rank)
         is_beaten = self.best_rank is None or self.best_rank > lowest + SAME_RANK
         if is_beaten or (has_lower_error and rank <= lowest + SAME_RANK):
-            return replace(self, best_step=self.step, best_error=error, best_rank=rank, lowest_rank=lowest)
-        return replace(self, lowest_rank=lowest)
+            return replace(state, best_step=self.step, best_error=error, best_rank=rank, lowest_rank=lowest)
+        return replace(state, lowest_rank=lowest)
 
 
 def checkpoint_name(step: int) -> str:
@@ -339,6 +342,8 @@ class SelectedCheckpoint:
 
     path: Path
     why: str  # how it was selected, in words
+    by: str  # how it was requested, as of `select_checkpoint`
+    newest: RunState  # progress of the run at its newest checkpoint
 
     def __str__(self) -> str:
         """Return its name, and how it was selected."""
@@ -363,7 +368,8 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
         raise InputError(where=str(run), found="a run without a whole checkpoint", needed="at least one", fix=fix)
     state = written_state(newest)
     if by == NEWEST or (by == SELECTED and state.best_step is None):
-        return SelectedCheckpoint(newest, "the newest" if by == NEWEST else "the newest: none was selected")
+        why = "the newest" if by == NEWEST else "the newest: none was selected"
+        return SelectedCheckpoint(newest, why, by, state)
     is_best = by in {SELECTED, BEST}
     step = state.best_step if is_best else step_of(f"step-{by.zfill(8)}")
     path = folder / checkpoint_name(step or 0)
@@ -379,5 +385,4 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
         steps = ", ".join(str(step_of(path.name)) for path in listed(folder) if find_damage(path) is None)
         raise InputError(where=str(folder), found=problem, needed=f"selected, newest, best or one of the steps {steps}")
     measure = "error" if state.best_rank is None else "action ranking"
-    best = f"the best by {measure}" if step else f"the base: none of its checkpoints is better by {measure}"
-    return SelectedCheckpoint(path, best if is_best else "as asked for")
+    return SelectedCheckpoint(path, f"the best by {measure}" if is_best else "as asked for", by, state)

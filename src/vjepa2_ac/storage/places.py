@@ -11,6 +11,8 @@ import re
 from pathlib import Path
 
 BUILTIN = "builtin:"  # models and configs that come with the package
+NO_DATA = "none"  # data.path of a model without a config
+SIMULATION_FILE = "simulation.json"  # in a data set that `simulate record` made
 
 HUB = "hf://"
 

@@ -87,6 +87,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             if opened:
                 _report_changes(run, reporter)
             if check_only:
+                reporter.task("computing one optimizer step")
                 gradients(run, batches_from(run))
                 reporter.note(_IN_PLACE)
             else:

@@ -121,9 +121,10 @@ class Watch:
                 copying = "; copying the last frame would be better" if now > 1.0 > before else ""
                 text = f"the {name} is {now:.3f} of persistence's in the validation (before training {before:.3f})"
                 yield name + copying, text + copying
-        if _number(metrics, "action_rank_low") > _number(self._at_start, "action_rank_high"):  # intervals are apart
-            rank, before = (100 * _number(row, "action_rank") for row in (metrics, self._at_start))
-            text = f"the action-ranking error is {rank:.1f} % (before training {before:.1f} %, chance 50 %)"
+        error = "action_ranking_error"
+        if _number(metrics, f"{error}_low") > _number(self._at_start, f"{error}_high"):  # intervals are apart
+            now, before = (100 * _number(row, error) for row in (metrics, self._at_start))
+            text = f"the action-ranking error is {now:.1f} % (before training {before:.1f} %, chance 50 %)"
             text += ", although predictions are better than the base's" if better else ""
             yield "rank", f"{text}. `vjepa2-ac data check` measures how diverse the motions of the data are"
 

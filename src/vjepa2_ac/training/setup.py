@@ -40,7 +40,7 @@ from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.checkpoints.loading import base_sizes, load_base
 from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
-from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.reporter import LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.training.cost.memory import batch_bytes
 from vjepa2_ac.training.data_sets import (
@@ -163,11 +163,12 @@ def set_up(
     if not allow_config_change:
         first_only(accelerator, lambda: require_same_data(config, (dataset, *others)))
 
+    reporter.task(LOADING)
     world_model = chooser or load_base(config.model, seed=config.seed)
     first_only(accelerator, lambda: require_same_base(config, world_model))
     extrinsics_for(world_model, clip)
     if decoder is not None:
-        decoder.require_fit(world_model, config.data.crop, subject=str(config.model.base or "the random model"))
+        decoder.require_fit(world_model, config.data, subject=str(config.model.base or "the random model"))
 
     _require_shared_memory(config, clip, world_model.sizes, accelerator)
     for replayed in others:

@@ -24,7 +24,7 @@ from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.setup import Run, encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
-RANK = "action_rank"  # checkpoint.keep_best ranking
+RANK = "action_ranking_error"  # checkpoint.keep_best ranking
 USED = 0.02  # share of error that wrong actions cost a model that uses them, at least
 _AT_ONCE = 64  # samples per batch: as many tokens as the clips of a small micro-batch
 _NOT_ASKED = (
@@ -160,6 +160,7 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
     """
     if run.state.step:
         return None
+    reporter.task("measuring the model before the first step")
     found = validate(run, reporter)
     config, error = run.config, one_step_over_persistence(found.errors).value
     if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:

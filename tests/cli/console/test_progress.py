@@ -49,8 +49,8 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
     reporter = TrainingConsole()
     reporter.validated(10, Validation(errors(), ranking_of(np.array([0.1, 0.2]), ("a", "b"))))
     reporter.started(10, 100)
-    for step in (11, 12, 13):
-        now[0] += 6.0
+    for step in (11, 12, 13, 14):
+        now[0] += 4.5
         reporter.stepped(step, FIGURES)
     title, one_step, rollout, ranked, *lines = written.getvalue().splitlines()
     assert title.startswith("validation at step 10, errors relative to persistence")
@@ -58,7 +58,8 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
     assert rollout == "  rollout error         0.500 after 1 model step, 0.500 after 3"
     assert re.fullmatch(r"  action-ranking error  15 % \[\d+, \d+\] \(0 % is best, chance 50 %\)", ranked)
     words = "loss 0.5123  one-step error 0.250 of persistence  1.50 clips/s"
-    assert lines == [f"training 12/100  {words}  0:08:48 left"], "a line every 10 seconds"
+    expected = [f"training 11/100  {words}  0:06:40 left", f"training 14/100  {words}  0:06:27 left"]
+    assert lines == expected, "a line before 5 seconds, then one every 10"
 
 
 def test_a_validation_without_a_ranking_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:

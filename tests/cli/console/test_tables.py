@@ -46,7 +46,7 @@ def evaluations() -> list[Table]:
     names = ["base", "adapter", "runs/of-another-day/with-a-long-name", "vjepa2-ac-vitg.pt"]
     contenders = [Contender(name, "trained" if name == "adapter" else "base", Halfway()) for name in names[:2]]
     contenders += [Contender(name, "other", Copier()) for name in names[2:]]
-    probes = ProbeOptions(sensitivity_clips=4, samples=4, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
+    probes = ProbeOptions(ranking_clips=4, samples=4, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
     found = evaluate(cast("Any", contenders), again(clips_batch(12, 0)), about(), probes=probes)
     return row_tables(rows_of(found), "Held-out episodes")
 

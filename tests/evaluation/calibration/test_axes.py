@@ -14,7 +14,7 @@ from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.model_setup import Axes
 from worlds import TIME, Copier, Oracle, clips_batch
 
-CLIPS = 30
+CLIPS = 16
 
 
 class Turned(Oracle):

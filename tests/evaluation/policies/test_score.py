@@ -79,7 +79,7 @@ def test_policies_of_known_quality_come_out_in_their_order(dataset: Dataset) -> 
     assert [one.name for one in found.policies] == ["good", "fair", "bad"]
     assert (found.places, found.episodes, found.left_out) == (2 * EPISODES, EPISODES, EPISODES)
     assert not found.is_blind
-    assert found.others_better.value == 0.0
+    assert found.others_below_true.value == 0.0
     assert found.policies[0].behind is None
     assert all(one.behind.low > 0 for one in found.policies[1:] if one.behind is not None)
     assert all(one.best.value <= one.mean.value for one in found.policies)
@@ -90,7 +90,7 @@ def test_policies_of_known_quality_come_out_in_their_order(dataset: Dataset) -> 
 def test_a_model_at_chance_is_said_to_be_blind(dataset: Dataset) -> None:
     found = score_policies(knowing(blind=True), dataset, [policy(dataset, "one", 0.1)])
     assert found.is_blind
-    assert found.others_better.low < 0.5
+    assert found.others_below_true.low < 0.5
 
 
 @pytest.mark.parametrize(

@@ -60,10 +60,10 @@ def test_a_rollout_of_validation_keeps_the_keys_and_values_that_are_counted() ->
 
 
 def test_the_peak_is_that_of_training_or_of_validation() -> None:
-    few, many = (run_config(data__frames=16, validation__batch_size=clips) for clips in (2, 64))
-    estimate = estimate_memory(many, ModelSizes())
+    few, many = (run_config(data__frames=8, validation__batch_size=clips) for clips in (2, 64))
+    estimate = estimate_memory(many, model_sizes())
     assert estimate.total(checkpointing=True) == estimate.standing + estimate.validating
-    assert estimate.total(checkpointing=True) > estimate_memory(few, ModelSizes()).total(checkpointing=True)
+    assert estimate.total(checkpointing=True) > estimate_memory(few, model_sizes()).total(checkpointing=True)
 
 
 USUAL = {"run_dir": "run", "data": {"path": "set", "frames": 16}, "model": {"base": "not-here.pt"}}

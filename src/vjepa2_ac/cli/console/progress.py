@@ -16,10 +16,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextCol
 from rich.table import Column, Table
 from rich.text import Text
 
+from vjepa2_ac.cli.console.waiting import begin_work, count_line
 from vjepa2_ac.errors import printable
 from vjepa2_ac.reporter import Reporter
 
-_LINE_EVERY_S = 10.0
+_FIRST_LINE_S, _LINE_EVERY_S = 4.0, 10.0
 _WIDE = 120  # columns that leave room for a long bar
 _BESIDE_A_CELL = 3  # a line and two spaces
 _WHOLE = 16  # characters: a longer word of a table, such as a path, may be divided
@@ -116,8 +117,9 @@ class ProgressBar:
     """
 
     def __init__(self, title: str, unit: str = "") -> None:
-        self._title, self._unit, self._total = title, unit, -1
-        self._first, self._began, self._last_line = 0, 0.0, 0.0
+        self.title, self._unit, self._total = title, unit, -1
+        self.created = time.monotonic()
+        self._first, self._began, self._next_line = 0, 0.0, 0.0
         self._bar: Progress | None = None
 
     def __call__(self, done: int, total: int, words: str = "") -> None:
@@ -127,14 +129,16 @@ class ProgressBar:
         now = time.monotonic()
         if self._unit and done:
             speed = done / max(now - self._began, 1e-9)
-            words = f"{speed:.{1 if speed < 100 else 0}f} {self._unit}/s"
+            words = f"{speed:{'.2g' if speed < 1 else '.1f' if speed < 100 else '.0f'}} {self._unit}/s"
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=done, words=words, left=self._left(done, now))
-        elif not console.is_terminal and (done == total or now - self._last_line >= _LINE_EVERY_S):
-            self._last_line = now
-            console.print("  ".join(filter(None, (f"{self._title} {done}/{total}", words, self._left(done, now)))))
+        elif not console.is_terminal and (done == total or now >= self._next_line):
+            self._next_line = now + _LINE_EVERY_S
+            count_line()
+            console.print("  ".join(filter(None, (f"{self.title} {done}/{total}", words, self._left(done, now)))))
         if done >= total:
             self.close()
+            begin_work(f"work after {self.title}")
 
     def close(self) -> None:
         """Restore the terminal."""
@@ -145,7 +149,8 @@ class ProgressBar:
     def _open(self, done: int, total: int) -> None:
         self.close()
         self._first, self._total = done, total
-        self._began = self._last_line = time.monotonic()
+        self._began = time.monotonic()
+        self._next_line = self._began + _FIRST_LINE_S
         if not console.is_terminal:
             return
         self._bar = Progress(
@@ -156,7 +161,7 @@ class ProgressBar:
             _Words("{task.fields[words]}", table_column=Column()),  # wraps if it does not fit
             console=console,
         )
-        self._bar.add_task(self._title, total=total, completed=done, words="", left="")
+        self._bar.add_task(self.title, total=total, completed=done, words="", left="")
         self._bar.start()
 
     def _left(self, done: int, now: float) -> str:
@@ -171,7 +176,7 @@ class ConsoleReporter(Reporter):
     """Shows messages, and one task after another as a bar; at the end of its `with` block the terminal is restored."""
 
     def __init__(self) -> None:
-        self._bar = ProgressBar("")
+        self._bar, self.seconds = ProgressBar(""), dict[str, float]()  # of finished tasks, by title
 
     def note(self, text: str) -> None:
         """Print a message."""
@@ -179,9 +184,14 @@ class ConsoleReporter(Reporter):
 
     def task(self, title: str, unit: str = "") -> ProgressBar:
         """Begin another task; return its bar."""
-        self._bar.close()
+        self._end()
         self._bar = ProgressBar(title, unit)
+        begin_work(title)
         return self._bar
+
+    def _end(self) -> None:
+        self._bar.close()
+        self.seconds[self._bar.title] = time.monotonic() - self._bar.created
 
     def __enter__(self) -> Self:
         """Return this reporter."""
@@ -189,4 +199,4 @@ class ConsoleReporter(Reporter):
 
     def __exit__(self, *_: object) -> None:
         """Restore the terminal."""
-        self._bar.close()
+        self._end()

@@ -39,7 +39,7 @@ from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.settings import AXES_FORMAT, require_axes_in
-from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.storage.structured import utc_now
 
 MOST_CONDITION = 10.0  # beyond it, one direction is hardly inferred, or hardly executed
@@ -325,6 +325,7 @@ def calibrate_axes(
     accelerator = make_accelerator(config)
     settings = config.data.model_copy(update={"frames": 2, "short_episodes": "skip"})
     dataset = open_dataset(settings, progress=reporter.task(INDEXING))
+    reporter.task(LOADING)
     world_model = load_named(config, dataset, model)
     known = Fingerprints.of(world_model)
     if world_model.adaptation is not None:

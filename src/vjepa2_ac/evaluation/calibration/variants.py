@@ -33,7 +33,7 @@ from vjepa2_ac.evaluation.result import L1, Row
 from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.spaces import ActionSpace
@@ -325,6 +325,7 @@ def calibrate_config(
     """
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+    reporter.task(LOADING)
     world_model = load_named(config, dataset, model).to(accelerator.device)
     return calibrate_model(world_model, dataset, config, accelerator, sample, reporter.task("measuring clips"))
 

@@ -27,8 +27,8 @@ from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.storage.structured import plain
 
-CHANCE = 0.5  # share of others' actions that look better than the true one, of a model that sees no actions
-_OTHERS = 16  # actions of other places, beside the true ones
+CHANCE = 0.5  # share of other actions with a lower energy than the true ones, for a model that ignores actions
+_OTHERS = 16  # actions of other places, in addition to the true ones
 _NEEDED = "arrays `episodes` (names), `frames` (control steps) and `chunks` (places x chunks x control steps x numbers)"
 
 
@@ -57,7 +57,7 @@ class PolicyScores:
 
     policies: tuple[PolicyScore, ...]
     demonstrated: Estimate  # what was done, over doing nothing: no policy is expected to be better
-    others_better: Estimate  # share of the actions of other places that look better than the true ones; chance: 0.5
+    others_below_true: Estimate  # share of the actions of other places with a lower energy than the true ones
     places: int
     episodes: int
     left_out: int  # places whose goal would be after the episode's end
@@ -65,7 +65,7 @@ class PolicyScores:
     @property
     def is_blind(self) -> bool:
         """Whether the model ranks the true actions no better than chance, so that its order means nothing."""
-        return is_blind(self.others_better)
+        return is_blind(self.others_below_true)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
@@ -108,18 +108,17 @@ def read_chunks(path: Path) -> Float[np.ndarray, "chunks steps dim"]:
     return found.astype(np.float64)
 
 
-def is_blind(others_better: Estimate | None) -> bool:
+def is_blind(error: Estimate | None) -> bool:
     """Return whether a model ranks true actions no better than chance, so that its energies order nothing.
 
-    Where nothing was measured (None) nothing is held against it.
+    Args:
+        error: Share of other actions with a lower energy than the true ones. None, not measured: False is returned.
     """
-    if others_better is None:
-        return False
-    return not (others_better.high if others_better.has_interval else others_better.value) < CHANCE
+    return error is not None and not (error.high if error.has_interval else error.value) < CHANCE
 
 
 def ranking_of_run(subject: str, checkpoint: str) -> Estimate | None:
-    """Return the share of other moves that looked better in the validation of a run's checkpoint; None: not measured.
+    """Return the action-ranking error in the validation of a run's checkpoint; None: not measured.
 
     Args:
         subject: The folder of a run, or a model, of which nothing is known.
@@ -128,10 +127,11 @@ def ranking_of_run(subject: str, checkpoint: str) -> Estimate | None:
     if not is_run(subject):
         return None
     step = step_of(checkpoint.split(maxsplit=1)[0]) or 0
-    rows = [row for row in read_metrics_log(Path(subject) / METRICS) if "action_rank" in row and row["step"] <= step]
+    key = "action_ranking_error"
+    rows = [row for row in read_metrics_log(Path(subject) / METRICS) if key in row and row["step"] <= step]
     if not rows:
         return None
-    numbers = (rows[-1][name] for name in ("action_rank", "action_rank_low", "action_rank_high"))
+    numbers = (rows[-1][name] for name in (key, f"{key}_low", f"{key}_high"))
     return Estimate(*(math.nan if one is None else float(one) for one in numbers))
 
 

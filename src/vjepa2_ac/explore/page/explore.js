@@ -562,6 +562,8 @@ function setUp(header) {
   part("lost").hidden = true;
   const step = hello.step_seconds ? `, a step of imagination ${hello.step_seconds.toFixed(2)} s` : "";
   part("subject").textContent = `${hello.subject} on ${hello.device}${step}`;
+  part("notes").textContent = hello.notes.join(" ");
+  part("notes").hidden = !hello.notes.length;
   part("episode").replaceChildren(
     ...hello.episodes.map(({ name, full }, /** @type {number} */ value) => make("option", { value, title: full }, name)),
   );

@@ -155,5 +155,5 @@ byId("tally").textContent = isKnown
 byId("about").textContent =
   (isKnown ? `Understood: the error, in the encoder's numbers, is below ${UNDERSTOOD} of that of copying the first frame;` : "") +
   (isKnown ? " not understood: above it. " : "") +
-  `${subject}, episode ${episode}; a move is ${moves[0].size}. Nothing is computed here: every future was imagined beforehand.`;
+  `${subject}, episode ${episode}; a move is ${moves[0].size}. Nothing is computed here: every future was imagined beforehand. ${content.notes.join(" ")}`;
 draw();

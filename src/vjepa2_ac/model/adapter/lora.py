@@ -75,7 +75,7 @@ class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no typ
             return None
         if self.lora_variant or self.lora_bias.get(adapters[0]) or type(layer).forward is not nn.Linear.forward:
             return None
-        if tokens.dim() < 2 or any(own.requires_grad for own in layer.parameters()):
+        if tokens.dim() < 2 or layer.weight.requires_grad or (layer.bias is not None and layer.bias.requires_grad):
             return None
         if torch.is_autocast_enabled(tokens.device.type):
             return torch.get_autocast_dtype(tokens.device.type)

@@ -27,7 +27,7 @@ from vjepa2_ac.intervals import Estimate, ratio
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.prior.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
-from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces
 from vjepa2_ac.storage.structured import utc_now
 
@@ -78,6 +78,7 @@ def train_prior(
     require_stride(config.data, to="know how long a model step is")
     device = computing_device(config.training)
     data, frames = config.data, open_dataset(config.data, progress=reporter.task(INDEXING))
+    reporter.task(LOADING)
     model, spaces = (
         load_base(config.model, seed=config.seed).to(device),
         frames.spaces,

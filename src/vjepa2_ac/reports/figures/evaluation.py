@@ -94,8 +94,8 @@ def drawings(evaluation: Evaluation) -> Iterator[Drawing]:
     if any(model.distribution and math.isfinite(model.distribution.spread[-1].value) for model in models):
         yield Drawing("spread", "Spread by horizon", 6.4, 3.4, draw_spread)
     yield Drawing("actions", "One-step error with other actions", 6.4, 3.0, draw_use_of_actions)
-    if any(model.sensitivity for model in models):
-        yield Drawing("actions", "Ranks of the true action", 6.4, 3.4, draw_ranks)
+    if any(model.ranking for model in models):
+        yield Drawing("actions", "Action-ranking error of every move", 6.4, 3.4, draw_ranks)
     if clips := landscape_clips(evaluation):
         rows = len(clips) * (2 if evaluation.base and evaluation.models[evaluation.base].landscapes else 1)
         described = "Energy around the true action: cross; lowest energy: ring"
@@ -165,17 +165,16 @@ def draw_use_of_actions(figure: Any, evaluation: Evaluation) -> None:
 
 
 def draw_ranks(figure: Any, evaluation: Evaluation) -> None:
-    """Draw how often the true action is among the best share of others, by model; dashed: among those in a box."""
+    """Draw the share of moves up to each action-ranking error, by model."""
     axes = figure.subplots()
-    axes.plot([0, 1], [0, 100], color=GREY, linestyle=":", label="chance")
+    errors = np.linspace(0, 100, 51)
+    axes.plot([0, 100], [0, 100], color=GREY, linestyle=":", label="chance")
     for name, colour in _colours(evaluation.models).items():
-        sensitivity = evaluation.models[name].sensitivity
-        for ranking, dashes in zip(sensitivity.rankings if sensitivity else (), _DASHES, strict=False):
-            ranks = np.sort(ranking.rank)
-            shares = 100 * np.searchsorted(ranks, np.linspace(0, 1, 51), side="right") / max(len(ranks), 1)
-            label = f"{_short(name)}, {'others' if ranking.drawn_from == 'clips' else 'in a box'}"
-            axes.plot(np.linspace(0, 1, 51), shares, color=colour, linestyle=dashes, label=label)
-    axes.set(title="Rank of the true action (0: best)", xlabel="rank", ylabel="share of clips up to it (%)")
+        if (ranking := evaluation.models[name].ranking) is not None:
+            shares = 100 * np.searchsorted(np.sort(ranking.ranks), errors / 100, side="right") / len(ranking.ranks)
+            axes.plot(errors, shares, color=colour, label=_short(name))
+    axes.set(title="Action-ranking error of every move (0 %: best)")
+    axes.set(xlabel="action-ranking error (%)", ylabel="share of moves up to it (%)")
     axes.legend()
 
 

@@ -16,7 +16,7 @@ from vjepa2_ac import __version__
 from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.windows import require_stride
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+from vjepa2_ac.decoding.decoder_folder import SIMULATED, TrainedDecoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.demonstrations.alike import StartAndGoal, goals_alike
 from vjepa2_ac.planning.goals import GoalFolder, SubGoal
@@ -83,8 +83,15 @@ class ServedPlanner:
         return np.asarray(answer["actions"][0])
 
 
-def agent_of_session(session: PlanningSession, decoder: TrainedDecoder | None = None) -> Agent:
+def agent_of_session(
+    session: PlanningSession, decoder: TrainedDecoder | None = None, *, in_our_world: bool = True
+) -> Agent:
     """Return a model of this process.
+
+    Args:
+        session: The model.
+        decoder: Shows what was imagined.
+        in_our_world: It acts with the simulated arm, not in a third-party world, which its data are assumed to show.
 
     Raises:
         InputError: It takes what the simulated arm does not measure, its model step has no known length, or the decoder
@@ -101,7 +108,8 @@ def agent_of_session(session: PlanningSession, decoder: TrainedDecoder | None = 
         needed = f"poses; or seven joint angles and the gripper: data.fields.state: [{', '.join(JOINT_FIELDS)}]"
         raise InputError(where="data.states: vector", found=found, needed=needed)
     if decoder is not None:
-        decoder.require_fit(session.world_model, config.data.crop, subject=session.subject)
+        shown = SIMULATED if in_our_world else None
+        decoder.require_fit(session.world_model, config.data, subject=session.subject, shown=shown)
     uses_camera = session.world_model.sizes.predictor.use_extrinsics
     name = Path(session.subject).name or session.subject
     if name in {ZeroActions.name, RandomActions.name, Oracle.name}:  # in tables the names of references are theirs

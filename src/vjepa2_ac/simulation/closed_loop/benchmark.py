@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE, Verdict, closed_loop
 from vjepa2_ac.media.film import below_each_other, side_by_side
 from vjepa2_ac.media.images import encode_png
@@ -27,7 +28,7 @@ from vjepa2_ac.planning.demonstrations.key_frames import (
     with_frames_between,
 )
 from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
-from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.reporter import SILENT, Reporter, duration
 from vjepa2_ac.simulation.closed_loop.agent import Agent
 from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Oracle, Policy, RandomActions, ZeroActions
 from vjepa2_ac.simulation.closed_loop.rollout import (
@@ -38,7 +39,7 @@ from vjepa2_ac.simulation.closed_loop.rollout import (
     Trials,
     World,
     run_episode,
-    run_task,
+    run_trials,
 )
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, Problem, TaskName, TaskProblem, arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
@@ -47,6 +48,7 @@ from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
+_LONG_S = 5.0  # a decision that takes longer says how long the others take
 _SMALL = (18, 32)  # height and width of images that nobody looks at
 
 
@@ -195,13 +197,35 @@ def run_benchmark(
     options, limits = replace(options, stride=agent.stride), agent.planning.limits
     arm = arm_for(options.task, options.world, views=agent.planning.views)
     model = agent.policy(arm, _goals_of(agent, options, arm, reporter))
-    policies: tuple[Policy, ...] = (ZeroActions(), RandomActions(limits, options.seed), Oracle(limits, arm))
-    results = []
-    for policy in (model, *policies):
-        spec = options if policy is model else replace(options, films=0)
-        results.append(run_task(spec, policy, arm, reporter.task(f"{options.task}: {policy.name}")))
-    benchmark = ClosedLoopBenchmark(agent, options, tuple(results))
+    policies = (model, ZeroActions(), RandomActions(limits, options.seed), Oracle(limits, arm))
+    results = try_policies(SimulatedWorld(arm), policies, agent, options, options.films, reporter)
+    benchmark = ClosedLoopBenchmark(agent, options, results)
     return benchmark, write_benchmark(benchmark, folder)
+
+
+def try_policies(
+    world: World, policies: Sequence[Policy], agent: Agent, trials: Trials, films: int, reporter: Reporter
+) -> tuple[ClosedLoopResult, ...]:
+    """Let policies solve the same problems; the first one is the model, with some episodes filmed.
+
+    A note says how long all decisions of the model take, as soon as some were measured. The first one includes
+    preparations, so the second one counts, unless the first one is long.
+    """
+    work = f"{counted(trials.episodes, 'episode')} x {counted(trials.model_steps, 'decision')}"
+    work += f", {counted(sum(agent.planning.sequences), 'action sequence')} each"
+    results = list[ClosedLoopResult]()
+
+    def shown(done: int, total: int) -> None:
+        ends.append(time.monotonic())
+        progress(done, total)
+        if not results and done == (1 if ends[min(done, 1)] - ends[0] > _LONG_S else 2):
+            seconds = ends[done] - ends[done - 1]
+            reporter.note(f"{work}: {duration(total * seconds / 3600)} on this machine")
+
+    for policy in policies:
+        ends, progress = list[float](), reporter.task(f"{trials.task_name}: {policy.name}", "decisions")
+        results.append(run_trials(world, policy, trials, 0 if results else films, shown))
+    return tuple(results)
 
 
 def write_benchmark(benchmark: ClosedLoopBenchmark, folder: Path) -> tuple[Path, ...]:
@@ -252,6 +276,7 @@ def _goals_of(agent: Agent, options: BenchmarkOptions, arm: SimulatedArm, report
     if options.sub_goals == "every-step":
         spec = every_step(spec)
     goals_of = DemonstratedGoals(options.task, options.world, spec, views=agent.planning.views)
+    reporter.task("demonstrations of all problems")
     goals_of.require(options.problems)
     return goals_of
 

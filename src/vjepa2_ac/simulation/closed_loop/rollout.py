@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
@@ -250,7 +250,7 @@ def run_task(
         spec: The problems.
         policy: The policy.
         arm: In their domain, from `arm_for` of this task, to be reused; None: a new one.
-        progress: Called with the number of finished episodes.
+        progress: Called with the number of finished decisions, from 0 on.
 
     Raises:
         InputError: No such domain.
@@ -271,15 +271,17 @@ def run_trials(
         policy: The policy.
         trials: The problems.
         films: Number of episodes, the first ones, whose frames are stored.
-        progress: Called with the number of finished episodes.
+        progress: Called with the number of finished decisions, from 0 on.
 
     Raises:
         ValueError: As `run_in`.
     """
     done, span = list[EpisodeResult](), Span(trials.model_steps, trials.stride)
+    numbers, total = itertools.count(), trials.episodes * span.steps
+    progress(next(numbers), total)
     for problem in trials.problems:
-        done.append(run_in(world, policy, problem, span, keep_frames=len(done) < films))
-        progress(len(done), trials.episodes)
+        decided = lambda: progress(next(numbers), total)  # noqa: E731
+        done.append(run_in(world, policy, problem, span, keep_frames=len(done) < films, decided=decided))
     return ClosedLoopResult(trials, policy.name, tuple(done))
 
 
@@ -378,8 +380,24 @@ class SimulatedWorld:
         )
 
 
-def run_in(world: World, policy: Policy, problem: Problem, span: Span, *, keep_frames: bool = False) -> EpisodeResult:
+def run_in(
+    world: World,
+    policy: Policy,
+    problem: Problem,
+    span: Span,
+    *,
+    keep_frames: bool = False,
+    decided: Callable[[], None] = lambda: None,
+) -> EpisodeResult:
     """Let a policy solve a problem in a world, and return the record.
+
+    Args:
+        world: Where the policy acts.
+        policy: The policy.
+        problem: The problem.
+        span: How long it may take.
+        keep_frames: Whether the result holds the camera images.
+        decided: Called after each decision has been carried out.
 
     Raises:
         ValueError: An action of other than the finite numbers that the policy moves, or joints where none are told.
@@ -403,6 +421,7 @@ def run_in(world: World, policy: Policy, problem: Problem, span: Span, *, keep_f
         is_within, now = world.act(action, policy.moves, span.stride)
         unreachable += not is_within
         seen.append(now)
+        decided()
     blocks = [one.block for one in seen if one.block is not None]
     return EpisodeResult(
         problem=problem,

@@ -34,16 +34,16 @@ from vjepa2_ac.simulation.closed_loop.benchmark import (
     DemonstrationSpec,
     every_step,
     of_demonstrations_alike,
+    try_policies,
     write_benchmark,
 )
-from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Image, Moves, Policy, RandomActions, ZeroActions
+from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Image, Moves, RandomActions, ZeroActions
 from vjepa2_ac.simulation.closed_loop.rollout import (
     ClosedLoopResult,
     EpisodeResult,
     Observation,
     Span,
     commanded,
-    run_trials,
 )
 from vjepa2_ac.simulation.closed_loop.tasks import Problem
 from vjepa2_ac.simulation.closed_loop.world_process import PROTOCOL, WorldProcess
@@ -266,12 +266,8 @@ def run_world_benchmark(
     if options.sub_goals == "alike":
         alike = of_demonstrations_alike(agent, world, trials.problems, reporter)
         trials = replace(trials, problems=tuple(replace(one, goals=tuple(alike(one))) for one in trials.problems))
-    limits, results = agent.planning.limits, []
-    policies: tuple[Policy, ...] = (model, ZeroActions(), RandomActions(limits, options.seed))
-    for policy in policies:
-        progress = reporter.task(f"{name}: {policy.name}")
-        films = options.films if policy is model else 0
-        results.append(run_trials(world, policy, trials, films, progress))
+    policies = (model, ZeroActions(), RandomActions(agent.planning.limits, options.seed))
+    results = try_policies(world, policies, agent, trials, options.films, reporter)
     benchmark = ClosedLoopBenchmark(agent, trials, (*results, shown))
     return benchmark, write_benchmark(benchmark, folder)
 

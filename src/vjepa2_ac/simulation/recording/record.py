@@ -35,6 +35,7 @@ from vjepa2_ac.simulation.closed_loop.tasks import arm_for
 from vjepa2_ac.simulation.world.arm import Look, SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, load_mujoco, named_domain, sample_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
+from vjepa2_ac.storage.places import SIMULATION_FILE
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
 
 RecordedTask = Literal["push", "pick", "place"]
@@ -233,8 +234,6 @@ def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "s
 
 
 # ---- simulation.json ----
-
-SIMULATION_FILE = "simulation.json"
 
 _PROGRAM, _LIBRARIES = "vjepa2-ac", ("mujoco", "numpy", "scipy", "simplejpeg")  # other versions may change last digits
 _NEEDED = "what `vjepa2-ac simulate record` writes"

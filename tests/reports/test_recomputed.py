@@ -1,0 +1,150 @@
+"""Every number of the summary can be recomputed from metrics.json: here with NumPy, and nothing of this package."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vjepa2_ac.evaluation.evaluate import Contender, evaluate
+from vjepa2_ac.evaluation.request import ProbeOptions
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
+from worlds import Oracle, about, again, clips_batch
+
+T = {5: 2.7764451, 6: 2.5705818}  # by number of episodes n: the quantile 0.975 of Student's t with n - 1 degrees
+PROBES = ProbeOptions(ranking_clips=10, samples=12, landscape_clips=10, axis_clips=0, nodes=3, examples=0)
+
+
+class Short(Oracle):
+    """Predicts less motion than there is: a lower error than that of the base model, and a lower spread."""
+
+    def predict(self, latents, actions, states, extrinsics=None):  # type: ignore[no-untyped-def]
+        return super().predict(latents, actions * 0.6 + 0.002, states, extrinsics)
+
+
+class Long(Oracle):
+    """Predicts more motion than there is."""
+
+    def predict(self, latents, actions, states, extrinsics=None):  # type: ignore[no-untyped-def]
+        return super().predict(latents, actions * 1.7 + 0.004, states, extrinsics)
+
+
+def measured(folder: Path, *, with_base: bool) -> dict[str, Any]:
+    """Return the content of the metrics.json of an evaluation, written into a folder."""
+    contenders = [Contender("base", "base", Long())] * with_base + [Contender("adapter", "trained", Short())]
+    path = write_metrics(evaluate(contenders, again(clips_batch()), about(), probes=PROBES), folder / METRICS_FILE)
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
+
+
+def estimate(
+    formula: Callable[[np.ndarray], np.ndarray], columns: Sequence[Sequence[float]], episode_ids: Sequence[str]
+) -> tuple[float, float, float]:
+    """Return a function of sums over clips with its interval, as docs/evaluation_reference.md describes it."""
+    names, episode_of = np.unique(episode_ids, return_inverse=True)
+    n = len(names)
+    sums = np.stack([np.bincount(episode_of, weights=column) for column in columns])
+    drawn = np.random.default_rng(0).integers(n, size=(2000, n))
+    p = math.erfc(math.sqrt(n / (n - 1)) * T[n] / math.sqrt(2)) / 2
+    low, high = np.quantile(formula(sums[:, drawn].sum(axis=2)), [p, 1 - p])
+    return float(formula(sums.sum(axis=1))), float(low), float(high)
+
+
+def mean(values: Sequence[float], episode_ids: Sequence[str]) -> tuple[float, float, float]:
+    return estimate(lambda sums: sums[0] / sums[1], [values, np.ones(len(values))], episode_ids)
+
+
+def percent(share: float) -> str:
+    return f"{100 * share:.0f}" if share >= 0.0995 else f"{100 * share:.1f}"
+
+
+def with_interval(value: float, low: float, high: float) -> tuple[str, str]:
+    form = ".0f" if value >= 0.0995 else ".1f"
+    return percent(value), f"[{100 * low:{form}}, {100 * high:{form}}]"
+
+
+def recomputed(metrics: dict[str, Any]) -> dict[str, tuple[str, str, str]]:
+    """Return statement, interval and reference of each verdict, from the measured arrays of a metrics.json."""
+    ids = [episode for episode, _ in metrics["clips"]["named"]]
+    name, base, by_clip = metrics["trained"], metrics["base"], metrics["by_clip"]
+    about, models = metrics["about"], metrics["models"]
+    ahead = f"{(about['frames'] - 1) * about['seconds_per_step']:.1f} s ahead"
+    last = by_clip["last_horizon"]
+    found = {}
+
+    def gain(metric: str, other: Sequence[float]) -> tuple[str, str]:
+        return with_interval(*estimate(lambda sums: 1 - sums[0] / sums[1], [last[metric][name], other], ids))
+
+    nothing = [clip[-1] for clip in by_clip["persistence"]]
+    share, interval = gain("l1", last["l1"][base] if base else nothing)
+    spread = models[name]["distribution"]["variance"][-1] / models[name]["distribution"]["true_variance"][-1]
+    before, reference = 1.0, "true latents"
+    if base:
+        of_base, reference = models[base]["distribution"], "base model"
+        before = of_base["variance"][-1] / of_base["true_variance"][-1]
+    found["predicts"] = (
+        f"error {share} % lower than with {'the base model' if base else 'persistence'}, {ahead}",
+        interval,
+        f"(part of the gain may be blur: spread {spread:.2f}, {reference} {before:.2f})",
+    )
+
+    errors = by_clip["one_step"][name]
+    cost = with_interval(*estimate(lambda sums: sums[0] / sums[1] - 1, [errors["shuffled"], errors["true"]], ids))
+    found["uses_actions"] = f"one-step error {cost[0]} % higher with shuffled actions", cost[1], ""
+
+    ranking = models[name]["ranking"]
+    error, interval = with_interval(*mean(ranking["ranks"], ranking["episode_ids"]))
+    of_base = f"base model {percent(float(np.mean(models[base]['ranking']['ranks'])))} %, " if base else ""
+    found["ranks_actions"] = f"action-ranking error {error} %", interval, f"({of_base}chance 50 %)"
+
+    def landscape(model: str) -> tuple[tuple[float, float, float], float, float]:
+        maps = models[model]["landscapes"]["maps"]
+        chances, sharpness = [], []
+        for one in maps:
+            points = np.stack(np.meshgrid(*one["axes"], indexing="ij"), axis=-1).reshape(-1, 3)
+            chances.append(np.linalg.norm(points - one["true"], axis=1).mean())
+            sharpness.append(np.ptp(one["energy"]) / np.mean(one["energy"]))
+        distances = [math.dist(one["minimum"], one["true"]) for one in maps]
+        episodes = [one["episode_id"] for one in maps]
+        return mean(distances, episodes), float(np.mean(chances)), float(np.mean(sharpness))
+
+    (distance, low, high), chance, sharpness = landscape(name)
+    texts = [f"random point {chance:.1f} cm", f"sharpness {sharpness:.2g}"]
+    if base:
+        of_base = landscape(base)
+        texts = [f"base model {of_base[0][0]:.1f} cm", texts[0], f"{texts[1]}, base model {of_base[2]:.2g}"]
+    statement = f"energy minimum {distance:.1f} cm from the true action"
+    found["landscape"] = statement, f"[{low:.1f}, {high:.1f}]", f"({'; '.join(texts)})"
+    return found
+
+
+@pytest.mark.parametrize("with_base", [True, False])
+def test_numpy_recomputes_every_number_of_the_summary_from_metrics_json(with_base: bool, tmp_path: Path) -> None:
+    metrics, summary = measured(tmp_path, with_base=with_base), read_metrics(tmp_path).summary
+    printed = " ".join(str(summary).split())
+    for name, (statement, interval, reference) in recomputed(metrics).items():
+        verdict = getattr(summary, name)
+        assert (verdict.statement, verdict.interval, verdict.reference) == (statement, interval, reference)
+        for text in (statement, interval, reference):
+            assert not set(re.findall(r"[\d.]+", text)) - set(re.findall(r"[\d.]+", printed))
+
+
+def test_the_conclusions_follow_from_paired_differences_in_metrics_json(tmp_path: Path) -> None:
+    written, metrics = measured(tmp_path, with_base=True)["models"], read_metrics(tmp_path)
+    ranks, base_ranks = (written[name]["ranking"]["ranks"] for name in ("adapter", "base"))
+    ids = written["adapter"]["ranking"]["episode_ids"]
+    maps, base_maps = (written[name]["landscapes"]["maps"] for name in ("adapter", "base"))
+    distances = [one["distance"] - other["distance"] for one, other in zip(maps, base_maps, strict=True)]
+    for key, values, episode_ids in (
+        ("ranking.difference_to_base", np.subtract(ranks, base_ranks), ids),
+        ("landscapes.difference_to_base", distances, [one["episode_id"] for one in maps]),
+    ):
+        row = metrics.of(key)
+        assert row is not None
+        assert (row.value, row.low, row.high) == pytest.approx(mean(values, episode_ids), abs=1e-6)

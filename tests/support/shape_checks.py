@@ -1,0 +1,44 @@
+"""Checks of shapes and types of arrays, at each call of a function that takes or returns arrays."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any, get_args
+
+import jaxtyping
+
+
+def install(modules: list[str], typechecker: str) -> None:
+    """Check the calls of functions, and the fields of records, whose annotations have shapes.
+
+    All other functions stay as they are: mypy proves their types, and each check would be much slower than the call.
+    """
+    jaxtyped = jaxtyping.jaxtyped
+
+    def decorator(*, typechecker: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda thing: jaxtyped(thing, typechecker=typechecker) if has_shapes(thing) else thing
+
+    jaxtyping.jaxtyped = decorator  # what the hook decorates with
+    jaxtyping.install_import_hook(modules, typechecker)
+
+
+def has_shapes(thing: Any) -> bool:
+    """Return whether a function, a method, a property or a record has an array among its annotations."""
+    thing = getattr(thing, "fget", None) or getattr(thing, "__func__", thing)
+    if inspect.isclass(thing):
+        names: Mapping[str, Any] = vars(sys.modules[thing.__module__])
+        annotations = [value for kind in thing.__mro__ for value in vars(kind).get("__annotations__", {}).values()]
+    else:
+        names, annotations = thing.__globals__, [*thing.__annotations__.values()]
+    return any(_is_array(annotation, names) for annotation in annotations)
+
+
+def _is_array(annotation: Any, names: Mapping[str, Any]) -> bool:
+    if isinstance(annotation, str):
+        return any(_is_array(names[word], {}) for word in re.findall(r"\w+", annotation) if word in names)
+    if inspect.isclass(annotation) and issubclass(annotation, jaxtyping.AbstractArray | jaxtyping.AbstractDtype):
+        return True
+    return any(_is_array(one, names) for one in get_args(annotation))
