@@ -210,7 +210,7 @@ def test_the_command_scores_the_chunks_of_a_scene(
     assert main(["score", str(base_folder), *scene, "--control-steps", "2"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "Action ranking of this model: not measured" in said
-    assert "doing nothing" in said
+    assert "no motion" in said
 
 
 def test_the_command_scores_policies_and_joints_through_the_users_kinematics(
