@@ -179,3 +179,9 @@ def test_a_stride_that_fits_nowhere_has_no_coverage(tmp_path: Path) -> None:
     dataset = open_dataset(written(tmp_path, one_way=False)).with_stride(50)
     assert coverage_in(dataset) is None
     assert inspect_dataset(dataset).values["coverage"] is None
+
+
+def test_data_without_a_model_step_are_skipped_with_what_they_need() -> None:
+    (finding,) = coverage_findings(None)
+    assert (finding.level, finding.about) == ("skipped", "coverage")
+    assert "needs episodes with more consecutive steps than data.stride" in finding.text

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.cli.console.waiting import Work
 from vjepa2_ac.cli.next_command import next_simulation, option_words
-from vjepa2_ac.errors import InputError, shell_command
+from vjepa2_ac.errors import InputError, counted, shell_command
 
 if TYPE_CHECKING:
     import ssl
@@ -239,7 +239,7 @@ def _record(options: argparse.Namespace) -> int:
         progress = reporter.task("recording")
         progress(0, episodes)
         folder = record_dataset(target, spec, episodes=episodes, workers=workers, progress=progress)
-    cli.show(f"{episodes} episodes are in {folder}")
+    cli.show(f"{counted(episodes, 'episode')} in {folder}")
     return 0
 
 
@@ -253,7 +253,7 @@ def _record_world(options: argparse.Namespace, target: Path) -> int:
         seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
         solved, shown = record_world(world, target, seeds, reporter.task("recording"))
     done = f"the expert solved {solved} of {shown}, the others are play"
-    cli.show(f"{len(seeds)} episodes are in {target}; {done}. Next: {shell_command('init', target)}")
+    cli.show(f"{counted(len(seeds), 'episode')} in {target}; {done}. Next: {shell_command('init', target)}")
     return 0
 
 
@@ -317,7 +317,8 @@ def _summary(benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> Sum
     agent, trials = benchmark.agent, benchmark.trials
     how = _evaluate_command(options) or "`vjepa2-ac evaluate`"
     predicts, uses, ranks = (not_measured(name, how) for name in ("predicts", "uses actions", "ranks actions"))
-    measured = f"{trials.task_name}, {trials.place}, {trials.model_steps} steps of {trials.seconds_per_step:.2f} s"
+    steps = counted(trials.model_steps, "step")
+    measured = f"{trials.task_name}, {trials.place}, {steps} of {trials.seconds_per_step:.2f} s"
     summary = Summary(agent.subject, measured, predicts, uses, ranks, benchmark.verdict)
     if agent.checkpoint and (Path(agent.subject) / METRICS_FILE).is_file():
         evaluated = read_metrics(Path(agent.subject))

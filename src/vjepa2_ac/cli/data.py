@@ -93,7 +93,7 @@ def _converter(options: argparse.Namespace) -> None:
         print(converter_text(options.name), end="")
         return
     for name, about in converters().items():
-        print(f"{name:<16}{about}")
+        cli.show(f"{name:<16}{about}")
 
 
 def _check(options: argparse.Namespace) -> int:

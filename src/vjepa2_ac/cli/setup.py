@@ -190,7 +190,7 @@ def _config(options: argparse.Namespace) -> None:
         print(json.dumps(config_schema(), indent=2))
     elif what == "list":
         for name, about in packaged_configs().items():
-            print(f"builtin:{name:<14}{about}")
+            cli.show(f"builtin:{name:<14}{about}")
     elif what == "text":
         print(config_path(options.config).read_text(encoding="utf-8"), end="")
     else:

@@ -159,7 +159,7 @@ class _Rows(list[Row]):
             self.line(group, f"{actions} actions", f"one_step.{actions}", found, chance=1.0)
         for part in self.evaluation.strata:
             found = {name: one_step_over_persistence(one, "true", part) for name, one in self.errors.items()}
-            label = f"{part.label} ({int(part.steps.sum())} steps)"
+            label = f"{part.label} ({counted(int(part.steps.sum()), 'step')})"
             self.line(group, label, f"one_step.{part.key}", found, chance=1.0)
         grown, gap = "Growth of the one-step error without the true actions", "The same, over the error of persistence"
         for actions in ACTIONS[1:]:

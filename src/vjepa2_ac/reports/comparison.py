@@ -116,8 +116,8 @@ def compare(folders: Sequence[Path]) -> Comparison:
         if row.model == one.trained
     ]
     return Comparison(
-        title=f"{L1.label} error over persistence on {clips.count} {about.split} clips of {clips.episodes}"
-        f" episode{'s' * (clips.episodes != 1)}",
+        title=f"{L1.label} error over persistence on {counted(clips.count, about.split + ' clip')}"
+        f" of {counted(clips.episodes, 'episode')}",
         rows=(*_gains(measured), *rows),
         seconds=about.seconds_per_step * np.arange(1, about.frames),
         curves={name: _curve(metrics) for name, metrics in measured.items()},

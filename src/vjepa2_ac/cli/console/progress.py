@@ -25,7 +25,7 @@ _WIDE = 120  # columns that leave room for a long bar
 _BESIDE_A_CELL = 3  # a line and two spaces
 _WHOLE = 16  # characters: a longer word of a table, such as a path, may be divided
 _LONGEST_LINE = 100  # columns
-_COMMAND = r"(?<![\w/.-])(vjepa2-ac |(\S+ -m )?pip install )((?!   #).)*"
+_COMMAND = r"(Next: )?(?<![\w/.-])(vjepa2-ac |(\S+ -m )?pip install )((?!   #).)*"
 _IN_ONE_PIECE = re.compile(rf"^ +|`[^`\n]*`|{_COMMAND}|(?<=\d) %", re.MULTILINE)
 _SPACE = "\ue000"  # stands for a space that is not broken
 

@@ -138,7 +138,9 @@ def demonstrate(
     shown = run_episode(arm, Oracle(limits, arm), problem, steps, spec.stride, keep_frames=True)
     if not shown.success or shown.frames is None:
         where = f"demonstration of problem {problem.index} ({problem.task})"
-        found = f"the oracle ends {100 * shown.distances_m[-1]:.1f} cm from the goal after {steps} model steps"
+        found = (
+            f"the oracle ends {100 * shown.distances_m[-1]:.1f} cm from its goal after {counted(steps, 'model step')}"
+        )
         fix = "Allow it longer steps along each axis (planning.limits.xyz, planning.limits.ball), or more of them"
         raise InputError(where=where, found=found, needed="a demonstration that succeeds", fix=fix)
     return shown.frames, shown.states

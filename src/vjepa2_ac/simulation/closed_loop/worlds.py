@@ -17,6 +17,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import counted
 from vjepa2_ac.media.video import video_library
 from vjepa2_ac.planning.demonstrations.key_frames import (
     OF_MODEL_STEPS,
@@ -297,7 +298,8 @@ def find_problems(
         if len(problems) == options.episodes:
             break
     else:
-        found = f"the expert solves {len(problems)} of {len(problems) + len(left_out)} problems in {steps} model steps"
+        tried = counted(len(problems) + len(left_out), "problem")
+        found = f"the expert solves {len(problems)} of {tried} in {counted(steps, 'model step')}"
         raise world.refused(found, "half of them", "Allow more of them with --steps")
     trials = WorldTrials(about, options.seed, stride, steps, tuple(problems), options, tuple(left_out))
     return trials, ClosedLoopResult(trials, EXPERT, tuple(shown))
