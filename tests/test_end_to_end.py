@@ -29,7 +29,7 @@ def write_config(folder: Path, name: str, **sections: object) -> str:
             "steps": 3, "batch_size": 2, "accumulation": 1, "warmup_steps": 0, "precision": "fp32", "device": "cpu",
             "allow_weak_base": True,
         },
-        "validation": {"every": 3, "clips": 4, "batch_size": 2, "ranking_clips": 2, "ranking_samples": 4},
+        "validation": {"every": 3, "clips": 4, "batch_size": 2, "ranking_samples": 4},
         "checkpoint": {"every": 3},
         **sections,
     }  # fmt: skip

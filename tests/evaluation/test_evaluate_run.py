@@ -156,7 +156,9 @@ def test_a_cache_gives_the_figures_of_the_frames_and_frames_of_its_own(
 ) -> None:
     encode_for(config, load_base(config.model, seed=0), open_dataset(config.data))
     path = written(config, tmp_path, cache="require")
-    found = main(["evaluate", run, "--data", path, "--out", str(tmp_path / "cached"), "--clips", "5", *QUICK])
+    found = main(
+        ["evaluate", run, "--data", path, "--out", str(tmp_path / "cached"), "--clips", "5", *QUICK, "--axes=3"]
+    )
     assert found == 0
     fly, cached = figures_of(run), figures_of(tmp_path / "cached")
     assert (fly["models"], fly["rows"]) == (cached["models"], cached["rows"])

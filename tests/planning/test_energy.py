@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from jaxtyping import TypeCheckError
 from torch import Tensor
 
 from decisions import STATE, image
@@ -243,3 +244,9 @@ def test_a_model_in_bfloat16_plans_on_a_cpu_as_in_float32_to_its_precision() -> 
             energies.append(run.decision.cost(tried))
     torch.testing.assert_close(energies[1], energies[0], rtol=0.03, atol=0.0)
     assert energies[1].std() > 0
+
+
+def test_a_wrong_shape_is_refused_while_testing() -> None:
+    pytest.importorskip("beartype")
+    with pytest.raises(TypeCheckError):
+        cost(tiny_model())(torch.zeros(3, 7))

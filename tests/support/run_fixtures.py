@@ -158,7 +158,7 @@ def tiny_config(run_dir: Path, data_folder: Path, base_folder: Path, **changes: 
             "steps": 6, "batch_size": 2, "accumulation": 2, "learning_rate": 1e-3, "warmup_steps": 1,
             "precision": "fp32", "device": "cpu", "log_every": 1, "allow_weak_base": True,
         },
-        "validation": {"every": 3, "clips": 4, "batch_size": 2, "ranking_clips": 2, "ranking_samples": 4},
+        "validation": {"every": 3, "clips": 4, "batch_size": 2, "ranking_samples": 4},
         "checkpoint": {"every": 2, "keep": 5},
         "tracking": {"tensorboard": False},
     }  # fmt: skip
