@@ -45,7 +45,13 @@ def add_evaluate(commands: cli.Commands) -> None:
     group = parser.add_argument_group("use of the actions")
     cli.add(group, "--ranking-clips N", "clips for the action-ranking error (32)", cli.whole_number(0))
     cli.add(group, "--samples N", "alternative actions for each of them (64)", cli.count)
-    cli.add(group, "--landscapes N", "those with a landscape (8)", cli.whole_number(0), dest="landscape_clips")
+    cli.add(
+        group,
+        "--landscapes N",
+        "clips of those with a landscape (8)",
+        cli.whole_number(0),
+        dest="landscape_clips",
+    )
     cli.add(group, "--axes N", "clips of those to calibrate the axes by (32)", cli.whole_number(0), dest="axis_clips")
     cli.add(group, "--nodes N", "points of a landscape along each axis (9)", cli.whole_number(3, 51))
     cli.add(group, "--reach CM", "half its width (7.5)", cli.number_between(0.0, 1000.0, "cm"), dest="reach_cm")

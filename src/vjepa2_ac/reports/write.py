@@ -107,7 +107,7 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
     environment.filters |= {"coded": coded, "count": counted}
     environment.filters["figure"] = lambda row: f"{percent(row.value)} %" if row.better else f"{row.value:.2f}"
     environment.filters["baseline"] = lambda one: (
-        f"{percent(one.baseline)} %" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
+        f"{100 * one.baseline:.0f} %" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
     )
     return environment.get_template("report.html.jinja").render(
         evaluation=evaluation,
