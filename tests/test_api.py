@@ -229,7 +229,7 @@ def test_a_run_is_trained_resumed_and_measured(make_config: MakeConfig, tmp_path
     assert sorted(steps) == [1, 2]
     assert sum(note.startswith("Validation at step") for note in notes) == 2
     assert train(config, on_step=lambda *_: pytest.fail("it is finished")) == run
-    result = evaluate(run, clips=4, out=tmp_path / "out", probes=False)
+    result = evaluate(run, clips=4, checkpoint="newest", out=tmp_path / "out", probes=False)
     assert list(result.error_over_persistence) == ["base", "adapter"]
     assert len(result.error_over_persistence["adapter"]) == config.data.frames - 1
     assert str(result.summary).startswith(result.evaluation.title)

@@ -294,7 +294,7 @@ def evaluate(
 
     Example:
         >>> result = evaluate("demo/run", clips=64)
-        >>> result.error_over_persistence["adapter"][-1]  # at the last horizon, with its 95 % interval
+        >>> result.error_over_persistence[result.evaluation.trained][-1]  # at the last horizon, with its 95 % interval
         Estimate(value=0.728, low=0.699, high=0.759)
     """
     from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
