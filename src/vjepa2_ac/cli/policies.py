@@ -168,7 +168,9 @@ def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray]
             control_steps=options.control_steps,
             progress=reporter.task("scoring", "places"),
         )
-    title = f"Energy relative to the zero action, {counted(found.places, 'frame')} of {counted(found.episodes, 'episode')}"
+    title = (
+        f"Energy relative to the zero action, {counted(found.places, 'frame')} of {counted(found.episodes, 'episode')}"
+    )
     table = MetricsTable(title, ["policy", "all chunks", "its best", "behind the one before"])
     for one in found.policies:
         table.add_row(one.name, str(one.mean), str(one.best), "" if one.behind is None else str(one.behind))
@@ -271,7 +273,9 @@ def _prior(options: argparse.Namespace) -> None:
     text = "Error on held-out clips: not measured; it needs a test split."
     if found := card.held_out:
         true, others = (found[name]["value"] for name in ("true_goals", "goals_of_others"))
-        text = f"Error on held-out clips relative to the zero action: {true:.2f}; with goals of other clips {others:.2f}."
+        text = (
+            f"Error on held-out clips relative to the zero action: {true:.2f}; with goals of other clips {others:.2f}."
+        )
         text += " The prior ignores the goal." if others <= true else ""
     cli.show(text)
     cli.show(f"The prior is in {folder}. Plan with it: {shlex.quote(f'planning.prior={folder}')} planning.samples=100")
