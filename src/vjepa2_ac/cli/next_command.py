@@ -50,15 +50,15 @@ def next_simulation(
     """
     from vjepa2_ac.reporter import duration
 
-    time, how = "its time was not measured", ""
+    time, where = "its time was not measured", "here"
     is_chosen = any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)
     is_long = sum(planning.sequences) > QUICK_SEQUENCES and planning.planner != "gradient" and planning.budget_s is None
     fits = max(planning.cem.elites, planning.icem.elites) <= QUICK["samples"]
     if on_cpu and is_long and fits and not is_chosen:
-        words, how = [*words, *QUICK_WORDS], ", with the quick planner for a CPU"
+        words, where = [*words, *QUICK_WORDS], "on this CPU with the quick planner"
         planning = planning.model_copy(update=QUICK)
     count = sum(planning.sequences)
     if prediction_s is not None:
-        time = f"{duration(decisions * count * planning.horizon * prediction_s / 3600)} here"
+        time = f"{duration(decisions * count * planning.horizon * prediction_s / 3600)} {where}"
     about = f"{counted(decisions, 'decision')} of {counted(count, 'action sequence')} each"
-    return [f"Next: {shell_command('simulate', *words)}", f"  ({time}: {about}{how})"]
+    return [f"Next: {shell_command('simulate', *words)}", f"  ({time}: {about})"]
