@@ -232,7 +232,7 @@ def test_a_run_is_trained_resumed_and_measured(make_config: MakeConfig, tmp_path
     result = evaluate(run, clips=4, checkpoint="newest", out=tmp_path / "out", probes=False)
     assert list(result.error_over_persistence) == ["base", "adapter"]
     assert len(result.error_over_persistence["adapter"]) == config.data.frames - 1
-    assert str(result.summary).startswith(result.evaluation.title)
+    assert " ".join(str(result.summary).split()).startswith(result.evaluation.title)
     assert all(path.parent == tmp_path / "out" for path in result.files)
     with pytest.raises(UserError, match="no checkpoint of step 7"):
         evaluate(run, checkpoint=7)

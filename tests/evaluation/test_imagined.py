@@ -183,7 +183,7 @@ def test_where_nothing_was_simulated_nothing_is_said_of_what_would_happen(whole_
         ({"actions": ("nowhere.npy",)}, "nowhere.npy: cannot be read"),
         ({"actions": ()}, "--actions"),
         ({"size_m": 0.0}, "--size"),
-        ({"episode": "nobody"}, "--episode: 0 episodes with nobody"),
+        ({"episode": "nobody"}, "--episode: 0 episodes named \\*nobody"),
         ({"episode": "first", "start": -1}, r"--start: -1, in an episode of 24 steps.*0 to 17"),
         ({"episode": "first", "start": 18}, r"--start: 18, .*0 to 17: a clip takes 7 control steps"),
         ({"episode": "first", "steps": 12}, "a longer episode"),

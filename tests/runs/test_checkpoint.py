@@ -82,7 +82,7 @@ def test_what_a_killed_writer_left_behind_is_never_resumed_from_and_is_cleaned_u
 def test_when_every_checkpoint_is_damaged_the_run_stops_and_leaves_them(tmp_path: Path) -> None:
     for step in (10, 20):
         (write(tmp_path, step) / "optimizer.pt").write_bytes(b"")
-    with pytest.raises(InputError, match="all 2 checkpoints are damaged"):
+    with pytest.raises(InputError, match="all checkpoints are damaged \\(2 checkpoints"):
         newest_checkpoint(tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
 

@@ -104,7 +104,7 @@ def test_the_base_is_measured_once_and_its_metrics_say_so(base_run: Path, caplog
     asked = EvaluationOptions(clips=3, probes=FEW.probes, checkpoint="newest", out=base_run / "newest")
     later = evaluate_subject(str(base_run), asked).evaluation
     assert (list(later.models), later.about.is_base) == (["base", "adapter"], False)
-    assert list(compare([base_run, base_run / "newest"]).summaries) == ["run", "newest"]
+    assert list(compare([base_run, base_run / "newest"]).measured) == ["run", "newest"]
 
 
 def test_the_explorer_shows_one_model_and_the_note(base_run: Path, whole_decoder: Path) -> None:  # noqa: F811

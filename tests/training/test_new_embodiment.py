@@ -64,7 +64,7 @@ def test_from_recordings_to_a_model_of_its_own(
     assert len(fresh) == sum(width != 7 for width in widths)
     if widths.state != 7:
         assert f"state encoder: {widths.state} numbers instead of the base's 7: initialised anew" in fresh
-    assert any("not asked whether it is better" in note for note in reporter.notes)
+    assert any("Base against persistence: skipped" in note for note in reporter.notes)
     run = load_run(folder)
     assert widths_of_model(run.world_model.sizes) == widths
 

@@ -29,7 +29,7 @@ from vjepa2_ac.training.loop import train
 MakeConfig = Callable[..., Config]
 SIZES = {**TINY, "predictor": {**TINY["predictor"], "use_states": False}}  # type: ignore[dict-item]
 PROBES = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, axis_clips=0, nodes=3, examples=1)
-QUICK = EvaluationOptions(split="validation", clips=4, probes=PROBES)
+QUICK = EvaluationOptions(split="validation", clips=4, probes=PROBES, checkpoint="newest")
 SEARCH = PlanningConfig(samples=6, iterations=2, cem=CemConfig(elites=3))
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 

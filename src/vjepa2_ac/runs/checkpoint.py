@@ -190,7 +190,8 @@ def newest_checkpoint(folder: Path) -> Path | None:
             return path
         logger.warning("%s: %s; this checkpoint is skipped", path, problem)
     if found:
-        damaged, fix = f"damaged: {counted(len(found), 'checkpoint')}", "To start again from step 0, delete this folder"
+        damaged = f"all checkpoints are damaged ({counted(len(found), 'checkpoint')})"
+        fix = "To start again from step 0, delete this folder"
         raise InputError(where=str(folder), found=damaged, fix=fix)
     return None
 

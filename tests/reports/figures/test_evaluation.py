@@ -21,7 +21,7 @@ def test_every_run_is_drawn_under_its_own_name_and_style(tmp_path, monkeypatch) 
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), save(self, *a, **k))[1])
     curves = {name: (Estimate(0.9, 0.8, 1.0), Estimate(0.8, 0.7, 0.9)) for name in NAMES}
-    comparison = Comparison("errors", (), np.array([0.5, 1.0]), curves, (), {})
+    comparison = Comparison("errors", (), np.array([0.5, 1.0]), curves, (), {}, {})
     assert plot_comparison(comparison, tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     (legend,) = drawn[0].legends
     assert [text.get_text() for text in legend.get_texts()] == ["persistence (doing nothing)", *NAMES]
