@@ -231,9 +231,8 @@ def mapped(result: ModelResult, distance: float, sharpness: float, episodes: int
         Landscape(name, 0, np.zeros((3, 2)), np.ones((2, 2, 2)), np.zeros(3), np.zeros(3), float(one))
         for name, one in zip(ids, distances, strict=True)
     )
-    level, none = mean_of(np.full(episodes, sharpness), ids), Estimate(math.nan, math.nan, math.nan)
-    statistics = (none,) * 3, (0.5,) * 3, (0,) * 3, 1.0
-    found = Landscapes(("dx", "dy", "dz"), "cm", maps, mean_of(distances, ids), level, 25.0, *statistics)  # type: ignore[arg-type]
+    level = mean_of(np.full(episodes, sharpness), ids)
+    found = Landscapes(("dx", "dy", "dz"), "cm", maps, mean_of(distances, ids), level, 25.0)
     return replace(result, landscapes=found)
 
 

@@ -92,9 +92,8 @@ def _landscape(rng: np.random.Generator, episode_id: str, off: float) -> Landsca
 def _landscapes(rng: np.random.Generator, ids: tuple[str, ...], off: float) -> Landscapes:
     maps = tuple(_landscape(rng, name, off) for name in ids[:5])
     distance = mean_of(np.array([one.distance for one in maps]), ids[:5])
-    signs = tuple(mean_of(np.array([1.0, 1.0, 0.0, 1.0, 1.0]), ids[:5]) for _ in range(3))
     sharpness = mean_of(np.array([np.ptp(one.energy) / one.energy.mean() for one in maps]), ids[:5])
-    return Landscapes(("dx", "dy", "dz"), "cm", maps, distance, sharpness, 8.1, signs, (0.5, 0.5, 0.5), (5, 5, 0), 1.25)  # type: ignore[arg-type]
+    return Landscapes(("dx", "dy", "dz"), "cm", maps, distance, sharpness, 8.1)
 
 
 def _axes(ids: tuple[str, ...], degrees: float) -> AxisFit:

@@ -17,7 +17,7 @@ from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import ActionRanking, Landscape, Landscapes
-from vjepa2_ac.intervals import Estimate, mean_of, ratio
+from vjepa2_ac.intervals import mean_of, ratio
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.spaces import POSE, ActionSpace, vector_states
 
@@ -261,9 +261,7 @@ def measure_landscapes(
 
     maps = shared(starts, landscape, progress)
     ids = [one.episode_id for one in maps]
-    least = space.shown_factor * half / (nodes - 1)
     chance = np.mean([np.linalg.norm(_places_of(one.axes) - one.true, axis=1).mean() for one in maps])
-    agreements, chances, counts = zip(*(_signs(maps, axis, least) for axis in range(3)), strict=True)
     return Landscapes(
         axis_names=space.names[_AXES],
         unit=space.shown_unit,
@@ -271,10 +269,6 @@ def measure_landscapes(
         distance=mean_of(np.array([one.distance for one in maps]), ids),
         sharpness=mean_of(np.array([np.ptp(one.energy) / one.energy.mean() for one in maps]), ids),
         chance_distance=float(chance),
-        sign_agreement=agreements,
-        sign_chance=chances,
-        sign_clips=counts,
-        sign_least=least,
     )
 
 
@@ -308,22 +302,6 @@ def _landscape(
         minimum=minimum * unit,
         distance=float(np.linalg.norm(minimum - true)) * unit,
     )
-
-
-def _signs(maps: Sequence[Landscape], axis: int, least: float) -> tuple[Estimate, float, int]:
-    """Return how often the minimum has the true action's sign, the same of any node, and the number of clips.
-
-    Clips that hardly move along the axis are not counted.
-    """
-    counted = [one for one in maps if abs(one.true[axis]) >= least]
-    if not counted:
-        return Estimate(np.nan, np.nan, np.nan), np.nan, 0
-    agreeing, by_chance = [], []
-    for one in counted:
-        right = np.sign(_places_of(one.axes)[:, axis]) == np.sign(one.true[axis])
-        agreeing.append(right[lowest(one.energy).ravel()].mean())
-        by_chance.append(right.mean())
-    return mean_of(np.array(agreeing), [one.episode_id for one in counted]), float(np.mean(by_chance)), len(counted)
 
 
 def _places_of(axes: Float[np.ndarray, "3 nodes"]) -> Float[np.ndarray, "places 3"]:

@@ -254,10 +254,6 @@ class Landscapes:
     distance: Estimate  # mean over clips
     sharpness: Estimate  # mean over clips of (highest - lowest) / mean energy of a landscape; 0: flat
     chance_distance: float  # the same of a node drawn at random
-    sign_agreement: tuple[Estimate, Estimate, Estimate]  # per axis: share of clips whose minimum has the true sign
-    sign_chance: tuple[float, float, float]  # share of the nodes that have it
-    sign_clips: tuple[int, int, int]  # counted clips: those whose true action is sign_least or more along the axis
-    sign_least: float  # in the units of the axes
 
 
 @dataclass(frozen=True)

@@ -205,11 +205,6 @@ class _Rows(list[Row]):
         if base is not None and base is not found:
             label, difference = "distance minus the base's", {model: distance_difference(found, base)}
             self.line(group, label, "landscapes.difference_to_base", difference, form="+.3f", chance=0.0, detail=True)
-        signs = zip(found.axis_names, found.sign_agreement, found.sign_chance, found.sign_clips, strict=True)
-        for axis, agreement, chance, count in signs:
-            if count:
-                label, right = f"its {axis} has the true sign ({counted(count, 'clip')})", {model: agreement}
-                self.line(group, label, f"landscapes.sign.{axis}", right, better="higher", chance=chance)
 
     def add_plans(self) -> None:
         """Add the metrics of plans, and their differences to doing nothing and to the base's, paired by start."""
