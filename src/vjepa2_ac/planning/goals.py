@@ -143,7 +143,7 @@ class GoalProgress:
         if not why:
             return stays
         name = f"Goal {self.place + 1} ({goal.name})" if goal.name else f"Goal {self.place + 1}"
-        text = f"{name}, after {steps} step{'s' * (steps > 1)}: {why}."
+        text = f"{name}, after {counted(steps, 'step')}: {why}."
         if is_last:
             return replace(self, changed=text, done=True)
         return GoalProgress(self.place + 1, step, energy(self.place + 1), text)

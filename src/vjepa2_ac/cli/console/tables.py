@@ -59,7 +59,7 @@ def plan_table(answer: PlanResult) -> Table:
         names = ["dx (cm)", "dy (cm)", "dz (cm)", *turn, "gripper", "then x, y, z (m)", "gripper"]
     why, steps = answer.decision.why, len(answer.actions)
     has_plan = answer.decision.plan is not None and why != "no finite energy"
-    title = f"Plan of {steps} model step{'s' * (steps != 1)}" if has_plan else f"Zero action: {why}"
+    title = f"Plan of {counted(steps, 'model step')}" if has_plan else f"Zero action: {why}"
     table = MetricsTable(title, ["step", *names], labelled=False)
     for step, (action, after) in enumerate(zip(answer.actions, answer.states[1:], strict=True), start=1):
         if is_pose:

@@ -186,7 +186,7 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
     heights = [2.0 * rows, *(1.4 for given in (states, course) if given is not None)]
     options = made.options
     how = f"every {options.every} frames" if options.by == "every" else f"by {options.by}"
-    count = f"{len(made.goals)} goal{'s' * (len(made.goals) > 1)}"
+    count = counted(len(made.goals), "goal")
     with written_figure(path, _WIDTH, 0.5 + sum(heights), dpi=130) as figure:
         headline(figure, f"{count}, {how}; {options.stride} frames are a model step")
         sheet, *parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
