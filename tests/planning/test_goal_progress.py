@@ -85,7 +85,7 @@ def test_without_a_share_only_steps_count() -> None:
     found = progress_over(rules, [[1.0, 1.0], [0.0, 0.0], [0.5, 1.0], [0.0, 0.0]])
     assert [one.place for one in found] == [0, 0, 1, 1]
     assert not found[-1].done
-    assert found[2].changed == "Goal 1, after 2 steps: its 2 steps are over at energy 0.5, 50% of 1."
+    assert found[2].changed == "Goal 1, after 2 steps: it ends after 2 steps, at energy 0.5, 50% of 1."
 
 
 def test_no_threshold_is_below_the_noise() -> None:

@@ -76,7 +76,7 @@ def test_a_named_goal_and_a_prompt_begin_what_the_server_keeps() -> None:
     assert (first["goal"]["name"], first["goal"]["since"]) == ("a", 0)
     second = ask(one, **request(2, prompt="two"))
     assert (second["goal"]["name"], second["goal"]["index"], second["goal"]["since"]) == ("b", 1, 1)
-    assert "its 1 steps are over" in second["goal"]["changed"]
+    assert "it ends after 1 step" in second["goal"]["changed"]
     assert "names no goal. needed: the name of one (this server keeps cup, two)" in refused(
         one, **request(prompt="cap")
     )
