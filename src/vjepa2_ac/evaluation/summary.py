@@ -320,12 +320,12 @@ def _landscape(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict
         return None
     distance, chance, unit = rows[key].estimate, rows[key].chance or 0.0, rows[key].unit
     conclusion, compared_with = conclusion_of(distance.below(chance), 0.0), _CHANCE
-    references = [f"random point {_with_unit(chance, unit)}", f"sharpness {rows[sharpness].value:.2g}"]
+    references = [f"random point {_with_unit(chance, unit)}", f"sharpness {rows[sharpness].value:#.2g}"]
     if (difference := rows.get("landscapes.difference_to_base")) is not None:
         if conclusion == "yes":
             conclusion, compared_with = conclusion_of(difference.estimate.below(0.0), 0.0), _BASE
         references.insert(0, f"base model {_with_unit(base_rows[key].value, unit)}")
-        references[-1] += f", base model {base_rows[sharpness].value:.2g}"
+        references[-1] += f", base model {base_rows[sharpness].value:#.2g}"
     statement = f"energy minimum {_with_unit(distance.value, unit)} from the true action"
     verdict = _verdict("landscape", conclusion, statement, distance, compared_with)
     return replace(verdict, reference=f"({'; '.join(references)})", baseline=chance, unit="cm" if unit else "")

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from vjepa2_ac.errors import counted
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.energy import FEWEST_NODES, EnergySlice, energy_slices, fitting_nodes, sequences_of_slices
 from vjepa2_ac.planning.goals import SubGoal
@@ -64,11 +65,16 @@ class PlanResult:
         return self.controller.spaces.state
 
     @property
-    def worse_than(self) -> dict[str, float]:
-        """Energies that are lower than the one predicted for the plan: of the zero action, and of the current frame."""
+    def worse_than(self) -> dict[str, str]:
+        """A sentence on each energy below the one predicted for the plan: of the zero action, of the current frame."""
         energy = math.nan if self.decision.plan is None else self.decision.plan.energy
         others = {"zero action": self.doing_nothing, "current frame": self.decision.energy_now}
-        return {name: other for name, other in others.items() if energy > other}
+        said = "The plan is predicted to be worse than the {}: energy {:.4f} against {:.4f}{}."
+        return {
+            name: said.format(name, energy, other, _change(energy, other))
+            for name, other in others.items()
+            if energy > other
+        }
 
     @property
     def unused_goals(self) -> tuple[int, ...]:
@@ -213,7 +219,7 @@ def summarize(answer: PlanResult) -> str:
             f" {plan.evaluations:,} action sequences. The model is broken; try another checkpoint."
         )
     rounds = len(plan.iterations)
-    searched = f"{_count(plan.evaluations, 'action sequence')} in {_count(rounds, 'iteration')}"
+    searched = f"{counted(plan.evaluations, 'action sequence')} in {counted(rounds, 'iteration')}"
     found = [
         _motion(answer),
         f"Energy {now:.4f} now, {plan.energy:.4f} predicted for the plan{_change(plan.energy, now)},",
@@ -224,8 +230,6 @@ def summarize(answer: PlanResult) -> str:
         found.append(
             f"Time was up after {rounds} of {answer.controller.config.iterations} iterations: the best so far."
         )
-    if plan.energy == answer.doing_nothing:
-        found.append("No evaluated action sequence is predicted to be better than the zero action.")
     if at_limit := axes_at_limit(answer):
         knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
         found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
@@ -236,32 +240,15 @@ def summarize(answer: PlanResult) -> str:
     return " ".join(found)
 
 
-def warn_of_plan(answer: PlanResult) -> tuple[str, ...]:
-    """Return a sentence on each energy that is lower than the one predicted for the plan."""
-    energy = math.nan if answer.decision.plan is None else answer.decision.plan.energy
-    return tuple(
-        f"The plan is predicted to be worse than the {name}:"
-        f" energy {energy:.4f} against {other:.4f}{_change(energy, other)}."
-        for name, other in answer.worse_than.items()
-    )
-
-
 def _change(energy: float, reference: float) -> str:
-    if not reference:
-        return ""
-    percent = 100 * (energy - reference) / abs(reference)
-    return f" ({percent:+.{0 if abs(percent) >= 10 else 1}f} %)"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}{'s' * (number != 1)}"
+    return f" ({100 * (energy - reference) / abs(reference):+.1f} %)" if reference else ""
 
 
 def _motion(answer: PlanResult) -> str:
     space, change, steps = answer.state_space, answer.states[-1] - answer.states[0], len(answer.actions)
     shown = change[list(answer.controller.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
     names = [space.change_names[axis] for axis in answer.controller.shown_axes]
-    lasting = f"in {_count(steps, 'model step')}"
+    lasting = f"in {counted(steps, 'model step')}"
     if not space.is_pose:
         parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, shown, strict=True))
         more = ", ..." if len(answer.space.free) > len(names) else ""
