@@ -18,7 +18,6 @@ from vjepa2_ac.planning.decision import (
     axes_at_limit,
     decide,
     summarize,
-    warn_of_plan,
     write_plan,
 )
 from vjepa2_ac.planning.energy import WorldModelCost
@@ -105,12 +104,12 @@ def test_a_plan_is_called_worse_than_exactly_the_lower_energies(tmp_path: Path, 
     decision = replace(found.decision, energy_now=now * energy)
     found = replace(found, doing_nothing=still * energy, decision=decision)
     worse = [name for name, share in (("zero action", still), ("current frame", now)) if share < 1.0]
-    assert read(found, tmp_path)["worse_than"] == list(found.worse_than) == worse
+    assert read(found, tmp_path)["worse_than"] == worse
     said = {
-        "zero action": f"zero action: energy {energy:.4f} against {energy / 2:.4f} (+100 %).",
-        "current frame": f"current frame: energy {energy:.4f} against {0.8 * energy:.4f} (+25 %).",
+        "zero action": f"zero action: energy {energy:.4f} against {energy / 2:.4f} (+100.0 %).",
+        "current frame": f"current frame: energy {energy:.4f} against {0.8 * energy:.4f} (+25.0 %).",
     }
-    assert warn_of_plan(found) == tuple(f"The plan is predicted to be worse than the {said[name]}" for name in worse)
+    assert found.worse_than == {name: f"The plan is predicted to be worse than the {said[name]}" for name in worse}
 
 
 def test_at_the_goal_nothing_is_done_and_the_summary_says_so(tmp_path: Path) -> None:
@@ -153,12 +152,9 @@ def test_goals_share_the_horizon_by_default() -> None:
 
 def test_what_a_person_should_know_of_a_plan_is_said() -> None:
     found = asked(limits=LimitsConfig(xyz=(0.05, 0.0, 0.05)))
-    assert "better than the zero action" not in summarize(found)
     found.actions[0, :3] = (-0.0495, 0.0, 0.048)
     assert axes_at_limit(found) == ["dx"]
-    object.__setattr__(found, "doing_nothing", found.decision.plan.energy)
-    for said in ("at its limit along dx (", "No evaluated action sequence is predicted to be better"):
-        assert said in summarize(found)
+    assert "at its limit along dx (" in summarize(found)
     ticks = iter(range(1000))
     controller = Controller(tiny_model(), QUICK.model_copy(update={"budget_s": 4.0}))
     controller.planner.clock = lambda: float(next(ticks))

@@ -340,14 +340,15 @@ def _next(summary: Summary, plans: Verdict, options: argparse.Namespace) -> str:
 @contextmanager
 def _agent(options: argparse.Namespace) -> Iterator[Agent]:
     """Return who acts; a server as long as the context lasts."""
+    from vjepa2_ac.decoding.decoder_folder import SIMULATED
     from vjepa2_ac.serving.access import read_key
     from vjepa2_ac.serving.wire import PlanningClient
     from vjepa2_ac.simulation.closed_loop.agent import agent_of_server, agent_of_session
 
     if not cli.is_server(options.subject):
         decoder = cli.given_decoder(options)
-        session = cli.load_planning_session(options)
-        yield agent_of_session(session, decoder, in_our_world=options.world is None)
+        shown = SIMULATED if options.world is None else None  # a third-party world is what the data show
+        yield agent_of_session(cli.load_planning_session(options), decoder, shown=shown)
         return
     key = None if options.key_file is None else read_key(options.key_file)
     with PlanningClient(options.subject, key) as client:

@@ -87,7 +87,7 @@ def _plan(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.cli.console.tables import plan_table
     from vjepa2_ac.evaluation.imagined_plan import imagine_plan
-    from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, warn_of_plan, write_plan
+    from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
     from vjepa2_ac.reports.figures.planning import PLAN_IMAGE, plot_plan
     from vjepa2_ac.storage import user_can_write
 
@@ -108,7 +108,8 @@ def _plan(options: argparse.Namespace) -> int:
     with user_can_write(options.out):
         file = write_plan(found, about, options.out / PLAN_FILE)
         image = plot_plan(found, options.out / PLAN_IMAGE, imagined)
-    cli.show(*warn_of_plan(found), plan_table(found), textwrap.fill(summarize(found), _COLUMNS), files=[file, image])
+    words = textwrap.fill(summarize(found), _COLUMNS)
+    cli.show(*found.worse_than.values(), plan_table(found), words, files=[file, image])
     return int(found.decision.why == "no finite energy" or bool(found.worse_than))
 
 

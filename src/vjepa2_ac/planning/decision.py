@@ -64,11 +64,16 @@ class PlanResult:
         return self.controller.spaces.state
 
     @property
-    def worse_than(self) -> dict[str, float]:
-        """Energies that are lower than the one predicted for the plan: of the zero action, and of the current frame."""
+    def worse_than(self) -> dict[str, str]:
+        """A sentence on each energy below the one predicted for the plan: of the zero action, of the current frame."""
         energy = math.nan if self.decision.plan is None else self.decision.plan.energy
         others = {"zero action": self.doing_nothing, "current frame": self.decision.energy_now}
-        return {name: other for name, other in others.items() if energy > other}
+        said = "The plan is predicted to be worse than the {}: energy {:.4f} against {:.4f}{}."
+        return {
+            name: said.format(name, energy, other, _change(energy, other))
+            for name, other in others.items()
+            if energy > other
+        }
 
     @property
     def unused_goals(self) -> tuple[int, ...]:
@@ -224,8 +229,6 @@ def summarize(answer: PlanResult) -> str:
         found.append(
             f"Time was up after {rounds} of {answer.controller.config.iterations} iterations: the best so far."
         )
-    if plan.energy == answer.doing_nothing:
-        found.append("No evaluated action sequence is predicted to be better than the zero action.")
     if at_limit := axes_at_limit(answer):
         knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
         found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
@@ -236,21 +239,8 @@ def summarize(answer: PlanResult) -> str:
     return " ".join(found)
 
 
-def warn_of_plan(answer: PlanResult) -> tuple[str, ...]:
-    """Return a sentence on each energy that is lower than the one predicted for the plan."""
-    energy = math.nan if answer.decision.plan is None else answer.decision.plan.energy
-    return tuple(
-        f"The plan is predicted to be worse than the {name}:"
-        f" energy {energy:.4f} against {other:.4f}{_change(energy, other)}."
-        for name, other in answer.worse_than.items()
-    )
-
-
 def _change(energy: float, reference: float) -> str:
-    if not reference:
-        return ""
-    percent = 100 * (energy - reference) / abs(reference)
-    return f" ({percent:+.{0 if abs(percent) >= 10 else 1}f} %)"
+    return f" ({100 * (energy - reference) / abs(reference):+.1f} %)" if reference else ""
 
 
 def _count(number: int, what: str) -> str:

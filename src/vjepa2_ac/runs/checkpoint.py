@@ -71,7 +71,6 @@ class RunState:
     best_error: Finite | None = None  # its rollout error
     best_rank: Finite | None = None  # its mean rank of the true action, if that selects
     lowest_rank: Finite | None = None  # of all validations
-    base_error: Finite | None = None  # rollout error before the first step
     base_rank: Finite | None = None  # mean rank of the true action before the first step, if that selects
     measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.resume`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
@@ -91,7 +90,7 @@ class RunState:
         """
         if not math.isfinite(error) or (rank is not None and not math.isfinite(rank)):
             return self
-        state = self if self.step else replace(self, base_error=error, base_rank=rank)
+        state = self if self.step else replace(self, base_rank=rank)
         has_lower_error = self.best_error is None or error < self.best_error
         if rank is None:
             return replace(state, best_step=self.step, best_error=error) if has_lower_error else state

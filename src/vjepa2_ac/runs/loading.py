@@ -95,25 +95,19 @@ def note_about(config: Config, chosen: SelectedCheckpoint) -> str:
 
 
 def describe_selection(folder: Path) -> str:
-    """Return which checkpoint of a run is selected, by which rule, and its metric against that of the untrained model.
+    """Return which checkpoint of a run is selected, by which rule, and its action-ranking error.
 
     Raises:
         InputError: As `select_checkpoint`.
     """
     config, chosen = read_run_config(folder), select_checkpoint(folder)
     state, step = chosen.newest, step_of(chosen.path.name) or 0
-    is_by_rank = state.best_rank is not None
-    best, first = (state.best_rank, state.base_rank) if is_by_rank else (state.best_error, state.base_error)
-
-    def metric(value: float) -> str:
-        return f"{100 * value:.1f} %" if is_by_rank else f"{value:.3f}"
-
     lines = [f"Selected checkpoint: step {step:,}, {chosen.why}."]
-    if best is not None:
-        references = [f"{untrained_model(config, chosen.path)} {metric(first)}"] if step and first is not None else []
-        references += ["chance 50 %"] if is_by_rank else ["copying the last frame 1"]
-        name = "Action-ranking error" if is_by_rank else "Rollout error / persistence"
-        lines.append(f"{name}: {metric(best)} ({', '.join(references)}).")
+    if state.best_rank is not None:
+        base = ""
+        if step and state.base_rank is not None:
+            base = f"{untrained_model(config, chosen.path)} {100 * state.base_rank:.1f} %, "
+        lines.append(f"Action-ranking error: {100 * state.best_rank:.1f} % ({base}chance 50 %).")
     return "\n".join(filter(None, (*lines, note_about(config, chosen))))
 
 

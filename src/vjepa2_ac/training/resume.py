@@ -138,8 +138,7 @@ def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> 
         f"Validation measures something else than before (other: {', '.join(differing)}): the error"
         f" {state.best_error:.4g} of step {state.best_step}, the best so far, does not compare and no longer counts."
     )
-    state = replace(state, base_error=None, base_rank=None)
-    return replace(state, best_step=None, best_error=None, best_rank=None, lowest_rank=None)
+    return replace(state, best_step=None, best_error=None, best_rank=None, lowest_rank=None, base_rank=None)
 
 
 def micro_batches_of(config: Config, state: RunState, processes: int, reporter: Reporter) -> int:

@@ -84,14 +84,14 @@ class ServedPlanner:
 
 
 def agent_of_session(
-    session: PlanningSession, decoder: TrainedDecoder | None = None, *, in_our_world: bool = True
+    session: PlanningSession, decoder: TrainedDecoder | None = None, *, shown: str | None = SIMULATED
 ) -> Agent:
     """Return a model of this process.
 
     Args:
         session: The model.
         decoder: Shows what was imagined.
-        in_our_world: It acts with the simulated arm, not in a third-party world, which its data are assumed to show.
+        shown: What the frames show, as of `TrainedDecoder.require_fit`.
 
     Raises:
         InputError: It takes what the simulated arm does not measure, its model step has no known length, or the decoder
@@ -108,7 +108,6 @@ def agent_of_session(
         needed = f"poses; or seven joint angles and the gripper: data.fields.state: [{', '.join(JOINT_FIELDS)}]"
         raise InputError(where="data.states: vector", found=found, needed=needed)
     if decoder is not None:
-        shown = SIMULATED if in_our_world else None
         decoder.require_fit(session.world_model, config.data, subject=session.subject, shown=shown)
     uses_camera = session.world_model.sizes.predictor.use_extrinsics
     name = Path(session.subject).name or session.subject
