@@ -122,7 +122,7 @@ def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, m
     words = ["plan", "run", "--start", "now.png", "--goal", "goal.png", "--state", STATE, "--nodes", "0"]
     words += ["--out", "out", "planning.limits.xyz=[0.05,0.05,0.05]"]
     planned = command(*words, "--plugin", "my_module")
-    assert planned.returncode == 0, planned.stderr
+    assert planned.returncode in {0, 1}, planned.stderr  # 1: a plan that is predicted to be worse than staying
     assert json.loads((at_home / "out/plan.json").read_text())["settings"]["planner"] == "random"
 
     # a run may be a stranger's: its config imports nothing that lies beside it

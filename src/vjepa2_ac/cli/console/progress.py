@@ -40,7 +40,12 @@ def wrapped(text: str) -> str:
         columns = re.match(r"(.{0,38} {2,})?", line.replace(_SPACE, " "))[0]  # type: ignore[index]  # always matches
         indent = " " * (len(columns) if columns.strip() else len(columns) + 2)
         style = textwrap.TextWrapper(width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
-        lines += style.wrap(line) if len(line) > width else [line]
+        first, *more = style.wrap(line) if len(line) > width else [line]
+        if (
+            more and first.replace(_SPACE, " ") == columns.rstrip()
+        ):  # a long path after the columns: a line break does not help
+            first, more = f"{columns}{more[0].lstrip()}", more[1:]
+        lines += [first, *more]
     return "\n".join(lines).replace(_SPACE, " ")
 
 
