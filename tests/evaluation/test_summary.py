@@ -163,7 +163,7 @@ def test_the_third_line_is_action_ranking_until_a_closed_loop_was_measured(tmp_p
         assert with_closed_loop(summary, tmp_path / "no", "step 8") == summary
         assert "plans" not in str(summary)
     assert with_closed_loop(measured, tmp_path, "step 8").sentence.endswith(
-        "it solves more problems than the zero action and random actions."
+        "more problems solved than by the zero action and random actions."
     )
 
 
@@ -257,16 +257,26 @@ def test_a_better_landscape_needs_a_nearer_minimum_than_the_base_model_and_a_ran
     assert (verdict.conclusion, verdict.unit, verdict.baseline) == (conclusion, "cm", 25.0)
     assert verdict.value == pytest.approx(adapter[0], abs=0.5)
     assert verdict.statement == f"energy minimum {verdict.value:.1f} cm from the true action"
-    of_base = [] if base is None else [f"base model {verdict.value - adapter[0] + base[0]:.1f} cm", f"{base[1]:g}"]
+    of_base = [] if base is None else [f"base model {verdict.value - adapter[0] + base[0]:.1f} cm", f"{base[1]:#.2g}"]
     assert verdict.reference == (
-        f"(random point 25.0 cm; sharpness {adapter[1]:g})"
+        f"(random point 25.0 cm; sharpness {adapter[1]:#.2g})"
         if base is None
-        else f"({of_base[0]}; random point 25.0 cm; sharpness {adapter[1]:g}, base model {of_base[1]})"
+        else f"({of_base[0]}; random point 25.0 cm; sharpness {adapter[1]:#.2g}, base model {of_base[1]})"
     )
     few = summary_of(mapped(model("adapter", 0.7), *adapter, episodes=1)).landscape
     assert few is not None
     assert few.conclusion == "inconclusive"
     assert few.reference.endswith("; 1 episode is too few for a conclusion)")
+
+
+@pytest.mark.parametrize("distance", [10.0, 20.3])
+def test_the_sentence_names_a_landscape_that_is_not_better(distance: float) -> None:
+    base = mapped(ranked("base", 1.0, 0.05), 13.8, 0.072)
+    sentence = summary_of(base, mapped(ranked("adapter", 0.7, 0.02, shuffled=0.9), distance, 0.0086)).sentence
+    assert sentence.startswith("Better prediction than with the base model")
+    denied = "But the energy minimum is not nearer to the true action than with the base model."
+    assert sentence.endswith(denied) == (distance > 13.8)
+    assert len(sentence.split()) <= 40
 
 
 def by(l1: float, others: float, *, noise: float = 0.02) -> dict[Metric, np.ndarray]:

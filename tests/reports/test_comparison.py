@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
+from vjepa2_ac.evaluation.summary import Conclusion
 from vjepa2_ac.reports.comparison import Comparison, compare
 from vjepa2_ac.reports.figures.evaluation import plot_comparison
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
@@ -47,12 +49,12 @@ def test_runs_are_compared_with_the_first_one_pair_by_pair(tmp_path: Path) -> No
     assert plot_comparison(found, tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
 
 
-def of_runs(found: Comparison, **runs: tuple[float | None, float, int]) -> Comparison:
+def of_runs(found: Comparison, conclusion: Conclusion = "yes", **runs: tuple[float | None, float, int]) -> Comparison:
     """Return a comparison of runs with these action-ranking errors, last errors over persistence, and steps."""
     one, curve = next(iter(found.measured.items()))[1], next(iter(found.curves.values()))
     measured, curves = {}, {}
     for name, (rank, error, step) in runs.items():
-        ranks = replace(one.summary.ranks_actions, value=rank)
+        ranks = replace(one.summary.ranks_actions, value=rank, conclusion=conclusion)
         about = replace(
             one.about,
             checkpoint=f"step-{step:08d} (as asked for)",
@@ -88,12 +90,27 @@ def test_a_run_is_recommended_as_checkpoints_are_selected(two: Comparison, first
     assert expected in of_runs(two, a=first, b=second).next_command
 
 
-def test_no_run_is_recommended_without_a_conclusion(two: Comparison) -> None:
+@pytest.mark.parametrize(
+    ("conclusion", "reason"), [("no", "is not better than"), ("inconclusive", "is not known to be better than")]
+)
+def test_no_run_is_recommended_whose_action_ranking_is_not_better(two: Comparison, conclusion, reason: str) -> None:
+    found = of_runs(two, conclusion, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
+    assert found.next_command.startswith(f"No run is recommended: the action ranking of b {reason} ")
+
+
+def test_no_run_is_recommended_and_no_difference_claimed_with_too_few_episodes(two: Comparison) -> None:
     found = of_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
-    summary = found.measured["b"].summary
-    few = replace(summary, predicts=replace(summary.predicts, needs="1 held-out episode is too few."))
-    measured = dict(found.measured) | {"b": replace(found.measured["b"], summary=few)}
-    assert replace(found, measured=measured).next_command == "No run is recommended: 1 held-out episode is too few."
+    few = "1 held-out episode is too few for a conclusion; at least 5 are needed"
+    summaries = {name: one.summary for name, one in found.measured.items()}
+    summaries = {
+        name: replace(one, predicts=replace(one.predicts, needs=f"{few}. So far: error 1 % lower."))
+        for name, one in summaries.items()
+    }
+    measured = {name: replace(one, summary=summaries[name]) for name, one in found.measured.items()}
+    rows = tuple(replace(row, low=math.nan, high=math.nan) for row in found.rows)
+    found = replace(found, measured=measured, rows=rows)
+    assert found.next_command == f"No run is recommended: {few}."
+    assert f"Whether the errors differ is not measured: {few}." in " ".join(str(found).split())
 
 
 def test_columns_of_the_comparison_align_whatever_names_and_numbers_are(two: Comparison) -> None:

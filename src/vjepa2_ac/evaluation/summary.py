@@ -95,8 +95,14 @@ class Summary:
             return f"Not measured: {', '.join(missing)}."
         better = f"Better prediction than {self.predicts.compared_with}, sensitive to the actions"
         if self.plans is not None:
-            return f"{better}, and it solves more problems than {self.plans.compared_with}."
-        return f"{better}, better action ranking than {self.ranks_actions.compared_with}. Planning was not measured."
+            better += f", and more problems solved than by {self.plans.compared_with}."
+        else:
+            better += f", better action ranking than {self.ranks_actions.compared_with}. Planning was not measured."
+        if self.landscape is None or self.landscape.conclusion != "no":
+            return better
+        competitor = self.landscape.compared_with
+        competitor = "a random point" if competitor == _CHANCE else competitor
+        return f"{better} But the energy minimum is not nearer to the true action than {competitor}."
 
     @staticmethod
     def _denial(claim: str, verdict: Verdict) -> str:

@@ -62,6 +62,8 @@ class Comparison:
         """How the lowest error of the others differs from the first run's, as a sentence."""
         gains = {row.model: row.estimate for row in self.rows if row.key == "gain_over_first"}
         (first, measured), best = next(iter(self.measured.items())), max(gains, key=lambda name: gains[name].value)
+        if not gains[best].has_interval:
+            return f"Whether the errors differ is not measured: {self._too_few}"
         if not (side := gains[best].side(of=0.0)):
             return f"The errors of {best} and {first} do not differ significantly."
         low, value, high = (percent(one) for one in sorted(map(abs, astuple(gains[best]))))
@@ -80,13 +82,27 @@ class Comparison:
         best = min(equal, key=lambda name: self.curves[name][-1].value, default="")
         if missing := [name for name, rank in ranks.items() if math.isnan(rank)]:
             why = f"the action-ranking error of {', '.join(missing)} was not measured."
-        elif not (why := self.measured[best].summary.predicts.needs) and not _step(self.measured[best]):
-            why = f"{best}, with the lowest action-ranking error, was not fine-tuned."
+        elif not (why := self._too_few):
+            why = self._objection(best)
         if why:
             return f"No run is recommended: {why}"
-        folder = self.folders[best]
-        step = _step(self.measured[best])
+        folder, step = self.folders[best], _step(self.measured[best])
         return f"Next: {shell_command('export', folder, f'{folder.resolve().name}-merged', '--checkpoint', step)}"
+
+    @property
+    def _too_few(self) -> str:
+        """Why there are no conclusions from so few episodes, as a sentence; empty if there are enough."""
+        return next(iter(self.measured.values())).summary.predicts.needs.partition(" So far: ")[0]
+
+    def _objection(self, best: str) -> str:
+        """Return why the run with the lowest action-ranking error is not recommended, as a sentence; empty if it is."""
+        verdict = self.measured[best].summary.ranks_actions
+        if not _step(self.measured[best]):
+            return f"{best}, with the lowest action-ranking error, was not fine-tuned."
+        if verdict.conclusion == "yes":
+            return ""
+        known = "not better" if verdict.conclusion == "no" else "not known to be better"
+        return f"the action ranking of {best} is {known} than {verdict.compared_with}."
 
 
 def compare(folders: Sequence[Path]) -> Comparison:

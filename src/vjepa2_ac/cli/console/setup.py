@@ -26,8 +26,9 @@ _MILLION, _GIGABYTE = 10**6, 10**9
 _LEAST_SHOWN = 500_000  # bytes: less would be shown as 0.000 GB
 _COLUMNS = ("holds", "family", "encoder", "pixels", "file", "licence", "encoder's key")
 UNTESTED = (
-    "Estimated with fake tensors. On an H100 the estimate was within 1 % of the peak that PyTorch measured; the CUDA"
-    " allowance was not measured."
+    "Estimated with fake tensors. On an H100 the estimate for training from frames was within 1 % of the peak that"
+    " PyTorch measured. For training from cached latents it was not compared after its last change. The CUDA allowance"
+    " was not measured."
 )
 PUBLISHED_NOTES = (
     "The column encoder has the number of parameters; pixels are the size of its images.",
