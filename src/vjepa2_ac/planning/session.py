@@ -36,7 +36,7 @@ class PlanningSession:
     config: Config  # of it: planning, seed, data.crop and data.stride are used
     subject: str  # the run or model as given
     checkpoint: str  # which one, as text; "" of a model
-    warnings: tuple[str, ...] = ()  # that it is untrained; why its plans may leave what the run was taught
+    warnings: tuple[str, ...] = ()  # that it is untrained; why its plans may exceed the motions in its training data
 
     def controller(self, *, seed: int | None = None, extrinsics: Float[np.ndarray, " 6"] | None = None) -> Controller:
         """Return a controller with these settings.

@@ -114,10 +114,10 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metr
         if metrics is not None:
             if (folder / PLOT).is_file():
                 shutil.copyfile(folder / PLOT, fresh / PLOT)
-            told = json.loads((folder / METRICS_FILE).read_bytes())  # without paths of this machine
-            told["about"] |= {"subject": folder.resolve().name, "checkpoint_path": _measured(metrics)}
-            told["summary"] |= {"subject": folder.resolve().name}
-            write_atomically(fresh / METRICS_FILE, json.dumps(told, indent=1))
+            written = json.loads((folder / METRICS_FILE).read_bytes())  # without paths of this machine
+            written["about"] |= {"subject": folder.resolve().name, "checkpoint_path": _measured(metrics)}
+            written["summary"] |= {"subject": folder.resolve().name}
+            write_atomically(fresh / METRICS_FILE, json.dumps(written, indent=1))
         write_atomically(fresh / CARD, card)
 
 

@@ -84,11 +84,11 @@ class Metrics:
 def not_measured(one: Evaluation) -> dict[str, str]:
     """Return the parts of an evaluation that were not measured, with the reason of each."""
     model = one.models[one.trained]
-    found = {**vars(one), **vars(model), **one.beside, "base": one.base, "spread": model.distribution}
+    parts = {**vars(one), **vars(model), **one.beside, "base": one.base, "spread": model.distribution}
     return {
         part: next((note for note in one.notes if word in note), needs)
         for part, (word, needs) in _NEEDS.items()
-        if not found.get(part)
+        if not parts.get(part)
     }
 
 

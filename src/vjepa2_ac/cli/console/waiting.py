@@ -1,6 +1,6 @@
 """A line on stderr about the current work of a command that has printed nothing for some seconds.
 
-A progress bar writes all the time, so the line never appears beside a running one. Nothing heavy is imported.
+A running progress bar writes all the time, so the line never appears next to it. Nothing heavy is imported.
 """
 
 from __future__ import annotations

@@ -486,7 +486,7 @@ function drawMaps(header, action) {
   part("maps").classList.remove("old");
   part("maps").replaceChildren(...header.maps.map((/** @type {any} */ one) => energyMap(one, action)));
   const lowest = Math.min(...header.maps.flatMap((/** @type {any} */ one) => one.energy.flat()));
-  part("maps-text").textContent = `Energy ${value(header.now)} if nothing is done, ${value(lowest)} at best (ringed). Click a cell to execute its action.`;
+  part("maps-text").textContent = `Energy ${value(header.now)} for the current frame, ${value(lowest)} at the best action (ringed). Click a cell to execute its action.`;
   if (which >= 0) part("maps").children[which]?.querySelector(`[data-cell="${cell}"]`)?.focus();
 }
 
