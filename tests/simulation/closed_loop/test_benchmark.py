@@ -119,6 +119,7 @@ def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     assert list(rows) == ["tiny", "do nothing", "random", "oracle"]
     assert "reach in domain B: 2 problems of seed 0, 2 steps of 0.27 s" in shown
     assert "\n2 episodes x 2 decisions, 12 action sequences each: less than a minute on this machine\n" in "\n" + shown
+    assert "\n2 episodes x 2 decisions, 12 action sequences each; the first decision" in "\n" + shown
     following = shlex.split(re.search(r"^Next:\s+vjepa2-ac (.*)$", shown, re.M)[1])
     assert following[:4] == ["simulate", model, "--task", "reach"]
     kept = {"--domain": "B", "--episodes": "50", "--films": "1", "--out": str(tmp_path)}

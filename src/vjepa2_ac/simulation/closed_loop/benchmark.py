@@ -215,6 +215,7 @@ def try_policies(
     """
     work = f"{counted(trials.episodes, 'episode')} x {counted(trials.model_steps, 'decision')}"
     work += f", {counted(sum(agent.planning.sequences), 'action sequence')} each"
+    reporter.note(f"{work}; the first decision shows how long they take")
     results = list[ClosedLoopResult]()
 
     def shown(done: int, total: int) -> None:
