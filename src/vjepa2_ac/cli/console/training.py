@@ -44,7 +44,8 @@ class TrainingConsole(ConsoleReporter):
         rank = "not measured (needs validation.ranking_clips and clips in which the robot moves)"
         if found.ranking is not None:
             measured = found.ranking.rank
-            rank = f"{percent(measured.value)} % {interval_of(measured)} (0 % is best, chance 50 %)"
+            share = f"{percent(measured.value)} % {interval_of(measured)}".rstrip()
+            rank = f"{share} (0 % is best, chance 50 %)"
         show(
             f"validation at step {step:,}, errors relative to persistence (1: copying the last frame)",
             f"  one-step error        {true:.3f}; with zero actions {zero:.3f}, with shuffled actions {shuffled:.3f}",
