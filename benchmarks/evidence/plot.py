@@ -50,7 +50,7 @@ def _bars(axes: Any, results: Sequence[Figures]) -> None:
 
 def _ways(axes: Any, results: Sequence[Figures]) -> None:
     lines: list[tuple[str, str, str, Callable[[Figures], Any]]] = [
-        ("do nothing", "zero-shot", "#bbbbbb", lambda one: one["baselines"]["do nothing"]),
+        ("zero action", "zero-shot", "#bbbbbb", lambda one: one["baselines"]["zero action"]),
         ("random", "zero-shot", "#dddd88", lambda one: one["baselines"]["random"]),
         ("oracle", "zero-shot", "#000000", lambda one: one["baselines"]["oracle"]),
         ("zero-shot", "zero-shot", SHOWN["zero-shot"], lambda one: one["reach"]["l1"]),

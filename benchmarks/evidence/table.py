@@ -258,7 +258,7 @@ def of_worlds(results: Sequence[Figures]) -> str:
     if not tasks:
         return ""
     rows = [f"| {EPISODES} demonstrations | {' | '.join(tasks)} |", "|---|" + "---|" * len(tasks)]
-    for name, label in (("do nothing", "do nothing"), ("random", "random"), ("oracle", "expert")):
+    for name, label in (("zero action", "zero action"), ("random", "random"), ("oracle", "expert")):
         rows.append(f"| {label} | {' | '.join(_done(of_policy(results, BASES[0], name, task)) for task in tasks)} |")
     for method in (BEFORE, *IN_EVERY_WORLD, FROM_PRIOR, *IN_SOME_WORLDS):
         found = [main_cells(results, BASES[0], method, task) for task in tasks]
@@ -416,7 +416,7 @@ def _row(name: str, found: Sequence[Figures]) -> str:
 
 def _policies(results: Sequence[Figures], base: str, shift: str = "look") -> list[str]:
     rows = []
-    for name in ("do nothing", "random", "oracle"):
+    for name in ("zero action", "random", "oracle"):
         of_it = of_policy(results, base, name, shift)
         if of_it:
             rows.append(f"| {name} | | | {_reach(of_it, 'l1')} | {_distance(of_it, 'l1')} | | | | | |")

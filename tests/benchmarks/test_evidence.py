@@ -155,11 +155,11 @@ def test_every_table_has_who_needs_no_model_and_time_that_other_work_does_not_le
         return {"cell": cell, "shifted": errors, "reach": {"l1": reach}, **trained, **more}
 
     reach = {"distance_cm": [[20.0, 20.0], [20.0, 20.0]]}
-    alone = {"baselines": dict.fromkeys(("do nothing", "random", "oracle"), reach)}
+    alone = {"baselines": dict.fromkeys(("zero action", "random", "oracle"), reach)}
     results = [figures("motion", "one camera", "zero-shot", **alone), figures("motion", "one camera", "full")]
     lines = evidence.table._shifted(results, "motion").splitlines()
     assert [line.split(" | ")[0] for line in lines[4:]] == [
-        "| do nothing", "| random", "| oracle", "| zero-shot (one camera)", "| full (one camera)",
+        "| zero action", "| random", "| oracle", "| zero-shot (one camera)", "| full (one camera)",
     ]  # fmt: skip
     assert " 5.0 " in lines[-1]
     assert "77" not in lines[-1]
@@ -225,7 +225,7 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
     assert (
         before["baselines"]["oracle"]["distance_cm"][0][-1]
         < 1
-        < before["baselines"]["do nothing"]["distance_cm"][0][-1]
+        < before["baselines"]["zero action"]["distance_cm"][0][-1]
     )
 
     turned = small.measure.measure(replace(cell, method=small.cells.AXES), small.folder, goals=1)

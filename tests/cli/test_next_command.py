@@ -117,6 +117,8 @@ def next_of_evaluate(
     checkpoint: str = "step-00000008 (the newest)",
     needs: str = "",
     predicts: str = "yes",
+    ranks: str = "yes",
+    plans: str | None = None,
     is_base: bool = False,
 ) -> list[str]:
     """Return the lines that `evaluate` prints for an evaluation of these words."""
@@ -124,8 +126,10 @@ def next_of_evaluate(
     reporter.seconds["action ranking, adapter"] = 2.0
     ranking = SimpleNamespace(ranks=np.zeros(10), samples=50)
     about = SimpleNamespace(subject=options.subjects[0], checkpoint=checkpoint, data=__file__, is_base=is_base)
-    verdicts = {"predicts": SimpleNamespace(needs=needs, conclusion=predicts), "plans": None}
-    summary = SimpleNamespace(**verdicts, uses_actions=SimpleNamespace(conclusion="yes"))
+    first = SimpleNamespace(needs=needs, conclusion=predicts)
+    planning = None if plans is None else SimpleNamespace(conclusion=plans)
+    verdicts = (first, SimpleNamespace(conclusion="yes"), planning or SimpleNamespace(conclusion=ranks))
+    summary = SimpleNamespace(predicts=first, plans=planning, verdicts=verdicts)
     adapter = SimpleNamespace(ranking=ranking)
     evaluation = SimpleNamespace(about=about, trained="adapter", models={"adapter": adapter})
     return _next(SimpleNamespace(evaluation=evaluation, summary=summary), options, reporter)
@@ -145,6 +149,14 @@ def test_real_data_are_never_sent_to_the_simulated_arm(monkeypatch: pytest.Monke
     minutes = round(50 * 12 * 256 * 2 * 2.0 / (10 * 101) / 60)  # decisions, sequences, steps, measured seconds
     where = "on this CPU with the quick planner"
     assert time == f"  (about {minutes} minutes {where}: 600 decisions of 256 action sequences each)"
+
+
+def test_a_robot_is_recommended_only_after_a_measured_gain() -> None:
+    check = ["Next: vjepa2-ac data check runs/a/config.yaml --model runs/a"]
+    serve = ["Next: vjepa2-ac serve runs/a"]
+    assert next_of_evaluate("runs/a", ranks="no") == next_of_evaluate("runs/a", plans="no") == check
+    assert next_of_evaluate("runs/a", ranks="inconclusive") == next_of_evaluate("runs/a", plans="inconclusive") == []
+    assert next_of_evaluate("runs/a", plans="yes") == serve
 
 
 def test_what_comes_before_planning_keeps_the_data(tmp_path: Path) -> None:

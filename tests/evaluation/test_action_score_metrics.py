@@ -104,7 +104,7 @@ def found() -> Evaluation:
 def test_rows_show_models_beside_what_takes_none_and_the_difference_to_the_base(found: Evaluation) -> None:
     rows = {(row.key, row.model): row.value for row in rows_of(found)}
     models = [model for key, model in rows if key == "plans.score"]
-    assert models == ["doing nothing", "random", "within limits", "base", "adapter"]
+    assert models == ["zero action", "random", "within limits", "base", "adapter"]
     assert rows["plans.score", "within limits"] == 80.0
     for name in ("missed_cm", "step_cm"):
         difference = rows[f"plans.{name}", "adapter"] - rows[f"plans.{name}", "base"]

@@ -120,6 +120,15 @@ def test_who_knows_only_short_steps_to_the_front_is_right_of_each_step_and_found
     assert rank_difference(oracle, taught).value == pytest.approx(-worse.value)
 
 
+class _Broken(Oracle):
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        return torch.nan * super().predict(latents, actions, states, extrinsics)
+
+
+def test_predictions_that_are_not_finite_rank_last() -> None:
+    assert ranked(_Broken(), walked(torch.full((CLIPS, 4, 7), 0.01))).rank.value == 1.0
+
+
 class _Length(Oracle):
     """Sees how far an action goes, and believes that it goes to the front."""
 

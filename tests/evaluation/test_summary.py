@@ -154,15 +154,15 @@ def test_the_third_line_is_action_ranking_until_a_closed_loop_was_measured(tmp_p
     plans = closed_loop(shares, "m", "oracle", 50, "reach")
     (tmp_path / "closed_loop" / "reach-B").mkdir(parents=True)
     file = tmp_path / "closed_loop" / "reach-B" / "closed_loop.json"
-    file.write_text(json.dumps({"about": {"checkpoint": "step 8"}, "verdict": asdict(plans)}))
+    file.write_text(json.dumps({"about": {"checkpoint": "step-8 (the newest)"}, "verdict": asdict(plans)}))
     for summary in (bare, measured):
-        planned = with_closed_loop(summary, tmp_path, "step 8")
+        planned = with_closed_loop(summary, tmp_path, "step-8 (the newest)")
         assert [one.name for one in summary.verdicts] == ["predicts", "uses actions", "ranks actions"]
         assert planned.verdicts == (*summary.verdicts[:2], plans)
-        assert with_closed_loop(summary, tmp_path, "step 9") == summary
-        assert with_closed_loop(summary, tmp_path / "no", "step 8") == summary
+        assert with_closed_loop(summary, tmp_path, "step-9 (the newest)") == summary
+        assert with_closed_loop(summary, tmp_path / "no", "step-8 (the newest)") == summary
         assert "plans" not in str(summary)
-    assert with_closed_loop(measured, tmp_path, "step 8").sentence.endswith(
+    assert with_closed_loop(measured, tmp_path, "step-8 (the newest)").sentence.endswith(
         "more problems solved than by the zero action and random actions."
     )
 
@@ -195,9 +195,9 @@ def test_a_measurement_of_fewer_episodes_than_the_evaluation_has_no_conclusion_a
     assert (summary.ranks_actions.conclusion, summary.ranks_actions.interval) == ("inconclusive", "")
     assert summary.ranks_actions.reference == "(chance 50 %; 2 episodes are too few for a conclusion)"
     assert summary.uses_actions.conclusion == "yes"
-    assert summary.sentence == "Inconclusive: action ranking. Measure more held-out episodes."
+    assert summary.sentence == "Inconclusive: action ranking. Measure more clips, with --ranking-clips."
     unclear = replace(summary, predicts=replace(summary.predicts, conclusion="inconclusive"))
-    assert unclear.sentence == "Inconclusive: prediction, action ranking. Measure more held-out episodes."
+    assert unclear.sentence == "Inconclusive: prediction, action ranking. Measure more clips, with --ranking-clips."
 
 
 def with_spread(result: ModelResult, spread: float) -> ModelResult:
@@ -269,6 +269,15 @@ def test_a_better_landscape_needs_a_nearer_minimum_than_the_base_model_and_a_ran
     assert few.reference.endswith("; 1 episode is too few for a conclusion)")
 
 
+def test_predictions_that_are_not_finite_have_no_conclusion() -> None:
+    adapter = model("adapter", 1.0)
+    broken = {way: math.nan * values for way, values in adapter.errors.arrays.items() if way[0] != "persistence"}
+    adapter = replace(adapter, errors=replace(adapter.errors, arrays=adapter.errors.arrays | broken))
+    summary = summary_of(model("base", 1.0), adapter)
+    assert (summary.predicts.conclusion, summary.predicts.value) == ("not measured", None)
+    assert "nan" not in str(summary)
+
+
 @pytest.mark.parametrize("distance", [10.0, 20.3])
 def test_the_sentence_names_a_landscape_that_is_not_better(distance: float) -> None:
     base = mapped(ranked("base", 1.0, 0.05), 13.8, 0.072)
@@ -313,13 +322,35 @@ def test_another_metric_that_contradicts_l1_is_named() -> None:
 def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
     solved: int, problems: int, oracle: int, conclusion: str, needs: str
 ) -> None:
-    counts = {"adapter": solved, "do nothing": 0, "random": min(2, problems - 1), "oracle": oracle}
+    counts = {"adapter": solved, "zero action": 0, "random": min(2, problems - 1), "oracle": oracle}
     shares = {name: share_of(count, problems) for name, count in counts.items()}
     plans = closed_loop(shares, "adapter", "oracle", problems, "reach")
     assert plans.conclusion == conclusion
     assert plans.needs.startswith(needs)
     assert bool(plans.needs) == bool(needs)
     assert plans.statement.endswith(f"of {problems} reach problem{'s' * (problems > 1)}")
+
+
+def test_predictions_that_vary_more_than_the_truth_are_not_called_blur() -> None:
+    adapter = with_spread(model("adapter", 0.5, noise=0.0), 1.43)
+    base_model = with_spread(model("base", 1.0, noise=0.0), 3.19)
+    assert not summary_of(base_model, adapter, copies=adapter.distribution).predicts.reference
+
+
+def test_an_equal_success_rate_is_inconclusive_if_its_interval_is_wide() -> None:
+    shares = {"adapter": share_of(20, 50), "random": share_of(21, 50), "oracle": share_of(50, 50)}
+    where = "in domain B, with key frames"
+    verdict = closed_loop(shares, "adapter", "oracle", 50, "reach", where)
+    assert verdict.conclusion == "inconclusive"
+    assert verdict.statement == f"solves 40 % of 50 reach problems {where}"
+
+
+def test_a_measured_plan_is_not_denied_by_the_use_of_the_actions() -> None:
+    summary = summary_of(model("adapter", 0.5))
+    assert summary.sentence.endswith("ignores the actions, so the model cannot be used for planning.")
+    shares = {"adapter": share_of(45, 50), "random": share_of(0, 50), "oracle": share_of(50, 50)}
+    measured = replace(summary, plans=closed_loop(shares, "adapter", "oracle", 50, "reach"))
+    assert measured.sentence == "The model predicts typical motion and ignores the actions."
 
 
 @pytest.mark.parametrize("episodes", [1, 8])

@@ -23,12 +23,38 @@ from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 PROBES = ProbeOptions(ranking_clips=4, samples=10, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
 
 
-def written(folder: Path, model: object, *, clips: int = 12, seed: int = 0, **changes: object) -> Path:
+def written(
+    folder: Path,
+    model: object,
+    *,
+    clips: int = 12,
+    seed: int = 0,
+    base: object = Copier(),
+    probes: ProbeOptions = PROBES,
+    **changes: object,
+) -> Path:
     folder.mkdir()
-    contenders = [Contender("base", "base", Copier()), Contender("adapter", "trained", model)]  # type: ignore[arg-type]
-    found = evaluate(contenders, again(clips_batch(clips, seed)), about(**changes), probes=PROBES)
+    contenders = [Contender("base", "base", base), Contender("adapter", "trained", model)]  # type: ignore[arg-type]
+    found = evaluate(contenders, again(clips_batch(clips, seed)), about(**changes), probes=probes)
     write_metrics(found, folder / METRICS_FILE)
     return folder
+
+
+def test_errors_against_different_base_models_are_not_put_in_one_column(tmp_path: Path) -> None:
+    folders = [written(tmp_path / name, Oracle(), base=base) for name, base in (("a", Copier()), ("b", Halfway()))]
+    found = compare(folders)
+    assert any("different base models" in note for note in found.notes)
+    assert "base model" not in str(found).splitlines()[2]
+    same = compare([folders[0], written(tmp_path / "c", Halfway())])
+    assert not same.notes
+    assert "base model" in str(same).splitlines()[2]
+
+
+def test_actions_that_were_ranked_differently_do_not_compare(tmp_path: Path) -> None:
+    more = replace(PROBES, samples=12)
+    found = compare([written(tmp_path / "a", Halfway()), written(tmp_path / "b", Halfway(), probes=more)])
+    assert any("ranked differently" in note for note in found.notes)
+    assert found.next_command == "No run is recommended: the actions were ranked with different settings."
 
 
 def test_runs_are_compared_with_the_first_one_pair_by_pair(tmp_path: Path) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -203,8 +203,9 @@ def _loaded(
 def _simulate(options: argparse.Namespace) -> int:
     """Let a model steer a simulated arm; or record data of it.
 
-    It steers to a goal image, beside doing nothing, chance and an oracle. Or, as `simulate record FOLDER`: record
-    demonstrations of the arm as a DROID data set. Status 1 where the model gave no finite energy in any decision.
+    It acts towards a goal image, compared with the zero action, random actions and an oracle. Or, as `simulate record
+    FOLDER`: record demonstrations of the arm as a DROID data set. Status 1 where the model gave no finite energy in any
+    decision.
     """
     if options.world is not None:
         _refuse(options, ("task", "domain"), needed="none: the world has its own")
@@ -252,7 +253,7 @@ def _record_world(options: argparse.Namespace, target: Path) -> int:
     with OtherWorld(options.world, options.world_timeout) as world, cli.reporter() as reporter:
         seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
         solved, shown = record_world(world, target, seeds, reporter.task("recording"))
-    done = f"the expert solved {solved} of {shown}, the others are play"
+    done = f"the expert solved {solved} of {shown}, the others are random exploration"
     cli.show(f"{counted(len(seeds), 'episode')} in {target}; {done}. Next: {shell_command('init', target)}")
     return 0
 
@@ -321,9 +322,10 @@ def _summary(benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> Sum
     measured = f"{trials.task_name}, {trials.place}, {steps} of {trials.seconds_per_step:.2f} s"
     summary = Summary(agent.subject, measured, predicts, uses, ranks, benchmark.verdict)
     if agent.checkpoint and (Path(agent.subject) / METRICS_FILE).is_file():
-        evaluated = read_metrics(Path(agent.subject))
-        if evaluated.about.checkpoint == agent.checkpoint:
-            summary = replace(evaluated.summary, measured=measured, plans=benchmark.verdict)
+        with contextlib.suppress(InputError):  # of an older format: the other verdicts are not measured
+            evaluated = read_metrics(Path(agent.subject))
+            if evaluated.about.checkpoint == agent.checkpoint:
+                summary = replace(evaluated.summary, measured=measured, plans=benchmark.verdict)
     return summary
 
 
@@ -336,6 +338,8 @@ def _next(summary: Summary, benchmark: ClosedLoopBenchmark, options: argparse.Na
     if cli.is_server(options.subject):
         return [f"Next: your robot's client at {options.subject} (docs/serving.md)"]
     command = _evaluate_command(options)
+    if options.sub_goals is not None:  # a server would plan without these sub-goals
+        return []
     if benchmark.verdict.conclusion == "yes" and (summary.predicts.value is not None or not command):
         words = option_words(options, "checkpoint", "config", "goals", "plugin")
         command = shell_command("serve", options.subject, *words, *options.overrides)
@@ -370,7 +374,7 @@ def _evaluate_command(options: argparse.Namespace) -> str:
     return shell_command("evaluate", options.subject, *words) if is_run(options.subject) else ""
 
 
-@contextmanager
+@contextlib.contextmanager
 def _agent(options: argparse.Namespace) -> Iterator[Agent]:
     """Return who acts; a server as long as the context lasts."""
     from vjepa2_ac.decoding.decoder_folder import SIMULATED

@@ -94,7 +94,8 @@ def add_imagine(commands: cli.Commands) -> None:
 def _evaluate(options: argparse.Namespace) -> None:
     """Measure a run on held-out episodes: did it become better?
 
-    Its predictions stand beside those of its base, of doing nothing and of wrong actions. A model is measured likewise.
+    Its predictions are compared with those of its base model, with persistence, and with wrong actions. A model is
+    measured likewise.
     """
     from vjepa2_ac.evaluation.request import settle
 
@@ -142,12 +143,14 @@ def _next(measured: Evaluated, options: argparse.Namespace, reporter: ConsoleRep
         is_other = cli.read_config(config).model.base not in {None, about.subject}
         words = ["train", config, *[f"model.base={about.subject}"] * is_other]
     elif not summary.predicts.needs and (
-        about.is_base or "no" in {summary.predicts.conclusion, summary.uses_actions.conclusion}
+        about.is_base or "no" in {verdict.conclusion for verdict in summary.verdicts[:3]}
     ):
         words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
     elif not summary.predicts.needs:
         if summary.plans is None and (lines := _next_closed_loop(measured, settings, options, reporter)):
             return lines
+        if summary.verdicts[2].conclusion != "yes":  # a robot is not recommended without a measured gain
+            return []
         words = ["serve", about.subject, *option_words(options, "checkpoint"), *settings]
     return [f"Next: {shell_command(*words, *option_words(options, 'plugin'))}"]
 

@@ -67,8 +67,8 @@ def _score(options: argparse.Namespace) -> int:
     """Score what a policy would do, by the energy of its actions.
 
     One chunk of actions is better than another if the model predicts that it leads nearer to the goal; both are shown
-    beside doing nothing. Or policies are put in order by what they would do at frames of held-out episodes. Status 1
-    where the model cannot tell: it ranks true actions no better than chance.
+    compared with the zero action. Or policies are put in order by what they would do at frames of held-out episodes.
+    Status 1 where the model cannot tell: it ranks true actions no better than chance.
     """
     one_scene = options.chunks is not None
     for name in ("start", "state", "goal", "goals"):

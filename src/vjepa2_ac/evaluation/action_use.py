@@ -216,7 +216,9 @@ def rank_actions(
         (true, *energies), (_, *changes) = evaluate_actions(model, move, np.concatenate(drawn), at_once=probes.at_once)
         alternatives = np.reshape(energies, (2, -1))
         is_same = np.abs(alternatives - true) <= _SAME * max(abs(true), 1e-12)
-        box, shell = np.where(is_same, 0.5, alternatives < true).mean(axis=1)
+        # A prediction that is not finite is the farthest: of the true action, no alternative is farther.
+        is_closer = alternatives < true if np.isfinite(true) else np.ones_like(alternatives)
+        box, shell = np.where(is_same, 0.5, is_closer).mean(axis=1)
         return box, shell, np.mean(changes[: probes.samples]), alternatives[0].std(), move.persistence
 
     in_box, on_shell, change, spread, now = np.array(shared(moves, ranked, progress)).T

@@ -28,7 +28,7 @@ def mean_error(errors: PredictionErrors, mode: Mode, metric: Metric = L1, way: W
 
 
 def over_persistence(errors: PredictionErrors, mode: Mode, metric: Metric = L1, way: Way = "true") -> Curve:
-    """Return mean error over mean persistence error by horizon: 1 as good as doing nothing; of L1, 0 is perfect."""
+    """Return mean error over mean persistence error by horizon: 1 as good as persistence; of L1, 0 is perfect."""
     return ratios(errors.of(mode, metric, way), errors.of(mode, metric, "persistence"), errors.episode_ids)
 
 

@@ -1,7 +1,7 @@
 """Measurement of predictions: errors between predicted and true latents, beside the error of persistence.
 
 All errors compare layer-normalised latents, per clip and model step. *Persistence* is the error of copying a frame that
-was seen. A ratio of 1 means: as good as doing nothing; 0: perfect.
+was seen. A ratio of 1 means: as good as persistence; 0: perfect.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class Row:
     high: _Number = math.nan
     form: str = ".3f"
     better: Literal["lower", "higher", ""] = "lower"
-    chance: float | None = None  # what doing nothing has, or a model that ignores its actions
+    chance: float | None = None  # what persistence has, or a model that ignores its actions
     note: str = ""
     unit: str = ""  # of the value, if it has one and `name` does not give it: cm
     detail: bool = False  # not for a screen
@@ -408,6 +408,15 @@ class Evaluation:
     def base(self) -> str | None:
         """The name of the base in `models`; None: there is none."""
         return next((name for name, model in self.models.items() if model.role == "base"), None)
+
+    @property
+    def ranked(self) -> str | None:
+        """How actions were ranked, as text: two evaluations with the same text compare; None: they were not ranked."""
+        ranking = self.models[self.trained].ranking
+        if ranking is None:
+            return None
+        alternatives = f"2 x {ranking.samples} alternatives within {100 * ranking.reach:g} cm, seed {self.about.seed}"
+        return f"{len(ranking.ranks)} moves, {alternatives}"
 
     @property
     def errors(self) -> PredictionErrors:

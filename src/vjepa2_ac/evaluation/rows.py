@@ -44,9 +44,9 @@ _REGIONS = {"whole": "whole image", "moving": "where something moves"}
 _PLANS = {  # label, format, and whether it is a detail
     "score": (f"Action Score (best {BEST_SCORE:.0f})", ".1f", False),
     "missed_cm": (f"end of {STEPS} steps off by, cm", ".1f", False),
-    "missed_over_zero": ("its end off, over doing nothing", ".2f", True),
+    "missed_over_zero": ("its end off, over the zero action", ".2f", True),
     "step_cm": ("one step off by, cm", ".1f", False),
-    "step_over_zero": ("one step off, over doing nothing", ".2f", True),
+    "step_over_zero": ("one step off, over the zero action", ".2f", True),
     **{f"axes_cm.{name}": (f"along {name}, cm", ".1f", False) for name in AXES},
     "angle_degrees": ("angle, degrees", ".0f", False),
     **{f"signs.{name}": (f"right sign of {name}", ".2f", False) for name in AXES},
@@ -207,12 +207,12 @@ class _Rows(list[Row]):
             self.line(group, label, "landscapes.difference_to_base", difference, form="+.3f", chance=0.0, detail=True)
 
     def add_plans(self) -> None:
-        """Add the metrics of plans, and their differences to doing nothing and to the base's, paired by start."""
+        """Add the metrics of plans, and their differences to the zero action and to the base's, paired by start."""
         study = self.evaluation.planning
         if study is None:
             return
         models = ways_of(self.evaluation)
-        free = {"doing nothing": study.zero, "random": study.random, "within limits": study.within_limits}
+        free = {"zero action": study.zero, "random": study.random, "within limits": study.within_limits}
         found = {name: metrics_of(study, plans) for name, plans in (free | models).items()}
         group = f"Plans beside demonstrations, from {counted(len(study.clips), 'clip')}"
         for key, (label, form, detail) in _PLANS.items():
@@ -224,7 +224,7 @@ class _Rows(list[Row]):
                 style["better"] = "higher" if kind in {"score", "signs"} else "lower"
                 self.line(group, label, f"plans.{key}", {name: one[key] for name, one in found.items()}, **style)
         base = None if self.base is None else self.base.plans
-        for kind, whose, other in (("zero", "doing nothing", study.zero), ("base", "the base", base)):
+        for kind, whose, other in (("zero", "zero action", study.zero), ("base", "the base", base)):
             for name, plans in models.items():
                 if other is not None and plans is not other:
                     for key, one in differences_of(study, plans, other).items():

@@ -27,9 +27,11 @@ Conclusion = Literal["yes", "no", "inconclusive", "not measured"]
 
 SAME_ERROR = 0.01  # relative; errors this close count as equal, whatever their interval
 SAME_RANK = 0.005  # absolute; likewise for action-ranking errors
+SAME_SUCCESS = 0.1  # absolute; a success rate that is surely less than this above a competitor's is not better
 CHANCE = 0.5  # action-ranking error of a model that ignores its actions
 CLOSED_LOOP_FILE = "closed_loop.json"  # in RUN/closed_loop/TASK-DOMAIN
 _BASE, _PERSISTENCE, _CHANCE = "with the base model", "with persistence", "chance"  # what a verdict compares with
+_TOO_FEW = "too few for a conclusion"
 _COLUMNS, _NO_BREAK = 80, "\N{NO-BREAK SPACE}"
 _wrap = partial(wrap, break_on_hyphens=False)  # commands and paths have hyphens
 
@@ -90,6 +92,7 @@ class Summary:
                 return self._denial(name, verdict)
         if unclear := [name for name, verdict in claims.items() if verdict.conclusion == "inconclusive"]:
             more = "problems" if unclear == ["planning"] else "held-out episodes"
+            more = "clips, with --ranking-clips" if _TOO_FEW in self.verdicts[2].reference else more
             return f"Inconclusive: {', '.join(unclear)}. Measure more {more}."
         if missing := [name for name, verdict in claims.items() if verdict.conclusion == "not measured"]:
             return f"Not measured: {', '.join(missing)}."
@@ -104,17 +107,21 @@ class Summary:
         competitor = "a random point" if competitor == _CHANCE else competitor
         return f"{better} But the energy minimum is not nearer to the true action than {competitor}."
 
-    @staticmethod
-    def _denial(claim: str, verdict: Verdict) -> str:
+    @property
+    def _unusable(self) -> str:
+        """What follows for planning, unless planning itself was measured."""
+        return ", so the model cannot be used for planning" if self.plans is None else ""
+
+    def _denial(self, claim: str, verdict: Verdict) -> str:
         """Return the sentence on the first claim that was measured to be false."""
         if verdict.name != "uses actions":
             check = " Check data, axes and stride first." * (verdict.name == "predicts")
             return f"{claim.capitalize()} is not better than {verdict.compared_with}.{check}"
         if verdict.compared_with == _CHANCE:
-            return "Action ranking is worse than chance, so the model cannot be used for planning."
+            return f"Action ranking is worse than chance{self._unusable}."
         if verdict.high is not None and verdict.high < 0:
             return "The error is lower with shuffled actions than with true ones. Check data, axes and stride first."
-        return "The model predicts typical motion and ignores the actions, so it cannot be used for planning."
+        return f"The model predicts typical motion and ignores the actions{self._unusable}."
 
     def __str__(self) -> str:
         gap = _COLUMNS - len(self.subject) - len(self.measured)
@@ -188,7 +195,7 @@ def _without_conclusion(verdict: Verdict) -> Verdict:
 
 
 def _are_too_few(number: int, what: str) -> str:
-    return f"{counted(number, what)} {'is' if number == 1 else 'are'} too few for a conclusion"
+    return f"{counted(number, what)} {'is' if number == 1 else 'are'} {_TOO_FEW}"
 
 
 def not_measured(name: str, how: str) -> Verdict:
@@ -201,7 +208,8 @@ def with_closed_loop(summary: Summary, run: Path, checkpoint: str) -> Summary:
     files = sorted(run.glob(f"closed_loop/*/{CLOSED_LOOP_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in files:
         written = json.loads(file.read_bytes())
-        if written["about"]["checkpoint"] == checkpoint and "verdict" in written:
+        measured = written["about"]["checkpoint"] or ""  # its name, and how it was selected
+        if measured.partition(" ")[0] == checkpoint.partition(" ")[0] and "verdict" in written:
             return replace(summary, plans=Verdict(**written["verdict"]))
     return summary
 
@@ -235,6 +243,8 @@ def conclusion_of(gain: Estimate, same: float) -> Conclusion:
 
 
 def _verdict(name: str, conclusion: Conclusion, statement: str, estimate: Estimate, compared_with: str) -> Verdict:
+    if math.isnan(estimate.value):
+        return Verdict(name, "not measured", "the predictions are not finite")
     low, high = (estimate.low, estimate.high) if estimate.has_interval else (None, None)
     return Verdict(name, conclusion, statement, estimate.value, low, high, compared_with=compared_with)
 
@@ -272,7 +282,7 @@ def _blur(rows: Mapping[str, Row], base_rows: Mapping[str, Row], horizon: int) -
     if key not in rows or math.isnan(rows[key].value):
         return ""
     spread, before = rows[key].value, base_rows[key].value if key in base_rows else 1.0
-    if spread >= before * (1 - SAME_ERROR):
+    if spread >= min(before, 1.0) * (1 - SAME_ERROR):  # 1: as varied as the truth
         return ""
     reference = "base model" if key in base_rows else "true latents"
     return f"part of the gain may be blur: spread {spread:.2f}, {reference} {before:.2f}"
@@ -341,7 +351,9 @@ def _with_unit(number: float, unit: str) -> str:
     return f"{number:.1f} {unit}".rstrip()
 
 
-def closed_loop(shares: Mapping[str, Estimate], model: str, oracle: str, problems: int, task: str) -> Verdict:
+def closed_loop(
+    shares: Mapping[str, Estimate], model: str, oracle: str, problems: int, task: str, conditions: str = ""
+) -> Verdict:
     """Conclude from the share of problems solved in closed loop: yes needs more than every other policy but the oracle.
 
     Args:
@@ -350,10 +362,12 @@ def closed_loop(shares: Mapping[str, Estimate], model: str, oracle: str, problem
         oracle: That of the oracle. If it fails, or with fewer than five problems, there is no conclusion.
         problems: Their number.
         task: Name of the task.
+        conditions: Where, and with which help the model acts, as text.
     """
     share, reference = shares[model], shares[oracle]
     best = max((one for name, one in shares.items() if name not in {model, oracle}), key=lambda one: one.value)
-    conclusion: Conclusion = "yes" if share.low > best.high else "no" if share.value <= best.value else "inconclusive"
+    is_not_better = share.value <= best.value and share.high < best.value + SAME_SUCCESS
+    conclusion: Conclusion = "yes" if share.low > best.high else "no" if is_not_better else "inconclusive"
     needs = ""
     if reference.value < CHANCE:
         solved = f"The oracle solves only {percent(reference.value)} % of these problems"
@@ -361,7 +375,7 @@ def closed_loop(shares: Mapping[str, Estimate], model: str, oracle: str, problem
     elif problems < ENOUGH_EPISODES:
         needs = f"{_are_too_few(problems, 'problem')}; use --episodes 50."
     others = ", ".join(f"{name} {percent(one.value)} %" for name, one in shares.items() if name != model)
-    statement = f"solves {percent(share.value)} % of {counted(problems, f'{task} problem')}"
+    statement = f"solves {percent(share.value)} % of {counted(problems, f'{task} problem')} {conditions}".rstrip()
     competitors = "the zero action and random actions"
     verdict = _verdict("plans", "inconclusive" if needs else conclusion, statement, share, competitors)
     return replace(verdict, reference=f"({others})", needs=needs, baseline=best.value)

@@ -24,6 +24,8 @@ from vjepa2_ac.spaces import StateSpace
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import json_text, plain
 
+_SAME = 1e-6  # relative difference below which energies are equal: rounding decides nothing
+
 
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
@@ -73,7 +75,7 @@ class PlanResult:
         return {
             name: said.format(name, energy, other, _change(energy, other))
             for name, other in others.items()
-            if energy > other
+            if energy > other + _SAME * abs(other)
         }
 
     @property

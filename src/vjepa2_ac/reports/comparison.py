@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -44,7 +44,7 @@ class Comparison:
     def __str__(self) -> str:
         """Return the checkpoint and the metrics of each run in columns, and the difference of the errors."""
         first, key = next(iter(self.measured.values())), f"rollout.{L1.name}.gain_over_base.{len(self.seconds)}"
-        has_base = all(one.of(key) or one.about.is_base for one in self.measured.values())
+        has_base = _have_same_base(self.measured.values())
         reference = "base model" if has_base else "persistence"
         lines = [_LINE.format(*head).rstrip() for head in (_WHAT, ("run", "checkpoint", reference, *_OF_WHAT), _BETTER)]
         for name, one in self.measured.items():
@@ -80,6 +80,8 @@ class Comparison:
         ranks = {name: _number(one.summary.ranks_actions) for name, one in self.measured.items()}
         equal = [name for name, rank in ranks.items() if rank <= min(ranks.values()) + SAME_RANK]
         best = min(equal, key=lambda name: self.curves[name][-1].value, default="")
+        if len({one.ranked for one in self.measured.values()}) > 1:
+            return "No run is recommended: the actions were ranked with different settings."
         if missing := [name for name, rank in ranks.items() if math.isnan(rank)]:
             why = f"the action-ranking error of {', '.join(missing)} was not measured."
         elif not (why := self._too_few):
@@ -193,6 +195,16 @@ def _curve(metrics: Metrics) -> tuple[Estimate, ...]:
     return tuple(Estimate(math.nan, math.nan, math.nan) if row is None else row.estimate for row in rows)
 
 
+def _have_same_base(measured: Iterable[Metrics]) -> bool:
+    """Return whether all runs were compared with a base model, and with the same one: of equal errors."""
+    errors = []
+    for one in measured:
+        if one.base is None and not one.about.is_base:
+            return False
+        errors.append(float(np.mean(one.by_clip.models[one.base or one.trained])))
+    return max(errors) - min(errors) <= _SAME_LATENTS * abs(errors[0])
+
+
 def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
     nothing = {name: _last(one)[1].mean() for name, one in measured.items()}
     first, *names = measured
@@ -207,6 +219,11 @@ def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
         notes.append(
             f"Checkpoints were chosen differently: {', '.join(f'{way} ({name})' for name, way in ways.items())}."
         )
+    if len({one.ranked for one in measured.values() if one.ranked is not None}) > 1:
+        settings = "; ".join(f"{name}: {one.ranked}" for name, one in measured.items())
+        notes.append(f"Action-ranking errors do not compare, the actions were ranked differently ({settings}).")
+    if not _have_same_base(measured.values()) and all(one.base or one.about.is_base for one in measured.values()):
+        notes.append("The runs have different base models: errors are compared with persistence.")
     plans = [one.planning for one in measured.values() if one.planning is not None]
     if len({f"{study.get('clips')} {study.get('places')}" for study in plans}) > 1:
         notes.append("Plans began at other frames (another --planning-clips or seed): Action Scores do not compare.")

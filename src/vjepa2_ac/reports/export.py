@@ -18,6 +18,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError, counted, escaped
 from vjepa2_ac.evaluation.result import Row
+from vjepa2_ac.evaluation.summary import Summary, with_closed_loop
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import merge_adapter, trainable_report
 from vjepa2_ac.model.checkpoints.loading import to_official
@@ -121,6 +122,11 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metr
         write_atomically(fresh / CARD, card)
 
 
+def _latest_summary(metrics: Metrics, folder: Path) -> Summary:
+    """Return the summary of an evaluation, with a closed loop that was measured after it."""
+    return with_closed_loop(metrics.summary, folder, metrics.about.checkpoint)
+
+
 def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
     """Return the README.md of an adapter, in Markdown, with the Hub's front matter."""
     config, model, name = run.config, run.world_model, escaped(folder.resolve().name)
@@ -146,7 +152,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         run=run,
         name=name,
         evaluation=metrics,
-        summary=None if metrics is None else replace(metrics.summary, subject=name),
+        summary=None if metrics is None else replace(_latest_summary(metrics, folder), subject=name),
         measured=measured,
         plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
         base=model.adaptation,

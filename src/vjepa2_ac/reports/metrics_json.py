@@ -68,6 +68,7 @@ class Metrics:
     clips: WrittenClips
     rows: tuple[Row, ...]
     by_clip: WrittenErrors
+    ranked: str | None = None  # how actions were ranked; None: they were not
     planning: dict[str, Any] | None = None
 
     @property
@@ -92,9 +93,9 @@ def not_measured(one: Evaluation) -> dict[str, str]:
     }
 
 
-def write_metrics(evaluation: Evaluation, path: Path) -> Path:
-    """Write all metrics of an evaluation; the file is written atomically."""
-    write_atomically(path, json_text(metrics_as_dict(evaluation)))
+def write_metrics(evaluation: Evaluation, path: Path, summary: Summary | None = None) -> Path:
+    """Write all metrics of an evaluation, and its summary (None: without a closed loop), atomically."""
+    write_atomically(path, json_text(metrics_as_dict(evaluation, summary)))
     return path
 
 
@@ -119,12 +120,12 @@ def read_metrics(folder: Path) -> Metrics:
         raise InputError(where=str(folder), found=found, fix=fix) from None
 
 
-def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
+def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> dict[str, Any]:
     """Return all metrics as plain values; see docs/evaluation_reference.md for the meaning of each."""
     from vjepa2_ac.evaluation.rows import rows_of  # reading needs no PyTorch
 
     one, clips, study, rows = evaluation, evaluation.clips, evaluation.planning, rows_of(evaluation)
-    summary = summarize(one, rows)
+    summary = summary or summarize(one, rows)
     named = list(zip(clips.episode_ids, clips.starts, strict=True))
     about = {name: value for name, value in vars(one.about).items() if name != "space"}
     decoded, planning = one.decoded, {"three_steps_settings": SCORED}
@@ -143,6 +144,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
             "fingerprint": hashlib.sha256(json.dumps(named).encode()).hexdigest()[:16],
             "named": named,
         },
+        "ranked": one.ranked,
         "rows": rows,
         "episodes": one.episodes,
         "by_clip": {

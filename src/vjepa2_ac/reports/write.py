@@ -306,7 +306,7 @@ def _written(evaluation: Evaluation, summary: Summary, rows: Sequence[Row], fold
     write_atomically(folder / REPORT, report_page(evaluation, summary))
     return (
         plot_evaluation(evaluation, folder / PLOT),
-        write_metrics(evaluation, folder / METRICS_FILE),
+        write_metrics(evaluation, folder / METRICS_FILE, summary),
         *write_tables(rows, folder / METRICS_FILE),
         folder / REPORT,
     )

@@ -107,7 +107,7 @@ def describe_selection(folder: Path) -> str:
         base = ""
         if step and state.base_rank is not None:
             base = f"{untrained_model(config, chosen.path)} {100 * state.base_rank:.1f} %, "
-        lines.append(f"Action-ranking error: {100 * state.best_rank:.1f} % ({base}chance 50 %).")
+        lines.append(f"Action-ranking error in validation: {100 * state.best_rank:.1f} % ({base}chance 50 %).")
     return "\n".join(filter(None, (*lines, note_about(config, chosen))))
 
 

@@ -169,7 +169,7 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
         reporter.note(_NOT_ASKED)
         return found
     said = f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame"
-    needed = "a base that is better than doing nothing (below 1)"
+    needed = "a base model that is better than persistence (below 1)"
     fix = "Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction;"
     fix += " to adapt it anyway, set training.allow_weak_base=true"
     raise InputError(where="model.base", found=said, needed=needed, fix=fix)

@@ -54,7 +54,7 @@ def test_each_work_is_named_after_five_seconds_of_silence_and_then_more_rarely(m
             assert clock.after(9.0) == [], "the bar has printed a line, and prints the next one after 10 seconds"
             encoding(100, 100)
             reporter.task("measuring")(2, 2)
-            assert clock.after(5.0) == ["work after measuring: 5 s so far"]
+            assert clock.after(5.0) == ["finishing measuring: 5 s so far"]
         Work.begin("")
         assert clock.after(1000.0) == []
     Work.begin("nobody watches")

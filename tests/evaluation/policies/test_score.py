@@ -1,6 +1,7 @@
 """Policies are put in order by the energy of what they would do, and not where the model cannot tell actions apart."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -177,6 +178,15 @@ def test_a_run_knows_from_its_validation_whether_it_can_tell(tmp_path: Path, who
     assert found is not None
     assert 0 <= found.value <= 1
     assert ranking_of_run(str(tmp_path), "") is None
+
+
+def test_a_run_that_logged_the_older_key_is_still_checked(tmp_path: Path, whole_run: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole_run, run)
+    log = run / "metrics.jsonl"
+    log.write_text(log.read_text().replace("action_ranking_error", "action_rank"))
+    checkpoint = "step-00000006 (the newest)"
+    assert ranking_of_run(str(run), checkpoint) == ranking_of_run(str(whole_run), checkpoint)
 
 
 @pytest.fixture

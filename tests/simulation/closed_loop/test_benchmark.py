@@ -116,7 +116,7 @@ def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     )
     shown = capsys.readouterr().out
     rows = {line.split("│")[1].strip(): line for line in shown.splitlines() if line.startswith("│")}
-    assert list(rows) == ["tiny", "do nothing", "random", "oracle"]
+    assert list(rows) == ["tiny", "zero action", "random", "oracle"]
     assert "reach in domain B: 2 problems of seed 0, 2 steps of 0.27 s" in shown
     assert "\n2 episodes x 2 decisions, 12 action sequences each: less than a minute on this machine\n" in "\n" + shown
     assert "\n2 episodes x 2 decisions, 12 action sequences each; the first decision" in "\n" + shown
@@ -164,7 +164,7 @@ def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
     out = tmp_path / "out"
     assert main(["simulate", str(tmp_path / "broken"), *TWICE, "--films", "0", "--out", str(out), *SMALL]) == 1
     assert "broken: of 4 decisions no finite energy 4" in capsys.readouterr().out
-    steered, nothing = (metrics(out)["policies"][name]["by_episode"] for name in ("broken", "do nothing"))
+    steered, nothing = (metrics(out)["policies"][name]["by_episode"] for name in ("broken", "zero action"))
     assert steered["distance_cm"] == nothing["distance_cm"]
 
 
@@ -224,7 +224,7 @@ def test_goals_on_the_way_come_from_one_demonstration_of_the_same_problem(model:
     assert [one["about"]["sub_goals"] for one in found.values()] == ["none", *ways_to_give]
     ways = [one["policies"]["tiny"]["by_episode"]["distance_cm"] for one in found.values()]
     assert ways[0] != ways[1] != ways[2] != ways[0]
-    for name in ("do nothing", "oracle"):
+    for name in ("zero action", "oracle"):
         one, *others = (run["policies"][name]["by_episode"]["distance_cm"] for run in found.values())
         assert others == [one, one], "only the model has goals on the way"
 

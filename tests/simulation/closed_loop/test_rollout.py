@@ -73,7 +73,7 @@ def test_the_oracle_succeeds_and_nothing_and_chance_do_not(arm: SimulatedArm) ->
     assert nothing.success_rate.value == nothing.success_ever_rate.value == 0.0
     np.testing.assert_allclose(nothing.distance_cm[:, -1], nothing.distance_cm[:, 0], atol=1e-2)
     assert chance.success_rate.value < 0.3
-    assert [result.policy for result in results] == ["oracle", "do nothing", "random"]
+    assert [result.policy for result in results] == ["oracle", "zero action", "random"]
     assert oracle.why_counts == {"scripted": 40}
     assert not oracle.unreachable.any()
 

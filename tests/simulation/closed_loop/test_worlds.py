@@ -53,9 +53,9 @@ def test_a_model_and_those_without_one_act_on_the_problems_that_the_expert_solve
     assert "Come in fake 1.0: 3 problems of seed 0, 3 steps of 0.40 s" in shown
     found = json.loads((tmp_path / CLOSED_LOOP_FILE).read_text())
     assert (found["about"]["seeds"], found["about"]["left_out"]) == ([0, 2, 3], [1])
-    assert list(found["policies"]) == ["tiny", "do nothing", "random", "expert"]
+    assert list(found["policies"]) == ["tiny", "zero action", "random", "expert"]
     assert found["policies"]["expert"]["success"]["value"] == 1.0
-    still = np.array(found["policies"]["do nothing"]["by_episode"]["distance_cm"])
+    still = np.array(found["policies"]["zero action"]["by_episode"]["distance_cm"])
     assert (still == still[:, :1]).all()
     moved = np.array(found["policies"]["tiny"]["by_episode"]["distance_cm"])
     np.testing.assert_array_equal(moved[:, 0], still[:, 0])

@@ -143,7 +143,7 @@ class ProgressBar:
             console.print("  ".join(filter(None, (f"{self.title} {done}/{total}", words, self._left(done, now)))))
         if done >= total:
             self.close()
-            Work.begin(f"work after {self.title}")
+            Work.begin(f"finishing {self.title}")
 
     def close(self) -> None:
         """Restore the terminal."""

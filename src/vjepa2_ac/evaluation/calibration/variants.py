@@ -263,7 +263,7 @@ class Calibration:
                 words += f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
             words += "" if self.is_certain else f": not certain on {counted(best.episodes, 'episode')}, try more"
         if best.ratio.value >= 1:
-            return f"{words}. At no stride is the model better than doing nothing: does it fit this data at all?"
+            return f"{words}. At no stride is the model better than persistence: does it fit this data at all?"
         return f"{words}."
 
     def rows(self, model: str) -> list[Row]:

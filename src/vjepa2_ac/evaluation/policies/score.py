@@ -43,7 +43,7 @@ class PolicyChunks:
 
 @dataclass(frozen=True)
 class PolicyScore:
-    """How a policy fares: mean energy over that of doing nothing, below 1 is better."""
+    """How a policy fares: mean energy over that of the zero action, below 1 is better."""
 
     name: str
     mean: Estimate  # of all its chunks
@@ -56,7 +56,7 @@ class PolicyScores:
     """Policies, the best first, and whether the model can tell."""
 
     policies: tuple[PolicyScore, ...]
-    demonstrated: Estimate  # what was done, over doing nothing: no policy is expected to be better
+    demonstrated: Estimate  # what was done, over the zero action: no policy is expected to be better
     others_below_true: Estimate  # share of the actions of other places with a lower energy than the true ones
     places: int
     episodes: int
@@ -127,8 +127,9 @@ def ranking_of_run(subject: str, checkpoint: str) -> Estimate | None:
     if not is_run(subject):
         return None
     step = step_of(checkpoint.split(maxsplit=1)[0]) or 0
-    key = "action_ranking_error"
-    rows = [row for row in read_metrics_log(Path(subject) / METRICS) if key in row and row["step"] <= step]
+    log = [row for row in read_metrics_log(Path(subject) / METRICS) if row["step"] <= step]
+    keys = ("action_ranking_error", "action_rank")  # the second one in runs before 2026-11-29
+    key, rows = max(((key, [row for row in log if key in row]) for key in keys), key=lambda one: len(one[1]))
     if not rows:
         return None
     numbers = (rows[-1][name] for name in (key, f"{key}_low", f"{key}_high"))

@@ -68,8 +68,8 @@ def train_prior(
         reporter: Shows the progress.
 
     Returns:
-        What is known of it: of held-out clips the error of its mean, over that of doing nothing, for true goals and for
-        goals of other clips. A prior whose two numbers are the same does not look at the goal.
+        What is known of it: of held-out clips the error of its mean, over that of the zero action, for true goals and
+        for goals of other clips. A prior whose two numbers are the same does not look at the goal.
 
     Raises:
         InputError: The data or the model cannot be used, or the loss is not finite.
@@ -169,7 +169,7 @@ def _pairs(clips: LatentBatch, spaces: Spaces, drawn: torch.Generator) -> _Pairs
 
 @torch.no_grad()
 def _measured(dataset: Dataset, model: WorldModel, prior: ActionPrior, spaces: Spaces) -> dict[str, Any]:
-    """Return the error of the mean over that of doing nothing on held-out clips: with true goals, and with others'."""
+    """Return the error of the mean over that of the zero action on held-out clips: with true and with others' goals."""
     drawn, size = torch.Generator().manual_seed(0), spaces.action.sized
     errors: dict[str, list[Tensor]] = {"true_goals": [], "goals_of_others": [], "nothing": []}
     ids: list[str] = []

@@ -33,7 +33,7 @@ from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, RED, headline, vis
 from vjepa2_ac.media.film import FilmStrip, Kind, StripRow, draw_rows
 from vjepa2_ac.reports.comparison import Comparison
 
-_NOTHING = "persistence (doing nothing)"
+_NOTHING = "persistence"
 _COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE, "decoded truth": GREEN, "raw persistence": RED}
 _RUNS = (BLUE, ORANGE, GREEN, "#8f5bb0", RED, "#0b7f8a", "#8a6d0b", "#333333")
 _DASHES = ("-", "--", ":")  # after all colours

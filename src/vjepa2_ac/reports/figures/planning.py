@@ -137,7 +137,7 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
     axes.plot(numbers, lowest, "o--", color=BLUE, markersize=3, label="lowest")
     levels = {
         "now": (answer.decision.energy_now, GREY, "-"),
-        "doing nothing": (answer.doing_nothing, GREY, ":"),
+        "zero action": (answer.doing_nothing, GREY, ":"),
         "the plan": (plan.energy, RED, "--"),
     }
     for name, (level, colour, dashes) in levels.items():

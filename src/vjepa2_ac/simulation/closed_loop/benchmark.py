@@ -173,7 +173,14 @@ class ClosedLoopBenchmark:
         """Whether the model plans better than what looks at no image."""
         shares = {result.policy: result.success_rate for result in self.results}
         model, *_, oracle = shares
-        return closed_loop(shares, model, oracle, self.trials.episodes, self.trials.task_name)
+        about = self.trials.as_dict()
+        helped = {
+            "demonstration": ", with key frames of the oracle's solution as sub-goals",
+            "every-step": ", with each step of the oracle's solution as sub-goal",
+            "alike": ", with key frames of the nearest demonstration as sub-goals",
+        }.get(about["sub_goals"], f", with the goals in {about['goals']}" if about["goals"] else "")
+        conditions = f"in {self.trials.place}{helped}"
+        return closed_loop(shares, model, oracle, self.trials.episodes, self.trials.task_name, conditions)
 
 
 def run_benchmark(

@@ -53,7 +53,7 @@ class ZeroActions:
         limits: The allowed actions.
     """
 
-    name, why, moves = "do nothing", "nothing", Moves.FLANGE
+    name, why, moves = "zero action", "nothing", Moves.FLANGE
 
     def __init__(self, limits: LimitsConfig | None = None) -> None:
         self._limits = limits or LimitsConfig()
