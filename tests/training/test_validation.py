@@ -99,7 +99,7 @@ def test_the_lowest_rank_is_selected_though_the_error_falls_on(make_config, repo
     assert {path.name for path in (folder / "checkpoints").iterdir()} == {checkpoint_name(1), checkpoint_name(6)}
     assert describe_selection(folder) == (
         "Selected checkpoint: step 1, the best by action ranking.\n"
-        "Action-ranking error: 5.0 % (base model 10.0 %, chance 50 %)."
+        "Action-ranking error in validation: 5.0 % (base model 10.0 %, chance 50 %)."
     )
 
 
@@ -109,7 +109,7 @@ def test_a_base_that_is_never_beaten_is_selected(make_config, reporter, ranks_ar
     assert {path.name for path in (folder / "checkpoints").iterdir()} == {checkpoint_name(0), checkpoint_name(6)}
     assert describe_selection(folder).splitlines() == [
         "Selected checkpoint: step 0, the best by action ranking.",
-        "Action-ranking error: 1.0 % (chance 50 %).",
+        "Action-ranking error in validation: 1.0 % (chance 50 %).",
         "The selected checkpoint is the base model: fine-tuning did not improve action ranking.",
     ]
 
