@@ -31,11 +31,12 @@ def written(
     seed: int = 0,
     base: object = Copier(),
     probes: ProbeOptions = PROBES,
+    ranking_seed: int = 0,
     **changes: object,
 ) -> Path:
     folder.mkdir()
     contenders = [Contender("base", "base", base), Contender("adapter", "trained", model)]  # type: ignore[arg-type]
-    found = evaluate(contenders, again(clips_batch(clips, seed)), about(**changes), probes=probes)
+    found = evaluate(contenders, again(clips_batch(clips, seed)), about(seed=ranking_seed, **changes), probes=probes)
     write_metrics(found, folder / METRICS_FILE)
     return folder
 
@@ -55,6 +56,8 @@ def test_actions_that_were_ranked_differently_do_not_compare(tmp_path: Path) -> 
     found = compare([written(tmp_path / "a", Halfway()), written(tmp_path / "b", Halfway(), probes=more)])
     assert any("ranked differently" in note for note in found.notes)
     assert found.next_command == "No run is recommended: the actions were ranked with different settings."
+    other_seed = compare([tmp_path / "a", written(tmp_path / "c", Halfway(), ranking_seed=1)])
+    assert not other_seed.notes
 
 
 def test_runs_are_compared_with_the_first_one_pair_by_pair(tmp_path: Path) -> None:

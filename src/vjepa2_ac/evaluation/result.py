@@ -415,8 +415,8 @@ class Evaluation:
         ranking = self.models[self.trained].ranking
         if ranking is None:
             return None
-        alternatives = f"2 x {ranking.samples} alternatives within {100 * ranking.reach:g} cm, seed {self.about.seed}"
-        return f"{len(ranking.ranks)} moves, {alternatives}"
+        # Without the seed: other draws of the alternatives are within the interval.
+        return f"{len(ranking.ranks)} moves, 2 x {ranking.samples} alternatives within {100 * ranking.reach:g} cm"
 
     @property
     def errors(self) -> PredictionErrors:
