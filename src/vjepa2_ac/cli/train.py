@@ -110,11 +110,11 @@ def _encode(options: argparse.Namespace) -> None:
         cli.show(f"This process has done its share; others are still at work on {encoded.folder}")
         return
     episodes = f"{encoded.encoded:,} of {counted(encoded.episodes, 'episode')}"
-    knobs = shlex.join(["data.source=latents", f"data.path={encoded.folder}"]) if options.out else "data.cache=auto"
+    overrides = shlex.join(["data.source=latents", f"data.path={encoded.folder}"]) if options.out else "data.cache=auto"
     cli.show(
         *(f"left out: {name}: {reason}" for name, reason in encoded.broken.items()),
         f"{episodes}, {encoded.frames:,} frames, {encoded.bytes / 1e9:.3g} GB are in {encoded.folder}",
-        f"Train on them with {knobs}",
+        f"Train on them with {overrides}",
     )
 
 

@@ -18,7 +18,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError, counted, escaped
 from vjepa2_ac.evaluation.result import Row
-from vjepa2_ac.evaluation.summary import Summary, with_closed_loop
+from vjepa2_ac.evaluation.summary import with_closed_loop
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import merge_adapter, trainable_report
 from vjepa2_ac.model.checkpoints.loading import to_official
@@ -122,11 +122,6 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metr
         write_atomically(fresh / CARD, card)
 
 
-def _latest_summary(metrics: Metrics, folder: Path) -> Summary:
-    """Return the summary of an evaluation, with a closed loop that was measured after it."""
-    return with_closed_loop(metrics.summary, folder, metrics.about.checkpoint)
-
-
 def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
     """Return the README.md of an adapter, in Markdown, with the Hub's front matter."""
     config, model, name = run.config, run.world_model, escaped(folder.resolve().name)
@@ -140,6 +135,9 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
     code = lambda name: f"`{escaped(str(name)).replace('`', '_')}`"  # noqa: E731 - names are no markup in a span of code
     environment.filters |= {"code": code, "count": counted, "ratio": _ratio}
     measured = None if metrics is None else _measured(metrics)
+    summary = None
+    if metrics is not None:  # a closed loop may be newer than this file
+        summary = with_closed_loop(replace(metrics.summary, subject=name), folder, metrics.about.checkpoint)
     front = ModelCardData(
         library_name="peft",
         pipeline_tag="robotics",
@@ -152,7 +150,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         run=run,
         name=name,
         evaluation=metrics,
-        summary=None if metrics is None else replace(_latest_summary(metrics, folder), subject=name),
+        summary=summary,
         measured=measured,
         plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
         base=model.adaptation,

@@ -27,7 +27,7 @@ _WHOLE = 16  # characters: a longer word of a table, such as a path, may be divi
 _LONGEST_LINE = 100  # columns
 _COMMAND = r"(Next: )?(?<![\w/.-])(vjepa2-ac |(\S+ -m )?pip install )((?!   #).)*"
 _IN_ONE_PIECE = re.compile(rf"^ +|`[^`\n]*`|{_COMMAND}|(?<=\d) %", re.MULTILINE)
-_SPACE = "\ue000"  # stands for a space that is not broken
+_SPACE = "\ue000"  # in place of a space at which no line is broken
 
 
 def wrapped(text: str) -> str:
@@ -41,9 +41,8 @@ def wrapped(text: str) -> str:
         indent = " " * (len(columns) if columns.strip() else len(columns) + 2)
         style = textwrap.TextWrapper(width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
         first, *more = style.wrap(line) if len(line) > width else [line]
-        if (
-            more and first.replace(_SPACE, " ") == columns.rstrip()
-        ):  # a long path after the columns: a line break does not help
+        # A word that is too long for the last column, such as a path, stays on the line of the other columns.
+        if more and first.replace(_SPACE, " ") == columns.rstrip():
             first, more = f"{columns}{more[0].lstrip()}", more[1:]
         lines += [first, *more]
     return "\n".join(lines).replace(_SPACE, " ")

@@ -97,19 +97,19 @@ def memory_lines(estimate: MemoryEstimate) -> list[str]:
     return [*lines, UNTESTED]
 
 
-def verdict(needed: int, available: int, gpu: str | None, knobs: list[str] | None) -> str:
+def verdict(needed: int, available: int, gpu: str | None, overrides: list[str] | None) -> str:
     """Return whether the run fits, or what to change.
 
     Args:
         needed: Bytes at the peak.
         available: Bytes of the GPU.
         gpu: Its name; None: there is none on this machine.
-        knobs: Changes that make it fit, or None if none do.
+        overrides: Changes that make it fit, or None if none do.
     """
     fits, size, room = needed <= available, f"{needed / _GIGABYTE:.1f} GB", f"{available / _GIGABYTE:.1f} GB"
     text = f"{'Fits' if fits else 'Does not fit'}: the estimated peak is {size}; {gpu or 'a usual GPU'} has {room}."
     if not fits:
-        text += f" It fits with {', '.join(knobs)}." if knobs else " It needs a larger GPU or a smaller model."
+        text += f" It fits with {', '.join(overrides)}." if overrides else " It needs a larger GPU or a smaller model."
     return text if gpu else f"{text}\nThis machine: not measured; it needs a GPU, PyTorch finds none."
 
 
