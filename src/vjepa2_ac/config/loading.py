@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import source_of
+from vjepa2_ac.config.removed import drop_removed_keys, why_removed
 from vjepa2_ac.config.run import ReplayConfig
 from vjepa2_ac.config.section import marks_of
 from vjepa2_ac.errors import InputError, shell_command
@@ -100,6 +101,8 @@ def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, wh
         _set(given, key.split("."), parse_yaml(text, where=f"override {key}"), override)
     _keep_drawn_splits(given)
     _replace_older_keys(given)
+    if not here:
+        drop_removed_keys(given, where)
     try:
         return Config.model_validate_json(_as_json(with_plugins(given, where=where, here=here), where))
     except ValidationError as error:
@@ -359,6 +362,8 @@ def _explain(key: str, detail: Any) -> str:
     if detail["type"] != "extra_forbidden":
         return message_of(detail)
     section, dot, name = key.rpartition(".")
+    if (why := why_removed(key)) is not None:
+        return why
     if key in all_keys():
         owners = [source for source, kind in DataConfig.kinds.items() if name in kind.model_fields]
         return f"a section of source {' or '.join(owners)}, and this is source {detail['loc'][-2]}"
