@@ -5,7 +5,7 @@ import logging
 import pytest
 
 from vjepa2_ac.config.loading import all_keys, config_as_dict, parse_config
-from vjepa2_ac.config.removed import REMOVED, Removed
+from vjepa2_ac.config.removed import REMOVED, RemovedKey
 from vjepa2_ac.errors import InputError
 
 VALUES = {"run_dir": "run", "data": {"source": "npz", "path": "data"}, "model": {"base": "builtin:sim-tiny"}}
@@ -13,8 +13,8 @@ VALUES = {"run_dir": "run", "data": {"source": "npz", "path": "data"}, "model": 
 
 @pytest.fixture(autouse=True)
 def removed_keys(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(REMOVED, "training.momentum", Removed("0.9", (0.9,)))
-    monkeypatch.setitem(REMOVED, "data.blur", Removed("off", ({"radius": 0},)))
+    monkeypatch.setitem(REMOVED, "training.momentum", RemovedKey("0.9", (0.9,)))
+    monkeypatch.setitem(REMOVED, "data.blur", RemovedKey("off", ({"radius": 0},)))
 
 
 def test_removed_key_in_a_config_of_a_user_is_one_error_that_names_the_value_of_today() -> None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 logger = logging.getLogger(__name__)
 
 
-class Removed(NamedTuple):
+class RemovedKey(NamedTuple):
     """What replaces a removed config key."""
 
     always: str
@@ -17,10 +17,10 @@ class Removed(NamedTuple):
     """The plain values of the config of an older run that had the same meaning; a section is a dict."""
 
 
-REMOVED: dict[str, Removed] = {
-    # "training.betas": Removed("(0.9, 0.999)", ([0.9, 0.999],)),
+REMOVED: dict[str, RemovedKey] = {
+    # "training.betas": RemovedKey("(0.9, 0.999)", ([0.9, 0.999],)),
 }
-"""Removed keys and sections, by their dotted key. A row for `data.x` also holds for `replay.data.x`."""
+"""RemovedKey keys and sections, by their dotted key. A row for `data.x` also holds for `replay.data.x`."""
 
 
 def why_removed(key: str) -> str | None:
