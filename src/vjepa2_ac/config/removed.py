@@ -20,7 +20,7 @@ class RemovedKey(NamedTuple):
 REMOVED: dict[str, RemovedKey] = {
     # "training.betas": RemovedKey("(0.9, 0.999)", ([0.9, 0.999],)),
 }
-"""RemovedKey keys and sections, by their dotted key. A row for `data.x` also holds for `replay.data.x`."""
+"""RemovedKey keys and sections, by their dotted key. A row for a key of `data` also holds below `replay`."""
 
 
 def why_removed(key: str) -> str | None:
