@@ -24,11 +24,11 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.demonstrations.key_frames import OF_MODEL_STEPS, gripper_key_frames
 from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.session import load_to_plan
-from vjepa2_ac.simulation.closed_loop.benchmark import DemonstrationSpec, demonstrate
-from vjepa2_ac.simulation.closed_loop.rollout import put
-from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem, arm_for, make_problem
-from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.domains import named_domain
+from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.benchmark import DemonstrationSpec, demonstrate
+from vjepa2_ac.simulation.domains import named_domain
+from vjepa2_ac.simulation.rollout import put
+from vjepa2_ac.simulation.tasks import TaskProblem, arm_for, make_problem
 
 STEP_M = 0.05
 STEPS = np.array(list(itertools.product((-STEP_M, 0.0, STEP_M), repeat=3)))

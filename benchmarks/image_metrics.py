@@ -28,7 +28,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.evaluation.distribution import discrepancy
 from vjepa2_ac.media.image_similarity import mean_where, moving_region, ms_ssim, psnr, ssim, ssim_map
 from vjepa2_ac.simulation.counterfactual import resimulate
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 _STEP_M, _STEPS, _STRIDE = 0.05, 3, 4
 _DIM, _EPISODES, _CLIPS, _SMOOTHED = 1408, 40, 6, 0.8

@@ -68,7 +68,7 @@ from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.cost.flops import frame_flops
 from vjepa2_ac.training.setup import Run, batches_from, set_up
 from vjepa2_ac.training.step import training_step

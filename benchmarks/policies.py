@@ -36,12 +36,12 @@ from vjepa2_ac.planning.prior.action_prior import load_prior
 from vjepa2_ac.planning.prior.train_prior import PriorOptions, train_prior
 from vjepa2_ac.planning.session import PlanningSession, load_to_plan
 from vjepa2_ac.planning.surprise import MONITOR, conformal_threshold, error_by_patch
-from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, every_step
-from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Planning
-from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, put, run_task, send_action
-from vjepa2_ac.simulation.closed_loop.tasks import STEPS, arm_for, make_problem
-from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.domains import Domain, named_domain
+from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.benchmark import DemonstratedGoals, DemonstrationSpec, every_step
+from vjepa2_ac.simulation.domains import Domain, named_domain
+from vjepa2_ac.simulation.policies import GoalsOf, Planning
+from vjepa2_ac.simulation.rollout import RolloutSpec, put, run_task, send_action
+from vjepa2_ac.simulation.tasks import STEPS, arm_for, make_problem
 from vjepa2_ac.storage import write_atomically
 
 PROPOSALS = 8

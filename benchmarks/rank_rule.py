@@ -22,7 +22,7 @@ from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.errors import UserError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.metrics_log import read_metrics_log
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.loop import train
 

@@ -29,7 +29,7 @@ from vjepa2_ac.data.inspection.findings import Finding
 from vjepa2_ac.data.inspection.statistics import at_some_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.data import VariantProbe, probe_config
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 HELD_OUT = 0.7  # of the episodes: the probe measures these
 _SAID = 68  # letters of a finding

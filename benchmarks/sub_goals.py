@@ -30,17 +30,17 @@ import torch
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.simulation.closed_loop.agent import Agent, agent_of_session
-from vjepa2_ac.simulation.closed_loop.benchmark import (
+from vjepa2_ac.simulation.agent import Agent, agent_of_session
+from vjepa2_ac.simulation.benchmark import (
     DemonstratedGoals,
     DemonstrationSpec,
     every_step,
     of_demonstrations_alike,
 )
-from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Oracle, Policy
-from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, RolloutSpec, SimulatedWorld, run_task
-from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskProblem, arm_for
-from vjepa2_ac.simulation.world.domains import named_domain
+from vjepa2_ac.simulation.domains import named_domain
+from vjepa2_ac.simulation.policies import GoalsOf, Oracle, Policy
+from vjepa2_ac.simulation.rollout import ClosedLoopResult, RolloutSpec, SimulatedWorld, run_task
+from vjepa2_ac.simulation.tasks import STEPS, TaskProblem, arm_for
 from vjepa2_ac.storage import write_atomically
 
 SLACK, SHARE = 3, 0.2  # model steps; UVD's share

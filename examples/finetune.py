@@ -11,7 +11,7 @@ from pathlib import Path
 
 from vjepa2_ac import UserError, evaluate, load_config, load_run, train
 from vjepa2_ac.process import StoppedError
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 RECORDED = Path("demo/examples/data")
 

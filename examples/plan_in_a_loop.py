@@ -13,9 +13,9 @@ import numpy as np
 from vjepa2_ac import Controller, UserError, load_model, load_run
 from vjepa2_ac.config import PlanningConfig
 from vjepa2_ac.media.images import encode_png
-from vjepa2_ac.simulation.closed_loop.rollout import put
-from vjepa2_ac.simulation.closed_loop.tasks import arm_for, make_problem
-from vjepa2_ac.simulation.world.domains import named_domain
+from vjepa2_ac.simulation.domains import named_domain
+from vjepa2_ac.simulation.rollout import put
+from vjepa2_ac.simulation.tasks import arm_for, make_problem
 from vjepa2_ac.spaces import apply_action
 
 FILM = Path("demo/examples/plan_in_a_loop.png")

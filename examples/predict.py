@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from vjepa2_ac import UserError, encode, load_model, open_dataset, read_clips
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 RECORDED = Path("demo/examples/data")
 

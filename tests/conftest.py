@@ -21,7 +21,7 @@ CHECKED = [
     "vjepa2_ac.data.transforms",
     "vjepa2_ac.planning",
     "vjepa2_ac.evaluation.action_use",
-    "vjepa2_ac.simulation.world.motion",
+    "vjepa2_ac.simulation.motion",
 ]
 ABSENT = missing.absent(os.environ)
 if missing.SHAPES not in ABSENT:

@@ -91,10 +91,15 @@ ORDERS: dict[str, list[str]] = {
         "__main__",
     ],
     "simulation": [
-        "world",
-        "closed_loop",
-        "recording",
-        "counterfactual",
+        "domains",
+        "motion camera",
+        "arm",
+        "tasks",
+        "policies",
+        "rollout agent",
+        "benchmark scripted_play",
+        "worlds record",
+        "counterfactual record_world",
     ],
 }
 
@@ -119,7 +124,7 @@ HOMES = {
     "markupsafe": ["reports/"],
     "matplotlib": ["media/", "reports/"],
     "msgpack": ["serving/wire.py"],
-    "mujoco": ["simulation/world/"],
+    "mujoco": ["simulation/domains.py"],
     "peft": ["model/adapter/"],
     "prometheus_client": ["serving/server.py"],
     "pyarrow": ["data/sources/lerobot/"],

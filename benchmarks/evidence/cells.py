@@ -10,7 +10,7 @@ from other_worlds import MANY, TASKS
 
 from vjepa2_ac.config import AdapterConfig, TrainingConfig
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges
 
 Base = Literal["one camera", "many cameras", "none"]
 

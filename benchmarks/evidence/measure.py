@@ -35,7 +35,8 @@ from vjepa2_ac.planning.prior.train_prior import train_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.loading import load_run
-from vjepa2_ac.simulation.closed_loop.policies import (
+from vjepa2_ac.simulation.domains import Domain, sample_domain
+from vjepa2_ac.simulation.policies import (
     GoalsOf,
     Image,
     Oracle,
@@ -44,9 +45,8 @@ from vjepa2_ac.simulation.closed_loop.policies import (
     RandomActions,
     ZeroActions,
 )
-from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
-from vjepa2_ac.simulation.closed_loop.tasks import Problem, TaskProblem
-from vjepa2_ac.simulation.world.domains import Domain, sample_domain
+from vjepa2_ac.simulation.rollout import RolloutSpec, run_task
+from vjepa2_ac.simulation.tasks import Problem, TaskProblem
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import json_text
 from vjepa2_ac.training.cost.memory import count_parameters

@@ -13,16 +13,16 @@ import numpy as np
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.episode import no_progress
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
-from vjepa2_ac.simulation.closed_loop.policies import Policy
-from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, run_trials
-from vjepa2_ac.simulation.closed_loop.worlds import (
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions
+from vjepa2_ac.simulation.policies import Policy
+from vjepa2_ac.simulation.record_world import record_world
+from vjepa2_ac.simulation.rollout import ClosedLoopResult, run_trials
+from vjepa2_ac.simulation.worlds import (
     OtherWorld,
     WorldProblem,
     WorldTrials,
     find_problems,
 )
-from vjepa2_ac.simulation.recording.record_world import record_world
 
 ROOT = Path(__file__).resolve().parents[2]
 STRIDE, EVERY = 4, 2  # control steps of a model step, and from one recorded frame to the next

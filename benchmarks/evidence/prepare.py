@@ -21,8 +21,8 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.export import export_run
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
-from vjepa2_ac.simulation.world.domains import DOMAIN_A
+from vjepa2_ac.simulation.domains import DOMAIN_A
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.loop import train
 
 BUILTIN = "builtin:sim-tiny"

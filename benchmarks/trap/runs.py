@@ -29,11 +29,11 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log
-from vjepa2_ac.simulation.closed_loop.policies import Planning
-from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
-from vjepa2_ac.simulation.world.motion import MotionRecipe
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
+from vjepa2_ac.simulation.motion import MotionRecipe
+from vjepa2_ac.simulation.policies import Planning
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.rollout import RolloutSpec, run_task
 from vjepa2_ac.training.loop import train
 
 Motions = Literal["narrow", "varied"]

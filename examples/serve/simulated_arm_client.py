@@ -12,10 +12,10 @@ import sys
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
 from vjepa2_ac.media.video import write_gif
-from vjepa2_ac.simulation.closed_loop.agent import ServedPlanner
-from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, every_step, film_frames
-from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
-from vjepa2_ac.simulation.world.domains import named_domain
+from vjepa2_ac.simulation.agent import ServedPlanner
+from vjepa2_ac.simulation.benchmark import DemonstratedGoals, DemonstrationSpec, every_step, film_frames
+from vjepa2_ac.simulation.domains import named_domain
+from vjepa2_ac.simulation.rollout import RolloutSpec, run_task
 
 
 def main(url: str, film: str, episodes: str = "4", seed: str = "3") -> None:

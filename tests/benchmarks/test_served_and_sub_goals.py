@@ -10,9 +10,9 @@ import pytest
 
 from benches import imported
 from vjepa2_ac.planning.session import load_to_plan
-from vjepa2_ac.simulation.closed_loop.agent import agent_of_session
-from vjepa2_ac.simulation.closed_loop.tasks import make_problem
-from vjepa2_ac.simulation.world.domains import named_domain
+from vjepa2_ac.simulation.agent import agent_of_session
+from vjepa2_ac.simulation.domains import named_domain
+from vjepa2_ac.simulation.tasks import make_problem
 
 pytest.importorskip("mujoco")
 

@@ -16,8 +16,8 @@ from vjepa2_ac.cli.program import _parser
 from vjepa2_ac.config.loading import config_as_yaml, load_config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.errors import shell_command
-from vjepa2_ac.simulation.recording import record
-from vjepa2_ac.simulation.recording.record import RecordedSimulation, RecordingSpec
+from vjepa2_ac.simulation import record
+from vjepa2_ac.simulation.record import RecordedSimulation, RecordingSpec
 
 
 def parse(words: list[str]) -> argparse.Namespace:

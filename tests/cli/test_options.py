@@ -15,8 +15,8 @@ from made_pages import _leaves
 from vjepa2_ac.cli import main, program, setup
 from vjepa2_ac.cli.options import parsed
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
-from vjepa2_ac.simulation.recording.record import RecordingSpec
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions
+from vjepa2_ac.simulation.record import RecordingSpec
 
 EVALUATE, SIMULATE = ["evaluate", "run"], ["simulate", "record", "folder"]
 CALIBRATE = ["data", "calibrate", "config.yaml"]

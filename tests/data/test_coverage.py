@@ -11,8 +11,8 @@ from vjepa2_ac.data.coverage import PLAY, Coverage, ReadEpisode, coverage_by, co
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.inspection.check import check_data, coverage_findings
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
-from vjepa2_ac.simulation.world.domains import named_domain
-from vjepa2_ac.simulation.world.motion import MotionRecipe, random_reaching
+from vjepa2_ac.simulation.domains import named_domain
+from vjepa2_ac.simulation.motion import MotionRecipe, random_reaching
 from vjepa2_ac.spaces import POSE, matrices_from_euler, rotation_differences, states_in_camera_frame, vector_states
 
 DIVERSE = "motions are diverse enough to plan with"

@@ -19,8 +19,8 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, decide
 from vjepa2_ac.planning.goals import timed
-from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.domains import DOMAIN_A
+from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.domains import DOMAIN_A
 from vjepa2_ac.spaces import POSE, Spaces, apply_action, vector_states
 
 QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))

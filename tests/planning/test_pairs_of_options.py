@@ -35,8 +35,8 @@ from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.planning.solvers import CemSolver
 from vjepa2_ac.planning.surprise import Monitor
 from vjepa2_ac.registry import ENERGIES, PLANNERS
-from vjepa2_ac.simulation.closed_loop.policies import Moves, Planning
-from vjepa2_ac.simulation.closed_loop.rollout import Observation, Span, run_in
+from vjepa2_ac.simulation.policies import Moves, Planning
+from vjepa2_ac.simulation.rollout import Observation, Span, run_in
 
 SIDE = 16  # pixels of a view: the model scales every image
 BASE = {"horizon": 2, "samples": 4, "iterations": 1, "cem.elites": 2, "icem.elites": 2}

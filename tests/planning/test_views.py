@@ -20,12 +20,12 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.demonstrations.make_goals import recording_of_episode
 from vjepa2_ac.planning.session import PlanningSession, load_to_plan
 from vjepa2_ac.serving.about import warm_up
-from vjepa2_ac.simulation.closed_loop.agent import agent_of_session
-from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
-from vjepa2_ac.simulation.closed_loop.tasks import arm_for
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
-from vjepa2_ac.simulation.world.camera import FRAME_SIZE
-from vjepa2_ac.simulation.world.domains import DOMAIN_A
+from vjepa2_ac.simulation.agent import agent_of_session
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_benchmark
+from vjepa2_ac.simulation.camera import FRAME_SIZE
+from vjepa2_ac.simulation.domains import DOMAIN_A
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.tasks import arm_for
 
 QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4), limits=LimitsConfig(rotation=0.1))
 

@@ -27,8 +27,8 @@ from vjepa2_ac.evaluation.imagined import Film, ImagineOptions, imagine_clip
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.planning.counterfactual import named_actions
 from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, Resimulation, resimulate, with_what_happens
-from vjepa2_ac.simulation.recording.record import SIMULATION_FILE, RecordingSpec, record_dataset, record_episode
-from vjepa2_ac.simulation.world.domains import DomainRanges
+from vjepa2_ac.simulation.domains import DomainRanges
+from vjepa2_ac.simulation.record import SIMULATION_FILE, RecordingSpec, record_dataset, record_episode
 
 STEPS, START, STRIDE = 13, 4, 4
 FILMED = 3

@@ -9,7 +9,7 @@ import numpy as np
 from vjepa2_ac.spaces import matrices_from_euler
 
 if TYPE_CHECKING:
-    from vjepa2_ac.simulation.world.arm import SimulatedArm
+    from vjepa2_ac.simulation.arm import SimulatedArm
 
 HAND_MIDDLE_M = 0.035  # from the flange, towards the fingers
 

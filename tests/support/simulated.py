@@ -12,7 +12,7 @@ IN_EXAMPLES = Path("demo/examples/data")  # where examples and docs/python.md ex
 
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+    from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
     return record_dataset(tmp_path_factory.mktemp("simulated") / "data", RecordingSpec("B", 14, seed=4), episodes=8)
 

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from vjepa2_ac.explore.watch import WatchPage
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
-    from vjepa2_ac.simulation.closed_loop.agent import Agent
-    from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, ClosedLoopBenchmark
+    from vjepa2_ac.simulation.agent import Agent
+    from vjepa2_ac.simulation.benchmark import BenchmarkOptions, ClosedLoopBenchmark
 
     Benchmark = tuple[ClosedLoopBenchmark, tuple[Path, ...]]  # and its files
 
@@ -231,7 +231,7 @@ def _record(options: argparse.Namespace) -> int:
     options.domain = options.domain or "A"
     cli.require_new_place(target)
 
-    from vjepa2_ac.simulation.recording.record import RecordingSpec, default_steps, record_dataset
+    from vjepa2_ac.simulation.record import RecordingSpec, default_steps, record_dataset
 
     task = None if options.task == "reach" else options.task
     spec = cli.record_of_options(RecordingSpec, options, task=task, steps=options.steps or default_steps(task))
@@ -247,8 +247,8 @@ def _record(options: argparse.Namespace) -> int:
 def _record_world(options: argparse.Namespace, target: Path) -> int:
     _refuse(options, _OF_RECORD, needed="the simulated arm: a world has one camera, and one process")
 
-    from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld
-    from vjepa2_ac.simulation.recording.record_world import record_world
+    from vjepa2_ac.simulation.record_world import record_world
+    from vjepa2_ac.simulation.worlds import OtherWorld
 
     with OtherWorld(options.world, options.world_timeout) as world, cli.reporter() as reporter:
         seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
@@ -276,7 +276,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
         _refuse(options, ("checkpoint", "config", "decoder", "overrides"), needed="the model itself; not its server")
 
     from vjepa2_ac.cli.console.tables import benchmark_notes, benchmark_table
-    from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
+    from vjepa2_ac.simulation.benchmark import BenchmarkOptions
 
     chosen = cli.record_of_options(BenchmarkOptions, options)
     chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
@@ -293,8 +293,8 @@ def _run_benchmark(options: argparse.Namespace) -> int:
 
 
 def _in_our_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: Path) -> Benchmark:
-    from vjepa2_ac.simulation.closed_loop.benchmark import run_benchmark
-    from vjepa2_ac.simulation.world.domains import load_mujoco
+    from vjepa2_ac.simulation.benchmark import run_benchmark
+    from vjepa2_ac.simulation.domains import load_mujoco
 
     load_mujoco()
     folder = options.out or home / f"{chosen.task}-{chosen.domain}"
@@ -303,7 +303,7 @@ def _in_our_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: P
 
 
 def _in_their_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: Path) -> Benchmark:
-    from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld, run_world_benchmark
+    from vjepa2_ac.simulation.worlds import OtherWorld, run_world_benchmark
 
     with OtherWorld(options.world, options.world_timeout) as env, _agent(options) as agent, cli.reporter() as reporter:
         name = re.sub(r"\W+", "-", f"{env.about.task} {env.about.world}", flags=re.ASCII).strip("-")[:200]
@@ -380,7 +380,7 @@ def _agent(options: argparse.Namespace) -> Iterator[Agent]:
     from vjepa2_ac.decoding.decoder_folder import SIMULATED
     from vjepa2_ac.serving.access import read_key
     from vjepa2_ac.serving.wire import PlanningClient
-    from vjepa2_ac.simulation.closed_loop.agent import agent_of_server, agent_of_session
+    from vjepa2_ac.simulation.agent import agent_of_server, agent_of_session
 
     if not cli.is_server(options.subject):
         decoder = cli.given_decoder(options)

@@ -164,9 +164,9 @@ def _next_closed_loop(
     """
     from vjepa2_ac.distributed import is_on_cpu
     from vjepa2_ac.planning.settings import planning_settings
-    from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
-    from vjepa2_ac.simulation.recording.record import read_simulation
-    from vjepa2_ac.simulation.world.domains import Domain
+    from vjepa2_ac.simulation.benchmark import BenchmarkOptions
+    from vjepa2_ac.simulation.domains import Domain
+    from vjepa2_ac.simulation.record import read_simulation
 
     evaluation, prediction_s = measured.evaluation, None
     try:

@@ -116,7 +116,7 @@ def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
     elif is_run(subject):
         yield None
     elif subject == _BUILTIN_MODEL:
-        from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+        from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
         with tempfile.TemporaryDirectory() as folder:
             Work.begin("recording episodes of the simulated arm")

@@ -271,7 +271,7 @@ def _demo(_options: argparse.Namespace) -> int:
     A tiny world model is trained with LoRA. All of it is in the folder demo, in 4 to 6 minutes on 2 cores, without a
     download. Run the same command again to resume.
     """
-    from vjepa2_ac.simulation.world.domains import load_mujoco
+    from vjepa2_ac.simulation.domains import load_mujoco
 
     load_mujoco()
     Work.begin("")  # each command shows its own

@@ -16,9 +16,9 @@ from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.explore.explorer import Explorer, Moment, Pixels, Place
 from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
 from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
-from vjepa2_ac.simulation.closed_loop.rollout import send_action
 from vjepa2_ac.simulation.counterfactual import Resimulation, resimulate
-from vjepa2_ac.simulation.recording.record import JPEG_QUALITY, carry_out
+from vjepa2_ac.simulation.record import JPEG_QUALITY, carry_out
+from vjepa2_ac.simulation.rollout import send_action
 from vjepa2_ac.storage.places import SIMULATION_FILE
 
 _KEPT = 4  # arms, each at its own start

@@ -18,9 +18,9 @@ from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.evaluation.imagined import Film
 from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
-from vjepa2_ac.simulation.closed_loop.rollout import send_action
-from vjepa2_ac.simulation.recording.record import JPEG_QUALITY, RecordingSpec, arm_of, carry_out, read_simulation
-from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.record import JPEG_QUALITY, RecordingSpec, arm_of, carry_out, read_simulation
+from vjepa2_ac.simulation.rollout import send_action
 from vjepa2_ac.storage.places import SIMULATION_FILE
 
 RECORDED_CAMERAS = {"exterior_1_left": "exterior_1", "exterior_2_left": "exterior_2", "wrist_left": "wrist"}

@@ -20,8 +20,8 @@ from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
-from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
-from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, RolloutSpec
+from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
+from vjepa2_ac.simulation.rollout import ClosedLoopResult, RolloutSpec
 from vjepa2_ac.spaces import POSE, vector_states
 from worlds import Copier, Halfway, about, again, clips_batch
 

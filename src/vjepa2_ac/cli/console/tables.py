@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.evaluation.calibration.variants import VariantResult
     from vjepa2_ac.planning.decision import PlanResult
     from vjepa2_ac.planning.demonstrations.make_goals import MadeGoals
-    from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
+    from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
 
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red", "skipped": "cyan"}
 _USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that are not mentioned

@@ -3,17 +3,7 @@
 import numpy as np
 import pytest
 
-from vjepa2_ac.simulation.closed_loop.tasks import (
-    GRASP_M,
-    HOLDING,
-    LIFT_M,
-    PLACE_WAY_M,
-    PUSH_WAY_M,
-    RELEASED,
-    SUCCESS_M,
-    make_problem,
-)
-from vjepa2_ac.simulation.world.domains import (
+from vjepa2_ac.simulation.domains import (
     BLOCK_M,
     DOMAIN_A,
     DOMAIN_B,
@@ -24,7 +14,17 @@ from vjepa2_ac.simulation.world.domains import (
     WORK_AREA_M,
     Domain,
 )
-from vjepa2_ac.simulation.world.motion import MotionRecipe, forward_kinematics, inverse_kinematics, rest_joints
+from vjepa2_ac.simulation.motion import MotionRecipe, forward_kinematics, inverse_kinematics, rest_joints
+from vjepa2_ac.simulation.tasks import (
+    GRASP_M,
+    HOLDING,
+    LIFT_M,
+    PLACE_WAY_M,
+    PUSH_WAY_M,
+    RELEASED,
+    SUCCESS_M,
+    make_problem,
+)
 from vjepa2_ac.spaces import matrices_from_euler
 
 RECIPE = MotionRecipe()

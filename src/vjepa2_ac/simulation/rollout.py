@@ -15,8 +15,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.intervals import Estimate, mean_of, share_of
-from vjepa2_ac.simulation.closed_loop.policies import Image, Moves, Planning, Policy
-from vjepa2_ac.simulation.closed_loop.tasks import (
+from vjepa2_ac.simulation.arm import Block, Mark, SimulatedArm, State
+from vjepa2_ac.simulation.domains import Domain, named_domain
+from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ, HIGH, LOW, OutOfReachError, rest_joints
+from vjepa2_ac.simulation.policies import Image, Moves, Planning, Policy
+from vjepa2_ac.simulation.tasks import (
     ALSO,
     STEPS,
     SUCCESS_M,
@@ -26,9 +29,6 @@ from vjepa2_ac.simulation.closed_loop.tasks import (
     arm_for,
     make_problem,
 )
-from vjepa2_ac.simulation.world.arm import Block, Mark, SimulatedArm, State
-from vjepa2_ac.simulation.world.domains import Domain, named_domain
-from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, LOW, OutOfReachError, rest_joints
 from vjepa2_ac.spaces import apply_action
 
 

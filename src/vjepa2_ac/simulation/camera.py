@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from vjepa2_ac.simulation.world.domains import ARM_GROUP, STATIC_GROUP, CameraPlace, Domain, load_mujoco
+from vjepa2_ac.simulation.domains import ARM_GROUP, STATIC_GROUP, CameraPlace, Domain, load_mujoco
 
 FRAME_SIZE = 180, 320  # height and width: size of DROID's images in RLDS
 

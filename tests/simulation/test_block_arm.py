@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from projections import pixel_of
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING
-from vjepa2_ac.simulation.world.domains import BLOCK_M, DOMAIN_A, DOMAIN_B, Domain
-from vjepa2_ac.simulation.world.motion import downward_poses, poses_in_base
+from vjepa2_ac.simulation.domains import BLOCK_M, DOMAIN_A, DOMAIN_B, Domain
+from vjepa2_ac.simulation.motion import downward_poses, poses_in_base
+from vjepa2_ac.simulation.tasks import GRASP_M, HOLDING
 from vjepa2_ac.spaces import matrices_from_euler
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.closed_loop.rollout import put
-from vjepa2_ac.simulation.closed_loop.tasks import arm_for
-from vjepa2_ac.simulation.world.arm import ContactArm, SimulatedArm
+from vjepa2_ac.simulation.arm import ContactArm, SimulatedArm
+from vjepa2_ac.simulation.rollout import put
+from vjepa2_ac.simulation.tasks import arm_for
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ from tiny_models import tiny_model
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, demonstrate, every_step
-from vjepa2_ac.simulation.closed_loop.policies import Planning
-from vjepa2_ac.simulation.closed_loop.rollout import put, run_episode
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, arm_for, make_problem
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
+from vjepa2_ac.simulation.benchmark import DemonstratedGoals, DemonstrationSpec, demonstrate, every_step
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
+from vjepa2_ac.simulation.policies import Planning
+from vjepa2_ac.simulation.rollout import put, run_episode
+from vjepa2_ac.simulation.tasks import GRASP_M, HOLDING, arm_for, make_problem
 
 SMALL = (36, 64)
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from vjepa2_ac.simulation.world.camera import FRAME_SIZE, RayCamera
-from vjepa2_ac.simulation.world.domains import FINGER_TRAVEL_M, MOVING, SUBSTEPS, Domain, compile_scene, load_mujoco
-from vjepa2_ac.simulation.world.motion import (
+from vjepa2_ac.simulation.camera import FRAME_SIZE, RayCamera
+from vjepa2_ac.simulation.domains import FINGER_TRAVEL_M, MOVING, SUBSTEPS, Domain, compile_scene, load_mujoco
+from vjepa2_ac.simulation.motion import (
     CONTROL_RATE_HZ,
     GRIPPER_LAG_S,
     Joints,

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.closed_loop.policies import Oracle, RandomActions, ZeroActions, farthest
-from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, put, run_episode, run_task
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, RELEASED, STEPS, arm_for, make_problem
+from vjepa2_ac.simulation.policies import Oracle, RandomActions, ZeroActions, farthest
+from vjepa2_ac.simulation.rollout import RolloutSpec, put, run_episode, run_task
+from vjepa2_ac.simulation.tasks import GRASP_M, RELEASED, STEPS, arm_for, make_problem
 
 LIMITS = LimitsConfig()
 

@@ -23,7 +23,8 @@ from vjepa2_ac.planning.goals import GoalFolder, SubGoal
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.serving.wire import PlanningClient, goal_keys
-from vjepa2_ac.simulation.closed_loop.policies import (
+from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.policies import (
     GoalsOf,
     Image,
     Moves,
@@ -33,8 +34,7 @@ from vjepa2_ac.simulation.closed_loop.policies import (
     RandomActions,
     ZeroActions,
 )
-from vjepa2_ac.simulation.closed_loop.tasks import Problem
-from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.tasks import Problem
 
 JOINT_FIELDS = ("steps/observation/joint_position", "steps/observation/gripper_position")
 

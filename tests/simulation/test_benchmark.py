@@ -28,16 +28,16 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.serving.about import metadata_of
 from vjepa2_ac.serving.session import Session, SessionOptions
-from vjepa2_ac.simulation.closed_loop.agent import JOINT_FIELDS, Agent, agent_of_session
-from vjepa2_ac.simulation.closed_loop.benchmark import (
+from vjepa2_ac.simulation.agent import JOINT_FIELDS, Agent, agent_of_session
+from vjepa2_ac.simulation.benchmark import (
     FILM,
     STILLS,
     BenchmarkOptions,
     film_frames,
     run_benchmark,
 )
-from vjepa2_ac.simulation.closed_loop.policies import Planning
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.policies import Planning
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3", "planning.limits.xyz=[0.03,0.03,0.03]"]
 TWICE = ["--episodes", "2", "--steps", "2", "--films", "1"]

@@ -29,9 +29,12 @@ from vjepa2_ac.planning.demonstrations.key_frames import (
 )
 from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter, duration
-from vjepa2_ac.simulation.closed_loop.agent import Agent
-from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Oracle, Policy, RandomActions, ZeroActions
-from vjepa2_ac.simulation.closed_loop.rollout import (
+from vjepa2_ac.simulation.agent import Agent
+from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.camera import FRAME_SIZE
+from vjepa2_ac.simulation.domains import Domain
+from vjepa2_ac.simulation.policies import GoalsOf, Oracle, Policy, RandomActions, ZeroActions
+from vjepa2_ac.simulation.rollout import (
     ClosedLoopResult,
     EpisodeResult,
     RolloutSpec,
@@ -41,10 +44,7 @@ from vjepa2_ac.simulation.closed_loop.rollout import (
     run_episode,
     run_trials,
 )
-from vjepa2_ac.simulation.closed_loop.tasks import STEPS, Problem, TaskName, TaskProblem, arm_for
-from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.camera import FRAME_SIZE
-from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.simulation.tasks import STEPS, Problem, TaskName, TaskProblem, arm_for
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 

@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
-from vjepa2_ac.simulation.closed_loop.tasks import TaskName, TaskProblem, arm_for, make_problem
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
+from vjepa2_ac.simulation.tasks import TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.spaces import actions_from_states
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from tiny_models import tiny_model
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.simulation.closed_loop.policies import (
+from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.motion import HIGH, forward_kinematics
+from vjepa2_ac.simulation.policies import (
     Moves,
     Oracle,
     Planning,
@@ -23,15 +25,13 @@ from vjepa2_ac.simulation.closed_loop.policies import (
     farthest,
     shortened,
 )
-from vjepa2_ac.simulation.closed_loop.rollout import (
+from vjepa2_ac.simulation.rollout import (
     ClosedLoopResult,
     EpisodeResult,
     RolloutSpec,
     run_episode,
     run_task,
 )
-from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.motion import HIGH, forward_kinematics
 
 LIMITS = LimitsConfig(xyz=(0.075, 0.075, 0.075))
 SMALL = LimitsConfig(xyz=(0.03, 0.03, 0.03))

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.simulation.domains import Domain
 from vjepa2_ac.spaces import euler_from_matrices, matrices_from_euler
 
 Joints = Float[np.ndarray, " 7"]  # angles in radians

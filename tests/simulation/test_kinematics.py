@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vjepa2_ac.simulation.world.motion import (
+from vjepa2_ac.simulation.motion import (
     HIGH,
     HOME,
     LOW,

@@ -5,17 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, arm_for
-from vjepa2_ac.simulation.world.domains import BLOCK_M, DOMAIN_A
-from vjepa2_ac.simulation.world.motion import forward_kinematics
+from vjepa2_ac.simulation.domains import BLOCK_M, DOMAIN_A
+from vjepa2_ac.simulation.motion import forward_kinematics
+from vjepa2_ac.simulation.tasks import GRASP_M, arm_for
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.simulation.recording.record import RecordingSpec, default_steps, record_episode
-from vjepa2_ac.simulation.recording.scripted_play import play
+from vjepa2_ac.simulation.record import RecordingSpec, default_steps, record_episode
+from vjepa2_ac.simulation.scripted_play import play
 
 
 def blocks_of(task: str, seed: int, *, script: bool, steps: int = 41) -> np.ndarray:
@@ -67,7 +67,7 @@ def test_an_episode_with_a_block_is_consistent_and_always_the_same() -> None:
 
 
 def test_every_other_episode_is_scripted(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vjepa2_ac.simulation.recording import scripted_play as module
+    from vjepa2_ac.simulation import scripted_play as module
 
     asked, real = [], module.play
     monkeypatch.setattr(module, "play", lambda *args, **more: asked.append(more["script"]) or real(*args, **more))

@@ -10,12 +10,12 @@ import simplejpeg
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, DomainRanges
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, DomainRanges
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.recording.record import RecordingSpec, episode_folder, record_dataset, record_episode
-from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.record import RecordingSpec, episode_folder, record_dataset, record_episode
 
 EPISODES, STEPS = 3, 5
 

@@ -15,13 +15,13 @@ from pathlib import Path
 import pytest
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.simulation.closed_loop import world_process
-from vjepa2_ac.simulation.closed_loop.world_process import WorldProcess
+from vjepa2_ac.simulation import worlds
+from vjepa2_ac.simulation.worlds import WorldProcess
 
 pytest.importorskip("av", reason="the extra `video` is not installed")
 
-from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld
-from vjepa2_ac.simulation.recording.record_world import record_world
+from vjepa2_ac.simulation.record_world import record_world
+from vjepa2_ac.simulation.worlds import OtherWorld
 
 PIXELS = base64.b64encode(bytes(18)).decode()
 START = f"""
@@ -50,7 +50,7 @@ def program(tmp_path: Path) -> Program:
 @pytest.fixture
 def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a loaded machine start a program within the limit of its first answer, and wait briefly for the others."""
-    monkeypatch.setattr(world_process, "LOADING", 300)
+    monkeypatch.setattr(worlds, "LOADING", 300)
 
 
 def fail(command: str, timeout_s: float | None = None) -> str:
@@ -77,7 +77,7 @@ def test_a_world_that_does_not_answer_is_refused_in_time_with_its_last_errors(pr
 
 
 def test_the_first_answer_may_take_longer_than_the_others(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(world_process, "LOADING", 2)
+    monkeypatch.setattr(worlds, "LOADING", 2)
     assert "no answer within 0.1 s" in fail(program(first="time.sleep(1000)"), 0.05)
 
 
@@ -87,7 +87,7 @@ def test_a_world_that_closes_its_output_and_still_runs_is_refused(program: Progr
 
 
 def test_a_line_without_end_is_refused_at_a_bounded_size(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(world_process, "_MOST_BYTES", 1 << 20)
+    monkeypatch.setattr(worlds, "_MOST_BYTES", 1 << 20)
     assert "a line of more than 1 MiB" in fail(program("while True: sys.stdout.write('x' * 65536)"))
 
 
@@ -171,7 +171,7 @@ STUBBORN = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\nabout['child'] = subp
 STUBBORN += f"\nabout['pid'] = os.getpid()\n{HELLO}"  # and it lives on at the end of its input
 OPENER = """
 import sys
-from vjepa2_ac.simulation.closed_loop.world_process import WorldProcess
+from vjepa2_ac.simulation.worlds import WorldProcess
 with WorldProcess(sys.argv[1]) as world:
     about = world.exchange()
     print(about["pid"], about["child"], flush=True)

@@ -10,11 +10,12 @@ import pytest
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, CameraPlace, DomainRanges
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, CameraPlace, DomainRanges
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.recording.record import (
+from vjepa2_ac.simulation.motion import MotionRecipe
+from vjepa2_ac.simulation.record import (
     SIMULATION_FILE,
     RecordedSimulation,
     RecordingSpec,
@@ -23,7 +24,6 @@ from vjepa2_ac.simulation.recording.record import (
     record_dataset,
     record_episode,
 )
-from vjepa2_ac.simulation.world.motion import MotionRecipe
 
 SPECS = [
     RecordingSpec("A", 5, seed=3),

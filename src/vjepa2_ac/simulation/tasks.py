@@ -12,9 +12,9 @@ from typing import Literal, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.simulation.world.arm import Block, ContactArm, Mark, SimulatedArm, State
-from vjepa2_ac.simulation.world.camera import FRAME_SIZE
-from vjepa2_ac.simulation.world.domains import (
+from vjepa2_ac.simulation.arm import Block, ContactArm, Mark, SimulatedArm, State
+from vjepa2_ac.simulation.camera import FRAME_SIZE
+from vjepa2_ac.simulation.domains import (
     BLOCK_M,
     FINGER_HALF_M,
     FINGER_INSIDE_M,
@@ -23,7 +23,7 @@ from vjepa2_ac.simulation.world.domains import (
     FINGERTIP_M,
     Domain,
 )
-from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
+from vjepa2_ac.simulation.motion import MotionRecipe, downward_poses, poses_in_base
 
 TaskName = Literal["reach", "push", "pick", "place"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld, WorldObservation
+from vjepa2_ac.simulation.worlds import OtherWorld, WorldObservation
 from vjepa2_ac.storage import atomic_writer, user_can_write
 
 REST_S = 0.5  # after success an episode goes on for so long

@@ -12,11 +12,11 @@ from jaxtyping import Float
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import ACTION_DIM
-from vjepa2_ac.simulation.closed_loop.policies import Oracle, shortened
-from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskName, TaskProblem, make_problem
-from vjepa2_ac.simulation.world.arm import Look, SimulatedArm
-from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, OutOfReachError
+from vjepa2_ac.simulation.arm import Look, SimulatedArm
+from vjepa2_ac.simulation.motion import Motion, MotionRecipe, OutOfReachError
+from vjepa2_ac.simulation.policies import Oracle, shortened
+from vjepa2_ac.simulation.rollout import put, ways_along
+from vjepa2_ac.simulation.tasks import GRASP_M, TaskName, TaskProblem, make_problem
 from vjepa2_ac.spaces import apply_action
 
 _NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's step

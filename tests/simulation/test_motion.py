@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
-from vjepa2_ac.simulation.world.motion import (
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
+from vjepa2_ac.simulation.motion import (
     HIGH,
     HOME,
     LOW,

@@ -31,10 +31,10 @@ from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.process import safe_imports
-from vjepa2_ac.simulation.closed_loop.tasks import arm_for
-from vjepa2_ac.simulation.world.arm import Look, SimulatedArm
-from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, load_mujoco, named_domain, sample_domain
-from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
+from vjepa2_ac.simulation.arm import Look, SimulatedArm
+from vjepa2_ac.simulation.domains import Domain, DomainRanges, load_mujoco, named_domain, sample_domain
+from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
+from vjepa2_ac.simulation.tasks import arm_for
 from vjepa2_ac.storage.places import SIMULATION_FILE
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
 
@@ -108,7 +108,7 @@ def carry_out(
     """
     rng = _stream(index, spec, _MOTION)
     if spec.task is not None:  # contacts depend on all that happened before
-        from vjepa2_ac.simulation.recording.scripted_play import play  # imports torch
+        from vjepa2_ac.simulation.scripted_play import play  # imports torch
 
         return play(arm, spec.task, spec.steps if until is None else until, rng, script=index % 2 == 0, look=look)
     arm.reset_clock()

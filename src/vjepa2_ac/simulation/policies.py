@@ -16,8 +16,8 @@ from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.evaluation.imagined_plan import imagined_next
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, RELEASED, Problem, TaskName, TaskProblem
-from vjepa2_ac.simulation.world.arm import Block, SimulatedArm, State
+from vjepa2_ac.simulation.arm import Block, SimulatedArm, State
+from vjepa2_ac.simulation.tasks import GRASP_M, RELEASED, Problem, TaskName, TaskProblem
 
 GoalsOf = Callable[[Any], Sequence[SubGoal]]  # of a problem of its world
 Image = UInt8[np.ndarray, "height width 3"]

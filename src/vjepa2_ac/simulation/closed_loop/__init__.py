@@ -1,1 +1,0 @@
-"""Closed loop: how well does a policy control the simulated arm?"""

@@ -1,1 +1,0 @@
-"""Recording: demonstrations of the simulated arm."""
