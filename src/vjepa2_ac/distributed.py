@@ -5,8 +5,7 @@ MASTER_PORT. Gradients are summed once per optimizer step, after the last micro-
 model: a process may have no clip in a micro-batch (`data.broken_episodes: skip`), and would leave a wrapper waiting.
 
 What only some processes do may take hours (an index, a checkpoint on a slow disk) or fail: `first_only`,
-`first_of_machine` and `agreed` let the others wait for it without a time-out, and raise its error in all. Processes
-that are `joined` do not wait for one that fails, is killed or stands still: all end with the first cause.
+`first_of_machine` and `agreed` let the others wait for it without a time-out, and raise its error in all.
 """
 
 from __future__ import annotations
@@ -16,11 +15,8 @@ import logging
 import math
 import os
 import re
-import socket
-import sys
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
 from datetime import timedelta
@@ -36,7 +32,7 @@ from torch import Tensor, nn
 from torch.distributed.rendezvous import rendezvous
 
 from vjepa2_ac.config import Config, ModelConfig, TrainingConfig
-from vjepa2_ac.errors import InputError, UnreachableError, UserError, in_words, printable
+from vjepa2_ac.errors import InputError, UnreachableError, UserError, in_words
 from vjepa2_ac.process import StoppedError
 
 _log = logging.getLogger(__name__)
@@ -60,9 +56,6 @@ _PATIENCE_S = 5.0  # until the others that are waited for are reported
 LARGE = 1_000_000  # numbers of a gradient that is a message of its own
 _LONGEST_STEP = timedelta(hours=2)  # until a process is given up that does not come to a sum: its disk may have stalled
 _AS_LONG_AS_IT_TAKES = timedelta(days=7)
-_BEAT_S = 2.0  # from one sign of life of a process to the next
-_SILENT_S, _BROKEN_SILENT_S = 30.0, 8.0  # without one a process is lost; the latter where a connection was lost, too
-_GRACE_S = 10.0  # for the main thread to end by itself
 
 
 # ---- the device, checked before anything is loaded ----
@@ -491,141 +484,36 @@ def shared(items: Sequence[_T], work: Callable[[_T], _Result], progress: Callabl
     return [result for _, result in sorted(gathered(found), key=lambda one: one[0])]
 
 
-# ---- nothing hangs ----
+# ---- a whole run ----
 
 
 @contextlib.contextmanager
 def joined(config: Config) -> Iterator[Accelerator]:
-    """Join the processes of a run, as `make_accelerator`; if one of them fails, dies or stands still, all end.
+    """Join the processes of a run, as `make_accelerator`.
 
-    A thread of every process gives a sign of life every two seconds, so that a slow process is no fault. One without a
-    sign for 30 s was killed or stopped, or its machine is gone. Whoever waits for it in a sum learns that, and ends.
+    The launcher (torchrun, `accelerate launch`, or srun with `--kill-on-bad-exit=1`) ends all processes when one fails.
 
     Raises:
-        UnreachableError: Another process was the first to end; names it, and what it said.
+        UnreachableError: The connection to another process was lost.
     """
     accelerator = make_accelerator(config)
-    if accelerator.num_processes == 1:
-        yield accelerator
-        return
-    watch = _Watch(accelerator)
     try:
         yield accelerator
-    except StoppedError:  # all at once
-        watch.leave()
+    except StoppedError:  # in all processes
         leave_processes()
         raise
-    except BaseException as error:
-        cause = watch.cause_of(error)
-        watch.leave()
-        if cause:
-            raise _ended_by(cause) from error
-        raise
-    watch.leave()
-
-
-_last_works: list[Callable[[], object]] = []
-
-
-@contextlib.contextmanager
-def before_exit(work: Callable[[], object]) -> Iterator[None]:
-    """Within the context, do this before the watch of `joined` ends this process, whose main thread stands still."""
-    _last_works.append(work)
-    try:
-        yield
-    finally:
-        _last_works.remove(work)
+    except RuntimeError as error:
+        if accelerator.num_processes == 1 or not _is_lost_connection(error):
+            raise
+        fix = "Look at the output of the other processes. The same command resumes from the newest checkpoint"
+        raise UnreachableError(where="another process of this run", found=in_words(error), fix=fix) from error
 
 
 def leave_processes() -> None:
-    """End what joins this process to others, if anything does; all call, after all has gone well."""
+    """End the process group, if there is one; all processes call it after success."""
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
 
 
-class _Watch:
-    """Gives signs of life of this process, and looks for those of others, in a store that all of them see."""
-
-    def __init__(self, accelerator: Accelerator) -> None:
-        self._rank = accelerator.process_index
-        self._watched = range(1, accelerator.num_processes) if self._rank == 0 else range(1)
-        self._store = _own_store(accelerator)
-        self._name = f"process {self._rank} ({socket.gethostname()}, pid {os.getpid()})"
-        self._store.multi_set([f"beat {self._rank}", f"name {self._rank}"], ["0", self._name])
-        if self._rank == 0:
-            self._store.multi_set(["is broken", "cause"], ["", ""])
-        all_gather_object(accelerator, None)  # everything is there
-        self._cause, self._is_known, self._leaves = "", threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
-        self._thread.start()
-
-    def cause_of(self, error: BaseException) -> str:
-        """Return what ended another process before this one met an error; empty: nothing. Tell the others of it."""
-        is_plain = isinstance(error, _ToldError) or not isinstance(error, RuntimeError)  # of a lost connection
-        with contextlib.suppress(RuntimeError):
-            if not is_plain:
-                self._store.set("is broken", "yes")
-                self._is_known.wait(_BROKEN_SILENT_S + 3 * _BEAT_S)
-            self._tell(f"{self._name} ended: {type(error).__name__}: {in_words(error)}")
-        return "" if is_plain or self._cause.startswith(self._name) else self._cause
-
-    def leave(self) -> None:
-        """End, without a fault; the first process, at which the others meet, lets them leave or learn first."""
-        self._leaves.set()
-        self._thread.join()
-        with contextlib.suppress(RuntimeError):
-            self._store.set(f"beat {self._rank}", "left")
-            end = time.monotonic() + 3 * _BEAT_S
-            while self._rank == 0 and time.monotonic() < end and set(self._beats()) != {b"left"}:
-                time.sleep(0.05)
-
-    def _run(self) -> None:
-        seen, count = {rank: (b"", time.monotonic()) for rank in self._watched}, 0
-        while not self._leaves.wait(_BEAT_S):
-            count += 1
-            try:
-                self._store.set(f"beat {self._rank}", str(count))
-                self._look(seen)
-                self._cause = self._store.get("cause").decode()
-            except RuntimeError:  # torch's DistError
-                if seen.get(0, (b"", 0.0))[0] == b"left":  # all has gone well there
-                    return
-                self._cause = "process 0, at which the others meet, is gone"
-            if self._cause:
-                self._is_known.set()
-                if not self._leaves.wait(_GRACE_S):  # the main thread waits for a process that will not come
-                    sys.stderr.write(f"error: {printable(str(_ended_by(self._cause)))}\n")
-                    for work in _last_works[::-1]:
-                        work()
-                    os._exit(2)
-                return
-
-    def _look(self, seen: dict[int, tuple[bytes, float]]) -> None:
-        """Update the last beat of each watched process, and when it was new; tell of one that is silent."""
-        now, limit = time.monotonic(), _BROKEN_SILENT_S if self._store.get("is broken") else _SILENT_S
-        for rank, beat in zip(self._watched, self._beats(), strict=True):
-            if beat == seen[rank][0] != b"left" and now - seen[rank][1] > limit:
-                name = self._store.get(f"name {rank}").decode()
-                self._tell(f"{name} was killed or stopped: no sign of life for {limit:.0f} s")
-            if beat != seen[rank][0]:
-                seen[rank] = beat, now
-
-    def _tell(self, cause: str) -> None:
-        """Tell all a cause, unless there is an earlier one."""
-        self._cause = self._store.compare_set("cause", "", cause).decode()
-
-    def _beats(self) -> list[bytes]:
-        return list(self._store.multi_get([f"beat {rank}" for rank in self._watched]))
-
-
-def _own_store(accelerator: Accelerator) -> Any:
-    """Return this process's own connection to the store by which the processes have met."""
-    place, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
-    c10d: Any = torch.distributed  # without types
-    store = c10d.TCPStore(place, port, is_master=False, timeout=timedelta(seconds=_SILENT_S))
-    return c10d.PrefixStore(broadcast_object(accelerator, uuid.uuid4().hex), store)
-
-
-def _ended_by(cause: str) -> UnreachableError:
-    fix = "The same command goes on from the newest checkpoint"
-    return UnreachableError(where="another process of this run", found=cause, fix=fix)
+def _is_lost_connection(error: RuntimeError) -> bool:
+    return isinstance(error, torch.distributed.DistError) or "gloo" in str(error)

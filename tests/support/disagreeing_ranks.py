@@ -64,23 +64,8 @@ def index_cannot_be_made() -> None:
         data_sets.open_dataset = mock.Mock(side_effect=InputError(where="data.path", found="no data set"))
 
 
-def all_lose_patience_soon() -> None:
-    distributed._SILENT_S, distributed._GRACE_S = 6.0, 2.0
-
-
 def another_never_comes() -> None:
     distributed._MEETING = timedelta(seconds=3)
-
-
-def one_leaves_late() -> None:
-    """When the first process, at which they meet, is gone."""
-    distributed._BEAT_S, leave = 0.2, distributed._Watch.leave
-
-    def late(watch: distributed._Watch) -> None:
-        time.sleep(3.0 * RANK)
-        leave(watch)
-
-    distributed._Watch.leave = late
 
 
 def one_is_killed_once() -> None:

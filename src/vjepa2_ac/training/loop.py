@@ -21,7 +21,6 @@ from vjepa2_ac.config.loading import config_as_dict
 from vjepa2_ac.distributed import (
     agreed,
     all_reduce_max,
-    before_exit,
     broadcast_object,
     first_only,
     joined,
@@ -147,7 +146,6 @@ def _begun(
     metrics_log, mirror = until_the_end.enter_context(watched), opened.mirror(run_id)
     if mirror is not None:
         until_the_end.enter_context(mirror)
-        until_the_end.enter_context(before_exit(mirror.finish_soon))
     return metrics_log, mirror
 
 
