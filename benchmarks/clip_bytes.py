@@ -21,8 +21,8 @@ from synthetic_droid import draw_episodes
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig, RldsData
-from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.simulation.droid_writer import write_droid_rlds
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 FRAMES, STRIDE = 16, 4

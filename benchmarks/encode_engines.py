@@ -25,8 +25,8 @@ from safetensors.torch import load_file
 from synthetic_droid import draw_episodes
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
-from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.simulation.droid_writer import write_droid_rlds
 
 STEPS = 40  # of an episode
 SIZES = ModelSizes(

@@ -35,9 +35,9 @@ from vjepa2_ac.data.dataset import open_dataset, read_clip
 from vjepa2_ac.data.index import EpisodeTable, get_or_build
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.selection import StepSelection
-from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.data.windows import ClipOrder, clip_starts, windows_of
 from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.simulation.droid_writer import write_droid_rlds
 
 DROID_EPISODES = 95_658
 

@@ -22,13 +22,13 @@ from faults import CLEAN, FAULTS, Fault, Recording, spoiled
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import load_config, parse_config
-from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.inspection.check import check_data
-from vjepa2_ac.data.inspection.findings import Finding
-from vjepa2_ac.data.inspection.statistics import at_some_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.data import VariantProbe, probe_config
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.coverage import sample_of
+from vjepa2_ac.inspection.findings import Finding
+from vjepa2_ac.inspection.statistics import at_some_stride
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 HELD_OUT = 0.7  # of the episodes: the probe measures these

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vjepa2_ac.data.sources.rlds.droid_writer import CAMERAS, DroidCommands, DroidEpisode, DroidMeasurements
 from vjepa2_ac.media.images import encode_jpeg
+from vjepa2_ac.simulation.droid_writer import CAMERAS, DroidCommands, DroidEpisode, DroidMeasurements
 
 
 def draw_episodes(count: int = 12, steps: int = 290) -> Iterator[DroidEpisode]:

@@ -138,7 +138,7 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
         raise Found(keys)
 
     for source in WRITERS:
-        module = source if source == "npz" else f"{source}.source"
+        module = source if source in {"npz", "droid_raw"} else f"{source}.source"
         monkeypatch.setattr(f"vjepa2_ac.data.sources.{module}.get_or_build", stop)
     monkeypatch.setattr(idle_ranges, "get_or_make", stop)
 

@@ -19,9 +19,9 @@ from vector_sets import draw_vector, vectors, write_vectors
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.data import convert
 from vjepa2_ac.data import dataset as opening
-from vjepa2_ac.data.conversion import lerobot_writer
-from vjepa2_ac.data.conversion.convert import convert_to_lerobot
+from vjepa2_ac.data.convert import convert_to_lerobot
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError, UnreachableError
@@ -176,7 +176,7 @@ def test_the_form_is_that_of_lerobot(droid: Path, tmp_path: Path) -> None:
 
 
 def test_the_table_of_episodes_says_where_each_is(droid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lerobot_writer, "_EPISODES_AT_ONCE", 4)  # written in two parts
+    monkeypatch.setattr(convert, "_EPISODES_AT_ONCE", 4)  # written in two parts
     convert_to_lerobot(config_of(droid), tmp_path / "out", SILENT)
     rows = parquet.read_table(tmp_path / "out/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     key = "observation.images.exterior_1_left"

@@ -16,12 +16,12 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data.dataset import Dataset, open_dataset, through_latents
-from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.splits import describe_splits
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft import Machine, choose_model, make_draft
 from vjepa2_ac.init.found import plain
 from vjepa2_ac.init.look import look_at, measured
+from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.training.data_sets import open_data_sets
 
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")

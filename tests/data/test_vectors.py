@@ -17,11 +17,11 @@ from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.inspection.check import batch_findings
-from vjepa2_ac.data.inspection.statistics import CHANGED, inspect_dataset
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.inspection.check import batch_findings
+from vjepa2_ac.inspection.statistics import CHANGED, inspect_dataset
 from vjepa2_ac.reports.sheet import plot_dataset
 from vjepa2_ac.spaces import Spaces
 

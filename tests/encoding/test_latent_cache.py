@@ -26,8 +26,6 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, frames_of, open_dataset
-from vjepa2_ac.data.inspection.check import check_data
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.data.sources.latents.cache_files import (
@@ -41,12 +39,14 @@ from vjepa2_ac.data.sources.latents.cache_files import (
     pack_latents,
     unpack_latents,
 )
-from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.encoding import batch
 from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.statistics import inspect_dataset
 from vjepa2_ac.reports.sheet import plot_dataset
+from vjepa2_ac.simulation.droid_writer import write_droid_rlds
 
 STEPS, FRAMES, TOKENS, DIM = 12, (0, 2, 5, 11), 4, 24
 

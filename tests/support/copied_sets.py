@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_sets import recorded, write_v30
 from recordings import write_raw_droid
 from synthetic import draw_frame, synthetic_episode, synthetic_states
-from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
+from vjepa2_ac.simulation.droid_writer import write_droid_rlds
 
 STEPS = 14
 SIZE = (24, 32)

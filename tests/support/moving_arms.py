@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.data.inspection.excerpts import Excerpt, small_grey
+from vjepa2_ac.inspection.excerpts import Excerpt, small_grey
 
 STEPS, RATE_HZ = 48, 15.0
 ROWS, COLUMNS = 24, 32

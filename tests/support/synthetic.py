@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.data.sources.rlds.droid_writer import (
+from vjepa2_ac.media.images import encode_jpeg
+from vjepa2_ac.simulation.droid_writer import (
     CAMERAS,
     DroidCommands,
     DroidEpisode,
     DroidMeasurements,
     write_droid_rlds,
 )
-from vjepa2_ac.media.images import encode_jpeg
 
 
 def synthetic_states(steps: int, *, seed: int = 0) -> Float[np.ndarray, "steps 7"]:

@@ -74,7 +74,7 @@ def _convert(options: argparse.Namespace) -> None:
     config = cli.read_config(options.config, options.overrides)
     cli.require_new_place(options.out)
 
-    from vjepa2_ac.data.conversion.convert import convert_to_lerobot
+    from vjepa2_ac.data.convert import convert_to_lerobot
 
     with cli.reporter() as reporter:
         episodes, steps = convert_to_lerobot(config.data, options.out, reporter)
@@ -119,8 +119,8 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
         as_json: Print one JSON object and nothing else, when all checks are done.
     """
     from vjepa2_ac.cli.console.tables import print_finding, variants_table
-    from vjepa2_ac.data.inspection.check import check_data
-    from vjepa2_ac.data.inspection.findings import Finding, findings_as_dict, summary_of
+    from vjepa2_ac.inspection.check import check_data
+    from vjepa2_ac.inspection.findings import Finding, findings_as_dict, summary_of
     from vjepa2_ac.reporter import INDEXING, SILENT
     from vjepa2_ac.storage.structured import json_text
 
@@ -152,8 +152,8 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
 
 def _probe(config: Config, model: str, *, clips: int, progress: Progress) -> VariantProbe:
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.data.inspection.statistics import at_some_stride
     from vjepa2_ac.evaluation.calibration.data import probe_config
+    from vjepa2_ac.inspection.statistics import at_some_stride
 
     return probe_config(config, at_some_stride(open_dataset(config.data)), model=model, clips=clips, progress=progress)
 
@@ -180,7 +180,7 @@ def _inspect(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.cli.console.tables import motion_table
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.data.inspection.statistics import RELEASED, at_some_stride, inspect_dataset
+    from vjepa2_ac.inspection.statistics import RELEASED, at_some_stride, inspect_dataset
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.sheet import plot_dataset
     from vjepa2_ac.storage import write_atomically

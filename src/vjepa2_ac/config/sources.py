@@ -142,7 +142,7 @@ class RldsData(DataConfig):
 class RawDroidData(DataConfig):
     """DROID's own folders."""
 
-    reader: ClassVar[str] = "vjepa2_ac.data.sources.droid_raw.source:RawDroidSource"
+    reader: ClassVar[str] = "vjepa2_ac.data.sources.droid_raw:RawDroidSource"
     has_vectors: ClassVar[bool] = False
     same_identity_fix: ClassVar[str] = "Name a smaller folder in data.path"
 

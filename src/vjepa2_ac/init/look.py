@@ -14,7 +14,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
 from vjepa2_ac.data.files import in_parallel, walk
 from vjepa2_ac.data.index import EpisodeTable
-from vjepa2_ac.data.sources.droid_raw.source import find_episodes
+from vjepa2_ac.data.sources.droid_raw import find_episodes
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.lerobot.info import INFO
 from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz

@@ -13,13 +13,13 @@ from jaxtyping import Float, UInt8
 from matplotlib.patches import Patch, Rectangle
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.coverage import ENOUGH_NEAR, ReadEpisode
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import runs_of
-from vjepa2_ac.data.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, Inspection, idle_runs, largest_change
 from vjepa2_ac.data.transforms import CropBox, crop_box
 from vjepa2_ac.episode import Progress, no_progress, short_names
 from vjepa2_ac.errors import InputError, counted
+from vjepa2_ac.inspection.coverage import ENOUGH_NEAR, ReadEpisode
+from vjepa2_ac.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, Inspection, idle_runs, largest_change
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, written_figure
 
 _PLACES = 6000  # points of the map, at most

@@ -20,19 +20,19 @@ from jaxtyping import Float
 from pydantic import Field
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.rlds.droid_writer import (
-    CAMERAS,
-    DroidCommands,
-    DroidEpisode,
-    DroidMeasurements,
-    write_droid_rlds,
-)
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.process import safe_imports
 from vjepa2_ac.simulation.arm import Look, SimulatedArm
 from vjepa2_ac.simulation.domains import Domain, DomainRanges, load_mujoco, named_domain, sample_domain
+from vjepa2_ac.simulation.droid_writer import (
+    CAMERAS,
+    DroidCommands,
+    DroidEpisode,
+    DroidMeasurements,
+    write_droid_rlds,
+)
 from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
 from vjepa2_ac.simulation.tasks import arm_for
 from vjepa2_ac.storage.places import SIMULATION_FILE

@@ -151,7 +151,7 @@ def _begun(
 
 def _write_measured(run: Run) -> None:
     """Write what the data and the base have shown: the metrics of a chosen stride, and what the actions teach."""
-    from vjepa2_ac.data.coverage import coverage_in
+    from vjepa2_ac.inspection.coverage import coverage_in
 
     folder = run.folder
     if run.calibration is not None:

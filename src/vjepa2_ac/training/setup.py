@@ -19,7 +19,6 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.model import ModelSizes
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.inspection.motion import warnings_from_index
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader
 from vjepa2_ac.data.streams import copies_for, require_shared_memory
 from vjepa2_ac.distributed import (
@@ -149,6 +148,8 @@ def set_up(
         decoder = load_decoder(config.validation.decoder, where="validation.decoder:")
     # The others find the index of the first one on this machine, however long it takes.
     dataset, *others = first_of_machine(accelerator, lambda: open_data_sets(config, reporter))
+    from vjepa2_ac.inspection.motion import warnings_from_index
+
     for warning in warnings_from_index(dataset):
         reporter.note(f"Warning: {warning.text}.")
     _check_heads(config, dataset)

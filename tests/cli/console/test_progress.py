@@ -17,9 +17,9 @@ from vjepa2_ac.cli.console import progress as console_module
 from vjepa2_ac.cli.console import tables
 from vjepa2_ac.cli.console.progress import ConsoleReporter, ProgressBar
 from vjepa2_ac.cli.console.training import TrainingConsole
-from vjepa2_ac.data.inspection.findings import Finding
 from vjepa2_ac.evaluation.measure import VALIDATED
 from vjepa2_ac.evaluation.result import PredictionErrors, Validation
+from vjepa2_ac.inspection.findings import Finding
 
 PACKAGE = Path(vjepa2_ac.__file__).parent
 FIGURES = {"loss": 0.51234, "samples_per_second": 1.5, "data_wait_share": 0.1}

@@ -15,7 +15,7 @@ from gcs import Gcs
 from recordings import write_mp4, write_raw_droid
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
+from vjepa2_ac.data.sources.droid_raw import RawDroidSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media import video as video_reader
 

@@ -20,13 +20,13 @@ from recordings import write_raw_droid
 from synthetic import draw_frame, synthetic_episode
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.inspection.excerpts import excerpts_of
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.inspection.excerpts import excerpts_of
+from vjepa2_ac.inspection.statistics import inspect_dataset
+from vjepa2_ac.simulation.droid_writer import write_droid_rlds
 from vjepa2_ac.storage import retries
 
 LENGTHS = (14, 17, 15, 12)

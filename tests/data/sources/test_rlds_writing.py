@@ -12,8 +12,8 @@ import pytest
 from paths import GOLDEN
 from synthetic import synthetic_episode, write_synthetic_droid
 from tfrecords import decode_example, index_records, read_record
-from vjepa2_ac.data.sources.rlds.droid_writer import CAMERAS, DroidEpisode, write_droid_rlds
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.simulation.droid_writer import CAMERAS, DroidEpisode, write_droid_rlds
 
 
 def layout(shard: Path) -> dict[str, list[object]]:

@@ -18,10 +18,10 @@ from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:
     from vjepa2_ac.data.index import EpisodeTable, Usage
-    from vjepa2_ac.data.inspection.findings import Finding
-    from vjepa2_ac.data.inspection.statistics import StepSizes
     from vjepa2_ac.decoding.decoder_folder import DecoderCard
     from vjepa2_ac.evaluation.calibration.variants import VariantResult
+    from vjepa2_ac.inspection.findings import Finding
+    from vjepa2_ac.inspection.statistics import StepSizes
     from vjepa2_ac.planning.decision import PlanResult
     from vjepa2_ac.planning.demonstrations.make_goals import MadeGoals
     from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
@@ -182,7 +182,7 @@ def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
 
 def motion_table(steps: Sequence[StepSizes]) -> Table:
     """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
-    from vjepa2_ac.data.inspection.statistics import CHANGED, MOVED, TURNED
+    from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED
 
     changes = "the number that changes most (% of its range)"
     sizes = {MOVED: "moves by (cm)", TURNED: "turns by (degrees)", CHANGED: changes}

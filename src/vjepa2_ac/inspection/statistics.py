@@ -12,7 +12,11 @@ from jaxtyping import Bool, Float
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import (
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
+from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.errors import InputError, counted
+from vjepa2_ac.inspection.coverage import (
     Coverage,
     Duplicates,
     ReadEpisode,
@@ -21,10 +25,6 @@ from vjepa2_ac.data.coverage import (
     lines_of,
     read_sample,
 )
-from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
-from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import rotation_angles
 
 PERCENTILES = (10, 50, 90, 99)

@@ -14,11 +14,11 @@ from gcs import Gcs
 from memory_source import MemorySource
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.coverage import Duplicates, find_duplicates
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index import UNKNOWN, hash_of_states
-from vjepa2_ac.data.inspection.check import check_data
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.coverage import Duplicates, find_duplicates
+from vjepa2_ac.inspection.statistics import inspect_dataset
 
 RECORDINGS = (0, 1, 2, 3, 0, 4, 5, 0, 6, 4)  # the first one three times, the fifth one twice
 

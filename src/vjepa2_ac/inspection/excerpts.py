@@ -22,10 +22,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import rankdata
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.coverage import read_each, sample_of
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.inspection.findings import Finding, Level
 from vjepa2_ac.errors import counted
+from vjepa2_ac.inspection.coverage import read_each, sample_of
+from vjepa2_ac.inspection.findings import Finding, Level
 from vjepa2_ac.spaces import POSE, StateSpace
 
 EPISODES, _EPISODES_AT_URL = 24, 12  # an episode of DROID is about 5 MB

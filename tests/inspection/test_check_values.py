@@ -8,7 +8,7 @@ import pytest
 from moving_arms import spot_frames, spot_states, write_spots
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.inspection.check import check_data
+from vjepa2_ac.inspection.check import check_data
 
 Values = dict[str, tuple[str, list[float]]]  # by name: level and numbers
 WITH_TIMES = {"source", "index", "timing"}

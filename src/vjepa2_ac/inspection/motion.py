@@ -11,16 +11,16 @@ from jaxtyping import Bool, Float, Float32
 from vjepa2_ac import storage
 from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.config.sources import PoseFields, RotationFormat
-from vjepa2_ac.data.coverage import PERCENTILE, ReadEpisode, find_duplicates, read_each, read_sample, sample_of
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import MEANS, SPANS
-from vjepa2_ac.data.inspection.excerpts import BLANK, is_still, num_excerpts, small_grey
-from vjepa2_ac.data.inspection.findings import Finding, Level, first_case
 from vjepa2_ac.data.poses import num_rotation_numbers
 from vjepa2_ac.data.rotation_formats import MIN_JUMPS, rotation_speeds, smoother_format
 from vjepa2_ac.data.selection import named
 from vjepa2_ac.data.sources.indexed_source import IndexedSource
 from vjepa2_ac.errors import counted
+from vjepa2_ac.inspection.coverage import PERCENTILE, ReadEpisode, find_duplicates, read_each, read_sample, sample_of
+from vjepa2_ac.inspection.excerpts import BLANK, is_still, num_excerpts, small_grey
+from vjepa2_ac.inspection.findings import Finding, Level, first_case
 from vjepa2_ac.spaces import POSE, step_sizes
 
 _EPISODES, _EPISODES_AT_URL = 200, 12

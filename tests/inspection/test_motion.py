@@ -13,11 +13,11 @@ from lerobot_sets import STATE, recorded, write_v30
 from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import MotionLimits
-from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.inspection import motion
-from vjepa2_ac.data.inspection.findings import Finding
-from vjepa2_ac.data.inspection.motion import (
+from vjepa2_ac.inspection import motion
+from vjepa2_ac.inspection.coverage import sample_of
+from vjepa2_ac.inspection.findings import Finding
+from vjepa2_ac.inspection.motion import (
     Stretch,
     check_motion,
     count_at_end,

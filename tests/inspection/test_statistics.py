@@ -9,10 +9,10 @@ import pytest
 from clips import dataset_in_memory, split_of
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.inspection.statistics import MOVED, TURNED, idle_runs, inspect_dataset
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.inspection.coverage import sample_of
+from vjepa2_ac.inspection.statistics import MOVED, TURNED, idle_runs, inspect_dataset
 from vjepa2_ac.reports import sheet as figure
 from vjepa2_ac.reports.sheet import plot_dataset
 

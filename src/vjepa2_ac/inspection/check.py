@@ -15,17 +15,17 @@ from jaxtyping import Float
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import ENOUGH_DIRECTIONS, Coverage, coverage_in, lines_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.inspection.excerpts import check_excerpts
-from vjepa2_ac.data.inspection.findings import Finding, Level, first_case
-from vjepa2_ac.data.inspection.motion import check_motion, duplicates_finding
-from vjepa2_ac.data.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.sources.indexed_source import FramesByStep
 from vjepa2_ac.data.splits import describe_splits, held_out_by
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError, counted
+from vjepa2_ac.inspection.coverage import ENOUGH_DIRECTIONS, Coverage, coverage_in, lines_of
+from vjepa2_ac.inspection.excerpts import check_excerpts
+from vjepa2_ac.inspection.findings import Finding, Level, first_case
+from vjepa2_ac.inspection.motion import check_motion, duplicates_finding
+from vjepa2_ac.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.media.video import is_same_rate
 from vjepa2_ac.spaces import POSE, POSES, Spaces, rotation_angles

@@ -9,10 +9,10 @@ import torch
 from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.inspection.check import batch_findings, check_data
-from vjepa2_ac.data.inspection.findings import Finding
-from vjepa2_ac.data.inspection.statistics import at_some_stride
 from vjepa2_ac.episode import Batch
+from vjepa2_ac.inspection.check import batch_findings, check_data
+from vjepa2_ac.inspection.findings import Finding
+from vjepa2_ac.inspection.statistics import at_some_stride
 
 ONLY_MOVES = torch.tensor([1.0, 1, 1, 0, 0, 0, 1])
 TURNS_BY_2_5 = torch.tensor([0.0, 0, 0, 2.5, 0, 0, 0])

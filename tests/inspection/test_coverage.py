@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.coverage import PLAY, Coverage, ReadEpisode, coverage_by, coverage_in, coverage_of
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.inspection.check import check_data, coverage_findings
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
+from vjepa2_ac.inspection.check import check_data, coverage_findings
+from vjepa2_ac.inspection.coverage import PLAY, Coverage, ReadEpisode, coverage_by, coverage_in, coverage_of
+from vjepa2_ac.inspection.statistics import inspect_dataset
 from vjepa2_ac.simulation.domains import named_domain
 from vjepa2_ac.simulation.motion import MotionRecipe, random_reaching
 from vjepa2_ac.spaces import POSE, matrices_from_euler, rotation_differences, states_in_camera_frame, vector_states

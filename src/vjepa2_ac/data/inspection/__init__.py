@@ -1,1 +1,0 @@
-"""Inspection: the content of a data set, and its errors."""

@@ -1,1 +1,0 @@
-"""DROID as it was recorded: trajectory.h5, metadata, MP4."""

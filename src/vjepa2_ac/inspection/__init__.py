@@ -1,0 +1,1 @@
+"""Inspection of data sets: checks, statistics, coverage of actions, duplicates."""
