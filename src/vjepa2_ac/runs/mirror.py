@@ -323,7 +323,8 @@ def _fetch(remote: RemoteCheckpoints, name: str, checkpoints: Path) -> bool:
 class Mirror:
     """Keeps another place in sync with a run's folder: in the background, one pass at a time.
 
-    An outage is warned of once, however long it is; and files that are only on this machine in the end, once more.
+    An outage is reported by one warning, however long it lasts. Files that are only on this machine at the end are
+    reported by another one.
 
     Args:
         place: `checkpoint.remote`.
@@ -333,20 +334,19 @@ class Mirror:
 
     def __init__(self, place: str, config: Config, run_id: str) -> None:
         self._remote, self._run_id = RemoteCheckpoints(storage.absolute(place)), run_id
-        self._folder, self._config, self._outage_reported = Path(config.run_dir), config.checkpoint, False
+        self._folder, self._config = Path(config.run_dir), config.checkpoint
         self._thread: threading.Thread | None = None
-        self._is_ending = self._has_ended = self._is_lost = self._is_hurried = False
-        self._finishing = threading.Lock()
         self._begun_s = -float("inf")
         self._aim: str | None = None  # the newest local checkpoint when the thread started
         self._sent: str | None = None  # the newest remote one
         self._starts: bytes | None = None  # the list of starts as uploaded: a different one there is a later start's
-        self._release()  # what a killed process has held
+        self._outage_reported = self._is_lost = self._is_ending = self._has_ended = False
+        self._release()  # links of a killed process
 
     def tick(self) -> None:
-        """Start a pass if it is due and there is something new; takes next to no time.
+        """Start a pass if it is due and there is a new checkpoint; returns at once.
 
-        The first checkpoint of a start is sent at once.
+        The first checkpoint of a start is sent without waiting.
         """
         is_due = time.monotonic() - self._begun_s >= 60.0 * self._config.remote_every_minutes
         if is_due and not self.is_sending and self._newest_here() != self._sent:
@@ -357,31 +357,23 @@ class Mirror:
         """Whether a pass is in progress."""
         return self._thread is not None and self._thread.is_alive()
 
-    def finish_soon(self) -> None:
-        """As `finish` on a machine that is about to stop; waits for one in another thread, which is short then."""
-        self._is_hurried = True
-        self.finish(lambda: True)
-
     def finish(self, is_asked_to_stop: Callable[[], bool]) -> None:
-        """Upload the newest files, and wait for that; warn if the place is not up to date then.
+        """Upload the newest files and wait for them; warn if the place is not up to date then.
 
         Args:
             is_asked_to_stop: Whether the machine is about to stop: then the wait is `checkpoint.remote_wait_seconds`,
                 else an hour.
         """
-        with self._finishing:
-            if not self._has_ended:
-                self._finish(is_asked_to_stop)
-
-    def _finish(self, is_asked_to_stop: Callable[[], bool]) -> None:
+        if self._has_ended:
+            return
         self._is_ending = True
-        is_short, until_s = False, time.monotonic() + LONGEST_WAIT_S
+        begun_s, limit_s = time.monotonic(), LONGEST_WAIT_S
         for is_last in (False, True):  # the current pass ends, or breaks off if there is a newer checkpoint
             if is_last and not self.is_sending:
                 self._begin()
-            while self._thread and self.is_sending and time.monotonic() < until_s:
-                if not is_short and (self._is_hurried or is_asked_to_stop()):
-                    is_short, until_s = True, time.monotonic() + self._config.remote_wait_seconds
+            while self._thread and self.is_sending and time.monotonic() < begun_s + limit_s:
+                if limit_s == LONGEST_WAIT_S and is_asked_to_stop():
+                    limit_s = time.monotonic() - begun_s + self._config.remote_wait_seconds
                 self._thread.join(_LOOK_EVERY_S)
         in_time = not self.is_sending
         self._has_ended = True
@@ -399,7 +391,7 @@ class Mirror:
     def __exit__(self, _kind: object, error: object, _traceback: object) -> None:
         """Stop uploading; if the run ends with an error, upload what exists first."""
         if isinstance(error, Exception):
-            self.finish_soon()
+            self.finish(lambda: True)
         self._has_ended = True
 
     def _begin(self) -> None:
@@ -424,7 +416,7 @@ class Mirror:
             log(text, _KNOB, _reason_of(error), self._config.remote_every_minutes)
             self._outage_reported = True
         except Exception:  # no error here may stop the run
-            logger.exception("%s: %s is not up to date; training goes on", _KNOB, self._remote.place)
+            logger.exception("%s: %s is not up to date; training continues", _KNOB, self._remote.place)
         finally:
             self._release()
 
