@@ -2,7 +2,6 @@
 
 import logging
 import sys
-import threading
 import types
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,7 +12,6 @@ import pytest
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.runs import trackers as tracker_threads
 from vjepa2_ac.runs.trackers import Trackers, open_trackers
 
 
@@ -108,66 +106,6 @@ def test_one_that_fails_later_costs_one_warning(caplog, fails_in: str) -> None:
     assert said.startswith("bad ")
     assert "ConnectionError: the network" in said
     assert "\n" not in said
-
-
-def test_one_that_hangs_is_left_behind(caplog, monkeypatch) -> None:
-    never, closing, slow = threading.Event(), threading.Event(), Kept()
-
-    def close() -> None:
-        closing.set()
-        never.wait(120)
-
-    slow.finish = close  # type: ignore[method-assign]
-    wait = tracker_threads._Thread.wait
-
-    def wait_when_all_hang(thread: tracker_threads._Thread, *limits: float) -> None:
-        assert closing.wait(120)
-        wait(thread, *limits)
-
-    monkeypatch.setattr(tracker_threads._Thread, "wait", wait_when_all_hang)
-    monkeypatch.setattr(tracker_threads, "CLOSING_S", 0.05)
-    trackers = Trackers({"stuck": lambda: never.wait(120), "slow": lambda: slow})  # type: ignore[dict-item, return-value]
-    trackers.log("train", 1, {"loss": 0.5})
-    trackers.close()
-    assert not never.is_set()
-    never.set()
-    assert len(slow.rows) == 1
-    assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["stuck cannot be opened", "slow did not close"]
-
-
-@pytest.fixture
-def now_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The time that trackers see, which stands."""
-    now = [0.0]
-    monkeypatch.setattr(tracker_threads, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
-    return now
-
-
-def test_one_that_takes_minutes_holds_up_nothing_and_gets_all_in_the_end(
-    caplog, monkeypatch, now_s: list[float]
-) -> None:
-    slow, is_asked, goes_on = Kept(), threading.Event(), threading.Event()
-    monkeypatch.setattr(tracker_threads, "CLOSING_S", 120.0)
-    taken = slow.log
-
-    def log(metrics: Mapping[str, float], step: int) -> None:
-        is_asked.set()
-        assert goes_on.wait(120)
-        taken(metrics, step)
-
-    slow.log = log  # type: ignore[method-assign]
-    trackers = Trackers({"slow": lambda: slow})
-    for step in range(100):
-        trackers.log("train", step, {"loss": 0.5})
-    assert is_asked.wait(120)
-    now_s[0] = 61.0
-    trackers.log("train", 100, {"loss": 0.5})
-    trackers.log("train", 101, {"loss": 0.5})
-    assert warnings_in(caplog) == ["slow failed (no answer within 60 s); its metrics wait"]
-    goes_on.set()
-    trackers.close()
-    assert [step for step, _ in slow.rows] == list(range(102))
-    assert slow.closed == 1
 
 
 def test_tensorboard_gets_the_numbers_and_forgets_steps_that_are_done_again(tmp_path: Path) -> None:

@@ -1,21 +1,19 @@
 """Trackers for a run's curves: TensorBoard, Weights & Biases and trackio, as the config asks, by Accelerate's classes.
 
-A tracker has a thread of its own: one that cannot be opened, fails or hangs is disabled with one warning, and training
-continues without it. Only a library that is not installed is an error, before the first step. `metrics.jsonl`
-(`runs.metrics_log`) has all metrics regardless of trackers. A resumed run, on whatever machine, continues the same W&B
-or trackio run.
+These libraries write in threads or processes of their own. A tracker that cannot be opened or that fails is disabled
+with one warning, and training continues without it. Only a library that is not installed is an error, before the first
+step. `metrics.jsonl` (`runs.metrics_log`) has all metrics regardless of trackers. A resumed run, on whatever machine,
+continues the same W&B or trackio run.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import logging
 import math
 import os
-import queue
-import threading
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,14 +29,9 @@ from vjepa2_ac.runs.folder import TENSORBOARD
 
 logger = logging.getLogger(__name__)
 
-PATIENCE_S = 60.0  # after which a warning says that a tracker does not answer
-CLOSING_S = 30.0  # that the end of a run waits for all of them
-MOST_ROWS = 10_000  # that wait for a tracker: some 15 MB
-MOST_IMAGES = 8  # likewise
-
 Image = UInt8[np.ndarray, "height width 3"]
 Opening = Callable[[], Any]
-"""Makes a tracker (accelerate.tracking.GeneralTracker), whose methods may raise anything, and take any time."""
+"""Makes a tracker (accelerate.tracking.GeneralTracker), whose methods may raise anything."""
 
 
 class Trackers:
@@ -49,80 +42,42 @@ class Trackers:
     """
 
     def __init__(self, openings: Mapping[str, Opening]) -> None:
-        self._threads = [_Thread(name, opening) for name, opening in openings.items()]
+        self._open: dict[str, Any] = {}
+        for name, opening in openings.items():
+            with self._disable_on_error(name, "cannot be opened", "training continues without it"):
+                tracker = opening()
+                tracker.start()
+                self._open[name] = tracker
 
     def log(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Log the numbers of a row; lists, such as errors by horizon, number by number from 1."""
         numbers = {f"{kind}/{key}": value for key, value in _numbers(metrics).items()}
-        for thread in self._threads:
-            thread.put(lambda tracker: tracker.log(numbers, step=step), MOST_ROWS)
+        self._for_each(lambda tracker: tracker.log(numbers, step=step))
 
     def log_image(self, kind: str, name: str, step: int, image: Image) -> None:
-        """Log an image, which nobody changes any more."""
-        for thread in self._threads:
-            thread.put(lambda tracker: tracker.log_images({f"{kind}/{name}": image[None]}, step=step), MOST_IMAGES)
+        """Log an image."""
+        self._for_each(lambda tracker: tracker.log_images({f"{kind}/{name}": image[None]}, step=step))
 
     def close(self) -> None:
         """Close all; a second call does nothing."""
-        threads, self._threads = self._threads, []
-        until_s = time.monotonic() + CLOSING_S
-        for thread in threads:
-            thread.rows.put(None)
-        for thread in threads:
-            thread.wait(max(0.0, until_s - time.monotonic()))
+        for name, tracker in self._open.items():
+            with self._disable_on_error(name, "did not close", "its last metrics may be missing there"):
+                tracker.finish()
+        self._open = {}
 
-
-class _Thread:
-    """A tracker in a thread, which makes it, sends it rows and closes it; problems are warned of once."""
-
-    def __init__(self, name: str, opening: Opening) -> None:
-        self._name, self._opening = name, opening
-        self.rows: queue.SimpleQueue[Callable[[Any], None] | None] = queue.SimpleQueue()  # None: the end
-        self._doing, self._since_s = "cannot be opened", time.monotonic()  # the current call, if it does not end
-        self._warned, self._dropped = False, 0
-        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
-        self._thread.start()
-
-    def put(self, send: Callable[[Any], None], most: int) -> None:
-        """Queue what is to be sent, unless so many rows wait already."""
-        if not self._thread.is_alive():
-            return
-        if self.rows.qsize() < most:
-            self.rows.put(send)
-        else:
-            self._dropped += 1
-        if time.monotonic() - self._since_s > PATIENCE_S:
-            self._warn(f"no answer within {PATIENCE_S:g} s", "its metrics wait")
-
-    def wait(self, within_s: float) -> None:
-        """Wait until it is closed, at most for the rest of `CLOSING_S`."""
-        self._thread.join(within_s)
-        if self._thread.is_alive():
-            self._warn(f"no answer within {CLOSING_S:g} s", "its last metrics may be missing there")
-        if self._dropped:
-            logger.warning("%s was too slow for %d rows, which are missing there", self._name, self._dropped)
-
-    def _work(self) -> None:
-        after = "going on without it"
-        try:
-            tracker = self._opening()
-            tracker.start()
-            self._since_s = math.inf
-            while (send := self.rows.get()) is not None:
-                self._doing, self._since_s = "failed", time.monotonic()
+    def _for_each(self, send: Callable[[Any], None]) -> None:
+        for name, tracker in list(self._open.items()):
+            with self._disable_on_error(name, "failed", "training continues without it"):
                 send(tracker)
-                self._since_s = math.inf
-            after = "its last metrics may be missing there"
-            self._doing, self._since_s = "did not close", time.monotonic()
-            tracker.finish()
-        except BaseException as error:  # also SystemExit and the like: a tracker never stops training
-            first_line = str(error).strip().partition("\n")[0]
-            self._warn(f"{type(error).__name__}: {first_line}".removesuffix(": "), after)
 
-    def _warn(self, reason: str, after: str) -> None:
-        if not self._warned:
-            self._warned = True
-            logger.warning("%s %s (%s); %s", self._name, self._doing, reason, after)
+    @contextlib.contextmanager
+    def _disable_on_error(self, name: str, problem: str, consequence: str) -> Iterator[None]:
+        try:
+            yield
+        except (Exception, SystemExit) as error:  # a tracker never stops training
+            reason = f"{type(error).__name__}: {next(iter(str(error).strip().splitlines()), '')}".removesuffix(": ")
+            logger.warning("%s %s (%s); %s", name, problem, reason, consequence)
+            self._open = {other: tracker for other, tracker in self._open.items() if other != name}
 
 
 def require_installed(tracking: TrackingConfig) -> None:
