@@ -82,7 +82,7 @@ ORDERS: dict[str, list[str]] = {
     "cli": [
         "console",
         "options next_command",
-        "completion train",
+        "train",
         "data",
         "evaluate explore plan policies closed_loop setup",
         "program",

@@ -32,10 +32,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Until then it holds its core: two trainings on the same cores were ten times slower (benchmarks/two_at_once.py).
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     atexit.register(gc.freeze)  # PyTorch's half a million objects are not searched for garbage when the program ends
-    if "_ARGCOMPLETE" in os.environ:  # a shell asks what may stand at its cursor
-        from vjepa2_ac.cli.completion import complete
-
-        complete(_parser(os.environ["COMP_LINE"].split()[1:]))
     with process.own_streams() as lost, _our_warnings(), tidy_end():
         status = _run(arguments)
         if problem := lost():
@@ -111,7 +107,7 @@ def _our_warnings() -> Iterator[None]:
 def _parser(words: Sequence[str] = ()) -> Parser:
     parser = Parser(prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped.")
     parser.add_argument("--version", action="version", version=__version__, help="show the version")
-    parser.epilog = "`vjepa2-ac COMMAND --help` begins with an example. Completion behind TAB: docs/start.md."
+    parser.epilog = "`vjepa2-ac COMMAND --help` begins with an example."
     groups: dict[str, list[Callable[[Commands], None]]] = {
         "begin": [setup.add_demo, setup.add_init, setup.add_download, setup.add_doctor, setup.add_config_command],
         "look": [data.add_data, evaluate.add_imagine, explore.add_explore],
