@@ -1,6 +1,6 @@
-"""Everything that needs a GPU, once: training step, memory, planning, encoders, decoder, a served decision.
+"""Everything that needs a GPU, once: training step, memory, planning, encoders.
 
-    python benchmarks/on_gpu.py --official ../vjepa2           # all of it: 15 to 20 minutes on an H100
+    python benchmarks/on_gpu.py --official ../vjepa2           # all of it: 10 to 15 minutes on an H100
     python benchmarks/on_gpu.py --only graph official --out FOLDER
 
 Each part is a benchmark of this folder with the arguments below, in a process of its own that ends within its limit,
@@ -10,7 +10,8 @@ then. Weights are random: times and memory do not depend on them. --official is 
 whose step and planner are timed beside ours; without one they are left out.
 
 The command is made for a machine that is lent for minutes: PyTorch with CUDA, Triton and gcc are needed, what was
-compiled is read again from TORCHINDUCTOR_CACHE_DIR. benchmarks/results/gpu.txt has what it printed on an H100.
+compiled is read again from TORCHINDUCTOR_CACHE_DIR. benchmarks/results/gpu.txt has what an H100 printed at commit
+0d046757, whose command had four more parts (serving, decoder, numerics, latents).
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from timing import BESIDE
 
 _STEP = "--device cuda --frames 16 --repeats 3 --warm-up 1 --official"
 _PLAN = "--device cuda --horizon 1 --at-once 64 --no-memory --warm-up 1 --official"
-_QUICK = {"--device cuda": "--quick", "+graph": "", "--large --decisions 3": "--decisions 2"}  # instead, by --quick
+_QUICK = {"--device cuda": "--quick", "+graph": ""}  # instead, by --quick
 _CPU_SCALE = 10  # of time limits with --quick: a CPU without AVX-512 emulates bfloat16
 
 
@@ -63,15 +64,8 @@ PARTS = (
          " --checkpointing on --attention auto", 90),
     Part("plan", "planning", f"{_PLAN} OFFICIAL --repeats 2", 120),
     Part("compiled_plan", "planning", f"{_PLAN} none --repeats 1 --compile --no-adapter", 90),
-    Part("serve", "serving", "--large --decisions 3", 90),
     Part("encoders", "encoders", "--device cuda", 60),
     Part("chunk", "encoders", "--device cuda --only ViT-g --frames 64", 40),
-    Part("decoder", "decoder", "--device cuda --dtype bfloat16 --image-size 256 --latent-dim 1408 --batch 64"
-         " --size small medium", 60),
-    Part("numerics", "numerics", "--device cuda --ways per_step auto --compile --steps 60 --image-size 128 --width 512"
-         " --latent-dim 256 --frames 8", 240),
-    Part("latents", "latents", "--device cuda --encoder-layers 40 --predictor-layers 24 --batch 8 --workers 8"
-         " --frames 16 --episodes 120 --test-episodes 16 --domains random", 240),
 )  # fmt: skip
 
 

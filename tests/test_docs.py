@@ -34,7 +34,7 @@ def test_every_form_of_data_has_its_config() -> None:
 
 DOCS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md"))]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
-TODAY = [path for path in [*DOCS, *SOURCES] if path.name != "log.md"]  # the log tells of how things were
+TODAY = [*DOCS, *SOURCES]
 PACKAGE = ROOT / "src/vjepa2_ac"
 OURS = {path.name for root in (ROOT, PACKAGE, ROOT / "tests") for path in root.iterdir() if path.is_dir()}
 OURS -= {"src", "demo"}  # the second is made by commands
@@ -155,7 +155,7 @@ SECTIONS = (
 
 def test_knobs_that_are_named_are_there() -> None:
     wrong = []
-    for path in [path for path in DOCS if path.name not in ("log.md", "IMPLEMENTATION_NOTES.md")]:
+    for path in [path for path in DOCS if path.name not in ("decisions.md", "IMPLEMENTATION_NOTES.md")]:
         named = re.findall(rf"`((?:{'|'.join(SECTIONS)})\.[a-z_]+(?:\.[a-z_]+)*)(?:[:=][^`]*)?`", path.read_text())
         wrong += [
             f"{path.name}: {name}" for name in named
@@ -166,7 +166,7 @@ def test_knobs_that_are_named_are_there() -> None:
 
 def test_whoever_shows_one_way_of_installing_an_extra_shows_both() -> None:
     for path in DOCS:
-        if path.name not in ("log.md", "CONTRIBUTING.md", "releasing.md"):
+        if path.name not in ("CONTRIBUTING.md", "releasing.md"):
             text = path.read_text()
             clone = set(re.findall(r'constraints\.txt -e "\.\[([\w,]+)\]"', text))
             wheel = set(re.findall(r'pip install "\$\(ls dist/\*\.whl\)\[([\w,]+)\]"', text))
@@ -176,7 +176,7 @@ def test_whoever_shows_one_way_of_installing_an_extra_shows_both() -> None:
 def test_no_text_installs_the_bare_name() -> None:
     """Whoever registers the name on an index could run code on the machine of every reader."""
     names = [*ROOT.glob("*.md"), *(path for folder in TEXTS for path in (ROOT / folder).rglob("*"))]
-    texts = {path: path.read_text() for path in names if path.suffix in SUFFIXES and path.name != "log.md"}
+    texts = {path: path.read_text() for path in names if path.suffix in SUFFIXES}
     bare = re.compile(r"""pip\S* install[^\n`#]*[\s"']vjepa2[-_]ac(?:\[[\w,]+\])?["'`\s](?!@)""")
     assert not {path.name: found for path, text in texts.items() if (found := bare.findall(text))}
     assert bare.search('pip install "vjepa2-ac[sim]"')

@@ -1,25 +1,31 @@
-"""What does PyTorch do otherwise where there is a GPU? It takes other attention, and many small tensors at once."""
+"""Replace what differs on a GPU: attention kernels, updates of many tensors at once, and a model without numbers."""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
 import torch
+from random_models import no_fingerprints
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 from torch.nn.functional import pad
 from torch.utils._python_dispatch import _disable_current_modes
+from train_step_variants import Bench
 
+from vjepa2_ac.config import AdapterConfig, Config, ModelSizes
+from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network import attention
+from vjepa2_ac.model.network.world_model import WorldModel
 
 FAKE = FakeTensorMode()  # one for all rows: our code keeps tables from one call to the next
 _MASK_ALIGNMENT = 16  # numbers
 _replaced: list[tuple[object, str, Any]] = []
-_seen_by_flex: dict[tuple[int, int], float] = {}  # by the numbers of queries and keys
 
 
 @contextmanager
@@ -37,7 +43,6 @@ def fake_gpu() -> Iterator[None]:
         (torch.cuda, "is_bf16_supported", lambda *_, **__: True),
         (import_module("torch.optim.optimizer"), "_foreach_supported_types", [FakeTensor]),
         (torch.utils._foreach_utils, "_foreach_supported_types", [FakeTensor]),
-        (FakeTensor, "__deepcopy__", _copied),
         (nn.Module, "_apply", _applied),
     ]
     _replaced[:] = [(place, name, getattr(place, name)) for place, name, _ in changes]
@@ -61,14 +66,6 @@ def _replacing(changes: list[tuple[object, str, Any]]) -> Iterator[None]:
         yield
 
 
-def _copied(own: Tensor, memo: dict[int, Any]) -> Tensor:
-    """Return a copy in the same mode: PyTorch's own brings another, which the first does not take."""
-    with torch.no_grad():
-        copied = own.detach().clone()
-    memo[id(own)] = nn.Parameter(copied, own.requires_grad) if isinstance(own, nn.Parameter) else copied
-    return memo[id(own)]  # type: ignore[no-any-return]  # a memo's
-
-
 def _applied(module: nn.Module, change: Callable[[Tensor], Tensor], recurse: bool = True) -> nn.Module:
     """Do what moves and casts weights, by replacing them: PyTorch cannot change fake ones where they are."""
     for child in module.children() if recurse else ():
@@ -79,11 +76,6 @@ def _applied(module: nn.Module, change: Callable[[Tensor], Tensor], recurse: boo
     for name, held in module._buffers.items():
         module._buffers[name] = None if held is None else change(held)
     return module
-
-
-def share_seen(queries: int, keys: int) -> float:
-    """Return the share of pairs of a query and a key that FlexAttention's mask leaves."""
-    return _seen_by_flex[queries, keys]
 
 
 def _attention(
@@ -124,13 +116,49 @@ def _added(mask: Tensor, query: Tensor, key: Tensor) -> Tensor:
     return mask.expand(*query.shape[:3], keys)
 
 
-def _flex(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
-    """Stand in for compiled FlexAttention, which without a compiler would make the whole matrix: one flash operation.
-
-    It is marked as causal, by which `share_seen` is asked for its arithmetic.
-    """
+def _flex(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:  # noqa: ARG001
+    """Return one flash operation: FlexAttention without a compiler would make the whole matrix."""
     query, key, value = _as_autocast(query, key, value)
-    steps, before = query.shape[2] // tokens_per_step, (key.shape[2] - query.shape[2]) // tokens_per_step
-    seen = sum(range(before + 1, before + steps + 1)) / (steps * (before + steps))
-    _seen_by_flex[query.shape[2], key.shape[2]] = seen
-    return torch.ops.aten._scaled_dot_product_flash_attention(query, key, value, 0.0, True)[0]  # type: ignore[no-any-return]
+    return torch.ops.aten._scaled_dot_product_flash_attention(query, key, value)[0]  # type: ignore[no-any-return]
+
+
+class FakeSteps(Bench):
+    """The training step of `train_step.py` on the fake GPU."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        super().__init__(options, options.dtype)
+
+    def _model(self) -> WorldModel:
+        return fake_model(self.sizes, self.dtype, encoder="pixels" in self.options.source)
+
+    def _drawn(self, shape: tuple[int, ...]) -> Tensor:
+        return torch.empty(shape, device=self.device)
+
+    def _accelerator(self, config: Config) -> Any:  # noqa: ARG002  # Accelerate's own needs a driver
+        return SimpleNamespace(
+            device=self.device, process_index=0, num_processes=1,
+            autocast=lambda: torch.autocast("cuda", self.dtype, enabled=self.dtype != torch.float32),
+        )  # fmt: skip
+
+
+def fake_model(sizes: ModelSizes, dtype: torch.dtype, *, encoder: bool) -> WorldModel:
+    """Return a model with an adapter on the fake GPU: frozen weights in a type, trained ones in float32.
+
+    It is made without memory, and its weights are replaced then: `Module.to` cannot replace fake ones.
+    """
+    with _disable_current_modes(), no_fingerprints(), torch.device("meta"):
+        model = WorldModel.empty(sizes)
+        add_adapter(model, AdapterConfig(), seed=0)
+        if not encoder:
+            model.set_encoder_aside()
+    for part in model.modules():
+        for name, old in part._parameters.items():
+            if old is not None:
+                kind = torch.float32 if old.requires_grad else dtype
+                part._parameters[name] = nn.Parameter(
+                    torch.empty(old.shape, dtype=kind, device="cuda"), old.requires_grad
+                )
+        for name, value in vars(part).items():
+            if isinstance(value, Tensor):
+                setattr(part, name, torch.empty(value.shape, dtype=value.dtype))
+    return model

@@ -162,7 +162,7 @@ def results_pages() -> Iterator[tuple[str, str]]:
             heading + on_site(text, f"benchmarks/results/{path.name}", f"made/results/{path.name}"),
         )
     entries = "\n".join(f"results/{name}" for name in names)
-    text = "Tables that commands of the repository write; the log says with which one, and when."
+    text = "Tables that commands of the repository write."
     yield "results.md", f"# Results\n\n{text}\n\n```{{toctree}}\n{entries}\n```\n"
 
 

@@ -1,9 +1,8 @@
-"""Benchmarks that nobody runs every day still run, and compare only what computes the same."""
+"""The benchmark of a training step runs, and compares only what computes the same."""
 
 import json
 import re
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -91,85 +90,3 @@ def test_no_ratio_is_printed_to_a_predictor_that_computes_something_else(
     printed = capsys.readouterr().out
     assert "official: NO RATIO" in printed
     assert [way for way, _, _ in rows(printed)] == ["dense", "auto"]
-
-
-@pytest.fixture
-def numerics(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The comparison of what ways learn."""
-    yield from imported("numerics", monkeypatch)
-
-
-def test_ways_learn_the_same_and_one_that_does_not_is_found(
-    numerics: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    numerics.main(["--quick"])
-    printed = capsys.readouterr().out
-    assert re.search(r"^per_step: strays by \S+ in 2 steps", printed, re.MULTILINE)
-    assert re.search(r"^bfloat16: \S+ after 16 predictions", printed, re.MULTILINE)
-    from vjepa2_ac.model.network import attention
-
-    wrong = {**attention._IMPLEMENTATIONS, "per_step": lambda *given: attention._dense(*given) * 1.1}
-    monkeypatch.setattr(attention, "_IMPLEMENTATIONS", wrong)
-    with pytest.raises(SystemExit, match="beyond its tolerance"):
-        numerics.main(["--quick"])
-
-
-@pytest.fixture
-def latents(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The benchmark of the latent cache."""
-    yield from imported("latents", monkeypatch)
-
-
-def test_latents_that_cannot_be_timed_are_a_row_and_sizes_and_errors_follow(
-    latents: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fails(*_: object, **__: object) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr(latents, "record_dataset", fails)
-    file = tmp_path / "latents.json"
-    with pytest.raises(SystemExit, match="3 of 6 rows failed"):
-        latents.main(["--quick", "--json", str(file)])
-    found = json.loads(file.read_text())["rows"]
-    assert [row["measured"] for row in found] == ["speed", *["size"] * 3, "reads of a clip", "added error"]
-    assert {row.get("problem") for row in found} == {None, "failed: OSError: disk full"}
-
-
-def test_quick_benchmark_of_latents_tells_speed_size_and_added_error(
-    latents: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("mujoco", reason="the arm is simulated")
-    file = tmp_path / "latents.json"
-    latents.main(["--quick", "--json", str(file)])
-    printed = capsys.readouterr().out
-    rows = json.loads(file.read_text())["rows"]
-    parts = {"encoder alone": 1, "speed": 1, "size": 3, "reads of a clip": 8, "added error": 3}
-    assert Counter(row["measured"] for row in rows) == parts
-    reads = [row for row in rows if row["measured"] == "reads of a clip"]
-    for here, there in zip(reads[::2], reads[1::2], strict=True):
-        assert (here["place"], there["place"], there["mb"]) == ("folder", "bucket", here["mb"])
-        assert 0 < there["reads"] <= here["reads"], "neighbouring frames are one request"
-    assert all(row["order"] == 1 for row in rows if row.get("stored_as") == "fp32" and "order" in row)
-    speed = r"^ +4 +\d+\.\d+ +\d+\.\d% +\d+\.\d+ +\d+%( +\d+ +\d+ +\d+ +\d+) +\d+\.\d\dx$"
-    (times,) = re.findall(speed, printed, re.MULTILINE)
-    pictures, least, latents, least_of_latents = map(int, times.split())
-    assert 0 < least <= pictures
-    assert 0 < least_of_latents <= latents
-    hours = [float(hour) for hour in re.findall(r"^ +(?:int8|bf16|fp32) +\S+ +(\d\.\d\d) +\S+$", printed, re.MULTILINE)]
-    bf16, fp32, int8 = hours
-    assert int8 < bf16 < fp32
-    added = re.findall(r"^ +random +(\w+) +\S+ +(\S+)% +\S+ +(\S+)%", printed, re.MULTILINE)
-    assert [kind for kind, *_ in added] == ["fp32", "bf16", "int8"]
-    assert all(float(one) == 0 for kind, *percent in added if kind == "fp32" for one in percent)
-    assert all(abs(float(one)) < 2 for _, *percent in added for one in percent)
-
-
-def test_a_decoder_is_timed_beside_the_linear_one(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for bench in imported("decoder", monkeypatch):
-        bench.main(["--quick", "--json", str(tmp_path / "rows.json")])
-    found = re.findall(r"^(linear|tiny) +(show|learn) +\S+ +\S+ +(\S+) +-$", capsys.readouterr().out, re.MULTILINE)
-    assert [row[:2] for row in found] == [("linear", "show"), ("tiny", "show"), ("linear", "learn"), ("tiny", "learn")]
-    assert [ratio for way, _, ratio in found if way == "linear"] == ["1.00", "1.00"]
-    assert len(json.loads((tmp_path / "rows.json").read_text())["rows"]) == 4

@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     error, in the end.
     """
     # OpenMP reads it when PyTorch is imported: a waiting thread sleeps after about 20 microseconds, not milliseconds.
-    # Until then it holds its core: two trainings on the same cores were ten times slower (benchmarks/two_at_once.py).
+    # Until then it holds its core: two trainings on the same cores were ten times slower (commit 0d046757).
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     atexit.register(gc.freeze)  # PyTorch's half a million objects are not searched for garbage when the program ends
     with process.own_streams() as lost, _our_warnings(), tidy_end():

@@ -188,7 +188,7 @@ class PlanningConfig(Section):
     `monitor` is surprised."""
     warm_start: bool = False
     """Whether a decision starts from the last one's plan, shifted by the steps executed. Not at horizon 1, where the
-    plan is the last action only: the arm overshoots (docs/log.md)."""
+    plan is the last action only: the arm overshoots (docs/decisions.md)."""
     views: Annotated[int, Field(ge=1, le=4)] = 1
     """Cameras whose pictures stand side by side in every image, all of one width: the model sees each by itself, and
     the energy is the mean over them. One view leaves a direction in which near and far look alike. The model has to

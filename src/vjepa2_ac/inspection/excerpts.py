@@ -1,6 +1,7 @@
 """Check excerpts of episodes without a model: do frames and states belong together, and are both plausible?
 
-The limits follow from measurements (docs/log.md: simulated arms, BridgeData and DROID excerpts, unchanged and spoiled):
+The limits follow from measurements on simulated arms, BridgeData and DROID excerpts, unchanged and with faults
+(docs/data_reference.md):
 each limit is well away from all clean sets, so slight errors pass.
 
                                     clean sets                spoiled                              limit
@@ -216,7 +217,7 @@ def _agreement(
     """Compare the change of frames with that of states.
 
     Where a robot moves faster, its frame changes more. The rank correlation of the two within an episode is 0.5 and
-    more on simulated arms at 15 Hz and on BridgeData at 5 Hz (docs/log.md); with the frames of another episode, at the
+    more on simulated arms at 15 Hz and on BridgeData at 5 Hz; with the frames of another episode, at the
     best of 21 shifts, it is 0.1 to 0.4. So the shift with the highest correlation shows frames that are late, frames
     that fit backwards are reversed, and frames that fit no better than another episode's belong to another episode.
 
