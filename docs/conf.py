@@ -40,7 +40,5 @@ def setup(app: Any) -> None:
     def read(_app: Any, page: str, source: list[str]) -> None:
         if not page.startswith("made/"):
             source[0] = on_site(source[0], f"docs/{page}.md", f"{page}.md")
-        if page == "log":  # not in the menu; pages of the project link to it
-            source[0] = f"---\norphan: true\n---\n\n{source[0]}"
 
     app.connect("source-read", read)
