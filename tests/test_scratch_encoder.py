@@ -13,7 +13,7 @@ from paths import GOLDEN
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelConfig
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 
 ENCODER = {"path": str(GOLDEN / "encoders" / "vjepa2_1_distilled.pt"), "heads": 4}
 MODEL = {
@@ -72,7 +72,7 @@ def test_a_run_that_was_killed_ends_in_the_same_bits(workshop: Path, nursery: Nu
     assert child.wait() == KILLED
     assert (run / "checkpoints").is_dir()
     assert main(["train", str(run), "--resume"]) == 0
-    whole, again = (load_run(folder).world_model.state_dict() for folder in (workshop / "whole", run))
+    whole, again = (load_subject(folder).world_model.state_dict() for folder in (workshop / "whole", run))
     assert all(torch.equal(again[name], value) for name, value in whole.items())
 
 
@@ -89,7 +89,7 @@ def test_it_is_evaluated_and_plans(workshop: Path, capsys: pytest.CaptureFixture
 def test_an_export_is_a_base_with_its_encoder(workshop: Path, tmp_path: Path) -> None:
     assert main(["export", str(workshop / "whole"), str(tmp_path / "merged")]) == 0
     assert main(["export", str(workshop / "whole"), str(tmp_path / "official.pt"), "--to", "official"]) == 0
-    run = load_run(workshop / "whole").world_model.eval()
+    run = load_subject(workshop / "whole").world_model.eval()
     sizes = {"image_size": 96, "encoder": {"heads": 4}, "predictor": {"width": 64, "heads": 4}}
     rng = np.random.default_rng(0)
     frames = torch.from_numpy(rng.normal(size=(1, 2, 3, 96, 96))).float()

@@ -30,11 +30,11 @@ from vjepa2_ac.model.adapter.lora import base_only, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.model_setup import Axes, Fingerprints
+from vjepa2_ac.planning.model_setup import Axes
 from vjepa2_ac.planning.prior.train_prior import train_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.simulation.domains import Domain, sample_domain
 from vjepa2_ac.simulation.policies import (
     GoalsOf,
@@ -265,7 +265,7 @@ def _calibrated(config: Config, model: WorldModel, path: Path) -> tuple[str | No
     write_atomically(path, json_text(found))
     if fit.problem is not None:
         return None, None, found
-    return str(path), Axes.read(str(path), Fingerprints.of(model)), found
+    return str(path), Axes.read(str(path), model.fingerprints()), found
 
 
 def _forgetting(model: WorldModel, before: DataConfig, config: Config) -> dict[str, Any]:
@@ -282,7 +282,7 @@ def _forgetting(model: WorldModel, before: DataConfig, config: Config) -> dict[s
 
 
 def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
-    loaded = load_run(run, NEWEST)  # as it was made: the last
+    loaded = load_subject(run, NEWEST)  # as it was made: the last
     counts = count_parameters(loaded.config, loaded.world_model.sizes)
     count = counts.trained if loaded.config.adapter.kind == "lora" else counts.predictor
     files = list((loaded.checkpoint / "adapter").rglob("*.safetensors"))

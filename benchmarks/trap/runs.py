@@ -27,8 +27,8 @@ from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
 from vjepa2_ac.simulation.motion import MotionRecipe
 from vjepa2_ac.simulation.policies import Planning
@@ -176,7 +176,7 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     asked = EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes)
     with joined(config) as accelerator:
         evaluation = measure_subject(str(home), asked, accelerator)
-    model = load_run(home, step).world_model
+    model = load_subject(home, step).world_model
     if model.adaptation is not None:
         merge_adapter(model)
     spec = RolloutSpec("reach", WORLD, goals, GOALS + cell.run.seed)

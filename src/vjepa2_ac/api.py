@@ -17,7 +17,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import Config, EncoderConfig, ModelSizes
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.config.loading import config_as_dict, parse_config
+from vjepa2_ac.config.loading import config_as_dict, config_of_model, parse_config
 from vjepa2_ac.data import dataset as datasets
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import validation_batches
@@ -30,8 +30,8 @@ from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE, load_trained
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.runs import loading
 from vjepa2_ac.runs.folder import is_run
+from vjepa2_ac.runs.subject import Subject, load_subject, run_config_of
 
 if TYPE_CHECKING:
     from vjepa2_ac.evaluation.result import Validation
@@ -179,13 +179,12 @@ def load_model(
     """
     place = _device(device)
     has_bfloat16 = place.type == "cuda" and has_bf16(place)
-    model_values = {
-        "base": str(name),
+    model_values: dict[str, Any] = {
         "dtype": ("bfloat16" if has_bfloat16 else "float32") if dtype == "auto" else dtype,
         "sizes": (sizes or ModelSizes()).model_dump(),
         "encoder": encoder.model_dump() if isinstance(encoder, EncoderConfig) else encoder and {"path": str(encoder)},
     }
-    config = parse_config(_REST | {"model": model_values}, where="load_model").model
+    config = config_of_model(str(name), where="load_model", **model_values).model
     require_type_of_weights(config, place)
     model = load_base(config, seed=0)
     if adapter is not None:
@@ -199,7 +198,7 @@ def load_run(
     *,
     device: Device = "auto",
     overrides: Iterable[str] = (),
-) -> loading.TrainedRun:
+) -> Subject:
     """Load the model of a trained run, in eval mode: its base with the adapter of a complete checkpoint.
 
     Args:
@@ -223,9 +222,8 @@ def load_run(
     if not is_run(str(folder)) and (folder / ADAPTER_FILE).is_file():
         found, fix = "an adapter without its run", "Name its base, too: load_model(BASE, adapter=FOLDER)"
         raise InputError(where=str(folder), found=found, needed="the folder of a run", fix=fix)
-    run = loading.load_run(folder, str(checkpoint), loading.run_config_of(folder, overrides))
-    run.warn_if_untrained()
-    run.world_model.to(place).eval()
+    run = load_subject(folder, str(checkpoint), config=run_config_of(folder, overrides))
+    run.world_model.to(place)
     return run
 
 

@@ -185,7 +185,7 @@ def test_a_decoder_shows_what_was_imagined_and_only_its_name_goes_into_the_file(
 def test_a_decoder_that_will_not_do_is_told_before_the_plan(
     workshop: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    where = "vjepa2_ac.planning.session.load_to_plan" if kind == "missing" else "vjepa2_ac.planning.decision.decide"
+    where = "vjepa2_ac.planning.model_setup.load_to_plan" if kind == "missing" else "vjepa2_ac.planning.decision.decide"
     monkeypatch.setattr(where, lambda *_, **__: pytest.fail("too late"))
     if kind != "missing":
         write_decoder(tmp_path / "decoder", tiny_model(), encoder="other")

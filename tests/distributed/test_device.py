@@ -20,7 +20,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.distributed import computing_device
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.planning.model_setup import load_to_plan
 
 DOORS = {
     "train": ["train", "CONFIG"],

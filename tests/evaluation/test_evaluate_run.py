@@ -19,7 +19,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.decoding.decoder_folder import DecoderCard, save_decoder
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate_run import load_subject
+from vjepa2_ac.evaluation.evaluate_run import load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -177,9 +177,9 @@ def test_a_run_without_a_base_is_measured_alone_unless_a_base_is_asked_for(
 ) -> None:
     config = make_config(model__base=None, model__random=TINY, adapter__kind="none")
     folder, dataset = write_adapted_run(config), open_dataset(config.data)
-    assert [one.role for one in load_subject(str(folder), config, asked(), dataset).contenders] == ["trained"]
+    assert [one.role for one in load_models(str(folder), config, asked(), dataset).contenders] == ["trained"]
     with pytest.raises(InputError, match=r"--against base: a model without a base"):
-        load_subject(str(folder), config, asked(against=("base",)), dataset)
+        load_models(str(folder), config, asked(against=("base",)), dataset)
 
 
 def changed(config: Config, **data: object) -> Config:

@@ -21,9 +21,8 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import apply_actions
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import WorldModelCost
-from vjepa2_ac.planning.model_setup import Axes, Fingerprints
-from vjepa2_ac.planning.session import load_to_plan
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.planning.model_setup import Axes, load_to_plan
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.spaces import CAMERA_POSE, POSE_CHANGE, Spaces
 
 TURN = Axes(math.radians(43.0))
@@ -43,7 +42,7 @@ def write(path: Path, model: WorldModel, degrees: float = 43.0, **changes: Any) 
         "pairs": 200,
         "episodes": 20,
         "problem": None,
-        "model": {"subject": "tiny", **Fingerprints.of(model)._asdict()},
+        "model": {"subject": "tiny", **model.fingerprints()._asdict()},
     }  # fmt: skip
     path.write_text(json.dumps(values | changes))
     return str(path)
@@ -137,14 +136,14 @@ def test_states_without_a_vertical_axis_are_refused(tmp_path: Path) -> None:
 def test_a_run_plans_by_axes_of_its_own_trained_weights_merged_or_not(make_config: Any, tmp_path: Path) -> None:
     config: Config = make_config(planning={"samples": 12, "iterations": 2})
     run = write_adapted_run(config)
-    loaded = load_run(run)
+    loaded = load_subject(run)
     path = write(tmp_path / "axes.json", loaded.world_model)
     for_base = write(tmp_path / "base.json", WorldModel.from_pretrained(str(config.model.base)))
     session = load_to_plan(str(run), overrides=[f"planning.axes={path}"])
-    session.controller()
+    Controller.of_subject(session)
     Controller.of_run(loaded, config.planning.model_copy(update={"axes": path}))
     with pytest.raises(InputError, match="fitted for another model"):
-        load_to_plan(str(run), overrides=[f"planning.axes={for_base}"]).controller()
+        Controller.of_subject(load_to_plan(str(run), overrides=[f"planning.axes={for_base}"]))
 
 
 def test_a_wrong_file_is_told_before_a_model_is_loaded(tmp_path: Path) -> None:
@@ -162,4 +161,4 @@ def test_what_a_fit_writes_can_be_read(tmp_path: Path) -> None:
     assert fit.problem is None
     model = tiny_model()
     path = write(tmp_path / "axes.json", model, **json.loads(json.dumps(fit.as_dict())))
-    assert Axes.read(path, Fingerprints.of(model)).yaw == pytest.approx(math.pi / 2, abs=1e-6)
+    assert Axes.read(path, model.fingerprints()).yaw == pytest.approx(math.pi / 2, abs=1e-6)

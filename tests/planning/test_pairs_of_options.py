@@ -29,12 +29,11 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, decide
 from vjepa2_ac.planning.goals import timed
-from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.planning.prior.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
-from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.planning.solvers import CemSolver
 from vjepa2_ac.planning.surprise import Monitor
 from vjepa2_ac.registry import ENERGIES, PLANNERS
+from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.simulation.policies import Moves, Planning
 from vjepa2_ac.simulation.rollout import Observation, Span, run_in
 
@@ -182,7 +181,7 @@ def entries(name: str) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     folder, model = tmp_path_factory.mktemp("files"), tiny_model(depth=1)
-    known = model.merged_from = Fingerprints.of(model)  # hashed once
+    known = model.merged_from = model.fingerprints()  # hashed once
     monitor = Monitor("vjepa2-ac monitor 1", 1e6, 0.1, 8, (1.0,), (0.0,) * TOKENS, known.encoder, known.predictor)
     (folder / "monitor.json").write_text(json.dumps(asdict(monitor)))
     whose = {"subject": "tiny", "encoder": known.encoder, "predictor": known.predictor}
@@ -223,7 +222,7 @@ class StillWorld:
 def tried(scene: Scene, *names: str) -> None:
     """Take options through two decisions in closed loop, `plan`, `score` and `imagine`."""
     config = scene.config(*names)
-    planning, controller = config.planning, Controller.of_config(scene.model, config)
+    planning, controller = config.planning, Controller.of_subject(Subject("tiny", config, scene.model))
     world = StillWorld(planning.views)
     goals = timed(world.images[2:], (1,))
     mask = np.arange(SIDE * SIDE * planning.views).reshape(SIDE, -1) % 3 > 0 if "mask" in names else None
@@ -243,7 +242,7 @@ def tried(scene: Scene, *names: str) -> None:
     if (read := f"{planning.views} {planning.limits}") in scene.imagined:  # it reads no other options
         return
     scene.imagined.add(read)
-    session = PlanningSession(scene.model, config, "tiny", "")
+    session = Subject("tiny", config, scene.model)
     film = imagine_image(session, "decoder", imagined.Seen(world.images[0], STATE), ["back"], steps=1)
     assert film.rollouts[0].frames.shape[1:] == film.first.shape == film.decoded_first.shape
 

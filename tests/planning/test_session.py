@@ -16,9 +16,10 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
-from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.folder import read_run_config
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train
 
 PLANNING = {"horizon": 2, "samples": 12, "iterations": 2, "cem": {"elites": 4}}
@@ -40,16 +41,16 @@ def prediction(world_model: WorldModel) -> torch.Tensor:
 
 def test_a_run_is_planned_with_as_its_own_config_says(run: Path) -> None:
     steering = load_to_plan(str(run))
-    assert steering.checkpoint == "step-00000010 (the best by error)"
+    assert steering.chosen == "step-00000010 (the best by error)"
     assert steering.config.planning.horizon == 2
-    controller = steering.controller()
+    controller = Controller.of_subject(steering)
     images = np.random.default_rng(0).integers(0, 256, (2, 40, 64, 3), dtype=np.uint8)
     controller.reset(images[0])
     controller.act(images[1], STATE)
     assert controller.decision.plan.seed == 7
     assert len(controller.decision.plan.actions) == 2
     assert controller.crop == "square"
-    assert steering.controller(seed=3).seed == 3
+    assert Controller.of_subject(steering, seed=3).seed == 3
 
 
 def test_the_checkpoint_that_is_named_is_the_one_that_plans(run: Path, base_folder: Path) -> None:
@@ -122,14 +123,14 @@ def test_a_run_of_vectors_plans_within_what_it_was_taught(make_config, reporter)
     states = [episode.states for episode in episodes_of(folder)]
     expected = np.percentile(np.abs(np.concatenate([one[2:] - one[:-2] for one in states])), 99, axis=0)
     np.testing.assert_allclose(taught, expected, rtol=1e-6)
-    controller = load_to_plan(str(folder)).controller()
+    controller = Controller.of_subject(load_to_plan(str(folder)))
     controller.reset(image(0))
     action = controller.act(image(1), states[0][0])
     assert action.shape == (8,)
     assert np.any(action)
     assert (np.abs(action) <= taught).all()
     np.testing.assert_allclose(controller.decision.states[1], states[0][0] + action, atol=1e-6)
-    limited = load_to_plan(str(folder), overrides=["planning.limits.axes=[0.01]"]).controller()
+    limited = Controller.of_subject(load_to_plan(str(folder), overrides=["planning.limits.axes=[0.01]"]))
     limited.reset(image(0))
     assert np.abs(limited.act(image(1), states[0][0])).max() <= 0.01
     with pytest.raises(InputError, match=r"state: 7 numbers .* needed: 8: state 0, state 1"):
@@ -140,7 +141,7 @@ def test_a_run_of_vectors_plans_within_what_it_was_taught(make_config, reporter)
             load_to_plan(str(folder))
     (folder / "changes.json").unlink()
     with pytest.raises(InputError, match=r"planning\.limits\.axes: data, of a model that does not.*of the 8 numbers"):
-        load_to_plan(str(folder)).controller()
+        Controller.of_subject(load_to_plan(str(folder)))
 
 
 def episodes_of(folder: Path) -> list[Episode]:
@@ -153,7 +154,7 @@ def test_recorded_commands_of_another_width_cannot_be_planned_with(make_config, 
     recorded["data__fields"] = VECTORS["data__fields"] | {"action": ["steps/action_dict/joint_position"]}
     folder = train(make_config(**{**VECTORS, **recorded}, training__steps=1), reporter)
     with pytest.raises(InputError, match=r"data\.actions: recorded: commands of which nobody knows"):
-        load_to_plan(str(folder)).controller()
+        Controller.of_subject(load_to_plan(str(folder)))
 
 
 ADAPTERS = {
@@ -169,7 +170,7 @@ def test_a_run_is_merged_in_its_bases_type_and_its_fingerprints_are_those_of_wha
 ) -> None:
     config = make_config(adapter=adapter, model__dtype="bfloat16", training__precision="bf16")
     run = write_adapted_run(config)
-    steering, trained = load_to_plan(str(run), checkpoint="newest"), load_run(run, "newest").world_model
+    steering, trained = load_to_plan(str(run), checkpoint="newest"), load_subject(run, "newest").world_model
     assert type(steering.world_model.predictor) is ActionConditionedPredictor
     assert steering.world_model.adaptation is None
     assert {value.dtype for value in steering.world_model.parameters()} == {torch.bfloat16}

@@ -16,7 +16,6 @@ from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.surprise import MONITOR, Monitor, Surprise, conformal_threshold, surprise_of
 from vjepa2_ac.serving.session import Session
@@ -24,7 +23,7 @@ from vjepa2_ac.serving.wire import pack, unpack
 
 
 def written(folder: Path, threshold: float) -> str:
-    known = Fingerprints.of(tiny_model())
+    known = tiny_model().fingerprints()
     usual = (0.0,) * tiny_model().num_tokens
     monitor = Monitor("vjepa2-ac monitor 1", threshold, 0.1, 8, (threshold,), usual, known.encoder, known.predictor)
     (folder / MONITOR).write_text(json.dumps(asdict(monitor)))
@@ -63,7 +62,7 @@ def test_the_score_is_what_patches_are_farther_off_than_usual() -> None:
 
 
 def test_what_is_not_a_number_is_an_alarm(tmp_path: Path) -> None:
-    monitor = Monitor.read(written(tmp_path, 9.0), Fingerprints.of(tiny_model()), tokens=9, where="test")
+    monitor = Monitor.read(written(tmp_path, 9.0), tiny_model().fingerprints(), tokens=9, where="test")
     still = torch.zeros(9, 5)
     assert not Surprise.of(still, still, monitor).is_alarm
     assert Surprise.of(still, torch.full_like(still, float("nan")), monitor).is_alarm

@@ -15,10 +15,10 @@ from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, settle
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.folder import read_run_config
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.spaces import actions_from_states
 from vjepa2_ac.training.loop import train
 
@@ -55,14 +55,14 @@ def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config
     limits = session.config.planning.limits.xyz
     assert (np.array(noted["changes"][:3]) - limits < 1e-4).all()
     assert not any("planning.limits" in warning for warning in session.warnings)
-    controller = session.controller()
+    controller = Controller.of_subject(session)
     controller.reset(image(0))
     action = controller.act(image(1), states[0][0])
     assert np.any(action)
     assert (np.abs(action[:3]) <= noted["changes"][:3]).all()
 
     taught = PlanningConfig.model_validate({**PLANNING, "limits": {"xyz": "data"}})
-    of_run = Controller.of_run(load_run(folder), taught)
+    of_run = Controller.of_run(load_subject(folder), taught)
     np.testing.assert_allclose(of_run.space.upper[0, :3], limits, rtol=1e-6)
     asked = EvaluationOptions(planning=("planning.limits.xyz=data",), probes=ProbeOptions(planning_clips=2))
     assert settle(str(folder), asked).planning.limits.xyz == limits
@@ -85,7 +85,7 @@ def test_a_run_without_it_plans_as_before_and_its_limits_cannot_be_those_of_the_
             planning_settings(str(subject), overrides=["planning.limits.xyz=data"])
     taught = PlanningConfig.model_validate({"limits": {"xyz": "data"}})
     with pytest.raises(InputError, match=error):
-        Controller(load_run(folder).world_model, taught)
+        Controller(load_subject(folder).world_model, taught)
     asked = EvaluationOptions(planning=("planning.limits.xyz=data",), probes=ProbeOptions(planning_clips=2))
     with pytest.raises(InputError, match=error):
         settle(str(folder), asked)
@@ -102,7 +102,7 @@ def test_whoever_loads_a_run_is_warned_of_limits_that_leave_what_it_was_taught(
     assert session.as_dict()["warnings"] == list(session.warnings)
     assert [(one.levelno, one.getMessage()) for one in caplog.records] == [(logging.WARNING, session.warnings[0])]
     caplog.clear()
-    Controller.of_run(load_run(run))
+    Controller.of_run(load_subject(run))
     assert "dx 5 (3) cm, dy 5 (2) cm, dz 5 (1) cm" in caplog.text
     caplog.clear()
     assert load_to_plan(str(run), overrides=["planning.limits.xyz=data"]).warnings == ()

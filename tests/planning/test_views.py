@@ -18,7 +18,8 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.imagined import Seen, imagine_image
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.demonstrations.make_goals import recording_of_episode
-from vjepa2_ac.planning.session import PlanningSession, load_to_plan
+from vjepa2_ac.planning.model_setup import load_to_plan
+from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.serving.about import warm_up
 from vjepa2_ac.simulation.agent import agent_of_session
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_benchmark
@@ -125,7 +126,7 @@ def test_an_image_of_two_views_is_imagined_view_by_view(tmp_path: Path) -> None:
 
     def film(pixels: np.ndarray, views: int) -> np.ndarray:
         config = parse_config(values | {"planning": {"views": views}}, where="test")
-        session = PlanningSession(model, config, "tiny", "")
+        session = Subject("tiny", config, model)
         found = imagine_image(session, decoder, Seen(pixels, STATE), ["up"], steps=2)
         return np.concatenate([found.first[None], found.decoded_first[None], found.rollouts[0].frames])
 

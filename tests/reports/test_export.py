@@ -30,7 +30,7 @@ from vjepa2_ac.reports.export import CARD, Exported, export_run
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import checkpoint_name, select_checkpoint, write_manifest
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train
 
 ROWS = [
@@ -92,7 +92,7 @@ def predictions(model: WorldModel) -> Tensor:
 
 
 def assert_predicts_as(found: WorldModel, run: Path) -> None:
-    model = load_run(run).world_model
+    model = load_subject(run).world_model
     expected = predictions(model)
     assert (predictions(found) - expected).abs().max() <= 1e-5 * expected.abs().max()
     with base_only(model):
@@ -100,7 +100,7 @@ def assert_predicts_as(found: WorldModel, run: Path) -> None:
 
 
 def sizes_of(run: Path) -> ModelSizes:
-    return load_run(run).world_model.sizes
+    return load_subject(run).world_model.sizes
 
 
 @pytest.mark.parametrize("kind", ["lora", "none"])
@@ -126,7 +126,7 @@ def test_merged_is_a_folder_that_predicts_as_the_run_does(trained, tmp_path: Pat
 
 def rewrite_adapter(run: Path, **changes: object) -> None:
     """Change the newest checkpoint's adapter_config.json, and write its manifest anew."""
-    checkpoint = load_run(run).checkpoint
+    checkpoint = load_subject(run).checkpoint
     path = checkpoint / "adapter" / "adapter_config.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
     write_manifest(checkpoint)
@@ -156,7 +156,7 @@ def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(copied, t
 )
 def test_a_trained_weight_that_is_not_finite_is_named(copied, tmp_path: Path, kind: str, file: str) -> None:
     run = copied(adapter__kind=kind)
-    checkpoint = load_run(run).checkpoint
+    checkpoint = load_subject(run).checkpoint
     name = poison(checkpoint / "adapter" / file)
     write_manifest(checkpoint)
     with pytest.raises(InputError, match=rf"{file}: {re.escape(name)} holds NaN or infinity"):
@@ -274,7 +274,7 @@ def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is
     copied, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = copied(training__steps=4, checkpoint__every=1, checkpoint__keep_best="ranking")
-    newest = load_run(run).checkpoint
+    newest = load_subject(run).checkpoint
     state = json.loads((newest / "state.json").read_text())
     (newest / "state.json").write_text(json.dumps({**state, "best_step": 2}))
     write_manifest(newest)
@@ -325,7 +325,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
         del checkpoint
         pytest.fail(f"{folder} was loaded")
 
-    monkeypatch.setattr(export, "load_run", refuse)
+    monkeypatch.setattr(export, "load_subject", refuse)
 
 
 @pytest.mark.usefixtures("no_work")

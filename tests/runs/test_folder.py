@@ -30,7 +30,7 @@ from vjepa2_ac.runs.folder import (
     read_run_config,
     run_id,
 )
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training import loop
 from vjepa2_ac.training.loop import train
 
@@ -200,7 +200,7 @@ def test_a_run_is_measured_and_goes_on_from_anywhere_as_from_its_own_folder(
     elsewhere, nearby = (found.models["adapter"].errors.of("rollout") for found in (there, here))
     assert (elsewhere == nearby).all()
     assert there.about.data == str(home / "data")
-    assert load_run(Path("../home/run")).config.model.base == str(home / "base")
+    assert load_subject(Path("../home/run")).config.model.base == str(home / "base")
     train(read_run_config(home / "run"), reporter, check_only=True)
     assert any("Resuming from" in note for note in reporter.notes)
     assert (home / "run/config.yaml").read_text() == as_written
@@ -263,7 +263,7 @@ def test_every_address_of_a_config_is_named_with_its_knob() -> None:
         (["evaluate", "RUN"], "vjepa2_ac.reports.write.evaluate_subject"),
         (
             ["plan", "RUN", "--start", "a.png", "--goal", "a.png", "--state", "0.4,0,0.3,3.1,0,0.1,0.2", "--out", "p"],
-            "vjepa2_ac.planning.session.load_to_plan",
+            "vjepa2_ac.planning.model_setup.load_to_plan",
         ),
     ],
     ids=["train", "evaluate", "plan"],

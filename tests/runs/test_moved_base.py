@@ -15,10 +15,10 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate_run import load_subject
+from vjepa2_ac.evaluation.evaluate_run import load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.training import setup
@@ -54,7 +54,7 @@ def exported(run: str, overrides: list[str]) -> WorldModel:
 def evaluated(run: str, overrides: list[str]) -> WorldModel:
     asked = EvaluationOptions(planning=tuple(overrides))
     config = settle(run, asked)
-    return load_subject(run, config, asked, open_dataset(config.data)).world_model
+    return load_models(run, config, asked, open_dataset(config.data)).world_model
 
 
 @pytest.mark.parametrize(

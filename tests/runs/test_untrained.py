@@ -18,14 +18,14 @@ from vjepa2_ac.model.adapter.adapter_folder import save_trained
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import fit_heads
-from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.export import CARD, export_run
 from vjepa2_ac.reports.metrics_json import read_metrics
 from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.checkpoint import ADAPTER, RunState, write_checkpoint
 from vjepa2_ac.runs.folder import CONFIG
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 
 SELECTED = "The selected checkpoint is the base model: fine-tuning did not improve action ranking."
 SCRATCH = {"model__base": None, "model__random": TINY, "adapter__kind": "none"}
@@ -84,7 +84,7 @@ def base_run(make_config: MakeConfig) -> Path:
 def test_a_checkpoint_before_the_first_step_is_called_what_it_is(
     make_config: MakeConfig, changes: dict[str, Any], how: dict[str, Any], checkpoint: str, note: str
 ) -> None:
-    found = load_run(untrained_run(make_config(**changes), **how), checkpoint)
+    found = load_subject(untrained_run(make_config(**changes), **how), checkpoint)
     assert found.note == note
     assert found.is_base == ("base model:" in note or "base model." in note)
 

@@ -25,7 +25,8 @@ from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE
 from vjepa2_ac.media.images import read_image
 from vjepa2_ac.media.video import read_header
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.serving.about import metadata_of
 from vjepa2_ac.serving.session import Session, SessionOptions
 from vjepa2_ac.simulation.agent import JOINT_FIELDS, Agent, agent_of_session
@@ -246,7 +247,7 @@ def test_goals_come_from_the_demonstration_that_looks_like_the_problem(
         r"Start and goal are [\d.]+ from those of the demonstration most alike, [\d.]+ of the median", shown
     )
     loaded = load_to_plan(model, config=tmp_path / "config.yaml", overrides=SMALL)
-    with serving(lambda: Session(loaded.controller()), told=partial(metadata_of, loaded)) as running:
+    with serving(lambda: Session(Controller.of_subject(loaded)), told=partial(metadata_of, loaded)) as running:
         assert main(["simulate", running.url, *given, "--out", str(tmp_path / "there")]) == 2
     assert "needed: a run; or a model with --config" in capsys.readouterr().err
 
@@ -272,7 +273,7 @@ def test_through_a_server_the_same_problems_are_solved_in_the_same_way(
         given += ["--sub-goals", "demonstration"]
     assert main(["simulate", model, *given, *SMALL, "--out", str(tmp_path / "here")]) == 0
     loaded = load_to_plan(model, overrides=SMALL)
-    with serving(lambda: Session(loaded.controller()), told=partial(metadata_of, loaded)) as running:
+    with serving(lambda: Session(Controller.of_subject(loaded)), told=partial(metadata_of, loaded)) as running:
         assert main(["simulate", running.url, *given, "--out", str(tmp_path / "there")]) == 0
         capsys.readouterr()
         for wrong in (["planning.samples=9"], ["--checkpoint", "newest"]):
@@ -292,7 +293,7 @@ def test_a_server_that_sends_something_else_is_refused(model: str, capsys: pytes
     loaded = load_to_plan(model, overrides=SMALL)
     for options in (SessionOptions("pose"), SessionOptions(dry_run=True)):
         with serving(
-            lambda how=options: Session(loaded.controller(), None, how), told=partial(metadata_of, loaded)
+            lambda how=options: Session(Controller.of_subject(loaded), None, how), told=partial(metadata_of, loaded)
         ) as at:
             assert main(["simulate", at.url, "--episodes", "1"]) == 2
             assert "needed: changes of a pose in the frame of the base" in capsys.readouterr().err

@@ -23,7 +23,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.runs.folder import read_run_config
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.setup import batches_from
@@ -132,7 +132,7 @@ def test_checkpointing_of_activations_changes_no_gradient(make_config, reporter)
 def test_only_the_adapter_moves(make_config, whole_run) -> None:
     config = make_config()
     before = load_base(config.model, seed=config.seed)
-    after = load_run(whole_run).world_model
+    after = load_subject(whole_run).world_model
     assert after.encoder_fingerprint() == before.encoder_fingerprint()
     assert after.predictor_fingerprint() == before.predictor_fingerprint()
     assert any(value.abs().max() > 0 for key, value in trained_weights(whole_run).items() if "lora_B" in key)

@@ -24,7 +24,7 @@ from vjepa2_ac.model.network.world_model import widths_of_model
 from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.reports.write import evaluate_subject
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train
 
 MakeConfig = Callable[..., Config]
@@ -65,7 +65,7 @@ def test_from_recordings_to_a_model_of_its_own(
     if widths.state != 7:
         assert f"state encoder: {widths.state} numbers instead of the base's 7: initialised anew" in fresh
     assert any("Base against persistence: skipped" in note for note in reporter.notes)
-    run = load_run(folder)
+    run = load_subject(folder)
     assert widths_of_model(run.world_model.sizes) == widths
 
     evaluation = evaluate_subject(str(folder), QUICK).evaluation
@@ -132,7 +132,7 @@ def test_a_head_that_nothing_trains_is_refused_before_the_model_is_loaded(
 def test_a_fresh_model_gets_heads_for_the_robot(make_robot: MakeConfig, reporter: Any, base_folder: Path) -> None:
     sizes = read_sizes(base_folder).model_dump(mode="json")
     config = make_robot(model__base=None, model__random=sizes, adapter__kind="none", training__steps=1)
-    assert widths_of_model(load_run(train(config, reporter)).world_model.sizes) == Widths(14, 14)
+    assert widths_of_model(load_subject(train(config, reporter)).world_model.sizes) == Widths(14, 14)
 
 
 def test_vectors_as_wide_as_poses_keep_the_heads_and_must_prove_themselves(

@@ -14,8 +14,8 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
-from vjepa2_ac.runs.loading import describe_selection
 from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.runs.subject import describe_selection
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
 

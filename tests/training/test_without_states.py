@@ -20,10 +20,10 @@ from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.reports.write import evaluate_subject
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train
 
 MakeConfig = Callable[..., Config]
@@ -80,7 +80,7 @@ def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_pat
     losses = [row["loss"] for row in metrics(folder) if row["kind"] == "train"]
     assert len(losses) == 6
     assert np.isfinite(losses).all()
-    run = load_run(folder)
+    run = load_subject(folder)
     assert not run.world_model.sizes.predictor.use_states
 
     evaluation = evaluate_subject(str(folder), QUICK).evaluation
@@ -95,7 +95,8 @@ def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_pat
     with torch.no_grad():
         expected = run.world_model.eval().predict(latents, actions, states)
         torch.testing.assert_close(loaded.predict(latents, actions, states), expected, atol=1e-5, rtol=1e-5)
-    drive(load_to_plan(str(merged), overrides=["planning.samples=6", "planning.cem.elites=3"]).controller(), STATE)
+    planned = load_to_plan(str(merged), overrides=["planning.samples=6", "planning.cem.elites=3"])
+    drive(Controller.of_subject(planned), STATE)
     with pytest.raises(InputError, match=r"Meta's code has no other.* --to merged"):
         export_run(folder, tmp_path / "official.pt", "official")
 
@@ -115,4 +116,4 @@ def test_states_of_any_width_need_no_new_head(
     with pytest.raises(InputError, match=r"states of 11 and actions of 7 numbers\. needed: states of 7"):
         evaluate_subject(str(folder), replace(QUICK, against=(str(tmp_path / "of 7"),)))
     planning = SEARCH.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
-    assert drive(Controller.of_run(load_run(folder), planning), np.zeros(11)).shape == (2, 7)
+    assert drive(Controller.of_run(load_subject(folder), planning), np.zeros(11)).shape == (2, 7)

@@ -167,6 +167,8 @@ def _loaded(
     """Load the model, and make a first decision; runs in the planning thread."""
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.evaluation.policies.score import is_blind, ranking_of_run
+    from vjepa2_ac.planning.controller import Controller
+    from vjepa2_ac.planning.model_setup import goals_of
     from vjepa2_ac.serving.about import in_words, metadata_of, roboarena_metadata, warm_up
     from vjepa2_ac.serving.recording import Recorder
     from vjepa2_ac.serving.request import IMAGE_KEYS
@@ -184,10 +186,10 @@ def _loaded(
         image_keys=IMAGE_KEYS if options.image_key is None else (options.image_key,),
         deadline_s=options.deadline,
         dry_run=options.dry_run,
-        is_blind=is_blind(ranking_of_run(options.subject, loaded.checkpoint)),
+        is_blind=is_blind(ranking_of_run(options.subject, loaded.chosen)),
     )
-    controller = loaded.controller(extrinsics=extrinsics)
-    kept = {name: loaded.goals_of(folder) for name, folder in (goals or {}).items()}
+    controller = Controller.of_subject(loaded, extrinsics=extrinsics)
+    kept = {name: goals_of(folder, loaded) for name, folder in (goals or {}).items()}
     session = Session(controller, kept, how)
     about = metadata_of(loaded, session)
     told = about if options.metadata == "full" else roboarena_metadata(session)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.cli.console.progress import ConsoleReporter
     from vjepa2_ac.config import Config
     from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-    from vjepa2_ac.planning.session import PlanningSession
+    from vjepa2_ac.runs.subject import Subject
     from vjepa2_ac.serving.access import Access
 
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
@@ -285,9 +285,9 @@ def require_to_plan(options: argparse.Namespace) -> Config:
     return config
 
 
-def load_planning_session(options: argparse.Namespace) -> PlanningSession:
+def load_planning_session(options: argparse.Namespace) -> Subject:
     """Load the run or the model that plans, with the settings that `require_to_plan` has checked."""
-    from vjepa2_ac.planning.session import load_to_plan
+    from vjepa2_ac.planning.model_setup import load_to_plan
 
     say_places_elsewhere(options.subject)
     how = {"checkpoint": options.checkpoint or "selected", "config": options.config, "overrides": options.overrides}

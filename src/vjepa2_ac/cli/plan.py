@@ -88,7 +88,9 @@ def _plan(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.cli.console.tables import plan_table
     from vjepa2_ac.evaluation.imagined_plan import imagine_plan
+    from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
+    from vjepa2_ac.planning.model_setup import goals_of
     from vjepa2_ac.reports.figures.planning import PLAN_IMAGE, plot_plan
     from vjepa2_ac.storage import user_can_write
 
@@ -96,10 +98,10 @@ def _plan(options: argparse.Namespace) -> int:
     session = cli.load_planning_session(options)
     if decoder is not None:
         decoder.require_fit(session.world_model, session.config.data, subject=options.subject)
-    request = PlanRequest(start, state, session.goals_of(goals), mask)
+    request = PlanRequest(start, state, goals_of(goals, session), mask)
     with cli.reporter() as reporter:
         reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
-        controller = session.controller(seed=options.seed, extrinsics=extrinsics)
+        controller = Controller.of_subject(session, seed=options.seed, extrinsics=extrinsics)
         controller.planner.progress = reporter.task("planning", "action sequences")
         found = decide(controller, request, nodes=options.nodes, reporter=reporter)
     names = options.goal or [str(options.goals or options.goal_from)]
@@ -185,7 +187,7 @@ def _goals(options: argparse.Namespace) -> None:
         recording_of_episode,
         recording_of_film,
     )
-    from vjepa2_ac.planning.session import load_to_plan
+    from vjepa2_ac.planning.model_setup import load_to_plan
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
     from vjepa2_ac.storage import user_can_write

@@ -103,22 +103,24 @@ def _score_chunks(options: argparse.Namespace, to_poses: Callable[[np.ndarray], 
     from vjepa2_ac.evaluation.policies.score import CHANCE, is_blind, ranking_of_run, read_chunks
     from vjepa2_ac.media.images import read_image
     from vjepa2_ac.planning.chunks import changes_of_chunks
+    from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
+    from vjepa2_ac.planning.model_setup import goals_of
     from vjepa2_ac.storage import write_atomically
     from vjepa2_ac.storage.structured import json_text
 
     chunks, state = read_chunks(options.chunks), cli.as_numbers(options.state, "--state")
     session = cli.load_planning_session(options)
-    controller = session.controller(extrinsics=cli.camera_pose(options.extrinsics))
+    controller = Controller.of_subject(session, extrinsics=cli.camera_pose(options.extrinsics))
     if options.goals is None:
         controller.follow((SubGoal(read_image(options.goal)),))
     else:
-        controller.follow(session.goals_of(read_goal_folder(options.goals)))
+        controller.follow(goals_of(read_goal_folder(options.goals), session))
     fix, space = "Say how many control steps of a chunk are one: --control-steps 4", controller.spaces.state
     steps = options.control_steps or require_stride(session.config.data, to="know a model step", fix=fix)
     changes = changes_of_chunks(to_poses(chunks), state, form=options.form, control_steps=steps, space=space)
     found = controller.score(read_image(options.start), state, changes)
-    ranking = ranking_of_run(options.subject, session.checkpoint)
+    ranking = ranking_of_run(options.subject, session.chosen)
     blind = is_blind(ranking)
     title = f"Energy after {counted(changes.shape[1], 'model step')} (now: {found.now:.4f})"
     table = MetricsTable(title, ["chunk", "energy", "relative to the zero action"])
@@ -151,6 +153,7 @@ def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray]
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.data.windows import require_frames
     from vjepa2_ac.evaluation.policies.score import CHANCE, read_policy_chunks, score_policies
+    from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.storage import write_atomically
     from vjepa2_ac.storage.structured import json_text
@@ -161,7 +164,7 @@ def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray]
     require_frames(session.config.data, to="score policies at")
     with cli.reporter() as reporter:
         found = score_policies(
-            session.controller(extrinsics=cli.camera_pose(options.extrinsics)),
+            Controller.of_subject(session, extrinsics=cli.camera_pose(options.extrinsics)),
             open_dataset(session.config.data, progress=reporter.task(INDEXING)),
             policies,
             form=options.form,
@@ -211,7 +214,6 @@ def _monitor(options: argparse.Namespace) -> int:
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.evaluation.policies.monitor import calibrate_monitor, watch_episodes
     from vjepa2_ac.planning.demonstrations.make_goals import number_of_episode
-    from vjepa2_ac.planning.model_setup import Fingerprints
     from vjepa2_ac.planning.surprise import MONITOR, Monitor
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.figures.planning import MONITOR_IMAGE, most_surprising, plot_watched
@@ -231,7 +233,7 @@ def _monitor(options: argparse.Namespace) -> int:
             files.append(folder / MONITOR)
         else:
             monitor = Monitor.read(
-                options.threshold, Fingerprints.of(model), tokens=model.num_tokens, where="--threshold"
+                options.threshold, model.fingerprints(), tokens=model.num_tokens, where="--threshold"
             )
         watched = list(watch_episodes(model, seen, wanted, reporter.task("watching", "episodes")))
     of = f"{counted(len(monitor.scores), 'held-out episode')} of up to {counted(monitor.steps, 'model step')}"

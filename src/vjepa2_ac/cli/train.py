@@ -79,7 +79,7 @@ def _train(options: argparse.Namespace) -> None:
     with TrainingConsole() as reporter:
         folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
     if is_first() and not options.check:
-        from vjepa2_ac.runs.loading import describe_selection
+        from vjepa2_ac.runs.subject import describe_selection
 
         cli.show(f"The run is in {folder}; see how good it is: {shell_command('evaluate', folder)}")
         cli.show(describe_selection(folder))

@@ -23,7 +23,7 @@ from vjepa2_ac.config.section import marks_of
 from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.registry import SOURCES, UNKNOWN_OPTION, import_plugins
 from vjepa2_ac.storage import read_bounded
-from vjepa2_ac.storage.places import BUILTIN
+from vjepa2_ac.storage.places import BUILTIN, NO_DATA
 from vjepa2_ac.storage.structured import message_of, parse_yaml
 
 _MOST_BYTES = 1_000_000  # no config needs more, and PyYAML reads 20 MB in a minute
@@ -54,6 +54,22 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
     path = config_path(config)
     of_run = any((path.parent / name).exists() for name in _OF_A_RUN)
     return parse_config(_read_yaml(path), overrides, where=str(config), here=not of_run)
+
+
+def config_of_model(base: str, overrides: Iterable[str] = (), *, where: str = "overrides", **model: Any) -> Config:
+    """Return the config of a model without a config file: the defaults, without data.
+
+    Args:
+        base: The model, as in `model.base`.
+        overrides: Such as planning.horizon=2.
+        where: What the values come from, for messages.
+        model: Further values of `model:`, such as dtype.
+
+    Raises:
+        InputError: As `parse_config`.
+    """
+    values = {"run_dir": "none", "data": {"path": NO_DATA}, "model": {"base": base, **model}}
+    return parse_config(values, overrides, where=where)
 
 
 def load_config_of_run(path: str | Path, overrides: Iterable[str] = ()) -> Config:

@@ -31,14 +31,13 @@ from vjepa2_ac.evaluation.measure import ClipSample, actions_before
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurement, Role, TrainingCurve
 from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
-from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.prior.action_prior import load_prior
 from vjepa2_ac.reporter import LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
-from vjepa2_ac.runs.loading import TrainedRun, load_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
+from vjepa2_ac.runs.subject import Subject, load_subject
 from vjepa2_ac.storage import try_writing_at, user_can_write
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import utc_now
@@ -48,13 +47,17 @@ _NO_BASE = "There is no base to compare with: it takes states or actions of othe
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
-    """A run or a model, loaded, and all that is measured with it."""
+class Models:
+    """A run or a model, and what it is compared with."""
 
-    run: TrainedRun | None  # None: a model
-    world_model: WorldModel
+    subject: Subject
     contenders: tuple[Contender, ...]  # the base first and the subject last
     notes: tuple[str, ...]  # on them
+
+    @property
+    def world_model(self) -> WorldModel:
+        """The model of the subject."""
+        return self.subject.world_model
 
     def put_on(self, device: torch.device) -> None:
         """Move all models to a device, ready to be measured; the encoder of the subject is enough for all."""
@@ -64,9 +67,9 @@ class Subject:
         self.world_model.to(device).eval()
 
 
-def load_subject(
+def load_models(
     name: str, config: Config, asked: EvaluationOptions, dataset: Dataset, decoder: TrainedDecoder | None = None
-) -> Subject:
+) -> Models:
     """Load a run or a model, and what it is compared with, on the CPU. Cheap failures first.
 
     Args:
@@ -79,24 +82,20 @@ def load_subject(
     Raises:
         InputError: One of the models cannot be loaded; it does not fit the data, the decoder, or the others.
     """
-    run = load_run(Path(name), asked.checkpoint, config) if is_run(name) else None
-    world_model = run.world_model if run else load_base(config.model.with_base(name), seed=config.seed)
+    subject = load_subject(name, asked.checkpoint, config=config)
+    world_model, is_of_run, is_base = subject.world_model, subject.checkpoint is not None, subject.is_base
     require_widths(world_model, dataset.widths, where=name)
-    notes: list[str] = []
-    if run is not None and run.note:
-        run.warn_if_untrained()
-        notes.append(run.note)
+    notes = list(subject.warnings)
     if decoder is not None:
         notes += decoder.require_fit(world_model, config.data, subject=name)
-    is_base = run is not None and run.is_base
-    against = asked.against if asked.against is not None else (BASE,) * (run is not None)
+    against = asked.against if asked.against is not None else (BASE,) * is_of_run
     against = tuple(other for other in against if other != BASE) if is_base else against  # it is measured once
     found: list[Contender] = []
     if BASE in against and config.model.base is None:
         if asked.against is not None:
             absent, needed = "a model without a base (model.base is not set)", "a base to compare with"
             raise InputError(where="--against base", found=absent, needed=needed, fix="Leave out --against base")
-    elif BASE in against and run is None:
+    elif BASE in against and not is_of_run:
         found.append(_contender(BASE, "base", _like(name, world_model, str(config.model.base), config, dataset.widths)))
     elif BASE in against and world_model.fresh_heads is not None:
         notes.append(_NO_BASE)
@@ -109,7 +108,7 @@ def load_subject(
             taken = {each.name for each in found} | {own, BASE, PERSISTENCE, TRUE_FRAMES, *NEIGHBOURS}
             called = Path(other).name if Path(other).name not in taken else other
             found.append(_contender(called, "other", _like(name, world_model, other, config, dataset.widths)))
-    return Subject(run, world_model, (*found, _contender(own, "trained", world_model)), tuple(notes))
+    return Models(subject, (*found, _contender(own, "trained", world_model)), tuple(notes))
 
 
 def _contender(
@@ -131,8 +130,7 @@ def _like(subject: str, world_model: WorldModel, other: str, config: Config, wid
     if not (other.startswith(BUILTIN) or Path(other).exists()):
         needed = "base, the folder of a run, or a model: what model.base takes"
         raise InputError(where=where, found="no such file or folder", needed=needed)
-    is_other_run, model = is_run(other), config.model.with_base(other)
-    loaded = load_run(Path(other)).world_model if is_other_run else load_base(model, seed=config.seed)
+    loaded = load_subject(other, config=None if is_run(other) else config).world_model
     same = loaded.image_size == world_model.image_size
     if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
         found, needed = f"another encoder than that of {subject}", "the same one: errors are of the same latents"
@@ -167,8 +165,8 @@ def measure_subject(
     dataset = first_of_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     reporter.task(LOADING)
-    loaded = load_subject(subject, config, asked, dataset, decoder)
-    run, world_model, contenders = loaded.run, loaded.world_model, loaded.contenders
+    loaded = load_models(subject, config, asked, dataset, decoder)
+    world_model, contenders, is_of_run = loaded.world_model, loaded.contenders, loaded.subject.checkpoint is not None
     prior = (
         None
         if trained is None
@@ -190,7 +188,7 @@ def measure_subject(
         evaluation = evaluate(
             contenders,
             clips,
-            _about(subject, run, config, dataset, asked),
+            _about(loaded.subject, config, dataset, asked),
             probes=replace(asked.probes, planning=config.planning, prior=prior, axis_clips=axis_clips),
             reporter=reporter,
         )
@@ -199,11 +197,11 @@ def measure_subject(
             decoder.to(accelerator.device)
             lpips = None if lpips is None else lpips.to(accelerator.device)
             decoded = measure_decoded(contenders, clips, decoder, evaluation.examples, lpips=lpips, reporter=reporter)
-    warned = [f"In training, {text}." for text in warnings_of(Path(subject) / METRICS)] if run else []
+    warned = [f"In training, {text}." for text in warnings_of(Path(subject) / METRICS)] if is_of_run else []
     return replace(
         evaluation,
         decoded=decoded,
-        training=_training_curves(Path(subject)) if run else (),
+        training=_training_curves(Path(subject)) if is_of_run else (),
         beside=beside,
         notes=(*loaded.notes, *warned, *evaluation.notes),
     )
@@ -257,12 +255,12 @@ def _clips(
     return RepeatableClips(tuple(by_name), read, not dataset.config.is_cache, before, device)
 
 
-def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:
+def _about(subject: Subject, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:
     data = dataset.config
     return About(
-        subject=subject,
-        checkpoint=run.chosen if run else "",
-        checkpoint_path=str(run.checkpoint) if run else "",
+        subject=subject.name,
+        checkpoint=subject.chosen,
+        checkpoint_path=str(subject.checkpoint or ""),
         source=data.source,
         data=data.path,
         cameras=tuple(data.cameras),
@@ -274,5 +272,5 @@ def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Datase
         seed=config.seed,
         version=__version__,
         time=utc_now(),
-        is_base=run is not None and run.is_base,
+        is_base=subject.is_base,
     )

@@ -24,11 +24,11 @@ from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.evaluation.evaluate_run import load_subject
+from vjepa2_ac.evaluation.evaluate_run import load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
 from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, named_actions, read_actions
-from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
+from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.spaces import StateSpace
 
 _RATE_HZ = 15.0  # of a robot, where nobody says: DROID's
@@ -47,7 +47,7 @@ class Seen:
 
 
 def imagine_image(
-    session: PlanningSession,
+    session: Subject,
     decoder_name: str,
     seen: Seen,
     actions: Sequence[str],
@@ -72,7 +72,7 @@ def imagine_image(
     _require_some(actions)
     model, config = session.world_model, session.config
     decoder = load_decoder(decoder_name)
-    warnings = decoder.require_fit(model, config.data, subject=session.subject)
+    warnings = decoder.require_fit(model, config.data, subject=session.name)
     decoder.to(model.device)
     space = measured_space(config.data, len(seen.state))
     _require_directions(space, where="--state")
@@ -90,7 +90,7 @@ def imagine_image(
         return shown(decoder.decoder, rolled, views)
 
     return Imagination(
-        subject=session.subject,
+        subject=session.name,
         episode_id="",
         start=0,
         seconds_per_step=(config.data.model_stride if config.data.stride != "auto" else 1) / _RATE_HZ,
@@ -188,7 +188,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     require_frames(config.data, to="show what is true")
     window = _window(dataset, asked)
     reporter.task(LOADING)
-    loaded = load_subject(subject, config, asked.evaluation, dataset, decoder)
+    loaded = load_models(subject, config, asked.evaluation, dataset, decoder)
     loaded.put_on(accelerator.device)
     decoder.to(accelerator.device)
     (batch,) = batches_of(dataset, [window], batch_size=1)

@@ -22,7 +22,7 @@ from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate_run import Subject, load_subject
+from vjepa2_ac.evaluation.evaluate_run import Models, load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
 from vjepa2_ac.explore.messages import MOST_STEPS, GoalFrame
 from vjepa2_ac.model.distances import absolute_difference
@@ -84,7 +84,7 @@ class Explorer:
 
     def __init__(
         self,
-        subject: Subject,
+        models: Models,
         decoder: TrainedDecoder,
         dataset: Dataset,
         episodes: tuple[int, ...],
@@ -93,7 +93,7 @@ class Explorer:
         """Prepare; `ExploreOptions.opened` loads the parts.
 
         Args:
-            subject: The models, on their device.
+            models: The models, on their device.
             decoder: Of their latents.
             dataset: Clips of two frames of one camera.
             episodes: Those that are shown, by their places in the data set.
@@ -102,7 +102,7 @@ class Explorer:
         Raises:
             InputError: Nobody knows which state follows from an action.
         """
-        self.world_model, self.contenders, self.notes = subject.world_model, subject.contenders, subject.notes
+        self.world_model, self.contenders, self.notes = models.world_model, models.contenders, models.notes
         self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
         if self.spaces.action.follows == "unknown":
             found = "commands of which nobody knows what they do to the state"
@@ -283,7 +283,7 @@ class ExploreOptions:
         dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
         require_frames(config.data, to="show what is true")
         reporter.task(LOADING)
-        loaded = load_subject(self.subject, config, self.evaluation, dataset, decoder)
+        loaded = load_models(self.subject, config, self.evaluation, dataset, decoder)
         loaded.put_on(accelerator.device)
         decoder.to(accelerator.device)
         members = dataset.members(self.evaluation.split)[dataset.episodes]

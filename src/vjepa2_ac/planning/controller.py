@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.sources.indexed_source import spaces_of
 from vjepa2_ac.data.transforms import Crop, split_views, view
@@ -26,13 +25,13 @@ from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.planning.chunks import ChunkScores
 from vjepa2_ac.planning.energy import EnergyFunction, Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
-from vjepa2_ac.planning.model_setup import Axes, Fingerprints, prepare_for_planning
+from vjepa2_ac.planning.model_setup import Axes, prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, until_cancelled
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
 from vjepa2_ac.planning.settings import require_base_frame, warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.solvers import PlanStart
 from vjepa2_ac.planning.surprise import Monitor, Surprise
-from vjepa2_ac.runs.loading import TrainedRun
+from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
 Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
@@ -131,7 +130,7 @@ class Controller:
             return
         if config.axes is not None:
             require_base_frame(f"planning.axes: {config.axes}", is_base=self.spaces.state.is_base_pose)
-        known = Fingerprints.of(world_model)
+        known = world_model.fingerprints()
         if config.axes is not None:
             self._axes = Axes.read(config.axes, known)
         if config.monitor is not None:
@@ -145,7 +144,7 @@ class Controller:
     @classmethod
     def of_run(
         cls,
-        run: TrainedRun,
+        run: Subject,
         config: PlanningConfig | None = None,
         *,
         seed: int | None = None,
@@ -161,29 +160,30 @@ class Controller:
         its = run.config if config is None else run.config.model_copy(update={"planning": config})
         its = with_taught_limits(its, Path(its.run_dir))
         warn_beyond_taught(its, Path(its.run_dir))
-        return cls.of_config(run.world_model, its, seed=seed, extrinsics=extrinsics)
+        return cls.of_subject(replace(run, config=its), seed=seed, extrinsics=extrinsics)
 
     @classmethod
-    def of_config(
-        cls,
-        world_model: WorldModel,
-        config: Config,
-        *,
-        seed: int | None = None,
-        extrinsics: Float[np.ndarray, " 6"] | None = None,
+    def of_subject(
+        cls, subject: Subject, *, seed: int | None = None, extrinsics: Float[np.ndarray, " 6"] | None = None
     ) -> Controller:
-        """Return the controller of a model by a config: its settings, crop, spaces and, unless another is given, seed.
+        """Return the controller of a model that `load_to_plan` loaded, with its settings.
+
+        Args:
+            subject: The model; its config gives the settings, crop and spaces.
+            seed: Of all decisions; None: the config's.
+            extrinsics: Pose of the camera, if the model uses it.
 
         Raises:
             InputError: As `Controller`.
         """
+        config = subject.config
         return cls(
-            world_model,
+            subject.world_model,
             config.planning,
             seed=config.seed if seed is None else seed,
             crop=config.data.crop,
             extrinsics=extrinsics,
-            spaces=spaces_of(config.data, widths_of_model(world_model.sizes)),
+            spaces=spaces_of(config.data, widths_of_model(subject.world_model.sizes)),
         )
 
     @property

@@ -1,42 +1,75 @@
-"""Model setup for planning: merged, in eval mode, compiled on request; and its axes where they are calibrated."""
+"""Loading a run or a model to plan with: merged, in eval mode, compiled on request; and its calibrated axes."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_type_of_weights
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.lora import unadapted_copy
+from vjepa2_ac.model.adapter.lora import merge_adapter, unadapted_copy
 from vjepa2_ac.model.network.compilation import require_compiler
-from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
+from vjepa2_ac.model.network.world_model import Fingerprints, WorldModel
 from vjepa2_ac.model.state_integration import euler_from_matrices, matrices_from_euler
-from vjepa2_ac.planning.settings import read_axes
+from vjepa2_ac.planning.goals import GoalFolder, SubGoal, with_shares
+from vjepa2_ac.planning.settings import planning_settings, read_axes, warn_beyond_taught
+from vjepa2_ac.runs.checkpoint import SELECTED
+from vjepa2_ac.runs.subject import Subject, load_subject
 
 _POSITION, _ROTATION = slice(0, 3), slice(3, 6)
 
 
-class Fingerprints(NamedTuple):
-    """Hashes of a model's weights."""
+def load_to_plan(
+    subject: str, *, checkpoint: str = SELECTED, config: str | Path | None = None, overrides: Sequence[str] = ()
+) -> Subject:
+    """Load a run or a model for planning, on its device.
 
-    encoder: str
-    base: str  # of the predictor before it was adapted
-    predictor: str  # with the trained weights
+    The settings of a run are those of its config: planning, seed, crop, stride, type of the weights. Those of a model
+    are the given config's; without one the defaults, and float32 weights if the device has no bfloat16, or is a CPU.
+    Limits beyond the motions in the training data, and narrow data, are logged and in the subject's `warnings`.
+    Trained weights are merged before the model moves to the device (see `prepare_for_planning`): it is there once.
 
-    @classmethod
-    def of(cls, model: WorldModel) -> Fingerprints:
-        """Hash a model, with its adapter separate from its base; of one that was merged, what it was before."""
-        if model.merged_from is not None:
-            return cls(*model.merged_from)
-        known, whole = model.adaptation, fingerprint(model.predictor.state_dict())
-        if known is not None:
-            return cls(known.encoder, known.base, whole)
-        return cls(model.encoder_fingerprint(), model.predictor_fingerprint(), whole)
+    Args:
+        subject: The folder of a run; or a model, as in `model.base`.
+        checkpoint: Of a run: selected, newest, best, or a number of optimizer steps.
+        config: A config file, for a model.
+        overrides: Such as planning.horizon=2.
+
+    Raises:
+        InputError: It does not exist, cannot be used for planning, or a setting is invalid or has no effect.
+    """
+    dtype = "bfloat16" if torch.cuda.is_available() and has_bf16() else "float32"
+    settings = planning_settings(subject, config=config, overrides=overrides, dtype=dtype)
+    device = torch.device("cpu" if is_on_cpu(settings.training) else "cuda")
+    require_type_of_weights(settings.model, device)  # without autocast
+    loaded = load_subject(subject, checkpoint, config=settings)
+    warnings = loaded.warnings
+    if loaded.checkpoint is not None:
+        warnings += warn_beyond_taught(settings, Path(subject))
+        loaded.world_model.merged_from = loaded.world_model.fingerprints()
+        merge_adapter(loaded.world_model)
+    loaded.world_model.to(device)
+    return replace(loaded, warnings=warnings)
+
+
+def goals_of(folder: GoalFolder, subject: Subject) -> tuple[SubGoal, ...]:
+    """Return the goals of a folder for a model, with their noise floor; what is changed is logged as a warning.
+
+    Raises:
+        InputError: A goal would never end, or the last one has a bound.
+    """
+    planning, has_noise = subject.config.planning, folder.noise is not None  # else no weights need to be hashed
+    encoder = subject.world_model.fingerprints().encoder if has_noise else ""
+    goals = folder.for_model(encoder, planning.energy.distance) if has_noise else folder.goals
+    with_shares(goals, planning.goals, first=1)
+    return goals
 
 
 def prepare_for_planning(world_model: WorldModel, config: PlanningConfig) -> WorldModel:

@@ -12,14 +12,13 @@ from typing import Annotated
 from pydantic import Field
 
 from vjepa2_ac.config import Config, DataConfig
-from vjepa2_ac.config.loading import load_config, parse_config
+from vjepa2_ac.config.loading import config_of_model, load_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import CHANGES, MOVABLE, is_of_moved, is_run, read_run_config
 from vjepa2_ac.spaces import POSE, REACH_M, vector_states
-from vjepa2_ac.storage.places import NO_DATA
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
 logger = logging.getLogger(__name__)
@@ -54,8 +53,7 @@ def planning_settings(
         folder = Path(subject)
         its = with_taught_limits(read_run_config(folder, [*overrides, _ANY_TYPE]), folder)
     elif config is None:
-        plain = {"run_dir": "none", "data": {"path": NO_DATA}, "model": {"base": subject, "dtype": dtype}}
-        its = parse_config(plain, overrides, where="overrides")
+        its = config_of_model(subject, overrides, dtype=dtype)
     else:
         its = load_config(config, [*overrides, _ANY_TYPE])
         its = its.model_copy(update={"model": its.model.with_base(subject)})

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.distances import absolute_difference
-from vjepa2_ac.planning.model_setup import Fingerprints
+from vjepa2_ac.model.network.world_model import Fingerprints
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
 MONITOR = "monitor.json"

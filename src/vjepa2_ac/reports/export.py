@@ -27,7 +27,7 @@ from vjepa2_ac.model.network.world_model import widths_as_text, widths_of_model
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state, write_torch
-from vjepa2_ac.runs.loading import TrainedRun, load_run, run_config_of
+from vjepa2_ac.runs.subject import Subject, load_subject, run_config_of
 from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, try_writing_at, user_can_write, write_atomically
 
 Form = Literal["merged", "official", "hub"]
@@ -76,9 +76,9 @@ def export_run(
         fix = "Export the whole model with --to merged or --to official"
         raise InputError(where=str(folder), found=found, needed=needed, fix=fix)
     metrics = read_metrics(folder) if form == "hub" and (folder / METRICS_FILE).exists() else None
-    run = load_run(folder, checkpoint, config)
-    run.warn_if_untrained()
-    card = _card(run, folder, metrics) if form == "hub" else ""
+    run = load_subject(folder, checkpoint, config=config)
+    assert run.checkpoint is not None  # noqa: S101  # a run has one
+    card = _card(run, run.checkpoint, folder, metrics) if form == "hub" else ""
     merge_adapter(run.world_model)  # also for the Hub: an adapter that makes it not finite is of no use
     require_finite(
         run.world_model.predictor.state_dict(),
@@ -86,7 +86,7 @@ def export_run(
         fix="Check lora_alpha in its adapter_config.json, or export another checkpoint: --checkpoint best",
     )
     if form == "hub":
-        _write_hub(run, folder, destination, card, metrics)
+        _write_hub(run.checkpoint, folder, destination, card, metrics)
     elif form == "merged":
         run.world_model.save_pretrained(destination)
     else:
@@ -107,10 +107,10 @@ def _check_free(destination: Path, form: Form) -> None:
         try_writing_at(destination)
 
 
-def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metrics: Metrics | None) -> None:
-    """Copy the adapter of a checkpoint, which load_run has verified, and put the card beside it."""
+def _write_hub(checkpoint: Path, folder: Path, destination: Path, card: str, metrics: Metrics | None) -> None:
+    """Copy the adapter of a checkpoint, which `load_subject` has verified, and add the card."""
     with folder_writer(destination, ADAPTER_FILE) as fresh:
-        for path in (run.checkpoint / ADAPTER).iterdir():
+        for path in (checkpoint / ADAPTER).iterdir():
             shutil.copyfile(path, fresh / path.name)
         if metrics is not None:
             if (folder / PLOT).is_file():
@@ -122,7 +122,7 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metr
         write_atomically(fresh / CARD, card)
 
 
-def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
+def _card(run: Subject, checkpoint: Path, folder: Path, metrics: Metrics | None) -> str:
     """Return the README.md of an adapter, in Markdown, with the Hub's front matter."""
     config, model, name = run.config, run.world_model, escaped(folder.resolve().name)
     environment = Environment(  # Markdown is not escaped
@@ -143,7 +143,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         pipeline_tag="robotics",
         tags=["v-jepa-2-ac", "world-model", "lora"],
         model_name=name,
-        eval_results=_eval_results(config, metrics) if metrics and measured == run.checkpoint.name else None,
+        eval_results=_eval_results(config, metrics) if metrics and measured == checkpoint.name else None,
     )
     return environment.get_template("model_card.md.jinja").render(
         **dict(config),
@@ -156,7 +156,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         base=model.adaptation,
         heads=None if model.fresh_heads is None else widths_of_model(model.sizes),
         takes=widths_as_text(model.sizes),
-        steps=read_state(run.checkpoint).step,
+        steps=read_state(checkpoint).step,
         trained=trainable_report(model),
         version=__version__,
         front=str(front.to_yaml()),

@@ -15,7 +15,7 @@ from vjepa2_ac.media.camera_check import require_contrast
 from vjepa2_ac.media.images import read_image, require_image
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import GOALS_FILE, GoalFolder, SubGoal, read_goal_folder
-from vjepa2_ac.planning.session import PlanningSession
+from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.serving.session import Session
 
 PROTOCOL = 1  # incremented when a client would have to change
@@ -24,7 +24,7 @@ _SIZE = 180, 320  # of a view in the picture of the first decision
 _SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])
 
 
-def metadata_of(loaded: PlanningSession, session: Session) -> dict[str, Any]:
+def metadata_of(loaded: Subject, session: Session) -> dict[str, Any]:
     """Return what a client may know of the server: plain values, without a path of this machine."""
     planning, options, model = loaded.config.planning, session.options, loaded.as_dict()["model"]
     sections = (getattr(loaded.config.data, name) for name in loaded.config.data.own_sections())
@@ -43,7 +43,7 @@ def metadata_of(loaded: PlanningSession, session: Session) -> dict[str, Any]:
         "limits": planning.limits.model_dump(mode="json"),
         "planning": planning.model_dump(mode="json"),
         "seed": session.controller.seed,
-        "checkpoint": loaded.checkpoint,
+        "checkpoint": loaded.chosen,
         "use_extrinsics": loaded.world_model.sizes.predictor.use_extrinsics,
         "image_keys": list(options.image_keys),
         "goals": sorted(session.goals)[:_MOST_NAMES],

@@ -18,10 +18,12 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.decoding.decoder_folder import SIMULATED, TrainedDecoder
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.demonstrations.alike import StartAndGoal, goals_alike
 from vjepa2_ac.planning.goals import GoalFolder, SubGoal
-from vjepa2_ac.planning.session import PlanningSession
+from vjepa2_ac.planning.model_setup import goals_of
 from vjepa2_ac.reporter import Reporter
+from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.serving.wire import PlanningClient, goal_keys
 from vjepa2_ac.simulation.arm import SimulatedArm
 from vjepa2_ac.simulation.policies import (
@@ -84,7 +86,7 @@ class ServedPlanner:
 
 
 def agent_of_session(
-    session: PlanningSession, decoder: TrainedDecoder | None = None, *, shown: str | None = SIMULATED
+    session: Subject, decoder: TrainedDecoder | None = None, *, shown: str | None = SIMULATED
 ) -> Agent:
     """Return a model of this process.
 
@@ -108,9 +110,9 @@ def agent_of_session(
         needed = f"poses; or seven joint angles and the gripper: data.fields.state: [{', '.join(JOINT_FIELDS)}]"
         raise InputError(where="data.states: vector", found=found, needed=needed)
     if decoder is not None:
-        decoder.require_fit(session.world_model, config.data, subject=session.subject, shown=shown)
+        decoder.require_fit(session.world_model, config.data, subject=session.name, shown=shown)
     uses_camera = session.world_model.sizes.predictor.use_extrinsics
-    name = Path(session.subject).name or session.subject
+    name = Path(session.name).name or session.name
     if name in {ZeroActions.name, RandomActions.name, Oracle.name}:  # in tables the names of references are theirs
         name = f"model {name}"
 
@@ -118,18 +120,18 @@ def agent_of_session(
         if arm is None and (uses_camera or config.data.states == "vector"):
             found = "a model that takes the pose of the camera" if uses_camera else "a model of joints"
             raise InputError(where="--world", found=found, needed="a model of poses: worlds tell nothing else")
-        controller = session.controller(extrinsics=arm.extrinsics() if arm and uses_camera else None)
+        controller = Controller.of_subject(session, extrinsics=arm.extrinsics() if arm and uses_camera else None)
         return Planning(controller, name, decoder, goals_of)
 
     return Agent(
-        subject=session.subject,
-        checkpoint=session.checkpoint,
+        subject=session.name,
+        checkpoint=session.chosen,
         planning=config.planning,
         seed=config.seed,
         stride=stride,
         warnings=session.warnings,
         policy=policy,
-        goals_of=session.goals_of,
+        goals_of=partial(goals_of, subject=session),
         goals_alike=partial(goals_alike, session),
         decoder=None if decoder is None else decoder.name,
     )

@@ -36,7 +36,7 @@ from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.model.distances import squared_difference
-from vjepa2_ac.planning.model_setup import Axes, Fingerprints
+from vjepa2_ac.planning.model_setup import Axes
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.settings import AXES_FORMAT, require_axes_in
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
@@ -327,7 +327,7 @@ def calibrate_axes(
     dataset = open_dataset(settings, progress=reporter.task(INDEXING))
     reporter.task(LOADING)
     world_model = load_named(config, dataset, model)
-    known = Fingerprints.of(world_model)
+    known = world_model.fingerprints()
     if world_model.adaptation is not None:
         merge_adapter(world_model)
     world_model.to(accelerator.device).eval()

@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
-from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.spaces import ActionSpace
 
 Encode = Callable[[Batch], LatentBatch]  # pixels into latents, on the model's device
@@ -202,15 +201,14 @@ def load_named(config: Config, dataset: Dataset, model: str | None) -> WorldMode
     Raises:
         InputError: There is none, it cannot be read, is randomly initialized, or does not fit the data.
     """
-    if model is not None and is_run(model):
-        loaded = load_run(Path(model)).world_model
+    if model is None:
+        require_learned(config.model)
+        loaded = load_base(config.model, seed=config.seed)
     else:
-        chosen = config.model if model is None else config.model.with_base(model)
-        require_learned(chosen)
-        loaded = load_base(chosen, seed=config.seed)
+        loaded = load_subject(model, config=None if is_run(model) else config).world_model
     require_widths(loaded, dataset.widths, where=model or f"model.base: {config.model.base}")
     require_same_encoder(loaded, dataset, config)
-    return loaded.eval()
+    return loaded
 
 
 def require_learned(model: ModelConfig) -> None:

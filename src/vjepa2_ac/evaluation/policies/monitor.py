@@ -16,7 +16,6 @@ from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.planning.surprise import Monitor, conformal_threshold, error_by_patch, surprise_of
 
 MOST_EPISODES = 200  # that a threshold is of
@@ -106,7 +105,7 @@ def calibrate_monitor(
         one.scores((sums.sum(axis=0) - sums[place]) / (steps.sum() - steps[place])).max()
         for place, one in enumerate(watched)
     ]
-    known = Fingerprints.of(model)
+    known = model.fingerprints()
     return Monitor(
         format="vjepa2-ac monitor 1",
         threshold=conformal_threshold(torch.tensor(highest), false_alarms),

@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from einops import rearrange
@@ -41,6 +41,14 @@ class Adaptation:
     base: str  # fingerprint of the predictor it started from
     encoder: str  # fingerprint of the encoder whose latents it learns from
     start: dict[str, Tensor] | None = None  # kind none: the weights it started from
+
+
+class Fingerprints(NamedTuple):
+    """Hashes of a model's weights."""
+
+    encoder: str
+    base: str  # of the predictor before it was adapted
+    predictor: str  # with the trained weights
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,7 @@ class WorldModel(LatentDynamics):
         self.predictor.requires_grad_(False)
         self.adaptation: Adaptation | None = None
         self.fresh_heads: FreshHeads | None = None
-        self.merged_from: tuple[str, str, str] | None = None  # fingerprints of encoder, base and adapted predictor
+        self.merged_from: Fingerprints | None = None  # before an adapter was merged
         self.encoder_origin: EncoderOrigin | None = None  # of an encoder that was read by itself
 
     @classmethod
@@ -206,6 +214,15 @@ class WorldModel(LatentDynamics):
     def encoder_in_words(self) -> str:
         """The encoder and where it came from, for cards."""
         return described(self.sizes.encoder, self.encoder_origin)
+
+    def fingerprints(self) -> Fingerprints:
+        """Hash the model, with its adapter separate from its base; for one that was merged, what it was before."""
+        if self.merged_from is not None:
+            return self.merged_from
+        adapted, whole = self.adaptation, fingerprint(self.predictor.state_dict())
+        if adapted is not None:
+            return Fingerprints(adapted.encoder, adapted.base, whole)
+        return Fingerprints(self.encoder_fingerprint(), self.predictor_fingerprint(), whole)
 
     def predictor_fingerprint(self) -> str:
         """Return a hash of the predictor's own weights; independent of an adapter and of fresh heads."""

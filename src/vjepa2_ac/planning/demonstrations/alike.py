@@ -26,8 +26,8 @@ from vjepa2_ac.planning.demonstrations.make_goals import (
     require_views,
 )
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.runs.subject import Subject
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ StartAndGoal = tuple[Image, Image]
 
 
 def demonstrations_alike(
-    config: DataConfig, session: PlanningSession, wanted: Sequence[StartAndGoal], reporter: Reporter = SILENT
+    config: DataConfig, session: Subject, wanted: Sequence[StartAndGoal], reporter: Reporter = SILENT
 ) -> tuple[Recording, ...]:
     """Return for each start and goal the demonstration that is most alike.
 
@@ -93,7 +93,7 @@ def ending_with(made: MadeGoals, photograph: Image) -> MadeGoals:
 
 
 def goals_alike(
-    session: PlanningSession, wanted: Sequence[StartAndGoal], reporter: Reporter = SILENT
+    session: Subject, wanted: Sequence[StartAndGoal], reporter: Reporter = SILENT
 ) -> tuple[tuple[SubGoal, ...], ...]:
     """Return for each start and goal the key frames of the demonstration that is most alike, and the goal itself.
 

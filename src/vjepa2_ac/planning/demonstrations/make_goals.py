@@ -39,8 +39,8 @@ from vjepa2_ac.planning.demonstrations.key_frames import (
 )
 from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.goals import NoiseFloor, SubGoal, write_goals
-from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
@@ -259,7 +259,7 @@ class MadeGoals:
 def make_goals(
     recording: Recording,
     options: KeyFrameOptions,
-    session: PlanningSession | None = None,
+    session: Subject | None = None,
     *,
     still: Recording | None = None,
     reporter: Reporter = SILENT,
@@ -304,13 +304,13 @@ def _keys(recording: Recording, options: KeyFrameOptions, seen: _Encoded | None)
 class _Encoded:
     """The latents of a demonstration: of all its frames, or of so many that they fit into memory."""
 
-    session: PlanningSession
+    session: Subject
     recording: Recording
     frames: Int[np.ndarray, " encoded"]
     latents: Float[Tensor, "encoded tokens dim"]
 
     @classmethod
-    def of(cls, session: PlanningSession, recording: Recording, reporter: Reporter) -> _Encoded:
+    def of(cls, session: Subject, recording: Recording, reporter: Reporter) -> _Encoded:
         step = math.ceil(recording.frames / _MOST_ENCODED)
         frames = np.unique(np.append(np.arange(0, recording.frames, step), recording.frames - 1))
         latents = _latents(session, recording.read, frames.tolist(), reporter.task("encoding frames"))
@@ -339,7 +339,7 @@ class _Encoded:
 
 
 def _latents(
-    session: PlanningSession, read: FrameReader, frames: Sequence[int], progress: Progress = no_progress
+    session: Subject, read: FrameReader, frames: Sequence[int], progress: Progress = no_progress
 ) -> Float[Tensor, "frames tokens dim"]:
     """Return the latents of some frames, as the session's model sees them; few pixels at a time are in memory."""
     found, crop, views = [], session.config.data.crop, session.config.planning.views
@@ -350,16 +350,14 @@ def _latents(
     return torch.cat(found)
 
 
-def energies_of(
-    session: PlanningSession, seen: Iterable[Tensor], wanted: Iterable[Tensor]
-) -> Float[np.ndarray, " frames"]:
+def energies_of(session: Subject, seen: Iterable[Tensor], wanted: Iterable[Tensor]) -> Float[np.ndarray, " frames"]:
     """Return the energy of latents of each frame to those of the wanted one: without a mask."""
     energy = session.config.planning.energy
     return np.array([float(distance(one, to, energy)) for one, to in zip(seen, wanted, strict=False)])
 
 
 def _noise_floor(
-    session: PlanningSession, recording: Recording, still: Recording | None, gap: int, reporter: Reporter
+    session: Subject, recording: Recording, still: Recording | None, gap: int, reporter: Reporter
 ) -> NoiseFloor | None:
     """Return the 95th percentile of energies between frames of a resting arm, `gap` apart; None: none rests."""
     if still is not None:
@@ -377,4 +375,5 @@ def _noise_floor(
     one, other = latents[torch.from_numpy(places.reshape(taken.shape).T)]
     energies = energies_of(session, one, other)
     kind = session.config.planning.energy.distance
-    return NoiseFloor(float(np.quantile(energies, _UPPER)), len(taken), session.encoder, kind)
+    encoder = session.world_model.fingerprints().encoder
+    return NoiseFloor(float(np.quantile(energies, _UPPER)), len(taken), encoder, kind)

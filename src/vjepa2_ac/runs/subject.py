@@ -1,13 +1,16 @@
-"""Loading the model of a run's checkpoint, and what the selection of this checkpoint says about the training."""
+"""A run or a model, opened: its world model, and what the selection of a checkpoint says about the training."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_of_model
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_folder import CARD, load_trained
 from vjepa2_ac.model.base_model import require_base_of_run
@@ -15,8 +18,8 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.process import is_first
 from vjepa2_ac.runs.checkpoint import ADAPTER, BEST, NEWEST, SELECTED, SelectedCheckpoint, select_checkpoint, step_of
-from vjepa2_ac.runs.folder import MOVABLE, is_of_moved, read_run_config
-from vjepa2_ac.storage.structured import read_json_object
+from vjepa2_ac.runs.folder import MOVABLE, is_of_moved, is_run, read_run_config
+from vjepa2_ac.storage.structured import read_json_object, utc_now
 
 logger = logging.getLogger(__name__)
 
@@ -24,41 +27,75 @@ BASE_MODEL = "base model"
 
 
 @dataclass(frozen=True)
-class TrainedRun:
-    """A run's config, and the model of one of its checkpoints in eval mode."""
+class Subject:
+    """A run or a model that is open: its world model in eval mode, its config, and where the weights come from."""
 
+    name: str  # the folder of the run, or the model, as given
     config: Config
-    world_model: WorldModel  # with its trained weights, not merged
-    checkpoint: Path
-    chosen: str  # which checkpoint it is, as text
+    world_model: WorldModel  # for planning on its device and with the adapter merged, else neither
+    checkpoint: Path | None = None  # its folder. None: a model
+    chosen: str = ""  # the checkpoint as text; "" for a model
     is_base: bool = False  # the checkpoint has the weights of the base model
     note: str = ""  # a sentence about a checkpoint of step 0; "" for a trained one
+    warnings: tuple[str, ...] = ()  # the note, and for planning why plans may exceed the motions in the training data
 
-    def warn_if_untrained(self) -> None:
-        """Log the note, in the first of several processes."""
-        if self.note and is_first():
-            logger.warning(self.note)
+    def as_dict(self) -> dict[str, Any]:
+        """Return the identity of the model as plain values: its name, and hashes of the weights."""
+        model = self.world_model
+        return {
+            "version": __version__,
+            "time": utc_now(),
+            "model": {
+                "subject": self.name,
+                "checkpoint": self.chosen or None,
+                **model.fingerprints()._asdict(),
+                "dtype": str(next(model.parameters()).dtype).removeprefix("torch."),
+                "device": model.device.type,
+                "image_size": model.image_size,
+            },
+            "warnings": list(self.warnings),
+            "control_steps_of_a_model_step": self.config.data.stride,
+            "frame_of_states": self.config.data.pose_frame,
+        }
 
 
-def load_run(folder: Path, checkpoint: str = SELECTED, config: Config | None = None) -> TrainedRun:
-    """Load the model of a run, on the CPU: its base with the trained weights of a complete checkpoint.
+def load_subject(
+    name: str | Path, checkpoint: str = SELECTED, overrides: Sequence[str] = (), *, config: Config | None = None
+) -> Subject:
+    """Load a run or a model, on the CPU: for a run its base with the trained weights of a complete checkpoint.
+
+    A checkpoint that has the base's weights is logged as a warning.
 
     Args:
-        folder: The run.
-        checkpoint: selected, newest, best, or a number of optimizer steps; see `runs.checkpoint.select_checkpoint`.
-        config: The run's config, with changed settings for loading; None: unchanged.
+        name: The folder of a run; or a model, as in `model.base`.
+        checkpoint: Of a run: selected, newest, best, or a number of optimizer steps; see
+            `runs.checkpoint.select_checkpoint`.
+        overrides: Where the base or the encoder of a run was moved: model.base=PATH, model.encoder.path=PATH. The
+            fingerprints of the weights must be those that the run was trained on.
+        config: The config to load with, for a run its own with changed settings. None: the run's own with the
+            overrides; for a model the defaults.
 
     Raises:
-        InputError: Not the folder of a run, no such checkpoint, or its base cannot be loaded.
+        InputError: There is no such run, checkpoint or model, or the base of the run cannot be loaded.
     """
-    config = config or read_run_config(folder)
+    name = str(name)
+    if not is_run(name):
+        if checkpoint != SELECTED:
+            found, needed = f"{name}, which is not the folder of a run", "a run: a model has no checkpoints"
+            raise InputError(where=f"--checkpoint {checkpoint}", found=found, needed=needed)
+        config = config_of_model(name, overrides) if config is None else config
+        return Subject(name, config, load_base(config.model.with_base(name), seed=config.seed))
+    folder, config = Path(name), config or run_config_of(Path(name), overrides)
     require_base_of_run(config.model, folder)
-    chosen = select_checkpoint(folder, checkpoint)
+    selected = select_checkpoint(folder, checkpoint)
     world_model = load_base(config.model, seed=config.seed)
-    load_trained(world_model, chosen.path / ADAPTER, trainable=False)
-    note = note_about(config, chosen)
-    is_base = bool(note) and untrained_model(config, chosen.path) == BASE_MODEL
-    return TrainedRun(config, world_model, chosen.path, str(chosen), is_base, note)
+    load_trained(world_model, selected.path / ADAPTER, trainable=False)
+    note = note_about(config, selected)
+    if note and is_first():
+        logger.warning(note)
+    is_base = bool(note) and untrained_model(config, selected.path) == BASE_MODEL
+    warnings = (note,) if note else ()
+    return Subject(name, config, world_model.eval(), selected.path, str(selected), is_base, note, warnings)
 
 
 def untrained_model(config: Config, checkpoint: Path) -> str:
