@@ -209,7 +209,7 @@ WRONG: dict[str, tuple[Callable[[Config], EvaluationOptions], str]] = {
 def test_invalid_input_is_reported_before_a_model_is_loaded(
     config: Config, run: str, make: Callable[[Config], EvaluationOptions], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vjepa2_ac.evaluation.evaluate_run.load_run", lambda *_: pytest.fail("loaded"))
+    monkeypatch.setattr("vjepa2_ac.evaluation.evaluate_run.load_subject", lambda *_, **__: pytest.fail("loaded"))
     with pytest.raises(InputError, match=words):
         evaluate_subject(run, make(config))
 

@@ -321,7 +321,7 @@ def test_a_run_without_an_adapter_has_nothing_for_the_hub(trained, tmp_path: Pat
 def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is loaded."""
 
-    def refuse(folder: Path, checkpoint: str) -> None:
+    def refuse(folder: Path, checkpoint: str, **_: object) -> None:
         del checkpoint
         pytest.fail(f"{folder} was loaded")
 
