@@ -22,23 +22,13 @@ from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE
-<<<<<<< HEAD:tests/simulation/test_worlds.py
-from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.simulation.agent import agent_of_session
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.policies import Image, Oracle, Problem, ZeroActions
 from vjepa2_ac.simulation.record_world import record_world
 from vjepa2_ac.simulation.rollout import run_trials
 from vjepa2_ac.simulation.worlds import OtherWorld, find_problems, run_world_benchmark
-=======
-from vjepa2_ac.planning.model_setup import load_to_plan
-from vjepa2_ac.simulation.closed_loop.agent import agent_of_session
-from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
-from vjepa2_ac.simulation.closed_loop.policies import Image, Oracle, Problem, ZeroActions
-from vjepa2_ac.simulation.closed_loop.rollout import run_trials
-from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld, find_problems, run_world_benchmark
-from vjepa2_ac.simulation.recording.record_world import record_world
->>>>>>> 65a3b1d8 (One way to open a run or a model: load_subject returns a Subject):tests/simulation/closed_loop/test_worlds.py
 
 SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3"]
 
