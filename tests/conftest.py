@@ -61,8 +61,9 @@ LONGEST = (
 
 
 SLOW = (
-    "benchmarks/", "distributed/test_nothing_hangs", "distributed/test_shared_work", "explore/test_page_in_browser",
-    "explore/test_postcard", "judge/", "reports/test_page_in_browser", "test_extending", "test_missing",
+    "benchmarks/", "distributed/test_nothing_hangs", "distributed/test_shared_work", "explore/test_command",
+    "explore/test_page_in_browser", "judge/", "reports/test_page_in_browser", "serving/test_real_client",
+    "test_extending", "test_missing",
     "test_notebook", "test_quickstart", "test_site", "test_spot", "test_wheel", "training/test_soak",
 )  # fmt: skip
 """Whole programs: `make test-slow`."""

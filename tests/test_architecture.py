@@ -44,7 +44,7 @@ ORDERS: dict[str, list[str]] = {
     "data.sources": ["indexed_source", "rlds droid_raw lerobot npz latents"],
     "serving": [
         "wire access",
-        "request recording pages listening",
+        "client request recording",
         "session",
         "about server",
     ],
@@ -67,9 +67,9 @@ ORDERS: dict[str, list[str]] = {
     "explore": [
         "messages",
         "explorer",
-        "search truth",
+        "search",
         "views",
-        "server postcard watch",
+        "server",
     ],
     "decoding": [
         "network",
@@ -124,7 +124,6 @@ HOMES = {
     "msgpack": ["serving/wire.py"],
     "mujoco": ["simulation/domains.py"],
     "peft": ["model/adapter/"],
-    "prometheus_client": ["serving/server.py"],
     "pyarrow": ["data/sources/lerobot/"],
     "ray": ["encoding/ray_engine.py"],
     "rich": ["cli/console/"],

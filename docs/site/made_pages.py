@@ -42,12 +42,6 @@ _PROJECT = {
     "releasing": "the steps of a release",
     "made/security": "what is trusted, and what is not",
 }
-_POSTCARD = """
-```{raw} html
-<iframe class="postcard" src="_static/postcard.html" loading="lazy"
- title="Play: what does a robot's world model think happens next?"></iframe>
-```
-"""
 _BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
 
@@ -62,7 +56,7 @@ def write_pages(folder: Path) -> None:
         **dict(results_pages()),
         "reference.md": contents_page("Reference", _REFERENCE),
         "project.md": contents_page("Project", _PROJECT),
-        "readme.txt": _first_page(),
+        "readme.txt": on_site((ROOT / "README.md").read_text(encoding="utf-8"), "README.md", "index.md"),
         **{f"{name.lower()}.md": _of_the_root(f"{name}.md") for name in ("CHANGELOG", "CONTRIBUTING", "SECURITY")},
     }
     folder.mkdir(exist_ok=True)
@@ -76,13 +70,6 @@ def write_pages(folder: Path) -> None:
             path.write_text(text, encoding="utf-8")
     for image in (ROOT / "benchmarks/results").glob("*.png"):
         shutil.copyfile(image, folder / "results" / image.name)
-
-
-def _first_page() -> str:
-    """Return the README with the postcard below its first film: a visitor plays before installing anything."""
-    text = on_site((ROOT / "README.md").read_text(encoding="utf-8"), "README.md", "index.md")
-    title, first, rest = text.partition("\n![A page on which")
-    return f"{title}{_POSTCARD}{first}{rest}"
 
 
 def contents_page(title: str, pages: Mapping[str, str]) -> str:

@@ -53,11 +53,11 @@ def test_the_recorded_way_has_recorded_states_and_the_true_frame(recorded: Views
     place, stride = recorded_path(explorer, steps), explorer.stride
     states = explorer.dataset.source.read(explorer.episodes[0]).states[: steps * stride + 1 : stride]
     np.testing.assert_allclose(explorer.states(place), states, atol=1e-6)
-    true = recorded.truth.outcome(place)
+    true = recorded.explorer.truth(place)
     assert true is not None
     assert not true.is_simulated
     assert np.array_equal(true.pixels, explorer.moment(0, steps * stride).pixels)
-    assert recorded.truth.outcome(place.before.after(UP)) is None
+    assert recorded.explorer.truth(place.before.after(UP)) is None
 
 
 def test_a_link_with_rounded_numbers_means_the_recorded_action(recorded: Views) -> None:
@@ -86,17 +86,15 @@ def test_the_simulated_truth_is_what_happens_whatever_was_done_before(live: View
     arm = resimulate(folder, explorer.dataset.source.read(explorer.episodes[0]), 4)
     expected = arm.under(np.array(place.actions), explorer.stride)
     for before in ((), (LEFT,), (UP, LEFT), (UP, LEFT, UP, LEFT)):
-        live.truth._outcomes.cache_clear()
-        live.truth.outcome(Place(0, 4, before))
-        live.truth._outcomes.cache_clear()
-        true = live.truth.outcome(place)
+        live.explorer.truth(Place(0, 4, before))
+        true = live.explorer.truth(place)
         assert true is not None
         assert true.is_simulated
         np.testing.assert_array_equal(true.state, expected.states[-1])
 
 
 def test_a_target_out_of_reach_is_said(live: Views) -> None:
-    true = live.truth.outcome(Place(0, 4, ((0.9, 0.0, 0.0, 0, 0, 0, 0),) * 2))
+    true = live.explorer.truth(Place(0, 4, ((0.9, 0.0, 0.0, 0, 0, 0, 0),) * 2))
     assert true is not None
     assert not true.reached
 

@@ -6,8 +6,8 @@ import pytest
 from served import STATE, image
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.serving.client import goal_keys
 from vjepa2_ac.serving.request import read_request
-from vjepa2_ac.serving.wire import goal_keys
 
 OURS = {"observation/image": image(0), "observation/state": STATE}
 GOALS = np.stack([image(1), image(2)])

@@ -17,7 +17,6 @@ from vjepa2_ac.planning.chunks import changes_of_chunks
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.session import (
-    STOPPED,
     ActionForm,
     GoneError,
     Session,
@@ -404,7 +403,7 @@ CHUNKS = STATE + np.random.default_rng(0).normal(0, 0.01, (300, 4, 7)) * [1, 1, 
 SCORE = {"endpoint": "score", "policy/chunks": CHUNKS}
 
 
-@pytest.mark.parametrize("ended_by", ["deadline", "client", "page"])
+@pytest.mark.parametrize("ended_by", ["deadline", "client"])
 def test_a_score_ends_after_the_part_in_which_it_is_cancelled(ended_by: str, monkeypatch: pytest.MonkeyPatch) -> None:
     one = session(energy=EnergyConfig(samples_at_once=16))
     ask(one, **request(goal_image=image(100)))
@@ -413,8 +412,6 @@ def test_a_score_ends_after_the_part_in_which_it_is_cancelled(ended_by: str, mon
 
     def counted(frame: torch.Tensor, *more: object, **how: object) -> object:
         parts.append(len(frame))
-        if ended_by == "page":
-            one.stopped.set()
         return rollout(frame, *more, **how)
 
     monkeypatch.setattr(one.controller._model, "rollout", counted)
@@ -423,9 +420,8 @@ def test_a_score_ends_after_the_part_in_which_it_is_cancelled(ended_by: str, mon
         with pytest.raises(GoneError):
             one.answer(message, lambda: bool(parts))
     else:
-        one._clock = _OverAfter(2) if ended_by == "deadline" else lambda: 0.0
-        answer = one.answer(message)
-        assert answer.startswith(f"request: no answer: {STOPPED if ended_by == 'page' else 'past the deadline'}")
+        one._clock = _OverAfter(2)
+        assert one.answer(message).startswith("request: no answer: past the deadline")
     assert parts == [16]
 
 
@@ -461,11 +457,3 @@ def test_an_episode_is_counted_once_and_not_for_a_robot_that_leaves() -> None:
     one.begin()
     ask(one, **request(goal_image=image(100)))
     assert one.counts.episodes == 4, "a client may name no episodes"
-
-
-def test_the_duration_of_every_decision_is_observed_at_once() -> None:
-    one, seconds = session(), []
-    one.counts.observe_seconds = seconds.append
-    for step in range(2):
-        ask(one, **request(step, goal_image=image(100)))
-    assert len(seconds) == 2

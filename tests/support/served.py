@@ -18,7 +18,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.serving.about import roboarena_metadata
 from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.server import PlanningServer, Served, ServerOptions, Watcher
+from vjepa2_ac.serving.server import PlanningServer, Served, ServerOptions
 from vjepa2_ac.serving.session import Session, SessionOptions
 from vjepa2_ac.spaces import Spaces
 
@@ -70,7 +70,6 @@ def serving(
     ping_s: float = 20.0,
     wait: bool = True,
     told: Callable[[Session], dict] = roboarena_metadata,
-    watch: Watcher | None = None,
 ) -> Iterator[Running]:
     """Serve in a thread as long as the context lasts; `wait` until it is ready."""
     lines: list[str] = []
@@ -89,7 +88,7 @@ def serving(
 
     async def run() -> bool:
         stop = asyncio.Event()
-        server = PlanningServer(loaded, ServerOptions(access or Access("127.0.0.1"), 0, None, ping_s, watch), tell)
+        server = PlanningServer(loaded, ServerOptions(access or Access("127.0.0.1"), 0, None, ping_s), tell)
         loop_of.extend((asyncio.get_running_loop(), stop, server))
         return await server.run(stop)
 

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vjepa2_ac.evaluation.summary import Summary
-    from vjepa2_ac.explore.watch import WatchPage
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
     from vjepa2_ac.simulation.agent import Agent
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 
     Benchmark = tuple[ClosedLoopBenchmark, tuple[Path, ...]]  # and its files
 
-_GB = 10**9
 _OF_RECORD = ("cameras", "workers")
 _OF_A_MODEL = ("sub_goals", "goals", "films", "decoder", "checkpoint", "config", "out", "key_file")
 
@@ -47,10 +45,8 @@ def add_serve(commands: cli.Commands) -> None:
     cli.add(parser, "--port N", "0: a free one (8000)", cli.whole_number(0, 65535), default=8000)
     cli.add(parser, "--key-file FILE", "with the key that clients send; needed where others can reach it", cli.as_path)
     cli.add(parser, "--dry-run", "plan, and answer zeros: the robot stays where it is", action="store_true")
-    cli.add(
-        parser, "--watch", "a page at /watch/ shows what the planner sees and wants, with a STOP", action="store_true"
-    )
-    cli.add_decoder(parser, "on that page what the planner imagined")
+    text = "write every decision with its images to a new folder, up to 2 GB"
+    cli.add(parser, "--record FOLDER", text, cli.as_path)
     group = parser.add_argument_group("messages")
     cli.add(group, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
     text = "what is told on connect; roboarena: its six keys only (full)"
@@ -61,9 +57,6 @@ def add_serve(commands: cli.Commands) -> None:
     cli.add_access(group)
     cli.add(group, "--certificate FILE", "TLS: the certificate and those it is signed by, PEM", cli.as_path)
     cli.add(group, "--certificate-key FILE", "its private key, PEM (in the same file)", cli.as_path)
-    group = parser.add_argument_group("record")
-    cli.add(group, "--record FOLDER", "every decision with its pictures, in a new folder", cli.as_path)
-    cli.add(group, "--record-gb GB", "its largest size (2)", cli.number_between(0, 10_000, "gigabytes"), default=2.0)
 
 
 def add_simulate(commands: cli.Commands) -> None:
@@ -110,8 +103,6 @@ def _serve(options: argparse.Namespace) -> int:
     if options.metadata == "roboarena" and options.actions != "pose":
         found, needed = f"--actions {options.actions}", "--actions pose: RoboArena knows no changes of a pose"
         raise InputError(where="--metadata roboarena", found=found, needed=needed)
-    if options.decoder is not None and not options.watch:
-        raise InputError(where="--decoder", found="no --watch", needed="the page that shows it")
     access = cli.access_of(options)
     extrinsics, tls = cli.camera_pose(options.extrinsics), _tls(options)
     cli.require_goals(options.goals)
@@ -123,13 +114,8 @@ def _serve(options: argparse.Namespace) -> int:
     if options.record is not None:
         cli.require_new_place(options.record)
     goals = None if options.goals is None else read_kept_goals(options.goals)
-    watch = None
-    if options.watch:
-        from vjepa2_ac.explore.watch import WatchPage
-
-        watch = WatchPage(options.subject, cli.given_decoder(options), cli.show)
-    how = ServerOptions(access, options.port, tls, watch=watch)
-    ended = serve(lambda: _loaded(options, goals, extrinsics, watch), how, cli.show)
+    how = ServerOptions(access, options.port, tls)
+    ended = serve(lambda: _loaded(options, goals, extrinsics), how, cli.show)
     if not ended:  # a search or a loading that takes longer than anybody waits: nothing of it is to be kept
         sys.stdout.flush()
         sys.stderr.flush()
@@ -161,9 +147,7 @@ def _tls(options: argparse.Namespace) -> ssl.SSLContext | None:
     return context
 
 
-def _loaded(
-    options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np.ndarray | None, watch: WatchPage | None
-) -> Served:
+def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np.ndarray | None) -> Served:
     """Load the model, and make a first decision; runs in the planning thread."""
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.evaluation.policies.score import is_blind, ranking_of_run
@@ -176,9 +160,6 @@ def _loaded(
     from vjepa2_ac.serving.session import Session, SessionOptions
 
     loaded = cli.load_planning_session(options)
-    if watch is not None and watch.decoder is not None:
-        watch.decoder.require_fit(loaded.world_model, loaded.config.data, subject=options.subject)
-        watch.decoder.to(loaded.world_model.device)
     steps = require_stride(loaded.config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
     how = SessionOptions(
         options.actions,
@@ -198,7 +179,7 @@ def _loaded(
     Work.begin("")
     if options.record is not None:
         about = {**about, "overrides": options.overrides, "config": options.config, **loaded.as_dict()}
-        session.recorder = Recorder(options.record, about, int(_GB * options.record_gb))
+        session.recorder = Recorder(options.record, about)
     return Served(session, told)
 
 
@@ -381,7 +362,7 @@ def _agent(options: argparse.Namespace) -> Iterator[Agent]:
     """Return who acts; a server as long as the context lasts."""
     from vjepa2_ac.decoding.decoder_folder import SIMULATED
     from vjepa2_ac.serving.access import read_key
-    from vjepa2_ac.serving.wire import PlanningClient
+    from vjepa2_ac.serving.client import PlanningClient
     from vjepa2_ac.simulation.agent import agent_of_server, agent_of_session
 
     if not cli.is_server(options.subject):

@@ -20,8 +20,11 @@ from vjepa2_ac.storage.places import BUILTIN
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
-    from vjepa2_ac.explore.explorer import ExploreOptions
+    from vjepa2_ac.data.dataset import Dataset
+    from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+    from vjepa2_ac.evaluation.evaluate_run import Models
     from vjepa2_ac.explore.views import Views
+    from vjepa2_ac.reporter import Reporter
     from vjepa2_ac.serving.access import Access
 
 _DEMO_RUN, _BUILTIN_MODEL = "demo/run", f"{BUILTIN}sim-tiny"
@@ -41,8 +44,6 @@ def add_explore(commands: cli.Commands) -> None:
     text = "what shows images: `vjepa2-ac decoder` made it (beside the run, else builtin:sim-tiny)"
     cli.add(parser, "--decoder FOLDER", text, cli.as_model)
     cli.add(parser, "--data CONFIG", "explore its data; needed for a model but the package's own", cli.as_local)
-    text = "write a page that plays without us into a new folder: six moves, four deep; nothing is served"
-    cli.add(parser, "--export FOLDER", text, cli.as_path)
     cli.add(parser, "--split", "which episodes (test)", choices=["test", "validation", "train"], default="test")
     cli.add_checkpoint(parser)
     group = parser.add_argument_group("the page")
@@ -65,23 +66,14 @@ def _explore(options: argparse.Namespace) -> int:
         options.subject, options.overrides = None, [options.subject, *options.overrides]
     subject = options.subject or (_DEMO_RUN if is_run(_DEMO_RUN) else _BUILTIN_MODEL)
     access = cli.access_of(options)
-    if options.export is not None:
-        cli.require_new_place(options.export)
     config = read_run_config(Path(subject), options.overrides) if is_run(subject) else None
     cli.require_subject(subject, config, options.words)
     cli.say_places_elsewhere(subject)
+    decoder = _decoder(subject, options)
     with _data(subject, options) as data:
-        from vjepa2_ac.explore.views import Views
-
         with cli.reporter() as reporter:
-            explorer, config = _asked(subject, data, options).opened(reporter)
-            views = Views.of(subject, explorer, config)
-            if options.export is not None:
-                from vjepa2_ac.explore.postcard import write_postcard
-
-                cli.show(files=[write_postcard(views, options.export, reporter.task("imagining", "futures"))])
-                return 0
-            episodes = counted(len(explorer.episodes), "episode")
+            views = _views(subject, data, decoder, options, reporter)
+            episodes = counted(len(views.explorer.episodes), "episode")
             about = f"{subject}, {episodes}; a step takes {views.step_seconds:.2f} s here"
         _serve(views, access, options, about)
     return 0
@@ -129,15 +121,31 @@ def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
         raise InputError(where=f"explore {subject}", found="a model, which has no data of its own", needed=needed)
 
 
-def _asked(subject: str, data: Config | None, options: argparse.Namespace) -> ExploreOptions:
-    """Return what is to be explored, with the decoder that is given, or lies beside the run, or is the package's."""
-    from vjepa2_ac.decoding.decoder_folder import CARD
-    from vjepa2_ac.evaluation.request import EvaluationOptions
-    from vjepa2_ac.explore.explorer import ExploreOptions
+def _decoder(subject: str, options: argparse.Namespace) -> TrainedDecoder:
+    """Load the decoder: the given one, or the one next to the run, or that of the package."""
+    from vjepa2_ac.decoding.decoder_folder import CARD, load_decoder
 
-    beside = Path(subject).parent / "decoder"
-    decoder = options.decoder or (str(beside) if (beside / CARD).is_file() else _BUILTIN_MODEL)
+    folder = Path(subject).parent / "decoder"
+    return load_decoder(options.decoder or (folder if (folder / CARD).is_file() else _BUILTIN_MODEL))
+
+
+def _views(
+    subject: str, data: Config | None, decoder: TrainedDecoder, options: argparse.Namespace, reporter: Reporter
+) -> Views:
+    from vjepa2_ac.evaluation.evaluate_run import load_models
+    from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
+    from vjepa2_ac.explore.explorer import open_explorer
+    from vjepa2_ac.explore.views import Views
+    from vjepa2_ac.simulation.counterfactual import SimulatedFutures
+
+    require_one_process()
     against = tuple(options.against) if options.against else None
     how = {"split": options.split, "checkpoint": options.checkpoint, "data": data, "against": against}
-    planning = tuple(options.overrides)
-    return ExploreOptions(subject, decoder, EvaluationOptions(**how, out=Path(), planning=planning))
+    asked = EvaluationOptions(**how, out=Path(), planning=tuple(options.overrides))
+    config = settle(subject, asked)
+
+    def load(dataset: Dataset, decoder: TrainedDecoder) -> Models:
+        return load_models(subject, config, asked, dataset, decoder)
+
+    explorer = open_explorer(config, decoder, options.split, load, SimulatedFutures.of, reporter)
+    return Views.of(subject, explorer, config)

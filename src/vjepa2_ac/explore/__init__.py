@@ -1,1 +1,1 @@
-"""The window: a page in which a person drives a model's imagination, and watches a robot that is served."""
+"""The interactive page: a person drives a model's predictions in a browser."""

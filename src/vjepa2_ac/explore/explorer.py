@@ -1,4 +1,4 @@
-"""What is explored: a model and what stands beside it, a decoder, held-out episodes; and a step of imagination."""
+"""The models, the decoder and the held-out episodes of `explore`; and the prediction of one more step."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of
-from vjepa2_ac.data.transforms import frames_as_seen
+from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.data.windows import require_frames
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.distributed import make_accelerator
-from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate_run import Models, load_models
-from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
+from vjepa2_ac.evaluation.evaluate_run import Models
 from vjepa2_ac.explore.messages import MOST_STEPS, GoalFrame
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
+from vjepa2_ac.planning.planner import Cancelled
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces
 
@@ -36,6 +37,8 @@ _KEPT_STEPS = 128  # of each model, for undo and for other branches
 _SAME = 2e-5  # of numbers of an action: links are rounded
 Pixels = UInt8[np.ndarray, "size size 3"]
 Actions = tuple[tuple[float, ...], ...]
+Simulate = Callable[[int, int, Actions, Cancelled], tuple[np.ndarray, np.ndarray, bool]]
+"""Episode, control step, actions, whether it is cancelled -> frame, state, and whether the arm reached its target."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +61,15 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A frame that is true, and what was measured then."""
+    """A true frame, and the state that was measured then."""
 
     pixels: Pixels  # as the encoder sees it
     latents: Float[Tensor, "tokens dim"]
     state: Float[np.ndarray, " state_dim"]
     action: tuple[float, ...] | None = None  # that was recorded, to the next moment; None: nobody knows
     extrinsics: Float[Tensor, " 6"] | None = None  # of the camera, where the model uses them
+    is_simulated: bool = False  # else recorded
+    reached: bool = True  # whether the arm could do the last action
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +94,9 @@ class Explorer:
         dataset: Dataset,
         episodes: tuple[int, ...],
         autocast: Callable[[], Any],
+        simulate: Simulate | None = None,
     ) -> None:
-        """Prepare; `ExploreOptions.opened` loads the parts.
+        """Prepare; `open_explorer` loads the parts.
 
         Args:
             models: The models, on their device.
@@ -98,12 +104,14 @@ class Explorer:
             dataset: Clips of two frames of one camera.
             episodes: Those that are shown, by their places in the data set.
             autocast: Within which models compute.
+            simulate: Simulates what was not recorded; None: the data were not simulated.
 
         Raises:
             InputError: Nobody knows which state follows from an action.
         """
         self.world_model, self.contenders, self.notes = models.world_model, models.contenders, models.notes
         self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
+        self.simulate = simulate
         if self.spaces.action.follows == "unknown":
             found = "commands of which nobody knows what they do to the state"
             needed = "data.actions: difference; or join_actions: sum or last"
@@ -201,6 +209,23 @@ class Explorer:
         first = Moment(pixels[0], latents[0], states[0], tuple(action.tolist()), camera)
         return first, Moment(pixels[1], latents[1], states[1])
 
+    @torch.no_grad()
+    def truth(self, place: Place, cancelled: Cancelled = lambda: False) -> Moment | None:
+        """Return what is true at a place: recorded, else simulated; None: it is unknown.
+
+        Raises:
+            SearchCancelledError: It was cancelled.
+        """
+        recorded = self.recorded(place)
+        if recorded is not None or self.simulate is None:
+            return recorded
+        episode, crop = self.episodes[place.episode], self.dataset.config.crop
+        frame, state, reached = self.simulate(episode, place.start, place.actions, cancelled)
+        with self.autocast():
+            latents = encode_frames(self.world_model, frame[None], crop)[0]
+        (pixels,) = frames_as_seen(view(frame[None], crop), self.world_model.image_size)
+        return Moment(pixels, latents, state, is_simulated=True, reached=reached)
+
     # ---- what is imagined ----
 
     def states(self, place: Place) -> Float[np.ndarray, "time state_dim"]:
@@ -260,38 +285,42 @@ def relative_spread(latents: Float[Tensor, "tokens dim"], like: Float[Tensor, "t
     return float(latents.var(dim=0).sum() / like.var(dim=0).sum())
 
 
-@dataclass(frozen=True)
-class ExploreOptions:
-    """What is to be explored."""
+def open_explorer(
+    config: Config,
+    decoder: TrainedDecoder,
+    split: Split,
+    load: Callable[[Dataset, TrainedDecoder], Models],
+    simulate: Callable[[Dataset], Simulate | None] = lambda _: None,
+    reporter: Reporter = SILENT,
+) -> Explorer:
+    """Load everything, on the device of the config.
 
-    subject: str
-    decoder: str
-    evaluation: EvaluationOptions  # checkpoint, data, against, split
+    Args:
+        config: With the data.
+        decoder: Of the latents of the models.
+        split: Whose episodes are shown.
+        load: Loads the models.
+        simulate: Returns what simulates a data set.
+        reporter: Shows the progress.
 
-    def opened(self, reporter: Reporter = SILENT) -> tuple[Explorer, Config]:
-        """Load everything, on the device of the config; return it with the settings of planning.
-
-        Raises:
-            InputError: Subject, data or decoder cannot be used.
-        """
-        decoder = load_decoder(self.decoder)
-        require_one_process()
-        config = settle(self.subject, self.evaluation)
-        one = {"frames": 2, "camera": config.data.cameras[0], "workers": 0}
-        config = config.model_copy(update={"data": config.data.model_copy(update=one)})
-        accelerator = make_accelerator(config)
-        dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-        require_frames(config.data, to="show what is true")
-        reporter.task(LOADING)
-        loaded = load_models(self.subject, config, self.evaluation, dataset, decoder)
-        loaded.put_on(accelerator.device)
-        decoder.to(accelerator.device)
-        members = dataset.members(self.evaluation.split)[dataset.episodes]
-        long_enough = dataset.table.num_steps[dataset.episodes] > config.data.model_stride
-        episodes = tuple(int(one) for one in dataset.episodes[members & long_enough])
-        if not episodes:
-            dataset.windows(self.evaluation.split)  # says why
-        return Explorer(loaded, decoder, dataset, episodes, accelerator.autocast), config
+    Raises:
+        InputError: Models or data cannot be used, or the decoder is that of another encoder.
+    """
+    one = {"frames": 2, "camera": config.data.cameras[0], "workers": 0}
+    config = config.model_copy(update={"data": config.data.model_copy(update=one)})
+    accelerator = make_accelerator(config)
+    dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+    require_frames(config.data, to="show what is true")
+    reporter.task(LOADING)
+    models = load(dataset, decoder)
+    models.put_on(accelerator.device)
+    decoder.to(accelerator.device)
+    members = dataset.members(split)[dataset.episodes]
+    long_enough = dataset.table.num_steps[dataset.episodes] > config.data.model_stride
+    episodes = tuple(int(one) for one in dataset.episodes[members & long_enough])
+    if not episodes:
+        dataset.windows(split)  # says why
+    return Explorer(models, decoder, dataset, episodes, accelerator.autocast, simulate(dataset))
 
 
 def goal_moment(explorer: Explorer, goal: GoalFrame) -> Moment:

@@ -4,24 +4,40 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import http
+import http.cookies
 import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import Any
+from urllib.parse import parse_qs, quote, unquote
 
 from vjepa2_ac.errors import InputError, UserError, require_library
 from vjepa2_ac.explore.messages import MOST_BYTES, PageRequest, packed, read_request
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.planning.planner import SearchCancelledError
-from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.listening import ends, listen, until_signalled, url_of
-from vjepa2_ac.serving.pages import Page
+from vjepa2_ac.serving.access import Access, ends, listen, single_header, until_signalled, url_of
 
 logger = logging.getLogger(__name__)
 
-_FILES = ("index.html", "style.css", "shared.js", "explore.js")
+_FILES = {
+    "/": ("index.html", "text/html"),
+    "/style.css": ("style.css", "text/css"),
+    "/shared.js": ("shared.js", "text/javascript"),
+    "/explore.js": ("explore.js", "text/javascript"),
+}
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self';"
+        " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
 _MOST_PAGES = 8
 
 
@@ -46,7 +62,6 @@ class ExploreServer:
             port: 0: a free one.
         """
         self._views, self._access, self._port = views, access, port
-        self._page = Page.of_package("/", "explore/page", _FILES)
         self._computing = ThreadPoolExecutor(1, "imagining")
         self._pages = 0
 
@@ -57,7 +72,7 @@ class ExploreServer:
             InputError: The address cannot be listened on.
         """
         library = require_library("websockets.asyncio.server", where="explore", called="websockets", extra="explore")
-        how = {"process_request": self._asked, "max_size": MOST_BYTES}
+        how = {"process_request": self._respond, "max_size": MOST_BYTES}
         server = await listen(library, self._came, self._access, self._port, **how)
         ready(f"{url_of(server, 'http')}/")
         try:
@@ -67,8 +82,31 @@ class ExploreServer:
             await ends(server.wait_closed())
             self._computing.shutdown(wait=False, cancel_futures=True)
 
-    def _asked(self, connection: Any, request: Any) -> Any:
-        return self._page.answer(connection, request, self._access)
+    def _respond(self, connection: Any, request: Any) -> Any:
+        """Return the HTTP response to a request; None: the socket of a page may open.
+
+        A browser cannot send the key as a header: the key arrives once as `?key=`, then in a cookie that no script
+        reads. The socket is only for this server's own page: `Origin` has to name the host of the request.
+        """
+        path, _, query = request.path.partition("?")
+        host, status = single_header(request, "Host"), http.HTTPStatus
+        key = parse_qs(query).get("key")
+        cookie = f"vjepa2-ac-{(host or '').rpartition(':')[2]}"  # browsers share cookies among the ports of a host
+        refusal = self._access.why_not(host, _authorization(request, cookie) if key is None else f"Bearer {key[0]}")
+        if refusal is not None:
+            hint = "; in a browser: /?key=KEY" if refusal[0] == status.UNAUTHORIZED else ""
+            return connection.respond(status(refusal[0]), f"{refusal[1]}{hint}\n")
+        if key is not None:
+            response = connection.respond(status.SEE_OTHER, "")
+            response.headers["Location"] = "/"
+            response.headers["Set-Cookie"] = f"{cookie}={quote(key[0])}; HttpOnly; SameSite=Strict; Path=/"
+            return response
+        if path == "/socket":
+            is_own = single_header(request, "Origin") in {f"http://{host}", f"https://{host}"}
+            return None if is_own else connection.respond(status.FORBIDDEN, "not this server's page\n")
+        if path not in _FILES:
+            return connection.respond(status.NOT_FOUND, "no such page\n")
+        return _file(connection, *_FILES[path])
 
     async def _came(self, connection: Any) -> None:
         if self._pages >= _MOST_PAGES:
@@ -138,6 +176,26 @@ class ExploreServer:
         except Exception:
             logger.exception("a request of a page could not be answered")
             return packed("error", request.seq, {"text": "This could not be computed; the terminal says more."})
+
+
+def _file(connection: Any, name: str, kind: str) -> Any:
+    """Return the response with a file of the page."""
+    response = connection.respond(http.HTTPStatus.OK, "")
+    response.body = files("vjepa2_ac").joinpath("explore/page", name).read_bytes()
+    del response.headers["Content-Type"], response.headers["Content-Length"]
+    lengths = {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(response.body))}
+    response.headers.update(lengths | _HEADERS)
+    return response
+
+
+def _authorization(request: Any, cookie: str) -> str | None:
+    """Return the key in a request as a header: from the cookie, else from the header `Authorization`."""
+    cookies: http.cookies.SimpleCookie = http.cookies.SimpleCookie()
+    try:
+        cookies.load("; ".join(request.headers.get_all("Cookie")))
+    except http.cookies.CookieError:
+        return None
+    return f"Bearer {unquote(cookies[cookie].value)}" if cookie in cookies else single_header(request, "Authorization")
 
 
 def _newest(told: asyncio.Queue[tuple[int, int]], progress: tuple[int, int]) -> None:

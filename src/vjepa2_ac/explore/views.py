@@ -15,10 +15,9 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress, short_names
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.explore.explorer import Explorer, Pixels, Place, goal_moment, relative_spread, token_errors
+from vjepa2_ac.explore.explorer import Explorer, Moment, Pixels, Place, goal_moment, relative_spread, token_errors
 from vjepa2_ac.explore.messages import MOST_STEPS, Image, PageRequest, packed, shown_units
 from vjepa2_ac.explore.search import Search
-from vjepa2_ac.explore.truth import TrueFrame, Truth
 from vjepa2_ac.media.film import spread_with_ends
 from vjepa2_ac.planning.planner import Cancelled
 
@@ -42,7 +41,6 @@ class Views:
     subject: str
     explorer: Explorer
     search: Search
-    truth: Truth
 
     @classmethod
     def of(cls, subject: str, explorer: Explorer, config: Config) -> Views:
@@ -50,7 +48,7 @@ class Views:
         planning = config.planning
         if explorer.device.type == "cpu" and planning == PlanningConfig(limits=planning.limits):
             planning = planning.model_copy(update=_QUICK)
-        return cls(subject, explorer, Search(explorer, planning), Truth(explorer))
+        return cls(subject, explorer, Search(explorer, planning))
 
     def answer(self, request: PageRequest, progress: Progress, cancelled: Cancelled) -> bytes:
         """Return the answer to a request.
@@ -80,7 +78,7 @@ class Views:
             "subject": self.subject,
             "notes": explorer.notes,
             "tellers": [{"id": one.name, "label": one.name} for one in explorer.contenders],
-            "truth": "simulated" if self.truth.is_simulated else "recorded",
+            "truth": "recorded" if explorer.simulate is None else "simulated",
             "episodes": [
                 {"name": name, "full": explorer.name(index), "steps": explorer.steps(index)}
                 for index, name in enumerate(self.episode_names[:_MOST_EPISODES])
@@ -137,21 +135,6 @@ class Views:
         ]
         return [*moves, {"id": "still", "label": "still", "axis": None, "sign": 0}]
 
-    def action(self, move: dict[str, Any]) -> tuple[float, ...]:
-        """Return the action of a move, of a usual size."""
-        numbers = enumerate(self.numbers)
-        return tuple(move["sign"] * one["step"] if axis == move["axis"] else 0.0 for axis, one in numbers)
-
-    def middle(self) -> Place:
-        """Return the start whose state is nearest to the mean of all: from there is room in every direction."""
-        explorer, found = self.explorer, []
-        for episode, states in enumerate(self._recorded_states):
-            shown = states[: -explorer.stride, explorer.spaces.state.sized]
-            found += [(episode, step, state) for step, state in enumerate(shown)]
-        mean = np.mean([state for *_, state in found], axis=0)
-        episode, start, _ = min(found, key=lambda one: float(np.linalg.norm(one[2] - mean)))
-        return Place(episode, start)
-
     @cached_property
     def _recorded_states(self) -> list[Float[np.ndarray, "steps dim"]]:
         read, first = self.explorer.dataset.source.read, self.explorer.episodes[:_SEARCHED]
@@ -202,7 +185,7 @@ class Views:
     def _look(self, request: PageRequest, place: Place, cancelled: Cancelled) -> bytes:
         explorer, start = self.explorer, self.explorer.moment(place.episode, place.start)
         goal = None if request.goal is None else goal_moment(explorer, request.goal)
-        outcome, states = self.truth.outcome(place, cancelled), explorer.states(place)
+        outcome, states = explorer.truth(place, cancelled), explorer.states(place)
         images = [Image("given", start.pixels, f"the given frame, recorded at control step {place.start}")]
         images += [] if outcome is None else [Image("truth", outcome.pixels, _true_alt(outcome))]
         images += [] if goal is None else [Image("goal", goal.pixels, "the goal frame")]
@@ -274,7 +257,7 @@ class Views:
         return packed("energy", request.seq, {"maps": shown, "now": now}, ())
 
 
-def _true_alt(outcome: TrueFrame) -> str:
+def _true_alt(outcome: Moment) -> str:
     return f"what really happens, {'simulated' if outcome.is_simulated else 'recorded'}"
 
 

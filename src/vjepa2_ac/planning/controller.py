@@ -288,11 +288,6 @@ class Controller:
         self._seen, self._cameras, self._done, self.decision = seen, cameras, self._done + 1, decision
         return decision.action
 
-    @property
-    def num_decisions(self) -> int:
-        """Decisions since the goals were set."""
-        return self._done
-
     @torch.no_grad()
     def score(
         self,

@@ -1,22 +1,28 @@
-"""Access: who may reach the server. Decided from headers alone, before a message is read."""
+"""Where a websocket server listens, and who may reach it: decided from headers alone, before a message is read."""
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import ipaddress
 import logging
 import re
 import shlex
+import signal
 import stat
-from collections.abc import Collection
+import threading
+from collections.abc import Awaitable, Callable, Collection, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)
 
 LEAST_KEY = 16  # characters
+END_S = 1.5  # for connections and computations, when a server ends
+_Result = TypeVar("_Result")
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:]+))(?::[0-9]*)?|([0-9a-f:]+)")  # [address]:port, name:port, address
 _SCHEMES = ("api-key", "bearer")  # openpi's clients send the first one
 
@@ -104,3 +110,56 @@ def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return ipaddress.ip_address(name)
     except ValueError:
         return None
+
+
+def single_header(request: Any, name: str) -> str | None:
+    """Return the value of a header that a request has once; None: it has none, or several."""
+    values = request.headers.get_all(name)
+    return values[0] if len(values) == 1 else None
+
+
+async def listen(
+    library: Any, handler: Callable[[Any], Coroutine[Any, Any, None]], access: Access, port: int, **options: Any
+) -> Any:
+    """Return a websocket server that listens.
+
+    Args:
+        library: `websockets.asyncio.server`.
+        handler: Serves a connection.
+        access: Where the server listens.
+        port: 0: a free port.
+        options: As `serve` of the library takes them.
+
+    Raises:
+        InputError: The address cannot be listened on.
+    """
+    try:
+        return await library.serve(handler, access.host, port, compression=None, server_header=None, **options)
+    except OSError as error:
+        where, fix = f"{access.host}:{port}", "Choose another --host or --port; 0 takes a free one"
+        raise InputError(where=where, found=f"cannot be listened on: {error.strerror or error}", fix=fix) from None
+
+
+def url_of(server: Any, scheme: str) -> str:
+    """Return the address at which a server listens."""
+    host, port = server.sockets[0].getsockname()[:2]
+    return f"{scheme}://{f'[{host}]' if ':' in str(host) else host}:{port}"
+
+
+async def ends(*ending: Awaitable[Any]) -> bool:
+    """Wait until all are done, for `END_S` at most; return whether they are."""
+    _, late = await asyncio.wait([asyncio.ensure_future(one) for one in ending], timeout=END_S)
+    return not late
+
+
+def until_signalled(run: Callable[[asyncio.Event], Coroutine[Any, Any, _Result]]) -> _Result:
+    """Run until SIGTERM or SIGINT, which set the event that `run` receives; in the main thread only."""
+
+    async def running() -> _Result:
+        stop, loop = asyncio.Event(), asyncio.get_running_loop()
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                loop.add_signal_handler(number, stop.set)
+        return await run(stop)
+
+    return asyncio.run(running())

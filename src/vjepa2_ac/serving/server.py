@@ -1,43 +1,25 @@
-"""The server: a websocket for one robot at a time, health and figures over HTTP. It plans in a thread of its own."""
+"""The planning server: a websocket for one robot at a time; health and counters over HTTP."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import http
-import signal
 import ssl
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 from vjepa2_ac.errors import require_library
-from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.listening import ends, listen, until_signalled, url_of
-from vjepa2_ac.serving.pages import Page, single_header
-from vjepa2_ac.serving.session import Counts, GoneError
+from vjepa2_ac.serving.access import Access, ends, listen, single_header, until_signalled, url_of
+from vjepa2_ac.serving.session import Counts, GoneError, Session
 from vjepa2_ac.serving.wire import MOST_BYTES, pack
-
-if TYPE_CHECKING:  # PyTorch is imported with the model, when the server listens
-    from vjepa2_ac.serving.session import Session
 
 _OPEN_S = 10.0  # that a handshake may take
 _WAITING = 2  # messages of a client that are read before they are answered
-
-
-class Watcher(Protocol):
-    """A page that shows what is served, beside the robot's own path."""
-
-    page: Page
-
-    def begin(self, session: Session, robot: Callable[[], str | None]) -> None:
-        """Watch a session, once it is loaded, and know the address of the robot that is served, if one is."""
-
-    async def show(self, connection: Any) -> None:
-        """Show it to a page, until that is closed."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +30,6 @@ class ServerOptions:
     port: int = 8000  # 0: a free one
     certificate: ssl.SSLContext | None = None  # None: no TLS
     ping_s: float = 20.0  # between pings; a client that does not answer one for as long is gone
-    watch: Watcher | None = None  # the page that shows what is done
 
 
 @dataclass(frozen=True)
@@ -76,13 +57,6 @@ class PlanningServer:
         self._ready = asyncio.Event()
         self._robot: str | None = None  # the address of the one that is served
         self._turned_away: Counter[str] = Counter()  # by HTTP status
-        self._metrics = require_library(
-            "prometheus_client", where="serve", called="prometheus-client, which writes /metrics", extra="serve"
-        )
-        self._registry = self._metrics.CollectorRegistry()
-        self._registry.register(self)
-        about = {"registry": self._registry, "buckets": (0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60)}
-        self._seconds = self._metrics.Histogram("vjepa2_ac_decision_seconds", "Duration of a decision.", **about)
 
     async def run(self, stop: asyncio.Event) -> bool:
         """Listen until `stop`; return whether the planning thread has ended, too.
@@ -122,18 +96,13 @@ class PlanningServer:
         if stop.is_set():
             return
         self._served = loading.result()
-        self._served.session.counts.observe_seconds = self._seconds.observe
-        if self._options.watch is not None:
-            self._options.watch.begin(self._served.session, lambda: self._robot)
         self._ready.set()
         self._tell("ready")
         await stopping
 
     def _asked(self, connection: Any, request: Any) -> Any:
         """Answer what comes over HTTP, and refuse who may not come in; None: a robot may begin."""
-        path, status, watch = request.path.partition("?")[0], http.HTTPStatus, self._options.watch
-        if watch is not None and watch.page.has(path):
-            return watch.page.answer(connection, request, self._options.access)
+        path, status = request.path.partition("?")[0], http.HTTPStatus
         host, authorization = (single_header(request, name) for name in ("Host", "Authorization"))
         if path == "/healthz":
             return connection.respond(status.OK, "OK\n")
@@ -144,7 +113,7 @@ class PlanningServer:
             )
         refused = self._options.access.why_not(host, authorization)
         if refused is None and path == "/metrics":
-            return connection.respond(status.OK, self._page())
+            return connection.respond(status.OK, self._metrics())
         if refused is None and path != "/":
             return connection.respond(status.NOT_FOUND, "no such page\n")
         if refused is None and request.headers.get_all("Upgrade"):
@@ -158,10 +127,7 @@ class PlanningServer:
         return connection.respond(status(refused[0]), f"{refused[1]}\n")
 
     async def _robot_came(self, connection: Any) -> None:
-        """Serve a robot until it leaves, or a page that watches; one that comes before the model is loaded waits."""
-        if self._options.watch is not None and self._options.watch.page.has(connection.request.path):
-            await self._options.watch.show(connection)
-            return
+        """Serve a robot until it leaves; one that comes before the model is loaded waits."""
         if self._robot is not None:  # both came at once
             await connection.close(1013, _busy(self._robot)[:100])
             return
@@ -206,51 +172,32 @@ class PlanningServer:
         except GoneError:
             return None
 
-    def release(self) -> None:
-        """Let actions move the robot again, after a page has stopped it."""
-        if self._served is not None and self._served.session.stopped.is_set():
-            self._served.session.stopped.clear()
-            self._tell("released: actions move the robot again")
-
-    @property
-    def _counts(self) -> Counts:
-        return Counts() if self._served is None else self._served.session.counts
-
-    def _page(self) -> str:
-        """Return the metrics in Prometheus' text format."""
-        return str(self._metrics.generate_latest(self._registry).decode())
-
-    def collect(self) -> Iterator[Any]:
-        """Yield the metrics that are read when the page is made: Prometheus' collector."""
-        families, counts = self._metrics.metrics_core, self._counts
-        robots, gauge, counter = int(self._robot is not None), families.GaugeMetricFamily, families.CounterMetricFamily
-        stopped = int(self._served is not None and self._served.session.stopped.is_set())
-        for family, name, about, label, values in (
-            (gauge, "ready", "1 once requests are answered.", "", {"": int(self._ready.is_set())}),
-            (gauge, "robots", "Robots that are connected.", "", {"": robots}),
-            (gauge, "stopped", "1 while a page has stopped the robot.", "", {"": stopped}),
-            (counter, "requests_refused", "Requests that could not be used.", "", {"": counts.refused}),
-            (counter, "requests_failed", "Requests at which the server failed.", "", {"": counts.failed}),
-            (counter, "episodes", "Episodes that were begun.", "", {"": counts.episodes}),
-            (counter, "alarms", "Frames that departed from what was predicted.", "", {"": counts.alarms}),
-            (gauge, "surprise", "Of the last frame: its distance from the prediction.", "", {"": counts.surprise}),
-            (counter, "decisions", "Decisions, by their reason.", "why", counts.decisions),
-            (counter, "connections_refused", "Connections, by HTTP status.", "status", self._turned_away),
-        ):
-            found = family(f"vjepa2_ac_{name}", about, labels=[label] if label else [])
-            for key, value in sorted(dict(values).items()):
-                found.add_metric([key] if label else [], value)
-            yield found
+    def _metrics(self) -> str:
+        """Return the counters in Prometheus' text format."""
+        counts = Counts() if self._served is None else self._served.session.counts
+        values = {
+            "ready": int(self._ready.is_set()),
+            "robots": int(self._robot is not None),
+            "requests_refused_total": counts.refused,
+            "requests_failed_total": counts.failed,
+            "episodes_total": counts.episodes,
+            "alarms_total": counts.alarms,
+            "surprise": counts.surprise,
+            "decision_seconds_sum": counts.seconds,
+            "decision_seconds_count": counts.decisions.total(),
+            **{f'decisions_total{{why="{why}"}}': number for why, number in sorted(counts.decisions.items())},
+            **{f'connections_refused_total{{status="{one}"}}': n for one, n in sorted(self._turned_away.items())},
+        }
+        return "".join(f"vjepa2_ac_{name} {value}\n" for name, value in values.items())
 
 
 def serve(load: Callable[[], Served], options: ServerOptions, tell: Callable[[str], None]) -> bool:
-    """Serve until SIGTERM or SIGINT; return whether the planning thread has ended, too. SIGUSR1 releases a stop.
+    """Serve until SIGTERM or SIGINT; return whether the planning thread has ended, too.
 
     Raises:
         InputError: As `PlanningServer.run`.
     """
-    server = PlanningServer(load, options, tell)
-    return until_signalled(server.run, {signal.SIGUSR1: server.release})
+    return until_signalled(PlanningServer(load, options, tell).run)
 
 
 async def _first_of(*futures: asyncio.Future[Any]) -> None:

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -39,7 +38,7 @@ ActionForm = Literal["delta", "pose"]
 Clock = Callable[[], float]  # seconds, from anywhere
 
 _MOST_NAMES = 20  # of goals in a message
-STOPPED, LATE = "stopped by the page", "past the deadline"
+LATE = "past the deadline"
 _ALARM = "what the camera sees departs from what was predicted: look at the robot"
 _BAR = 0.05  # share of an image's height, black at the top and at the bottom: a padded image
 
@@ -66,17 +65,7 @@ class Counts:
     episodes: int = 0
     alarms: int = 0  # frames that departed from what was predicted
     surprise: float = 0.0  # of the last frame that was compared
-    observe_seconds: Callable[[float], None] = lambda _: None  # takes the duration of each decision
-
-
-class Observer(Protocol):
-    """Sees what a session does, as it does it: in the planning thread, so that it has to be quick."""
-
-    def goal(self, goals: Sequence[SubGoal], mask: np.ndarray | None) -> None:
-        """Take note of a goal, with which an episode begins."""
-
-    def decision(self, controller: Controller, frame: np.ndarray, state: np.ndarray, answer: Mapping[str, Any]) -> None:
-        """Take note of a decision, what it saw, and what is sent."""
+    seconds: float = 0.0  # that all decisions took
 
 
 class GoneError(Exception):
@@ -109,8 +98,6 @@ class Session:
         self.goals = goals or {}
         self.counts = Counts()
         self.recorder: Recorder | None = None  # writes every decision down
-        self.watcher: Observer | None = None  # shows them, those that a stop or a deadline ended, too
-        self.stopped = threading.Event()  # while it is set, every answer is an action of zeros
         self._clock = clock
         self._episode: str | None = None
         self._has_begun = False  # whether there was an episode of this robot
@@ -161,14 +148,13 @@ class Session:
         except SearchCancelledError:
             if is_gone():
                 raise GoneError from None
-            why = STOPPED if self.stopped.is_set() else LATE
             if request.frame is None or request.state is None or request.is_score:
-                fix = "Send fewer goals or chunks, or raise --deadline" if why == LATE else ""
-                raise InputError(where="request", found=f"no answer: {why}", fix=fix) from None
-            return self._sent(request.frame, request.state, (None, why), (began, began))
+                fix = "Send fewer goals or chunks, or raise --deadline"
+                raise InputError(where="request", found=f"no answer: {LATE}", fix=fix) from None
+            return self._sent(request.frame, request.state, (None, LATE), (began, began))
 
     def _carried_out(self, request: Request, began: float, cancelled: Cancelled) -> dict[str, Any]:
-        """Return the answer to a request; a page that stops the robot cancels decisions and scores, too.
+        """Return the answer to a request.
 
         Raises:
             SearchCancelledError: It was cancelled.
@@ -183,19 +169,13 @@ class Session:
             needed = f"a goal first: goal/image, goal/images or goal/name{self._known_names()}"
             raise InputError(where="request", found="no goal in this episode", needed=needed)
         changes, planning_began, seen = self._changes(request), self._clock(), (request.frame, request.state)
-
-        def is_over() -> bool:
-            return self.stopped.is_set() or cancelled()
-
         if request.is_score and changes is not None:  # nothing moves, and no decision is counted
-            found = self.controller.score(*seen, changes, cancelled=is_over)
+            found = self.controller.score(*seen, changes, cancelled=cancelled)
             return {**found.as_dict(is_blind=self.options.is_blind), "goal": found.goal}
-        self.controller.act(*seen, samples=changes, cancelled=is_over)
+        self.controller.act(*seen, samples=changes, cancelled=cancelled)
         decision, why = self._checked(request.state)
         self._note(request.frame)
         self._watch(decision)
-        if self.stopped.is_set():
-            decision, why = replace(decision, plan=None, states=None), STOPPED
         return self._sent(*seen, (decision, why), (began, planning_began))
 
     def _changes(self, request: Request) -> Float[np.ndarray, "chunks model_steps dim"] | None:
@@ -212,7 +192,7 @@ class Session:
         decided: tuple[Decision | None, str],
         began: tuple[float, float],
     ) -> dict[str, Any]:
-        """Return the answer to a request for an action; it is counted, and sent to observers.
+        """Return the answer to a request for an action; it is counted and recorded.
 
         Args:
             frame: What the camera saw.
@@ -225,11 +205,9 @@ class Session:
         if self._last_ms is not None:
             found["server_timing"]["prev_total_ms"] = self._last_ms
         self.counts.decisions[why] += 1
-        self.counts.observe_seconds(now - began[0])
-        if self.recorder is not None and why not in {LATE, STOPPED}:
-            self.recorder.decision(self.controller, frame, state, found)
-        if self.watcher is not None:
-            self.watcher.decision(self.controller, frame, state, found)
+        self.counts.seconds += now - began[0]
+        if self.recorder is not None:
+            self.recorder.decision(frame, state, found)
         return found
 
     def _checked(self, state: np.ndarray) -> tuple[Decision, str]:
@@ -291,9 +269,8 @@ class Session:
         goals = goal.goals if goal.name is None else self.goals[goal.name]
         self.controller.follow(goals, mask=goal.mask, cancelled=cancelled)
         self._names = tuple(one.name for one in goals)
-        for observer in (self.recorder, self.watcher):
-            if observer is not None:
-                observer.goal(goals, goal.mask)
+        if self.recorder is not None:
+            self.recorder.goal(goals, goal.mask)
 
     def _known_names(self) -> str:
         names = list(self.goals)

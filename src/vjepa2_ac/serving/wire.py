@@ -1,4 +1,4 @@
-"""The wire format, msgpack maps with NumPy arrays in them as openpi's clients write and read them; and a client.
+"""The wire format: msgpack maps with NumPy arrays in them, as openpi's clients write and read them.
 
 Nothing that comes from the wire is trusted: types, lengths, depth and the number of parts are bounded before memory is
 taken for them, and an array is one of a few plain types whose bytes are all there.
@@ -7,14 +7,12 @@ taken for them, and an array is one of a few plain types whose bytes are all the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from vjepa2_ac.errors import InputError, UnreachableError, require_library
-from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.errors import require_library
 
 MOST_BYTES = 32 << 20  # of a message: eight pictures of 1280 x 720 pixels
 MOST_PARTS = 256  # maps and lists of a message, arrays included
@@ -22,7 +20,6 @@ MOST_ENTRIES = 64  # of a map or a list
 MOST_CHARACTERS = 4096  # of a text
 MOST_DEPTH = 6
 MOST_AXES = 4  # of an array
-_READY_S, _ANSWER_S = 600.0, 120.0  # how long a client waits: a server may be loading its model
 
 _ARRAY, _SCALAR, _DATA, _DTYPE, _SHAPE = b"__ndarray__", b"__npgeneric__", b"data", b"dtype", b"shape"
 _TYPES = frozenset({"|b1", "|u1", "|i1", "<u2", "<u4", "<u8", "<i2", "<i4", "<i8", "<f2", "<f4", "<f8"})
@@ -159,85 +156,3 @@ def _packed(value: Any) -> Any:
             return {_SCALAR: True, _DATA: value.item(), _DTYPE: value.dtype.str}
         return {_ARRAY: True, _DATA: value.tobytes(), _DTYPE: value.dtype.str, _SHAPE: value.shape}
     raise TypeError(f"{type(value).__name__} cannot be sent")
-
-
-class PlanningClient(ExitStack):
-    """A connection to a server; `close` ends it.
-
-    Example:
-        >>> with PlanningClient("ws://127.0.0.1:8000") as client:
-        >>>     answer = client.infer({"observation/image": image, "observation/state": state, "goal/image": goal})
-    """
-
-    def __init__(self, url: str, key: str | None = None, *, timeout_s: float | None = None) -> None:
-        """Connect, and wait until the server is ready.
-
-        Args:
-            url: ws://HOST:PORT, or wss://.
-            key: Of the server, if it needs one.
-            timeout_s: For an answer; None: 120 s, or twice the server's deadline if that is longer.
-
-        Raises:
-            UnreachableError: There is no server, or it refuses; or a library of the extra `serve` is missing.
-        """
-        super().__init__()
-        self.url = url
-        require_msgpack(url)
-        library = require_library("websockets.sync.client", where=url, called="websockets", extra="serve")
-        headers = {} if key is None else {"Authorization": f"Api-Key {key}"}
-        try:
-            self._connection = self.enter_context(
-                library.connect(url, compression=None, max_size=MOST_BYTES, additional_headers=headers, proxy=None)
-            )
-            self.metadata = unpack(self._connection.recv(timeout=_READY_S))
-        except Exception as error:
-            self.close()
-            body = getattr(getattr(error, "response", None), "body", None)  # the server's words, where it refuses
-            found = f"{_reason(error)}: {body.decode(errors='replace').strip()}" if body else _reason(error)
-            raise UnreachableError(where=url, found=found, needed="a server (`vjepa2-ac serve`)") from None
-        deadline_s = self.metadata.get("deadline_s")
-        self._timeout_s = timeout_s or max(_ANSWER_S, 2 * deadline_s if isinstance(deadline_s, float) else 0.0)
-
-    def infer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the answer to a request (docs/serving_reference.md).
-
-        Raises:
-            InputError: The server refuses it.
-            UnreachableError: The connection is lost, or there is no answer in time, which closes the connection: a late
-                answer would be taken for the answer to the next request.
-        """
-        try:
-            self._connection.send(pack(request))
-            answer = self._connection.recv(timeout=self._timeout_s)
-        except TimeoutError:
-            self.close()
-            found, fix = f"no answer within {self._timeout_s:g} s", "See the server's log, and connect again"
-            raise UnreachableError(where=self.url, found=found, fix=fix) from None
-        except Exception as error:
-            raise UnreachableError(where=self.url, found=f"the connection is lost: {_reason(error)}") from None
-        if isinstance(answer, str):
-            raise InputError(where=self.url, found=answer)
-        return unpack(answer)
-
-
-def goal_keys(goals: Sequence[SubGoal]) -> dict[str, Any]:
-    """Return the keys of a request for goals in order, with their rules.
-
-    Raises:
-        ValueError: Of the goals before the last some have a bound on their steps, and some have none.
-    """
-    bounds = [goal.at_most for goal in goals[:-1]]
-    if None in bounds and any(bounds):
-        raise ValueError(f"bounds {bounds}: for each goal but the last, or for none")
-    keys: dict[str, Any] = {
-        "goal/images": np.stack([goal.image for goal in goals]),
-        "goal/at_least": [goal.at_least for goal in goals],
-        "goal/shares": [goal.share or 0.0 for goal in goals],
-        "goal/floors": [goal.floor for goal in goals],
-        "goal/grippers": [goal.gripper or "" for goal in goals],
-    }
-    return keys if None in bounds else {**keys, "goal/durations": bounds}
-
-
-def _reason(error: Exception) -> str:
-    return str(error) or type(error).__name__

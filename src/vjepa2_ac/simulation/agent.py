@@ -24,7 +24,7 @@ from vjepa2_ac.planning.goals import GoalFolder, SubGoal
 from vjepa2_ac.planning.model_setup import goals_of
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.subject import Subject
-from vjepa2_ac.serving.wire import PlanningClient, goal_keys
+from vjepa2_ac.serving.client import PlanningClient, goal_keys
 from vjepa2_ac.simulation.arm import SimulatedArm
 from vjepa2_ac.simulation.policies import (
     GoalsOf,

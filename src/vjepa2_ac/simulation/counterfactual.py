@@ -7,17 +7,20 @@ the arm carries out other actions as in the closed loop (`closed_loop.rollout.se
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.decoding.imagine import AS_RECORDED
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.evaluation.imagined import Film
 from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
+from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
 from vjepa2_ac.simulation.arm import SimulatedArm
 from vjepa2_ac.simulation.record import JPEG_QUALITY, RecordingSpec, arm_of, carry_out, read_simulation
 from vjepa2_ac.simulation.rollout import send_action
@@ -26,7 +29,11 @@ from vjepa2_ac.storage.places import SIMULATION_FILE
 RECORDED_CAMERAS = {"exterior_1_left": "exterior_1", "exterior_2_left": "exterior_2", "wrist_left": "wrist"}
 """Camera of a data set, as in `data.fields.cameras` -> camera of the simulated arm."""
 
+_NUM_ARMS = 4  # of `explore`, each at its own start
 _STATE_TOLERANCE = 1e-5  # metres, radians, closedness: recorded states are float32, other libraries round otherwise
+
+
+Actions = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -128,3 +135,53 @@ def with_what_happens(film: Film) -> Film:
     stride, rollouts = film.dataset.config.model_stride, film.imagination.rollouts
     outcomes = {one.name: arm.under(one.actions, stride) for one in rollouts if one.name != AS_RECORDED}
     return film.with_outcomes({name: (one.frames, one.silhouettes) for name, one in outcomes.items()})
+
+
+class SimulatedFutures:
+    """Simulates recorded episodes again, with other actions from a control step on.
+
+    Raises:
+        InputError: The simulation gives other states than `simulation.json` and the recording say.
+    """
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._dataset = dataset
+        self._resimulated = lru_cache(maxsize=_NUM_ARMS)(self._resimulate)
+        self._actions: dict[tuple[int, int], Actions] = {}  # that each arm has done
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> SimulatedFutures | None:
+        """Return the futures of a data set; None if the data were not simulated."""
+        return cls(dataset) if Path(dataset.config.path, SIMULATION_FILE).is_file() else None
+
+    def __call__(
+        self, episode: int, step: int, actions: Actions, cancelled: Cancelled
+    ) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, " 7"], bool]:
+        """Return frame and state after actions, and whether the arm reached the target of the last one.
+
+        Args:
+            episode: Its number in the data set.
+            step: Control step from which the actions are done.
+            actions: Of model steps.
+            cancelled: Called before each action.
+
+        Raises:
+            SearchCancelledError: It was cancelled.
+        """
+        simulation = self._resimulated(episode, step)
+        is_next = bool(actions) and self._actions.pop((episode, step), None) == actions[:-1]
+        if not is_next:
+            carry_out(simulation.arm, simulation.number, simulation.spec, until=step)
+        reached = True
+        for action in actions[-1:] if is_next else actions:
+            if cancelled():
+                raise SearchCancelledError
+            reached = send_action(simulation.arm, np.array(action), self._dataset.config.model_stride)
+        self._actions[episode, step] = actions
+        image = encode_jpeg(simulation.arm.image(simulation.camera), quality=JPEG_QUALITY)  # as those of the data set
+        return decode_jpegs([image], [0], "a simulated frame")[0], simulation.arm.state, reached
+
+    def _resimulate(self, episode: int, step: int) -> Resimulation:
+        self._actions.pop((episode, step), None)
+        camera = self._dataset.config.cameras[0]
+        return resimulate(self._dataset.config.path, self._dataset.source.read(episode, camera), step, camera)
