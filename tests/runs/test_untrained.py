@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from decoders import whole_decoder  # noqa: F401 - a fixture
+from explored import explorer_of
 from run_fixtures import TINY, MakeConfig
 from vjepa2_ac import api
 from vjepa2_ac.cli import main
@@ -13,7 +14,6 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.explore.explorer import ExploreOptions
 from vjepa2_ac.model.adapter.adapter_folder import save_trained
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -108,7 +108,7 @@ def test_the_base_is_measured_once_and_its_metrics_say_so(base_run: Path, caplog
 
 
 def test_the_explorer_shows_one_model_and_the_note(base_run: Path, whole_decoder: Path) -> None:  # noqa: F811
-    explorer, _ = ExploreOptions(str(base_run), str(whole_decoder), EvaluationOptions(out=base_run)).opened()
+    explorer, _ = explorer_of(base_run, whole_decoder, EvaluationOptions(out=base_run))
     assert [one.name for one in explorer.contenders] == ["base"]
     assert explorer.notes[0] == SELECTED
 

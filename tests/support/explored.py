@@ -5,29 +5,33 @@ from pathlib import Path
 import pytest
 
 from run_fixtures import tiny_config
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import CemConfig, PlanningConfig
-from vjepa2_ac.decoding.decoder_folder import load_decoder
-from vjepa2_ac.evaluation.evaluate_run import load_models
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.evaluation.evaluate_run import Models, load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
-from vjepa2_ac.explore.explorer import open_explorer
+from vjepa2_ac.explore.explorer import Explorer, open_explorer
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.simulation.counterfactual import SimulatedFutures
 
 QUICK = PlanningConfig(samples=12, iterations=2, cem=CemConfig(elites=4))
 
 
+def explorer_of(subject: Path, decoder: Path, asked: EvaluationOptions) -> tuple[Explorer, Config]:
+    """Return an explorer as the command opens it, and its config."""
+    config = settle(str(subject), asked)
+
+    def load(dataset: Dataset, decoder: TrainedDecoder) -> Models:
+        return load_models(str(subject), config, asked, dataset, decoder)
+
+    return open_explorer(config, load_decoder(decoder), "test", load, SimulatedFutures.of), config
+
+
 def views_of(subject: Path, decoder: Path, data: Path, folder: Path, base: Path) -> Views:
     """Return the views of a run on data, with a search that is over at once."""
     config = tiny_config(folder / "none", data, base, data__test_share=0.5, data__stride=2)
-    asked = EvaluationOptions(data=config, out=folder)
-    config = settle(str(subject), asked)
-    explorer = open_explorer(
-        config,
-        load_decoder(decoder),
-        "test",
-        lambda dataset, decoder: load_models(str(subject), config, asked, dataset, decoder),
-        SimulatedFutures.of,
-    )
+    explorer, config = explorer_of(subject, decoder, EvaluationOptions(data=config, out=folder))
     return Views.of("the run", explorer, config.model_copy(update={"planning": QUICK}))
 
 
