@@ -21,6 +21,7 @@ from torch import Tensor
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.planning.energy import Goal, Scene
+from vjepa2_ac.planning.solvers import CemSolver
 
 PLANNER = Path("notebooks/utils/world_model_wrapper.py")  # of a checkout
 
@@ -49,18 +50,18 @@ class OfficialPlanner:
     @torch.no_grad()
     def decide(self, scene: Scene, goal: Goal, config: PlanningConfig, dtype: torch.dtype, seed: int) -> Tensor:
         """Return the actions of a plan, [steps, 7]."""
-        cem, most = config.cem, config.limits.xyz_m[0]
+        cem, most = CemSolver.Config.model_validate(config.planner.options), config.limits.xyz_m[0]
         arguments = {
             "rollout": config.horizon, "samples": config.samples, "cem_steps": config.iterations, "topk": cem.elites,
             "momentum_mean": cem.momentum_mean, "momentum_std": cem.momentum_std, "maxnorm": most,
             "momentum_mean_gripper": cem.momentum_mean_gripper, "momentum_std_gripper": cem.momentum_std_gripper,
         }  # fmt: skip
         world = self._module.WorldModel(
-            encoder=None, predictor=self._predictor, tokens_per_frame=scene.latents.shape[1], transform=None,
+            encoder=None, predictor=self._predictor, tokens_per_frame=scene.latents.shape[0], transform=None,
             mpc_args=arguments, device=self._device,
         )  # fmt: skip
         torch.manual_seed(seed)
-        here = (value.to(self._device) for value in (scene.latents, scene.states[None], goal.latents))
+        here = (value.to(self._device) for value in (scene.latents[None], scene.state[None, None], goal.latents))
         mixed = dtype != torch.float32
         with torch.autocast(self._device.type, dtype if mixed else None, enabled=mixed):
             actions: Tensor = world.infer_next_action(*here)

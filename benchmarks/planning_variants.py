@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
-from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
+from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
 from vjepa2_ac.model.adapter.lora import lora_layers
 from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -40,7 +40,7 @@ class PlainCost:
 
     def __init__(self, model: WorldModel, scene: Scene, goal: Goal, config: EnergyConfig) -> None:
         self._model, self._config = model, config
-        self._frame, self._state = scene.latents.to(model.device), scene.states[-1].numpy()
+        self._frame, self._state = scene.latents[None].to(model.device), scene.state.numpy()
         self._goal = goal.latents[-1].to(model.device)
 
     def __call__(self, actions: Tensor) -> Tensor:
@@ -71,8 +71,8 @@ class Bench:
         )
         self.model = self._model().eval()
         tokens, width = self.model.num_tokens, self.model.latent_dim
-        drawn = torch.randn(1, tokens, width, generator=torch.Generator().manual_seed(1))
-        self._scene = Scene(layer_norm(drawn, drawn.shape[-1:]), torch.tensor([POSE]), torch.zeros(0, 7))
+        drawn = torch.randn(tokens, width, generator=torch.Generator().manual_seed(1))
+        self._scene = Scene(layer_norm(drawn, drawn.shape[-1:]), torch.tensor(POSE))
         self._goals = self._reachable()
         self._made_ready: dict[torch.dtype, WorldModel] = {}
         self._plans: dict[int, Plan] = {}  # of ours in float32, by their horizon
@@ -119,7 +119,7 @@ class Bench:
         """Return upstream's planner with so much to try."""
         return PlanningConfig(
             horizon=horizon, samples=samples, iterations=iterations, energy=EnergyConfig(samples_at_once=at_once),
-            cem=CemConfig(elites=min(10, max(2, samples // 4))),
+            planner={"name": "cem", "options": {"elites": min(10, max(2, samples // 4))}},
         )  # fmt: skip
 
     def decision(self, way: Way, horizon: int) -> Callable[[], object]:
@@ -147,7 +147,7 @@ class Bench:
 
         Seen from a goal that has nothing to do with a random model's predictions, all of them would be equally far.
         """
-        cost = WorldModelCost(self.model, self._scene, Goal(self._scene.latents), EnergyConfig())
+        cost = WorldModelCost(self.model, self._scene, Goal(self._scene.latents[None]), EnergyConfig())
         return cost.imagine(torch.tensor(WANTED).expand(1, max(self.options.horizon), -1))[0][0]
 
     def _goal(self, horizon: int) -> Goal:

@@ -243,7 +243,7 @@ def test_a_run_is_trained_resumed_and_measured(make_config: MakeConfig, tmp_path
 
 
 def test_a_run_plans_with_its_own_settings(make_config: MakeConfig) -> None:
-    planning = {"horizon": 2, "samples": 12, "iterations": 2, "cem": {"elites": 4}}
+    planning = {"horizon": 2, "samples": 12, "iterations": 2, "planner": {"name": "cem", "options": {"elites": 4}}}
     folder = write_adapted_run(make_config(planning=planning, seed=7, data__crop="square"))
     controller = Controller.of_run(load_run(folder))
     assert (controller.config.horizon, controller.seed, controller.crop) == (2, 7, "square")

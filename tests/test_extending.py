@@ -97,14 +97,13 @@ def test_installed_packages_are_searched_once_for_a_name(monkeypatch: pytest.Mon
         assert registry.known(first) == first
         monkeypatch.setattr("vjepa2_ac.registry.installed", lambda _: pytest.fail("searched again"))
         assert registry.find(registry.known(first)) is registry.find(first)
-        assert registry.options(first, {}) == {}
         monkeypatch.undo()
 
 
 def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, make_config) -> None:
     values = yaml.safe_load(as_yaml(make_config(training__steps=1, run_dir=at_home / "run")))
     values["plugins"] = ["my_module"]
-    values["training"] |= {"loss": "log_cosh", "loss_options": {"scale": 2.0}}
+    values["training"] |= {"loss": {"name": "log_cosh", "options": {"scale": 2.0}}}
     values["data"] |= {"workers": 1, "transforms": [{"name": "sensor_noise", "options": {"std": 5.0}}]}
     values["planning"] |= {"planner": "random", "samples": 16, "iterations": 2}
     values["planning"]["energy"] |= {"distance": "largest"}
@@ -136,9 +135,9 @@ def test_options_and_names_are_checked_when_the_config_is_read(at_home: Path, ma
     (at_home / "own.yaml").write_text(as_yaml(make_config()))
     wrong = (
         ("training.loss=log_cosch", "Did you mean log_cosh?"),
-        ("training.loss_options={scale: much}", "scale"),
+        ("training.loss.options={scale: much}", "scale"),
         ("planning.energy.distance=larges", "Did you mean largest?"),
-        ("planning.planner_options={a: 1}", "no options of its own"),
+        ("planning.planner.options={a: 1}", "known here: elites"),
     )
     for override, told in wrong:
         words = ["config", "show", "own.yaml", "--plugin", "my_module", "training.loss=log_cosh", override]
@@ -153,8 +152,9 @@ def test_options_and_names_are_checked_when_the_config_is_read(at_home: Path, ma
 def test_the_schema_has_what_a_plug_in_brings() -> None:
     schema = json.loads(command("config", "schema", "--plugin", "my_module").stdout)
     training = schema["$defs"]["TrainingConfig"]["properties"]
-    assert {"l1", "log_cosh"} <= set(training["loss"]["enum"])
-    assert "scale" in training["loss_options"]["anyOf"][0]["properties"]
+    names, *with_options = training["loss"]["anyOf"]
+    assert {"l1", "log_cosh"} <= set(names["enum"])
+    assert "scale" in with_options[-1]["properties"]["options"]["properties"]
 
 
 def installed(at_home: Path, entry_points: str, code: str, *words: str) -> subprocess.CompletedProcess[str]:
@@ -171,10 +171,10 @@ def installed(at_home: Path, entry_points: str, code: str, *words: str) -> subpr
 
 def test_an_installed_package_is_known_without_being_named(at_home: Path, make_config) -> None:
     (at_home / "own.yaml").write_text(as_yaml(make_config()))
-    words = ["config", "show", "own.yaml", "training.loss=log_cosh", "training.loss_options={scale: 3}"]
+    words = ["config", "show", "own.yaml", "training.loss=log_cosh", "training.loss.options={scale: 3}"]
     done = installed(at_home, "[vjepa2_ac.losses]\nlog_cosh = my_package:LogCosh\n", recipes("A loss"), *words)
     assert done.returncode == 0, done.stderr
-    assert yaml.safe_load(done.stdout)["training"]["loss_options"] == {"scale": 3}
+    assert yaml.safe_load(done.stdout)["training"]["loss"]["options"] == {"scale": 3}
 
 
 def test_an_installed_package_adds_a_command_that_is_imported_when_it_is_asked_for(at_home: Path, make_config) -> None:

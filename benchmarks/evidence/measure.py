@@ -19,6 +19,7 @@ from offline import offline_figures, visited_correlation
 from prepare import base_model, data_before, data_shifted, encoded, training_episodes
 
 from vjepa2_ac.config import Config, ModelConfig, PlanningConfig, ValidationConfig
+from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.data import DataConfig, Split
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
@@ -111,7 +112,7 @@ def _cloned(cell: Cell, config: Config, folder: Path, goals: int, *, choosing: b
     began = time.process_time()
     place, found = _prior(cell, config, folder)
     minutes, seed = (time.process_time() - began) / 60, goals_seed(cell, choosing=choosing)
-    acts = PLANNING.model_copy(update={"planner": "prior", "prior": place})
+    acts = PLANNING.model_copy(update={"planner": Component("prior"), "prior": place})
     model = load_base(config.model, seed=cell.seed)
     policy = planner(model, "l1", acts, goals_of=None if cell.shift in SHIFTS else other_worlds.goals_of)
     reached = closed_loop(cell, policy, folder, seed=seed, goals=goals)
@@ -189,7 +190,7 @@ def planner(
     goals_of: GoalsOf | None = None,
 ) -> Policy:
     """Return a policy that plans with a model, in calibrated axes where a file of them is given."""
-    energy = config.energy.model_copy(update={"distance": distance})
+    energy = config.energy.model_copy(update={"distance": Component(distance)})
     controller = Controller(model, config.model_copy(update={"energy": energy, "axes": axes}))
     return Watched(controller) if goals_of is None else Planning(controller, goals_of=goals_of)
 

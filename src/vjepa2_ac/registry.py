@@ -20,7 +20,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn, TypeVar
 
-from pydantic import AfterValidator, BaseModel, Field, ValidationError, ValidationInfo
+from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from vjepa2_ac.errors import InputError, did_you_mean
@@ -103,11 +103,8 @@ class Registry:
         return thing
 
     def section(self, name: str) -> type[BaseModel] | None:
-        """Return the class of a thing's own options, its `Config`; None: it has none.
-
-        What this package lists has its knobs in the config itself, and is not imported for this.
-        """
-        return None if isinstance(self._things.get(name), str) else getattr(self.find(name), "Config", None)
+        """Return the class of a thing's own options, its `Config`; None: it has none."""
+        return getattr(self.find(name), "Config", None)
 
     def options(self, name: str, given: Mapping[str, Any], *, at: tuple[str, ...] = ()) -> dict[str, BaseModel]:
         """Return the checked options of a thing, as the keyword argument that it takes them by; empty: it has none.
@@ -130,30 +127,28 @@ class Registry:
             raise ValueError(f"{self.kind} {name!r} has no options of its own, and {', '.join(given)} is given")
         return {}
 
-    def options_of(self, name: str) -> Any:
-        """Return a check of a config key: it holds the options of the thing that the key `name` before it names."""
+    def changed_options(self, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Check options, and return those that are not the defaults.
 
-        def checked(given: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-            if name in info.data:  # else the name is wrong, which is reported there
-                self.options(info.data[name], given)
-            return given
+        Things of this package have a default for each option: without options they are not imported.
 
-        return AfterValidator(checked)
+        Raises:
+            ValueError: As `options`.
+        """
+        if not given and isinstance(self._things.get(name), str):
+            return {}
+        checked = self.options(name, given, at=("options",))
+        changed = checked["options"].model_dump(exclude_defaults=True) if checked else {}
+        return {key: given[key] for key in given if key in changed}
 
-    def function(self, name: str, given: Mapping[str, Any]) -> Callable[..., Any]:
-        """Return a function of a name; of a class an object that was made with its options.
+    def make(self, name: str, given: Mapping[str, Any]) -> Any:
+        """Return the thing of a name; of a class an object that was made with its options.
 
         Raises:
             ValueError: As `options`.
         """
         found, options = self.find(name), self.options(name, given)
-        made: Callable[..., Any] = found(**options) if isinstance(found, type) else found
-        return made
-
-    @property
-    def name_in_schema(self) -> Any:
-        """The names, as a JSON schema has them: for a knob that names one of these things."""
-        return Field(json_schema_extra=lambda schema: schema.update({"enum": [*self.names()]} if self.names() else {}))
+        return found(**options) if isinstance(found, type) else found
 
     @property
     def things_in_schema(self) -> Any:
@@ -168,17 +163,6 @@ class Registry:
                 schema["additionalProperties"] = False
 
         return Field(json_schema_extra=add)
-
-    @property
-    def options_in_schema(self) -> Any:
-        """The options of things that have some, by the names of their classes: for the knob that holds them."""
-
-        def add(schema: dict[str, Any]) -> None:
-            sections = [section.model_json_schema() for name in self.names() if (section := self.section(name))]
-            if sections:
-                schema["anyOf"] = [*sections, {"type": "object", "maxProperties": 0}]
-
-        return Field(json_schema_extra=add, validate_default=True)
 
 
 def _located(error: ValidationError, section: type[BaseModel], at: tuple[str, ...]) -> ValidationError:
@@ -204,7 +188,7 @@ LOSSES = Registry(
     {
         "l1": "model.distances:absolute_difference",
         "l2": "model.distances:squared_difference",
-        "smooth_l1": "training.loss:smooth_difference",
+        "smooth_l1": "training.loss:SmoothL1",
     },
 )
 PLANNERS = Registry(

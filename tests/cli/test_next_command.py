@@ -16,6 +16,7 @@ from vjepa2_ac.cli.program import _parser
 from vjepa2_ac.config.loading import config_as_yaml, load_config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.errors import shell_command
+from vjepa2_ac.planning.planner import samples_of_iterations
 from vjepa2_ac.simulation import record
 from vjepa2_ac.simulation.record import RecordedSimulation, RecordingSpec
 
@@ -89,14 +90,14 @@ def test_only_the_changed_options_change() -> None:
         (["planning.samples=800"], {}, True, False),
         (["planning.horizon=2"], {"horizon": 2}, True, True),
         ([], {"budget_s": 1.0}, True, False),
-        ([], {"cem": {"elites": 100}}, True, False),
+        ([], {"planner": {"name": "cem", "options": {"elites": 100}}}, True, False),
     ],
 )
 def test_a_cpu_gets_the_quick_planner_unless_the_user_chose(words, settings, *, on_cpu: bool, is_quick: bool) -> None:
     planning = PlanningConfig(**settings)
     command, time = next_simulation(["run", *words], planning, 400, 1e-3, on_cpu=on_cpu)
     assert all((f"planning.{key}={value}" in command) == is_quick for key, value in QUICK.items())
-    sequences = 256 if is_quick else sum(planning.sequences)
+    sequences = 256 if is_quick else sum(samples_of_iterations(planning))
     minutes = round(400 * sequences * planning.horizon * 1e-3 / 60)
     expected = f"about {minutes} minutes" if minutes < 60 else f"about {minutes / 60:.1f} hours"
     where = "on this CPU with the quick planner" if is_quick else "here"

@@ -16,7 +16,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.planning.decision import decide
 
 STATE = "0.4,0.0,0.3,3.1,0.0,0.1,0.2"
-QUICK = ["planning.samples=8", "planning.iterations=2", "planning.cem.elites=4", "--nodes", "0"]
+QUICK = ["planning.samples=8", "planning.iterations=2", "planning.planner.options.elites=4", "--nodes", "0"]
 
 
 @pytest.fixture(scope="module")

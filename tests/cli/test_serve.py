@@ -14,7 +14,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.errors import UnreachableError, pip_install
 from vjepa2_ac.serving.client import PlanningClient
 
-QUICK = ["planning.samples=8", "planning.iterations=2", "planning.horizon=2", "planning.cem.elites=4"]
+QUICK = ["planning.samples=8", "planning.iterations=2", "planning.horizon=2", "planning.planner.options.elites=4"]
 KEY = "correct-horse-battery-staple"
 
 

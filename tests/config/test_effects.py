@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from copied_sets import WRITERS
 from run_fixtures import TINY
 from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
-from vjepa2_ac.config.data import TransformConfig
+from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.loading import changed_keys, config_as_dict, config_as_yaml, parse_config
 from vjepa2_ac.config.section import Affects, Section, knobs_that_affect, mark_of, marks_of
 from vjepa2_ac.data import idle as idle_ranges
@@ -35,9 +35,12 @@ OTHERS = {
     "data.camera": {"npz": "pixels", "rlds": "wrist_left", "lerobot": "wrist_left", "droid_raw": "right"},
     "data.path": "elsewhere",
     "data.augment.crop_scale": (0.5, 1.0),
-    "data.transforms": (TransformConfig.model_construct(name="noise"),),
+    "data.transforms": (Component("noise"),),
     "data.stride_candidates": (2, 3),
     "planning.budget_s": 1.0,
+    "planning.planner": Component("icem"),
+    "planning.energy.distance": Component("l2"),
+    "training.loss": Component("l2"),
     "tracking.others": {"a tracker": {}},
     "planning.limits.axes": (0.1,),
     "planning.goals.share": 0.3,
@@ -211,7 +214,7 @@ def test_a_knob_that_changes_makes_strangers_of_what_it_affects_and_of_nothing_e
         if Affects.INDEX not in mark:  # a form of data may not have what the others index by
             assert changed[key] >= told, key
     assert {key for key, what in changed.items() if "index" in what}
-    assert len(changed) > 90
+    assert len(changed) > 60
 
 
 def test_each_knob_that_is_said_to_matter_to_an_index_does_in_one_form_of_data(
@@ -265,7 +268,7 @@ def test_settings_of_a_later_start_are_kept_in_the_run_unless_they_decide_it(tmp
         changes = json.loads((tmp_path / "run/environment.json").read_text())[-1]["config_changes"]
         assert len(changes) == len(changed_keys(config, start)), "what held before is recorded"
         kept += len(changes)
-    assert kept > 80
+    assert kept > 50
 
 
 def test_a_run_goes_on_only_where_no_knob_that_decides_it_has_changed(tmp_path: Path) -> None:

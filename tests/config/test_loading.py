@@ -214,14 +214,17 @@ class WithAlpha:
     Config = AlphaOptions
 
 
+MINE = {"name": "mine", "options": {"alphaa": 1}}
+
+
 @pytest.mark.parametrize(
     ("registry", "section", "values"),
     [
-        (LOSSES, "training.loss_options", {"loss": "mine", "loss_options": {"alphaa": 1}}),
-        (PLANNERS, "planning.planner_options", {"planner": "mine", "planner_options": {"alphaa": 1}}),
-        (ENERGIES, "planning.energy.options", {"energy": {"distance": "mine", "options": {"alphaa": 1}}}),
+        (LOSSES, "training.loss.options", {"loss": MINE}),
+        (PLANNERS, "planning.planner.options", {"planner": MINE}),
+        (ENERGIES, "planning.energy.distance.options", {"energy": {"distance": MINE}}),
         (TRACKERS, "tracking.others.mine", {"others": {"mine": {"alphaa": 1}}}),
-        (TRANSFORMS, "data.transforms.0.options", {"transforms": [{"name": "mine", "options": {"alphaa": 1}}]}),
+        (TRANSFORMS, "data.transforms.0.options", {"transforms": [MINE]}),
     ],
 )
 def test_a_wrong_option_is_named_by_its_whole_key(
@@ -238,10 +241,10 @@ def test_a_wrong_option_is_named_by_its_whole_key(
 
 def test_options_that_are_needed_are_asked_for_even_if_none_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(LOSSES._things, "mine", WithAlpha)
-    with pytest.raises(InputError, match=r"training\.loss_options\.alpha: missing"):
+    with pytest.raises(InputError, match=r"training\.loss\.options\.alpha: missing"):
         parse_config(MINIMAL | {"training": {"loss": "mine"}}, where="x.yaml")
-    with pytest.raises(InputError, match=r"training\.loss_options: loss 'l1' has no options of its own"):
-        parse_config(MINIMAL | {"training": {"loss_options": {"a": 1}}}, where="x.yaml")
+    with pytest.raises(InputError, match=r"training\.loss: loss 'l1' has no options of its own"):
+        parse_config(MINIMAL | {"training": {"loss": {"options": {"a": 1}}}}, where="x.yaml")
 
 
 def test_a_config_larger_than_a_megabyte_is_refused_before_it_is_parsed(

@@ -45,3 +45,41 @@ def test_removed_section_of_data_is_dropped_from_replay_too() -> None:
 
 def test_no_removed_key_is_a_key_of_today() -> None:
     assert not set(REMOVED) & set(all_keys())
+
+
+def test_options_of_an_older_run_move_to_their_components() -> None:
+    planning = {
+        "planner": "icem",
+        "planner_options": {},
+        "cem": {"elites": 10, "answer": "mean"},
+        "icem": {"elites": 20, "kept": 0.3},
+        "mppi": {"temperature": 0.1},
+        "energy": {"distance": "l2", "options": {}},
+        "replan": "always",
+    }
+    older = {
+        **VALUES,
+        "training": {"loss": "smooth_l1", "loss_options": {}, "smooth_l1_beta": 0.5},
+        "planning": planning,
+    }
+    today = {
+        "training": {"loss": {"name": "smooth_l1", "options": {"beta": 0.5}}},
+        "planning": {"planner": {"name": "icem", "options": {"elites": 20}}, "energy": {"distance": "l2"}},
+    }
+    read = [parse_config(values, where="run/config.yaml", here=False) for values in (older, {**VALUES, **today})]
+    assert read[0] == read[1]
+    changed = parse_config(older, ["planning.planner.options.elites=30"], where="run/config.yaml", here=False)
+    assert changed.planning.planner.options == {"elites": 30}
+    with pytest.raises(InputError, match=r"planning.icem: moved in 0.2, to planning.planner: {name: icem, options"):
+        parse_config(older, where="mine.yaml")
+
+
+def test_options_of_a_component_are_given_by_its_name_or_by_overrides() -> None:
+    config = parse_config(VALUES, ["planning.planner=icem", "planning.planner.options.elites=20"], where="mine.yaml")
+    assert config_as_dict(config)["planning"]["planner"] == {"name": "icem", "options": {"elites": 20}}
+    usual = parse_config(VALUES, ["planning.planner.options.elites=10"], where="mine.yaml")
+    assert config_as_dict(usual)["planning"]["planner"] == "cem", "an option with the default's value is left out"
+    with pytest.raises(InputError, match=r"planning.planner.options.elite: unknown key; did you mean elites"):
+        parse_config(VALUES, ["planning.planner.options.elite=20"], where="mine.yaml")
+    with pytest.raises(InputError, match=r"planning.planner: a name, or {name: NAME, options"):
+        parse_config(VALUES, ["planning.planner={elites: 20}"], where="mine.yaml")

@@ -85,7 +85,7 @@ def test_options_reach_a_class_and_are_checked() -> None:
         ({"name": "offset", "options": {"mots": 2}}, "mots"),
         ({"name": "halve", "options": {"most": 2}}, "no options of its own"),
         ({"name": "halved"}, "Did you mean halve"),
-        ({"options": {}}, r"transforms.0.name: missing"),
+        ({"options": {}}, "a name, or {name: NAME"),
     ):
         with pytest.raises(InputError, match=words):
             parse_config(values(transforms=[transform]), where="")
@@ -151,8 +151,12 @@ def test_cached_latents_cannot_be_transformed(data: dict[str, str]) -> None:
 
 def test_the_schema_names_the_transforms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     del tmp_path
-    described = config_schema()["$defs"]["TransformConfig"]["properties"]
-    assert described["name"]["enum"] == list(THINGS)
-    assert "most" in described["options"]["anyOf"][0]["properties"]
+    names, *with_options = transforms_in_schema()
+    assert names["enum"] == list(THINGS)
+    assert "most" in with_options[0]["properties"]["options"]["properties"]
     monkeypatch.setattr(TRANSFORMS, "_things", {})
-    assert "enum" not in config_schema()["$defs"]["TransformConfig"]["properties"]["name"]
+    assert transforms_in_schema() == [{"type": "string"}]
+
+
+def transforms_in_schema() -> list[dict]:
+    return config_schema()["$defs"]["RldsData"]["properties"]["transforms"]["items"]["anyOf"]

@@ -19,7 +19,7 @@ BROKEN = str(ROOT / "tests/support/broken_clips.py")
 PROBES = [
     "--clips", "7", "--ranking-clips", "5", "--samples", "6", "--landscapes", "2", "--nodes", "3", "--axes", "3",
     "--examples", "2", "--planning-clips", "3", "--planning", "planning.samples=12", "planning.iterations=2",
-    "planning.cem.elites=3",
+    "planning.planner.options.elites=3",
 ]  # fmt: skip
 
 

@@ -46,7 +46,8 @@ def test_plans_are_measured_on_held_out_clips_with_the_configs_settings(
 ) -> None:
     reporter = SilentReporter()
     several = replace(
-        asked(tmp_path, data_folder, base_folder), planning=("planning.iterations=2", "planning.cem.elites=3")
+        asked(tmp_path, data_folder, base_folder),
+        planning=("planning.iterations=2", "planning.planner.options.elites=3"),
     )
     evaluation = evaluate_subject(str(base_folder), several, reporter).evaluation
     assert {"planning, base", "planning, model"} <= set(reporter.tasks)
@@ -73,7 +74,7 @@ def test_plans_are_measured_on_held_out_clips_with_the_configs_settings(
 def test_a_trained_model_plans_merged_and_its_errors_are_measured_unmerged(
     make_config, adapter: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    small = {"samples": 12, "iterations": 2, "cem": {"elites": 4}}
+    small = {"samples": 12, "iterations": 2, "planner": {"name": "cem", "options": {"elites": 4}}}
     run = write_adapted_run(make_config(run_dir=str(tmp_path / "a run"), adapter=adapter, planning=small))
     planned: list[bool] = []
     measure = evaluate.measure_plans

@@ -81,8 +81,8 @@ def test_a_map_has_the_energy_of_each_action(recorded: Views) -> None:
     told, _ = asked(recorded, kind="energy", actions=[UP], goal=GOAL, teller="adapter", action=STILL)
     explorer, one = recorded.explorer, told["maps"][0]
     place = Place(0, 0, (tuple(UP),))
-    state = torch.tensor(explorer.states(place)[-1:], dtype=torch.float32)
-    scene = Scene(explorer.imagined(1, place)[None], state, torch.zeros(0, 7))
+    state = torch.tensor(explorer.states(place)[-1], dtype=torch.float32)
+    scene = Scene(explorer.imagined(1, place), state)
     goal = Goal(explorer.moment(0, GOAL.step).latents[None])
     cost = WorldModelCost(explorer.model(1), scene, goal, recorded.search.config.energy)
     action = torch.zeros(1, 1, 7)

@@ -9,7 +9,8 @@ from decisions import STATE
 from tiny_models import actions, cost, tiny_model
 from tracing import tracing
 from vjepa2_ac.config import AdapterConfig
-from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
+from vjepa2_ac.config.component import Component
+from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
 from vjepa2_ac.model.network import compilation
@@ -20,7 +21,11 @@ from vjepa2_ac.planning.model_setup import prepare_for_planning
 pytestmark = tracing
 
 PLAIN = PlanningConfig(
-    samples=11, iterations=2, horizon=3, cem=CemConfig(elites=4), energy=EnergyConfig(samples_at_once=4)
+    samples=11,
+    iterations=2,
+    horizon=3,
+    planner={"name": "cem", "options": {"elites": 4}},
+    energy=EnergyConfig(samples_at_once=4),
 )
 COMPILED = PLAIN.model_copy(update={"compile": "blocks"})
 
@@ -41,7 +46,7 @@ def decisions(model: WorldModel, config: PlanningConfig, count: int = 2) -> list
 @pytest.mark.parametrize("adapted", [False, True])
 @pytest.mark.parametrize("planner", ["cem", "gradient"])
 def test_compiled_plans_are_the_plain_ones(adapted: bool, planner: str) -> None:
-    model, planned = tiny_model(adapted=adapted), {"planner": planner}
+    model, planned = tiny_model(adapted=adapted), {"planner": Component(planner)}
     expected = decisions(model, PLAIN.model_copy(update=planned))
     assert not counters["stats"]
     found = decisions(model, COMPILED.model_copy(update=planned))

@@ -6,14 +6,15 @@ import torch
 
 from decisions import STATE, image
 from tiny_models import tiny_model
-from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.component import Component
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.spaces import Spaces, actions_from_states, apply_action
+from vjepa2_ac.spaces import Spaces, apply_action
 
-QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))
+QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, planner={"name": "cem", "options": {"elites": 4}})
 
 
 def controller(model: WorldModel | None = None, seed: int = 0, **changes: object) -> Controller:
@@ -55,24 +56,6 @@ def test_a_decision_holds_the_predicted_states_of_its_plan() -> None:
     np.testing.assert_allclose(run.decision.states, expected, atol=1e-6)
 
 
-def test_earlier_frames_are_seen_with_the_actions_that_were_done() -> None:
-    run, model = controller(context=3), tiny_model()
-    run.reset(image(100))
-    states = np.stack([STATE + 0.01 * step for step in range(5)])
-    for step, state in enumerate(states):
-        run.act(image(step), state)
-    scene = run._scene(run._seen)
-    assert len(scene.latents) == 3
-    np.testing.assert_allclose(scene.states, states[2:], atol=1e-6)
-    np.testing.assert_allclose(scene.actions, actions_from_states(states[2:]), atol=1e-6)
-    alone = controller(model=model)
-    alone.reset(image(100))
-    alone.act(image(4), states[4])
-    tried = torch.full((1, 1, 7), 0.02)
-    with torch.no_grad():
-        assert not torch.allclose(run.decision.cost(tried), alone.decision.cost(tried))
-
-
 def test_what_does_not_count_may_differ_at_the_goal() -> None:
     run = controller()
     mask = np.zeros((60, 48), bool)
@@ -87,7 +70,7 @@ def test_what_does_not_count_may_differ_at_the_goal() -> None:
 @pytest.mark.parametrize("planner", ["cem", "gradient"])
 def test_a_model_in_bfloat16_plans_as_well(planner: str) -> None:
     model = tiny_model().to(torch.bfloat16)
-    assert actions(controller(model, planner=planner), 2).any()
+    assert actions(controller(model, planner=Component(planner)), 2).any()
 
 
 @pytest.mark.parametrize(
@@ -124,7 +107,7 @@ def test_the_present_energy_is_that_of_an_image_that_stays(steps: str) -> None:
     run = controller(energy=EnergyConfig(steps=steps))
     run.reset(image(100), image(101), durations=(1,))
     run.act(image(1), STATE)
-    seen = run._seen[-1][0]
+    seen = run.encoded(image(1))
     first, second = (float((seen - wanted).abs().mean()) for wanted in run._goal_latents)
     expected = {"last": second, "sum": first + second}[steps]
     assert run.decision.energy_now == pytest.approx(expected, rel=1e-5)
@@ -137,16 +120,8 @@ def test_a_goal_that_is_reached_on_the_way_to_another_is_left() -> None:
         assert run.act(image(100), STATE).any()
 
 
-def test_a_new_goal_forgets_what_was_seen() -> None:
-    run = controller(context=3)
-    actions(run)
-    assert len(run._scene(run._seen).latents) == 3
-    actions(run, 1)
-    assert len(run._scene(run._seen).latents) == 1
-
-
 def test_a_decision_that_failed_can_be_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    undisturbed, run = actions(controller(context=3)), controller(context=3)
+    undisturbed, run = actions(controller()), controller()
     run.reset(image(100))
     run.act(image(0), STATE)
     for step in (1, 2):
@@ -204,7 +179,7 @@ def test_images_are_cropped_as_in_training() -> None:
 def test_a_model_without_states_decides_the_same_whatever_the_pose() -> None:
     found = []
     for state in (STATE, STATE + np.array([0.1, 0.1, 0.1, 0.5, 0.2, 0.1, 0.0])):
-        run = controller(tiny_model(states=False), context=2)
+        run = controller(tiny_model(states=False))
         run.reset(image(100))
         found.append([run.act(image(seed), state) for seed in range(2)])
     np.testing.assert_array_equal(*found)
@@ -216,7 +191,7 @@ def test_a_model_without_states_plans_vectors_and_takes_states_of_any_width_for_
     sizes = tiny_model(states=False).sizes
     predictor = sizes.predictor.model_copy(update={"action_dim": 8})
     model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
-    config = QUICK.model_copy(update={"context": 2, "limits": LimitsConfig(axes=(0.1,))})
+    config = QUICK.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
     run = Controller(model, config, spaces=Spaces.of_vectors(Widths(8, 8), joined))
     found = []
     for width in (8, 11, 3)[: 1 if joined == "last" else None]:

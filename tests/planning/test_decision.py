@@ -10,7 +10,8 @@ import torch
 
 from decisions import QUICK, STATE, asked, image
 from tiny_models import tiny_model
-from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.component import Component
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import (
     PlanRequest,
@@ -56,7 +57,8 @@ def test_maps_evaluate_no_more_than_the_search_and_without_them_nothing_is_but_n
         return once(cost, actions)
 
     monkeypatch.setattr(WorldModelCost, "__call__", counted)
-    settings = {"planner": planner, "iterations": iterations, "gradient": GradientConfig(starts=12)}
+    options = {"starts": 12} if planner == "gradient" else {"elites": 4} if planner in {"cem", "icem"} else {}
+    settings = {"planner": Component(planner, options), "iterations": iterations}
     plain, mapped = asked(nodes=0, **settings), asked(nodes=None, **settings)
     for found in (plain, mapped):
         searched = found.decision.plan.evaluations

@@ -79,12 +79,11 @@ def test_an_equal_image_is_the_goal_without_any_rule() -> None:
 
 
 def test_each_goal_has_its_own_gripper_mode() -> None:
-    run = controller(gripper_start_std=2.0)
+    run = controller()
     modes: list[GripperMode] = ["close", "held", "open"]
     run.follow([*(SubGoal(image(100 + n), at_most=1, gripper=mode) for n, mode in enumerate(modes)), SubGoal(image(9))])
     found = [run.act(image(seed), STATE)[6] for seed in range(4)]
     assert found[:3] == [1.0, 0.0, -1.0]
-    assert run.space.gripper_rounding == QUICK.limits.gripper_rounding
     assert float(run.space.upper[0, 6]) == pytest.approx(0.75)
 
 

@@ -37,26 +37,27 @@ from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.simulation.policies import Moves, Planning
 from vjepa2_ac.simulation.rollout import Observation, Span, run_in
 
+
+def planner(name: str, **options: Any) -> dict[str, Any]:
+    """Return a planner with options, and with few elites."""
+    return {"name": name, "options": {**({"elites": 2} if name in {"cem", "icem"} else {}), **options}}
+
+
 SIDE = 16  # pixels of a view: the model scales every image
-BASE = {"horizon": 2, "samples": 4, "iterations": 1, "cem.elites": 2, "icem.elites": 2}
+BASE: dict[str, Any] = {"horizon": 2, "samples": 4, "iterations": 1, "planner": planner("cem")}
 # Another value than the default's or that of BASE, for every key; with the keys that it needs.
 OTHERS: dict[str, Any] = {
-    "planner": {"planner": "icem"},
-    "planner_options": {"planner": "own planner", "planner_options": {"reach": 0.5}},
+    "planner": {"planner": planner("icem")},
     "horizon": 4,
     "action_repeat": 2,
     "samples": 6,
     "iterations": 2,
     "start_std": 0.5,
-    "gripper_start_std": 0.5,
     "budget_s": 1e-6,
     "prior": "PRIOR",
-    "prior_steps": 2,
     "monitor": "MONITOR",
-    "replan": {"replan": "on_surprise", "monitor": "MONITOR"},
     "warm_start": True,
     "views": 2,
-    "context": 2,
     "compile": "blocks",
     "axes": "AXES",
     "limits.xyz": [0.02, 0.0, 0.03],
@@ -67,48 +68,40 @@ OTHERS: dict[str, Any] = {
     "limits.axes": [0.1],
     "limits.gripper": 0.0,
     "limits.gripper_mode": "held",
-    "limits.gripper_rounding": 0.1,
-    "limits.gripper_from": {"limits.gripper_mode": "close", "limits.gripper_from": 2},
-    "energy.distance": "cosine",
-    "energy.options": {"energy.distance": "own energy", "energy.options": {"power": 3.0}},
+    "energy.distance": {"energy.distance": {"name": "own energy", "options": {"power": 3.0}}},
     "energy.steps": "sum",
     "energy.samples_at_once": 3,
     "goals.share": 0.9,
     "goals.stop_share": 0.9,
-    "cem.elites": 3,
-    "cem.momentum_mean": 0.5,
-    "cem.momentum_std": 0.5,
-    "cem.momentum_mean_gripper": 0.5,
-    "cem.momentum_std_gripper": 0.5,
-    "cem.try_mean": True,
-    "cem.answer": "best",
-    "icem.elites": {"planner": "icem", "icem.elites": 3},
-    "icem.momentum": {"planner": "icem", "icem.momentum": 0.5},
-    "icem.noise_exponent": {"planner": "icem", "icem.noise_exponent": 0.0},
-    "icem.shrink": {"planner": "icem", "icem.shrink": 2.0},
-    "icem.kept": {"planner": "icem", "icem.kept": 1.0},
-    "mppi.temperature": {"planner": "mppi", "mppi.temperature": 1.0},
-    "mppi.std_decay": {"planner": "mppi", "mppi.std_decay": 0.5},
-    "gradient.starts": {"planner": "gradient", "gradient.starts": 2},
-    "gradient.learning_rate": {"planner": "gradient", "gradient.learning_rate": 0.5, "gradient.starts": 2},
 }
-# What a caller gives along with a frame, and a planner that needs another option.
+# Other planners with their options, what a caller gives along with a frame, and a planner that needs another option.
 MORE: dict[str, Any] = {
+    **{
+        f"{name}.{option}": {"planner": planner(name, **{option: value})}
+        for name, option, value in (
+            ("cem", "momentum_mean", 0.5),
+            ("cem", "try_mean", True),
+            ("icem", "noise_exponent", 0.0),
+            ("icem", "kept", 1.0),
+            ("mppi", "temperature", 1.0),
+            ("gradient", "starts", 2),
+            ("own planner", "reach", 0.5),
+        )
+    },
     "planner=prior": {"planner": "prior", "prior": "PRIOR"},
     "mask": {},
     "samples of a policy": {},
 }
 # Options without which a decision does more: their pairs are tried one by one, those of all others three at a time.
-ALONE = {"budget_s", "replan", "samples of a policy"}
+ALONE = {"budget_s", "samples of a policy"}
 # Options that change numbers of a search only: their pairs are tried many at a time.
 NUMBERS = {
-    *("samples", "iterations", "start_std", "gripper_start_std", "prior_steps", "energy.distance", "goals.share"),
-    *("energy.samples_at_once", "limits.xyz", "limits.ball", "limits.radius", "limits.rotation", "limits.axes"),
-    *("limits.gripper", "limits.gripper_rounding", "gradient.learning_rate"),
-    *(name for name in OTHERS if name.startswith(("cem.", "icem.", "mppi."))),
+    *("samples", "iterations", "start_std", "energy.distance", "goals.share", "energy.samples_at_once"),
+    *("limits.xyz", "limits.ball", "limits.radius", "limits.rotation", "limits.axes", "limits.gripper"),
+    *(name for name in MORE if name.startswith(("cem.", "icem.", "mppi."))),
 }
 REFUSED = {
-    *(frozenset({"views", other}) for other in ("context", "axes", "prior", "planner=prior", "monitor", "replan")),
+    *(frozenset({"views", other}) for other in ("axes", "prior", "planner=prior", "monitor")),
     *(frozenset({"warm_start", other}) for other in ("prior", "planner=prior")),
 }
 
@@ -135,7 +128,7 @@ class OwnPlanner(CemSolver):
     Config = Reach
 
     def __init__(self, *given: Any, options: Reach) -> None:
-        super().__init__(*given)
+        super().__init__(*given, CemSolver.Config(elites=2))
         self.std = self.std * options.reach
 
 

@@ -11,6 +11,7 @@ from decisions import QUICK, STATE, image
 from run_fixtures import MakeConfig, SilentReporter
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
+from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
@@ -52,7 +53,7 @@ def acting(folder: Path | None, **changes: object) -> Controller:
 
 
 def test_alone_it_acts_within_the_limits_without_a_search(folder: Path) -> None:
-    run = acting(folder, planner="prior", limits=LimitsConfig(xyz=(0.05, 0.01, 0.05)))
+    run = acting(folder, planner=Component("prior"), limits=LimitsConfig(xyz=(0.05, 0.01, 0.05)))
     np.testing.assert_allclose(run.decision.action, [0.03, -0.01, 0.01, 0, 0, 0, 0.3], atol=1e-6)
     assert run.decision.plan.evaluations == 1
     assert run.decision.why == "planned"
@@ -60,14 +61,16 @@ def test_alone_it_acts_within_the_limits_without_a_search(folder: Path) -> None:
 
 @pytest.mark.parametrize("planner", ["cem", "icem", "mppi", "gradient"])
 def test_every_search_starts_from_it_as_wide_as_it_is_unsure(folder: Path, planner: str) -> None:
-    run = acting(folder, planner=planner, iterations=1, horizon=1, samples=400)
+    run = acting(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
     first = run.decision.plan.iterations[0]
     spread = np.sqrt(2) * np.exp(-3.0)
     far = (first.elites[:, 0, :3] - torch.tensor(MEAN[:3])).abs().max()
     assert far <= 5 * spread
     if planner in {"cem", "icem"}:
-        assert not torch.allclose(first.mean, acting(None, planner=planner, iterations=1, horizon=1).space.lower)
-    again = acting(folder, planner=planner, iterations=1, horizon=1, samples=400)
+        assert not torch.allclose(
+            first.mean, acting(None, planner=Component(planner), iterations=1, horizon=1).space.lower
+        )
+    again = acting(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
     np.testing.assert_array_equal(run.decision.action, again.decision.action)
 
 
@@ -77,7 +80,10 @@ def test_a_plan_of_several_steps_follows_what_the_model_predicts(tmp_path: Path)
     card = PriorCard("vjepa2-ac prior 1", SIZES, model.encoder_fingerprint(), "released", "nowhere", 0)
     save_prior(tmp_path / "prior", card, prior)
     run = acting(
-        tmp_path / "prior", planner="prior", horizon=3, limits=LimitsConfig(xyz=(1.0,) * 3, rotation=3.0, gripper=1.0)
+        tmp_path / "prior",
+        planner=Component("prior"),
+        horizon=3,
+        limits=LimitsConfig(xyz=(1.0,) * 3, rotation=3.0, gripper=1.0),
     )
     cost, wanted = run.decision.cost, run.encoded(image(100))
     seen, state = cost.now

@@ -62,13 +62,6 @@ def test_each_gripper_mode_does_what_it_says(mode: str, given: float, expected: 
     assert float(pose(gripper_mode=mode).finished(decisions)[0, 6]) == pytest.approx(expected)
 
 
-def test_the_gripper_closes_from_the_step_that_was_asked_for() -> None:
-    where = pose(horizon=6, action_repeat=2, gripper_mode="close", gripper_from=2)
-    done = where.over_steps(where.finished(torch.full((3, 7), 0.3)))
-    torch.testing.assert_close(done[:, 6], torch.tensor([0.3, 0.3, 1.0, 1.0, 1.0, 1.0]))
-    assert where.first_std[:, 6].tolist() == [1.0, 0.0, 0.0]
-
-
 def test_an_action_is_repeated_for_consecutive_steps() -> None:
     where = SearchSpace(-torch.ones(2, 1), torch.ones(2, 1), torch.ones(2, 1), repeat=3)
     assert where.over_steps(torch.tensor([[[1.0], [2.0]]])).flatten().tolist() == [1, 1, 1, 2, 2, 2]
@@ -79,7 +72,6 @@ def test_an_action_is_repeated_for_consecutive_steps() -> None:
     ("values", "complaint"),
     [
         ({"horizon": 3, "action_repeat": 2}, "multiple of action_repeat"),
-        ({"horizon": 4, "action_repeat": 2, "limits": {"gripper_from": 1}}, "multiple of action_repeat"),
         ({"samples": 5}, "more than 5 samples"),
         ({"limits": {"xyz": (0.0, 0.0, 0.0), "gripper_mode": "held"}}, "nothing is left"),
         ({"limits": {"xyz": (50.0, 50.0, 50.0)}}, "less than or equal to 1"),  # millimetres

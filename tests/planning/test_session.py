@@ -22,7 +22,7 @@ from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train
 
-PLANNING = {"horizon": 2, "samples": 12, "iterations": 2, "cem": {"elites": 4}}
+PLANNING = {"horizon": 2, "samples": 12, "iterations": 2, "planner": {"name": "cem", "options": {"elites": 4}}}
 
 
 @pytest.fixture
@@ -68,8 +68,8 @@ def test_a_model_needs_no_config_and_takes_one(make_config, base_folder: Path, t
     assert (alone.config.planning.samples, alone.config.seed, alone.config.planning.horizon) == (20, 4, 1)
     path = tmp_path / "its.yaml"
     path.write_text(config_as_yaml(make_config(planning=PLANNING, model__dtype="bfloat16", training__precision="bf16")))
-    reported = load_to_plan(str(base_folder), config=path, overrides=["planning.cem.elites=3"])
-    assert (reported.config.planning.horizon, reported.config.planning.cem.elites) == (2, 3)
+    reported = load_to_plan(str(base_folder), config=path, overrides=["planning.planner.options.elites=3"])
+    assert (reported.config.planning.horizon, reported.config.planning.planner.options) == (2, {"elites": 3})
     assert next(reported.world_model.parameters()).dtype == torch.bfloat16
 
 
@@ -112,7 +112,7 @@ VECTORS = {
     "data__states": "vector",
     "data__fields": {"state": ["steps/observation/joint_position", "steps/observation/gripper_position"]},
     "adapter__modules_to_save": ["state_encoder", "action_encoder"],
-    "planning": {"samples": 8, "iterations": 2, "cem": {"elites": 3}, "horizon": 2},
+    "planning": {"samples": 8, "iterations": 2, "planner": {"name": "cem", "options": {"elites": 3}}, "horizon": 2},
 }
 
 

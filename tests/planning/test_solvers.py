@@ -10,11 +10,10 @@ from torch import Tensor
 
 from paths import GOLDEN
 from solver_problems import PLANNERS, config, parabola, rosenbrock, solve, space, two_basins
-from vjepa2_ac.config.planning import CemConfig, GradientConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import no_progress
-from vjepa2_ac.evaluation.request import SCORED
-from vjepa2_ac.planning.planner import Plan, Planner
-from vjepa2_ac.planning.search_space import Ball
+from vjepa2_ac.planning.planner import Plan, Planner, samples_of_iterations
+from vjepa2_ac.planning.search_space import GRIPPER, Ball, pose_space
 from vjepa2_ac.planning.solvers import (
     EvaluatedPlans,
     GradientSolver,
@@ -72,22 +71,19 @@ def upstream_cost(actions: Tensor) -> Tensor:
 def test_cem_gives_upstreams_plan_for_upstreams_seed(case: dict) -> None:
     given = case["arguments"]
     closing = given.get("close_gripper")
-    limits = LimitsConfig(
-        xyz=(given.get("maxnorm", 0.05),) * 3,
-        gripper_mode="rounded" if closing is None else "close",
-        gripper_from=closing or 0,
-    )
-    cem = CemConfig(
-        elites=given["topk"],
-        momentum_mean=given.get("momentum_mean", 0.25),
-        momentum_std=given.get("momentum_std", 0.95),
-        momentum_mean_gripper=given.get("momentum_mean_gripper", 0.15),
-        momentum_std_gripper=given.get("momentum_std_gripper", 0.15),
-    )
+    usual = {"momentum_mean": 0.25, "momentum_std": 0.95}
+    cem = {"elites": given["topk"], **usual} | {name: given[name] for name in given if name.startswith("momentum")}
     settings = PlanningConfig(
-        horizon=given["rollout"], samples=given["samples"], iterations=given["cem_steps"], limits=limits, cem=cem
+        horizon=given["rollout"],
+        samples=given["samples"],
+        iterations=given["cem_steps"],
+        limits=LimitsConfig(xyz=(given.get("maxnorm", 0.05),) * 3),
+        planner={"name": "cem", "options": cem},
     )
-    plan = Planner(settings).plan(upstream_cost, torch.Generator().manual_seed(case["seed"]))
+    where = pose_space(settings)
+    if closing is not None:
+        where.lower[closing:, GRIPPER] = where.upper[closing:, GRIPPER] = 1.0
+    plan = Planner(settings, where).plan(upstream_cost, torch.Generator().manual_seed(case["seed"]))
     expected = torch.tensor(case["actions"])
     if closing is not None:  # there a mean on its way to 1
         expected[closing:, 6] = 1.0
@@ -102,9 +98,18 @@ def jepa_wms_cost(actions: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("case", json.loads((GOLDEN / "cem_jepa_wms.json").read_text()), ids=lambda c: str(c["seed"]))
-def test_cem_with_the_action_scores_settings_gives_jepa_wms_plan(case: dict) -> None:
-    settings = SCORED.model_copy(update={"samples": 304})  # then their one draw and our three give the same numbers
-    plan = Planner(settings).plan(jepa_wms_cost, torch.Generator().manual_seed(case["seed"]))
+def test_cem_with_settings_of_jepa_wms_gives_its_plan(case: dict) -> None:
+    none = dict.fromkeys(("momentum_mean", "momentum_std", "momentum_mean_gripper", "momentum_std_gripper"), 0.0)
+    settings = PlanningConfig(
+        planner={"name": "cem", "options": {**none, "try_mean": True}},
+        horizon=3,
+        samples=304,  # then their one draw and our three give the same numbers
+        iterations=15,
+        limits=LimitsConfig(xyz=(0.1, 0.1, 0.1), rotation=0.1, gripper=0.75, gripper_mode="free"),
+    )
+    where = pose_space(settings)
+    where.std[:, GRIPPER] = 0.1
+    plan = Planner(settings, where).plan(jepa_wms_cost, torch.Generator().manual_seed(case["seed"]))
     torch.testing.assert_close([one.lowest for one in plan.iterations], case["losses"], rtol=1e-3, atol=1e-7)
     torch.testing.assert_close(plan.actions, torch.tensor(case["actions"]), atol=1e-5, rtol=1e-3)
 
@@ -208,7 +213,8 @@ def test_progress_leads_from_nothing_to_all_sequences_and_changes_no_plan(planne
         reported.append([])
         looking = Planner(settings, space(), progress=lambda *seen: reported[-1].append(seen))
         plans.append(looking.plan(one, torch.Generator().manual_seed(0)))
-    ends = [(sum(settings.sequences[:done]), sum(settings.sequences)) for done in range(4)]
+    samples = samples_of_iterations(settings)
+    ends = [(sum(samples[:done]), sum(samples)) for done in range(4)]
     assert reported[0] == ends, "a cost that says nothing: after each iteration"
     assert set(ends) < set(reported[1]), "one that evaluates in parts: in between, too"
     assert reported[1] == sorted(set(reported[1])), "forwards, and nothing twice"
@@ -236,7 +242,7 @@ def test_a_warm_start_begins_where_the_last_plan_led(planner: str) -> None:
     target = torch.tensor([[0.2, 0.1], [0.8, -0.9], [-0.7, 0.6]])
     before = solve(planner, parabola(target), space(3), iterations=40)
     following = torch.cat([target[1:], target[-1:]])
-    start = before.start_after(1)
+    start = before.start_after()
     torch.testing.assert_close(start.mean[:2], before.mean[1:])
 
     def first(start: PlanStart | None) -> float:
@@ -247,17 +253,9 @@ def test_a_warm_start_begins_where_the_last_plan_led(planner: str) -> None:
     assert first(start) < first(None)
 
 
-@pytest.mark.parametrize(("done", "places"), [(0, [0, 1, 2]), (2, [1, 2, 2]), (5, [2, 2, 2])])
-def test_what_was_done_of_a_plan_is_gone_and_its_end_is_repeated(done: int, places: list[int]) -> None:
-    plan = repeated_plan()
-    start = plan.start_after(done)
-    assert torch.equal(start.mean, plan.mean[places])
-    assert torch.equal(start.elites, plan.iterations[-1].elites[:, places])
-
-
 def test_within_a_repeated_action_the_next_plan_begins_with_what_is_left_of_it() -> None:
     plan = repeated_plan()
-    start = plan.start_after(1)
+    start = plan.start_after()
     torch.testing.assert_close(start.mean[0], (plan.mean[0] + plan.mean[1]) / 2)
     torch.testing.assert_close(start.mean[2], plan.mean[2])
     elites = plan.iterations[-1].elites
@@ -272,14 +270,14 @@ def repeated_plan() -> Plan:
 
 def test_icems_elites_take_part_again() -> None:
     before = solve("icem", rosenbrock, space(2), iterations=3)
-    start = before.start_after(1)
+    start = before.start_after()
     shown: list[Tensor] = []
 
     def cost(actions: Tensor) -> Tensor:
         shown.append(actions)
         return rosenbrock(actions)
 
-    settings = config("icem", iterations=2, samples=40, icem=IcemConfig(elites=10, kept=0.3))
+    settings = config("icem", iterations=2, samples=40, options={"elites": 10, "kept": 0.3})
     plan = Planner(settings, space(2)).plan(cost, torch.Generator(), start)
     assert torch.equal(shown[0][40:], start.elites[:3])
     assert torch.equal(shown[1][32:35], plan.iterations[0].elites[:3])  # 40 / 1.25 fresh ones stand before
@@ -288,9 +286,8 @@ def test_icems_elites_take_part_again() -> None:
 
 
 def test_mppi_tries_its_mean_and_weighs_by_energy() -> None:
-    search = MppiSolver(
-        space(), config("mppi", samples=3, mppi=MppiConfig(temperature=0.5, std_decay=0.5)), torch.Generator()
-    )
+    options = MppiSolver.Config(temperature=0.5, std_decay=0.5)
+    search = MppiSolver(space(), config("mppi", samples=3), torch.Generator(), options=options)
     assert torch.equal(search.sample()[0], search.mean)
     tried = torch.tensor([[[0.0, 0.0]], [[1.0, 0.0]], [[0.0, 1.0]]])
     energies = torch.tensor([1.0, 3.0, 2.0])
@@ -315,9 +312,8 @@ def test_descents_survive_a_cost_that_once_says_nothing() -> None:
 
 
 def test_a_descent_at_the_limits_turns_back_at_once() -> None:
-    search = GradientSolver(
-        space(), config("gradient", iterations=1000, gradient=GradientConfig(starts=1)), torch.Generator()
-    )
+    options = GradientSolver.Config(starts=1)
+    search = GradientSolver(space(), config("gradient", iterations=1000), torch.Generator(), options=options)
     nothing, slope = torch.zeros(0, 1, 2), torch.ones(1, 1, 2)
     for towards in [-1.0] * 40 + [1.0] * 20:
         search.update(EvaluatedPlans(nothing, torch.zeros(0), towards * slope))
@@ -326,9 +322,7 @@ def test_a_descent_at_the_limits_turns_back_at_once() -> None:
 
 def test_the_first_descent_begins_where_the_last_best_one_ended() -> None:
     before = solve("gradient", two_basins, space())
-    after = Planner(config("gradient", iterations=1), space()).plan(
-        two_basins, torch.Generator(), before.start_after(0)
-    )
+    after = Planner(config("gradient", iterations=1), space()).plan(two_basins, torch.Generator(), before.start_after())
     torch.testing.assert_close(after.iterations[0].elites[0], before.iterations[-1].elites[0])
     assert (before.mean - before.actions).norm() > 0.1
 

@@ -12,11 +12,8 @@ from hypothesis import strategies as st
 
 from decisions import QUICK, STATE, image
 from tiny_models import tiny_model
-from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.surprise import MONITOR, Monitor, Surprise, conformal_threshold, surprise_of
 from vjepa2_ac.serving.session import Session
 from vjepa2_ac.serving.wire import pack, unpack
@@ -79,58 +76,7 @@ def test_what_the_last_decision_predicted_is_compared_with_what_is_seen(tmp_path
     assert all(one.surprise is None for one in acting(None))
 
 
-def test_a_plan_is_carried_on_until_it_ends_or_reality_departs(tmp_path: Path) -> None:
-    calm = acting(written(tmp_path, 1e6), frames=5, replan="on_surprise")
-    assert [one.why for one in calm] == ["planned", "as planned", "as planned", "planned", "as planned"]
-    for step in (1, 2):
-        np.testing.assert_array_equal(calm[step].action, calm[0].plan.actions[step].double().numpy())
-        assert calm[step].plan.evaluations == 0
-    alarmed = acting(written(tmp_path, 1e-6), frames=3, replan="on_surprise")
-    assert [one.why for one in alarmed] == ["planned"] * 3
-
-
-def test_a_plan_ends_where_another_goal_follows_and_the_search_starts_from_what_is_left_of_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    starts, plan = [], Planner.plan
-    monkeypatch.setattr(Planner, "plan", lambda *given: starts.append(given[3]) or plan(*given))
-    changes = {"monitor": written(tmp_path, 1e6), "replan": "on_surprise", "horizon": 4, "warm_start": True}
-    run = Controller(tiny_model(), QUICK.model_copy(update=changes))
-    run.reset(image(100), image(101), durations=(2,))
-    found = []
-    for seed in range(4):
-        run.act(image(seed), STATE)
-        found.append((run.decision.why, run.decision.progress.place))
-        first = run.decision.plan if not seed else first
-    assert found == [("planned", 0), ("as planned", 0), ("planned", 1), ("as planned", 1)]
-    assert starts[0] is None
-    assert torch.equal(starts[1].mean, first.mean[[2, 3, 3, 3]]), "two steps of the plan were executed"
-    assert torch.equal(starts[1].elites, first.iterations[-1].elites[:, [2, 3, 3, 3]])
-
-
-def test_a_plan_that_is_carried_on_stays_in_the_workspace(tmp_path: Path) -> None:
-    box = ((0.39, -0.01, 0.29), (0.41, 0.01, 0.31))
-    run = Controller(
-        tiny_model(),
-        QUICK.model_copy(
-            update={
-                "monitor": written(tmp_path, 1e6), "replan": "on_surprise", "horizon": 3,
-                "limits": LimitsConfig(workspace=box),
-            }
-        ),
-    )  # fmt: skip
-    run.reset(image(100))
-    for seed, x in enumerate((0.395, 0.409, 0.391)):
-        state = STATE.copy()
-        state[0] = x
-        action = run.act(image(seed), state)
-        assert box[0][0] - 1e-6 <= x + action[0] <= box[1][0] + 1e-6
-
-
 def test_settings_and_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    values = {"run_dir": "r", "data": {"path": "d"}, "model": {"base": "b"}, "planning": {"replan": "on_surprise"}}
-    with pytest.raises(InputError, match="replan needs monitor"):
-        parse_config(values, where="test")
     path = written(tmp_path, 1.0)
     known = json.loads(Path(path).read_text())
     Path(path).write_text(json.dumps(known | {"predictor": "0" * 64}))

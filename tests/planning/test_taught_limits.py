@@ -22,7 +22,7 @@ from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.spaces import actions_from_states
 from vjepa2_ac.training.loop import train
 
-PLANNING = {"samples": 12, "iterations": 2, "horizon": 2, "cem": {"elites": 4}}
+PLANNING = {"samples": 12, "iterations": 2, "horizon": 2, "planner": {"name": "cem", "options": {"elites": 4}}}
 TAUGHT = [0.03, 0.02, 0.01, 0.0, 0.1, 0.2, 0.8]  # metres, radians, closedness
 
 

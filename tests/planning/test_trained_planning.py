@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from decisions import STATE
 from tiny_models import actions, cost, tiny_model
 from vjepa2_ac.config import AdapterConfig
-from vjepa2_ac.config.planning import CemConfig, PlanningConfig
+from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
@@ -22,7 +22,7 @@ from vjepa2_ac.planning import controller
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 
-PLAIN = PlanningConfig(samples=16, iterations=2, horizon=2, cem=CemConfig(elites=4))
+PLAIN = PlanningConfig(samples=16, iterations=2, horizon=2, planner={"name": "cem", "options": {"elites": 4}})
 ADAPTERS = {
     "lora": AdapterConfig(rank=4, alpha=8.0, dropout=0.1),
     "heads": AdapterConfig(rank=4, alpha=8.0, modules_to_save=("predictor_embed", "predictor_proj", "action_encoder")),

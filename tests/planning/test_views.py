@@ -11,7 +11,7 @@ from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.errors import InputError
@@ -28,7 +28,13 @@ from vjepa2_ac.simulation.domains import DOMAIN_A
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 from vjepa2_ac.simulation.tasks import arm_for
 
-QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4), limits=LimitsConfig(rotation=0.1))
+QUICK = PlanningConfig(
+    samples=12,
+    iterations=2,
+    horizon=2,
+    planner={"name": "cem", "options": {"elites": 4}},
+    limits=LimitsConfig(rotation=0.1),
+)
 
 
 def decided(goal: np.ndarray, frame: np.ndarray, views: int, mask: np.ndarray | None = None) -> Controller:
@@ -78,8 +84,6 @@ def test_what_cannot_be_split_is_refused() -> None:
     odd = np.zeros((64, 65, 3), dtype=np.uint8)
     with pytest.raises(InputError, match=r"65 pixels wide.* 2 views share"):
         decided(odd, odd, 2)
-    with pytest.raises(ValueError, match="views excludes context"):
-        PlanningConfig(views=2, context=2)
     with pytest.raises(ValueError, match="views excludes axes"):
         PlanningConfig(views=2, axes="axes.json")
 
@@ -111,7 +115,7 @@ def test_goals_are_made_of_both_cameras_and_a_film_shows_both(tmp_path: Path) ->
     with pytest.raises(InputError, match=r"data.camera: exterior_1_left. needed: 2 cameras"):
         recording_of_episode(RldsData(path=str(data), camera="exterior_1_left"), "0", views=2)
 
-    quick = ["planning.views=2", "planning.samples=8", "planning.iterations=1", "planning.cem.elites=2"]
+    quick = ["planning.views=2", "planning.samples=8", "planning.iterations=1", "planning.planner.options.elites=2"]
     options = BenchmarkOptions(episodes=1, steps=2, films=1, sub_goals="demonstration")
     agent = agent_of_session(load_to_plan("builtin:sim-tiny", overrides=quick), load_decoder("builtin:sim-tiny"))
     benchmark, _ = run_benchmark(agent, options, tmp_path / "out")

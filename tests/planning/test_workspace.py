@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from decisions import image
 from tiny_models import tiny_model
-from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.search_space import Workspace, is_allowed, pose_space
@@ -73,7 +73,13 @@ def test_the_search_does_not_leave_the_box_with_its_first_decision(where) -> Non
 
 
 def controller(**limits: object) -> Controller:
-    config = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4), limits=LimitsConfig(**limits))
+    config = PlanningConfig(
+        samples=12,
+        iterations=2,
+        horizon=2,
+        planner={"name": "cem", "options": {"elites": 4}},
+        limits=LimitsConfig(**limits),
+    )
     made = Controller(tiny_model(), config)
     made.reset(image(100))
     return made

@@ -125,7 +125,7 @@ def test_an_export_says_so_before_it_writes(
 
 
 def test_what_plans_says_so_too(base_run: Path, caplog: pytest.LogCaptureFixture) -> None:
-    session = load_to_plan(str(base_run), overrides=["planning.samples=8", "planning.cem.elites=4"])
+    session = load_to_plan(str(base_run), overrides=["planning.samples=8", "planning.planner.options.elites=4"])
     assert session.warnings[0] == session.as_dict()["warnings"][0] == SELECTED
     api.load_run(base_run, 0)
     assert caplog.messages == [SELECTED, "Checkpoint 0 is the base model."]

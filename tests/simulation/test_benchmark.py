@@ -40,7 +40,12 @@ from vjepa2_ac.simulation.benchmark import (
 from vjepa2_ac.simulation.policies import Planning
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
-SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3", "planning.limits.xyz=[0.03,0.03,0.03]"]
+SMALL = [
+    "planning.samples=6",
+    "planning.iterations=2",
+    "planning.planner.options.elites=3",
+    "planning.limits.xyz=[0.03,0.03,0.03]",
+]
 TWICE = ["--episodes", "2", "--steps", "2", "--films", "1"]
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
 from vjepa2_ac.simulation.tasks import TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.spaces import actions_from_states
@@ -155,7 +155,7 @@ def test_a_command_out_of_reach_takes_the_arm_part_of_the_way_and_is_counted(arm
 
 
 def test_a_world_model_plans_within_its_limits_and_says_why(arm: SimulatedArm) -> None:
-    config = PlanningConfig(samples=8, iterations=2, limits=SMALL, cem=CemConfig(elites=3))
+    config = PlanningConfig(samples=8, iterations=2, limits=SMALL, planner={"name": "cem", "options": {"elites": 3}})
     policy = Planning(Controller(tiny_model(), config), name="tiny")
     reported = []
     spec = RolloutSpec("reach", DOMAIN_B, episodes=2, steps=2, films=1)

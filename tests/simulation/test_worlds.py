@@ -30,7 +30,7 @@ from vjepa2_ac.simulation.record_world import record_world
 from vjepa2_ac.simulation.rollout import run_trials
 from vjepa2_ac.simulation.worlds import OtherWorld, find_problems, run_world_benchmark
 
-SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3"]
+SMALL = ["planning.samples=6", "planning.iterations=2", "planning.planner.options.elites=3"]
 
 
 def command(how: str = "") -> str:

@@ -4,13 +4,13 @@ import numpy as np
 import torch
 
 from tiny_models import tiny_model
-from vjepa2_ac.config.planning import CemConfig, PlanningConfig
+from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, PlanResult, decide
 from vjepa2_ac.planning.goals import equal_durations, timed
 
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
-QUICK = PlanningConfig(samples=12, iterations=3, horizon=2, cem=CemConfig(elites=4))
+QUICK = PlanningConfig(samples=12, iterations=3, horizon=2, planner={"name": "cem", "options": {"elites": 4}})
 
 
 def image(seed: int, height: int = 60, width: int = 48) -> np.ndarray:

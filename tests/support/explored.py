@@ -6,7 +6,7 @@ import pytest
 
 from run_fixtures import tiny_config
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.planning import CemConfig, PlanningConfig
+from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.evaluation.evaluate_run import Models, load_models
@@ -15,7 +15,7 @@ from vjepa2_ac.explore.explorer import Explorer, open_explorer
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.simulation.counterfactual import SimulatedFutures
 
-QUICK = PlanningConfig(samples=12, iterations=2, cem=CemConfig(elites=4))
+QUICK = PlanningConfig(samples=12, iterations=2, planner={"name": "cem", "options": {"elites": 4}})
 
 
 def explorer_of(subject: Path, decoder: Path, asked: EvaluationOptions) -> tuple[Explorer, Config]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ranks import Rank
 from tiny_models import tiny_model
-from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
@@ -23,7 +23,7 @@ from vjepa2_ac.serving.session import Session, SessionOptions
 from vjepa2_ac.spaces import Spaces
 
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
-QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))
+QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, planner={"name": "cem", "options": {"elites": 4}})
 
 
 def image(seed: int, height: int = 48, width: int = 60) -> np.ndarray:

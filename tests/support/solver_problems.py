@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vjepa2_ac.config.planning import GradientConfig, MppiConfig, PlanningConfig
+from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.planning.planner import Plan, Planner
 from vjepa2_ac.planning.search_space import Ball, SearchSpace
 
@@ -19,12 +19,13 @@ def space(decisions: int = 1, dim: int = 2, reach: float = 1.0, ball: Ball | Non
     return SearchSpace(-upper, upper, upper, ball=ball)
 
 
-def config(planner: str, iterations: int = 30, samples: int = 200, **changes: Any) -> PlanningConfig:
+def config(
+    planner: str, iterations: int = 30, samples: int = 200, options: dict[str, Any] | None = None, **changes: Any
+) -> PlanningConfig:
     """Return settings that are good enough for a few numbers."""
-    more: dict[str, Any] = {
-        "gradient": GradientConfig(starts=16, learning_rate=0.1), "mppi": MppiConfig(std_decay=0.85),
-    }  # fmt: skip
-    return PlanningConfig(planner=planner, iterations=iterations, samples=samples, **(more | changes))
+    usual = {"gradient": {"starts": 16, "learning_rate": 0.1}, "mppi": {"std_decay": 0.85}}.get(planner, {})
+    component = {"name": planner, "options": options or usual}
+    return PlanningConfig(planner=component, iterations=iterations, samples=samples, **changes)
 
 
 def solve(planner: str, cost: Callable[[Tensor], Tensor], where: SearchSpace, seed: int = 0, **changes: Any) -> Plan:

@@ -38,12 +38,9 @@ def draw(*shape: int, seed: int = 1) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def scene(context: int = 1, *, extrinsics: bool = False) -> Scene:
-    """Return the last frames before a decision."""
-    camera = draw(6, seed=4) if extrinsics else None
-    return Scene(
-        draw(context, TOKENS, DIM), draw(context, 7, seed=2) * 0.3, draw(context - 1, 7, seed=3) * 0.05, camera
-    )
+def scene(*, extrinsics: bool = False) -> Scene:
+    """Return the frame and the state at a decision."""
+    return Scene(draw(TOKENS, DIM), draw(7, seed=2) * 0.3, draw(6, seed=4) if extrinsics else None)
 
 
 def actions(samples: int, steps: int, seed: int = 5) -> Tensor:
@@ -56,6 +53,6 @@ def goal(goals: int = 1, **more: object) -> Goal:
     return Goal(torch.nn.functional.layer_norm(draw(goals, TOKENS, DIM, seed=6), (DIM,)), **more)  # type: ignore[arg-type]
 
 
-def cost(model: WorldModel, context: int = 1, **settings: object) -> WorldModelCost:
+def cost(model: WorldModel, **settings: object) -> WorldModelCost:
     """Return the energy towards one goal from a scene."""
-    return WorldModelCost(model, scene(context), goal(), EnergyConfig(**settings))  # type: ignore[arg-type]
+    return WorldModelCost(model, scene(), goal(), EnergyConfig(**settings))  # type: ignore[arg-type]

@@ -68,11 +68,12 @@ def reference() -> tuple[WorldModel, LatentBatch]:
 
 def plain_distance(training: TrainingConfig, predicted: torch.Tensor, true: torch.Tensor) -> float:
     """One element after the other, as the definitions are written."""
-    beta, total = training.smooth_l1_beta, 0.0
+    loss, total = training.loss.name, 0.0
+    beta = training.loss.options.get("beta", 1.0)
     for difference in (predicted - true).abs().flatten().tolist():
-        if training.loss == "l1":
+        if loss == "l1":
             total += difference
-        elif training.loss == "l2":
+        elif loss == "l2":
             total += difference**2
         else:
             total += difference**2 / (2 * beta) if difference < beta else difference - beta / 2
@@ -85,7 +86,7 @@ def plain_distance(training: TrainingConfig, predicted: torch.Tensor, true: torc
         {"loss": "l1"},
         {"loss": "l2"},
         {"loss": "smooth_l1"},
-        {"loss": "smooth_l1", "smooth_l1_beta": 0.25},
+        {"loss": {"name": "smooth_l1", "options": {"beta": 0.25}}},
         {"rollout_steps": 3, "teacher_forcing_weight": 0.5, "rollout_weight": 2.0},
         {"loss": "l2", "rollout_steps": 1, "teacher_forcing_weight": 0.0},
         {"rollout_weight": 0.0},
@@ -115,7 +116,7 @@ def test_every_distance_and_weight_equals_a_plain_computation(knobs: dict[str, o
         ({"teacher_forcing_weight": 0.0, "rollout_weight": 0.0}, "both 0"),
         ({"rollout_weight": -1.0}, "greater than or equal to 0"),
         ({"loss": "huber"}, "no loss of this name"),
-        ({"smooth_l1_beta": 0.5}, "belongs to loss smooth_l1, not l1"),
+        ({"loss": {"name": "l1", "options": {"beta": 0.5}}}, "no options of its own"),
     ],
 )
 def test_a_loss_that_makes_no_sense_is_refused(knobs: dict[str, object], complaint: str) -> None:

@@ -13,7 +13,6 @@ from run_fixtures import TINY
 from same_run import metrics
 from vector_sets import write_vectors
 from vjepa2_ac.config import Config, LimitsConfig, ModelConfig, ModelSizes, PlanningConfig
-from vjepa2_ac.config.planning import CemConfig
 from vjepa2_ac.episode import STATE_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
@@ -30,7 +29,7 @@ MakeConfig = Callable[..., Config]
 SIZES = {**TINY, "predictor": {**TINY["predictor"], "use_states": False}}  # type: ignore[dict-item]
 PROBES = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, axis_clips=0, nodes=3, examples=1)
 QUICK = EvaluationOptions(split="validation", clips=4, probes=PROBES, checkpoint="newest")
-SEARCH = PlanningConfig(samples=6, iterations=2, cem=CemConfig(elites=3))
+SEARCH = PlanningConfig(samples=6, iterations=2, planner={"name": "cem", "options": {"elites": 3}})
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 
 
@@ -95,7 +94,7 @@ def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_pat
     with torch.no_grad():
         expected = run.world_model.eval().predict(latents, actions, states)
         torch.testing.assert_close(loaded.predict(latents, actions, states), expected, atol=1e-5, rtol=1e-5)
-    planned = load_to_plan(str(merged), overrides=["planning.samples=6", "planning.cem.elites=3"])
+    planned = load_to_plan(str(merged), overrides=["planning.samples=6", "planning.planner.options.elites=3"])
     drive(Controller.of_subject(planned), STATE)
     with pytest.raises(InputError, match=r"Meta's code has no other.* --to merged"):
         export_run(folder, tmp_path / "official.pt", "official")

@@ -339,11 +339,14 @@ def _next_benchmark(benchmark: ClosedLoopBenchmark, options: argparse.Namespace)
 
     from vjepa2_ac.distributed import is_on_cpu
     from vjepa2_ac.evaluation.summary import CHANCE
+    from vjepa2_ac.planning.planner import samples_of_iterations
 
     planning, trials, oracle = benchmark.agent.planning, benchmark.trials, benchmark.results[-1]
     episodes, steps = max(50, trials.episodes), trials.model_steps * (1 + (oracle.success_rate.value < CHANCE))
     changes = {"episodes": episodes} | ({"steps": steps} if steps != trials.model_steps else {})
-    prediction_s = float(np.median(benchmark.results[0].seconds)) / (sum(planning.sequences) * planning.horizon)
+    prediction_s = float(np.median(benchmark.results[0].seconds)) / (
+        sum(samples_of_iterations(planning)) * planning.horizon
+    )
     words = [options.subject, *option_words(options, **changes), *options.overrides]
     on_cpu = not cli.is_server(options.subject) and is_on_cpu(cli.require_to_plan(options).training)
     return next_simulation(words, planning, episodes * steps, prediction_s, on_cpu=on_cpu)

@@ -48,16 +48,19 @@ def next_simulation(
         prediction_s: Measured seconds for each model step of an action sequence; None: not measured.
         on_cpu: Whether the model computes on a CPU.
     """
+    from vjepa2_ac.config.planning import ELITES
+    from vjepa2_ac.planning.planner import samples_of_iterations
     from vjepa2_ac.reporter import duration
 
     time, where = "its time was not measured", "here"
     is_chosen = any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)
-    is_long = sum(planning.sequences) > QUICK_SEQUENCES and planning.planner != "gradient" and planning.budget_s is None
-    fits = max(planning.cem.elites, planning.icem.elites) <= QUICK["samples"]
+    is_sampled, elites = planning.planner.name != "gradient", planning.planner.options.get("elites", ELITES)
+    is_long = sum(samples_of_iterations(planning)) > QUICK_SEQUENCES and is_sampled and planning.budget_s is None
+    fits = elites <= QUICK["samples"]
     if on_cpu and is_long and fits and not is_chosen:
         words, where = [*words, *QUICK_WORDS], "on this CPU with the quick planner"
         planning = planning.model_copy(update=QUICK)
-    count = sum(planning.sequences)
+    count = sum(samples_of_iterations(planning))
     if prediction_s is not None:
         time = f"{duration(decisions * count * planning.horizon * prediction_s / 3600)} {where}"
     about = f"{counted(decisions, 'decision')} of {counted(count, 'action sequence')} each"

@@ -118,13 +118,15 @@ def _plan(options: argparse.Namespace) -> int:
 
 def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     """Return what a search predicts, and on a CPU what is quicker."""
-    count = sum(config.sequences)
+    from vjepa2_ac.planning.planner import samples_of_iterations
+
+    count = sum(samples_of_iterations(config))
     text = f"Planning: {count:,} action sequence{'s' * (count != 1)}"
     text += f" in {config.iterations} iteration{'s' * (config.iterations > 1)}"
     text += f", {config.horizon} model step{'s' * (config.horizon > 1)} each"
     if config.budget_s is not None:
         text += f", for {config.budget_s:g} s at most"
-    is_long = on_cpu and config.planner != "gradient" and count > QUICK_SEQUENCES
+    is_long = on_cpu and config.planner.name != "gradient" and count > QUICK_SEQUENCES
     return f"{text}." + f"\nQuick, for a CPU: {_QUICK}" * is_long
 
 

@@ -52,7 +52,7 @@ def add_prior(commands: cli.Commands) -> None:
 def add_monitor(commands: cli.Commands) -> None:
     """Add `monitor` to a parser."""
     parser = cli.command(commands, "monitor", _monitor, "demo/run --episode 3")
-    cli.add_planner(parser, such_as="such as planning.context=1")
+    cli.add_planner(parser, such_as="such as model.dtype=bfloat16")
     cli.add(parser, "--data CONFIG", "watch episodes of its data (those of the run)", cli.as_local)
     cli.add(parser, "--episode ID|NUMBER", "watch this one of the data; repeatable", action="append", default=[])
     text = "promised share of undisturbed episodes with an alarm (0.05)"

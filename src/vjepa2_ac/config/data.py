@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
+from vjepa2_ac.config.component import Component, ComponentOf
 from vjepa2_ac.config.section import (
     OFF,
     Affects,
@@ -99,15 +100,6 @@ class AugmentConfig(Section):
             (least > most, f"crop_scale: {least} is more than {most}"),
             (self.crop_aspect[0] > self.crop_aspect[1], "crop_aspect: {} is more than {}".format(*self.crop_aspect)),
         )
-
-
-class TransformConfig(Section):
-    """A change of training clips by code of your own (docs/extending.md)."""
-
-    name: Annotated[str, AfterValidator(TRANSFORMS.known), TRANSFORMS.name_in_schema]
-    """The name under which the transform is registered."""
-    options: Annotated[dict[str, Any], TRANSFORMS.options_of("name"), TRANSFORMS.options_in_schema] = {}
-    """Options of the transform, if its class has some."""
 
 
 class DiskCacheConfig(Section):
@@ -209,7 +201,7 @@ class DataConfig(Section):
     square: its central square (upstream's evaluation). letterbox: all of it, with black bars."""
     augment: Annotated[AugmentConfig, Affects.RUN] = AugmentConfig()
     """Random changes of training clips."""
-    transforms: Annotated[tuple[TransformConfig, ...], Affects.RUN] = ()
+    transforms: Annotated[tuple[Annotated[Component, ComponentOf(TRANSFORMS)], ...], Affects.RUN] = ()
     """Changes of training clips by code of your own, in this order, before `augment` (docs/extending.md). Each is given
     a random generator that depends on the seed and the position of the clip in the run."""
     cache: Annotated[Literal["off", "auto", "require"], OFF, Affects.RUN] = "off"

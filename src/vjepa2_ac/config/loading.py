@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import source_of
-from vjepa2_ac.config.removed import drop_removed_keys, why_removed
+from vjepa2_ac.config.removed import drop_removed_keys, move_component_options, why_removed
 from vjepa2_ac.config.run import ReplayConfig
 from vjepa2_ac.config.section import marks_of
 from vjepa2_ac.errors import InputError, shell_command
@@ -119,6 +119,7 @@ def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, wh
     _replace_older_keys(given)
     if not here:
         drop_removed_keys(given, where)
+        move_component_options(given)
     try:
         return Config.model_validate_json(_as_json(with_plugins(given, where=where, here=here), where))
     except ValidationError as error:
@@ -230,6 +231,8 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
     for depth, key in enumerate(keys[:-1]):
         if values.get(key) is None:
             values[key] = {}
+        if isinstance(values[key], str) and keys[depth + 1] == "options":
+            values[key] = {"name": values[key]}  # of a component
         inner = values[key]
         if not isinstance(inner, dict):
             found = f"{'.'.join(keys[: depth + 1])} is a value"

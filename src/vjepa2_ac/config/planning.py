@@ -1,19 +1,21 @@
-"""Planning knobs: horizon, planner, limits and objective of a decision."""
+"""Config keys of planning: horizon, planner, limits and energy of a decision."""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from vjepa2_ac.config.section import OFF, Count, Local, NonNegative, Positive, PositiveInt, Section, Share, ZeroToOne
+from vjepa2_ac.config.component import Component, ComponentOf
+from vjepa2_ac.config.section import OFF, Local, NonNegative, Positive, PositiveInt, Section, ZeroToOne
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.registry import ENERGIES, PLANNERS
 
 Place = Annotated[float, Field(ge=-5.0, le=5.0)]  # along an axis of the base frame, in metres; no arm reaches farther
 Corner = tuple[Place, Place, Place]
 Fraction = Annotated[float, Field(gt=0.0, lt=1.0)]
+ELITES = 10  # of the planners cem and icem, unless their option says another number
 Metre = ZeroToOne  # no arm moves farther in a model step: more would be millimetres
 
 
@@ -38,12 +40,8 @@ class LimitsConfig(Section):
     gripper: ZeroToOne = 0.75
     """Largest change of the gripper's closedness."""
     gripper_mode: Literal["rounded", "free", "held", "open", "close"] = "rounded"
-    """rounded: small changes of a finished plan become zero, as upstream. free: left as they are. held: no change.
-    open, close: a change of -1 or 1, whatever `gripper` says, from model step `gripper_from` on; rounded before."""
-    gripper_rounding: ZeroToOne = 0.25
-    """Changes below this become zero."""
-    gripper_from: Count = 0
-    """Model step of the plan at which open or close begins; a multiple of action_repeat."""
+    """rounded: changes below 0.25 of a finished plan become zero, as upstream. free: left as they are. held: no change.
+    open, close: a change of -1 or 1 in every model step, whatever `gripper` says; rounded before."""
 
     @property
     def xyz_m(self) -> tuple[float, float, float]:
@@ -75,11 +73,9 @@ class LimitsConfig(Section):
 class EnergyConfig(Section):
     """Distance of a prediction from the goal."""
 
-    distance: Annotated[str, AfterValidator(ENERGIES.known), ENERGIES.name_in_schema] = "l1"
+    distance: Annotated[Component, ComponentOf(ENERGIES, "l1")] = Component("l1")
     """Of predicted and goal latents. l1: mean absolute difference (upstream). l2: mean square. cosine: 1 - cosine of a
     token. Or an energy of your own (docs/extending.md)."""
-    options: Annotated[dict[str, Any], ENERGIES.options_of("distance"), ENERGIES.options_in_schema] = {}
-    """Options of an energy of your own, where its class has some."""
     steps: Literal["last", "sum"] = "last"
     """last: of the plan's last step (upstream). sum: over all its steps."""
     samples_at_once: PositiveInt = 64
@@ -97,95 +93,30 @@ class GoalsConfig(Section):
     nothing is done until the next reset. null: its own share, if any; else it is reached by an equal image only."""
 
 
-class CemConfig(Section):
-    """Cross-entropy method; the defaults are upstream's."""
-
-    elites: Annotated[int, Field(ge=2)] = 10
-    """Best samples, which decide the next mean and standard deviation."""
-    momentum_mean: Share = 0.15
-    """Share of the old mean in the new one."""
-    momentum_std: Share = 0.15
-    """Share of the old standard deviation in the new one."""
-    momentum_mean_gripper: Share = 0.15
-    """The same, of the gripper."""
-    momentum_std_gripper: Share = 0.15
-    """The same, of the gripper."""
-    try_mean: bool = False
-    """Whether the mean itself replaces an iteration's first sample (facebookresearch/jepa-wms)."""
-    answer: Literal["mean", "best"] = "mean"
-    """The mean of the last distribution (upstream), or the best sample of all."""
-
-
-class IcemConfig(Section):
-    """Improved cross-entropy method (arXiv 2008.06389); the defaults are the paper's."""
-
-    elites: Annotated[int, Field(ge=2)] = 10
-    """Best samples, which decide the next mean and standard deviation."""
-    momentum: Share = 0.1
-    """Share of the old mean and standard deviation in the new ones."""
-    noise_exponent: Annotated[float, Field(ge=0.0, le=8.0)] = 2.0
-    """Power spectrum 1 / frequency^exponent along the plan: 0 is white, more is smoother."""
-    shrink: Annotated[float, Field(ge=1.0)] = 1.25
-    """Each iteration has as many samples as the last divided by this, and at least twice the elites."""
-    kept: ZeroToOne = 0.3
-    """Share of the elites that are reused, in the next iteration and, with warm_start, in the next decision."""
-
-    def new_samples(self, samples: int, iteration: int) -> int:
-        """Return how many are drawn in an iteration (from 0), of so many in the first one."""
-        return max(int(samples * self.shrink**-iteration), 2 * self.elites)
-
-
-class MppiConfig(Section):
-    """Model predictive path integral control."""
-
-    temperature: Positive = 0.1
-    """Of the weights exp(-energy / temperature), in standard deviations of the samples' energies."""
-    std_decay: Annotated[float, Field(gt=0.0, le=1.0)] = 0.8
-    """Factor of the standard deviation after each iteration; 1: constant."""
-
-
-class GradientConfig(Section):
-    """Gradient descent through the model."""
-
-    starts: PositiveInt = 8
-    """Sequences that are optimised at once: the first from the previous plan (or none), the others from random ones."""
-    learning_rate: Positive = 0.1
-    """Of Adam at the first iteration, as a share of the limits; it decays linearly to zero."""
-
-
 class PlanningConfig(Section):
     """One decision: from the current frame to an action."""
 
-    planner: Annotated[str, AfterValidator(PLANNERS.known), PLANNERS.name_in_schema] = "cem"
+    planner: Annotated[Component, ComponentOf(PLANNERS, "cem")] = Component("cem")
     """How actions are searched: cem, icem, mppi, gradient, or a planner of your own (docs/extending.md). prior: not at
     all, the mean of `prior` is taken."""
-    planner_options: Annotated[dict[str, Any], PLANNERS.options_of("planner"), PLANNERS.options_in_schema] = {}
-    """Options of a planner of your own, where its class has some."""
     horizon: PositiveInt = 1
     """Model steps that a plan spans."""
     action_repeat: PositiveInt = 1
     """Model steps for which a plan repeats an action; the horizon is a multiple of it. Each step is decided anew."""
     samples: Annotated[int, Field(ge=2)] = 800
-    """Action sequences an iteration; gradient has `gradient.starts`."""
+    """Action sequences an iteration; the planner gradient has its option `starts` instead."""
     iterations: PositiveInt = 10
     """Iterations of sampling and fitting."""
     start_std: Positive = 1.0
     """Standard deviation of the first samples, as a share of the limits of position and rotation."""
-    gripper_start_std: Positive = 1.0
-    """The same of the gripper, in closedness: beyond its limit as upstream, where samples then gather."""
     budget_s: Positive | None = None
     """Seconds of search after which the best plan so far is taken: no iteration begins that would not end by then. The
     first always runs. Encoding the frame is not counted. null: all iterations run."""
     prior: Local | None = None
     """Folder of an action prior (`vjepa2-ac prior`), of which every search starts: from its mean, as wide as it is
     unsure."""
-    prior_steps: PositiveInt = 3
-    """Model steps in which the prior is to reach a goal that says no bound of its own: fewer are bolder."""
     monitor: Local | None = None
     """A monitor.json (`vjepa2-ac monitor`): each frame is compared with what the last decision predicted."""
-    replan: Literal["always", "on_surprise"] = "always"
-    """on_surprise: a plan of several steps is carried on, without a search, until it ends, another goal follows, or
-    `monitor` is surprised."""
     warm_start: bool = False
     """Whether a decision starts from the last one's plan, shifted by the steps executed. Not at horizon 1, where the
     plan is the last action only: the arm overshoots (docs/decisions.md)."""
@@ -193,8 +124,6 @@ class PlanningConfig(Section):
     """Cameras whose pictures stand side by side in every image, all of one width: the model sees each by itself, and
     the energy is the mean over them. One view leaves a direction in which near and far look alike. The model has to
     know all of them: `data.camera` of several."""
-    context: PositiveInt = 1
-    """Frames that the model sees, the current one included (upstream: 1); fewer at the start."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks; needs a C compiler, and a minute within the first decision. The
     same energies to rounding. Not of `evaluate --planning`, which computes plainly."""
@@ -207,32 +136,14 @@ class PlanningConfig(Section):
     """Distance of a prediction from the goal."""
     goals: GoalsConfig = GoalsConfig()
     """Several goals one after another, and the end of the last one."""
-    cem: CemConfig = CemConfig()
-    """Of planner cem only."""
-    icem: IcemConfig = IcemConfig()
-    """Of planner icem only."""
-    mppi: MppiConfig = MppiConfig()
-    """Of planner mppi only."""
-    gradient: GradientConfig = GradientConfig()
-    """Of planner gradient only."""
-
-    @property
-    def sequences(self) -> tuple[int, ...]:
-        """The action sequences that each iteration evaluates; without those that icem reuses."""
-        if self.planner == "icem":
-            return tuple(self.icem.new_samples(self.samples, number) for number in range(self.iterations))
-        if self.planner == "prior":
-            return (1,)
-        return (self.gradient.starts if self.planner == "gradient" else self.samples,) * self.iterations
 
     @model_validator(mode="after")
     def _numbers_fit(self) -> PlanningConfig:
-        elites = {"cem": self.cem.elites, "icem": self.icem.elites}.get(self.planner, 0)
-        repeat, first = self.action_repeat, self.limits.gripper_from
+        repeat, elites = self.action_repeat, self.planner.options.get("elites", ELITES)
+        few_samples = self.planner.name in {"cem", "icem"} and elites > self.samples
         return self.refused(
             (self.horizon % repeat, f"horizon {self.horizon} is not a multiple of action_repeat {repeat}"),
-            (first % repeat, f"limits.gripper_from {first} is not a multiple of action_repeat {repeat}"),
-            (elites > self.samples, f"{self.planner}.elites {elites} are more than {self.samples} samples"),
+            (few_samples, f"planner {self.planner.name}: {elites} elites are more than {self.samples} samples"),
             *(rule.on(self) for rule in RULES),
         )
 
@@ -258,15 +169,15 @@ class Rule(NamedTuple):
 def _is_set(config: PlanningConfig, option: str) -> bool:
     name, _, chosen = option.partition("=")
     value = getattr(config, name)
+    if isinstance(value, Component):
+        return value.name == chosen
     return bool(value == chosen if chosen else value != PlanningConfig.model_fields[name].default)
 
 
 RULES = (
-    Rule("views", "excludes", "context", "earlier frames are kept for one camera only", "Set context: 1"),
     Rule("views", "excludes", "axes", "axes are calibrated with one camera", "Leave axes out, or set views: 1"),
     Rule("views", "excludes", "prior", "a prior is trained with one camera", "Leave prior out, or set views: 1"),
     Rule("views", "excludes", "monitor", "a monitor is made with one camera", "Leave monitor out, or set views: 1"),
     Rule("prior", "excludes", "warm_start", "each says where a search starts", "Leave one of them out"),
-    Rule("replan", "needs", "monitor", "only a monitor notices a surprise", "`vjepa2-ac monitor RUN` makes one"),
     Rule("planner=prior", "needs", "prior", "it takes all actions from there", "`vjepa2-ac prior RUN` trains one"),
 )

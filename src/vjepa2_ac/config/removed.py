@@ -18,13 +18,34 @@ class RemovedKey(NamedTuple):
 
 
 REMOVED: dict[str, RemovedKey] = {
-    # "training.betas": RemovedKey("(0.9, 0.999)", ([0.9, 0.999],)),
+    "planning.cem.answer": RemovedKey("mean", ("mean",)),
+    "planning.context": RemovedKey("1", (1,)),
+    "planning.gripper_start_std": RemovedKey("1", (1.0,)),
+    "planning.limits.gripper_from": RemovedKey("0", (0,)),
+    "planning.limits.gripper_rounding": RemovedKey("0.25", (0.25,)),
+    "planning.prior_steps": RemovedKey("3", (3,)),
+    "planning.replan": RemovedKey("always", ("always",)),
 }
 """RemovedKey keys and sections, by their dotted key. A row for a key of `data` also holds below `replay`."""
 
 
+MOVED = {
+    **{
+        f"planning.{name}": f"planning.planner: {{name: {name}, options: {{...}}}}"
+        for name in ("cem", "icem", "mppi", "gradient")
+    },
+    "planning.planner_options": "planning.planner: {name: NAME, options: {...}}",
+    "planning.energy.options": "planning.energy.distance: {name: NAME, options: {...}}",
+    "training.loss_options": "training.loss: {name: NAME, options: {...}}",
+    "training.smooth_l1_beta": "training.loss: {name: smooth_l1, options: {beta: 1.0}}",
+}
+"""Keys and sections whose values are options of a component today."""
+
+
 def why_removed(key: str) -> str | None:
     """Return the explanation for a removed key; None if the key was never removed."""
+    if key in MOVED:
+        return f"moved in 0.2, to {MOVED[key]}"
     removed = REMOVED.get(key.removeprefix("replay."))
     return removed and f"removed in 0.2; it is always {removed.always} now. Delete the key"
 
@@ -48,3 +69,34 @@ def drop_removed_keys(values: dict[str, Any], where: str) -> None:
                 continue
             if (value := section.pop(name)) not in removed.values:
                 logger.warning("%s: %s was %s; this version always uses %s", where, path, value, removed.always)
+
+
+def move_component_options(values: dict[str, Any]) -> None:
+    """Move the options of planner, energy and loss in the config of an older run to their component, in place."""
+    places = (
+        (("planning",), "planner", "cem"),
+        (("planning", "energy"), "distance", "l1"),
+        (("training",), "loss", "l1"),
+    )
+    for sections, key, usual in places:
+        section: Any = values
+        for part in sections:
+            section = section.get(part) if isinstance(section, dict) else None
+        component = section.get(key, usual) if isinstance(section, dict) else None
+        component = {"name": component} if isinstance(component, str) else component
+        if not isinstance(component, dict):
+            continue  # an error, which the check of the config names
+        name = component.get("name", usual)
+        older = {one: section.pop(one, None) for one in _OLDER_OPTIONS[key]}
+        if name == "smooth_l1" and "smooth_l1_beta" in older:
+            older[name] = {"beta": older["smooth_l1_beta"]}
+        given = (older.get(name), older.get(f"{key}_options"), older.get("options"), component.get("options"))
+        options = {option: one[option] for one in given if isinstance(one, dict) for option in one}
+        section[key] = {**component, "options": options} if options else component
+
+
+_OLDER_OPTIONS = {
+    "planner": ("planner_options", "cem", "icem", "mppi", "gradient"),
+    "distance": ("options",),
+    "loss": ("loss_options", "smooth_l1_beta"),
+}

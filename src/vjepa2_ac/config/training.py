@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
+from vjepa2_ac.config.component import Component, ComponentOf
 from vjepa2_ac.config.section import (
     OFF,
     Affects,
@@ -41,13 +42,9 @@ class TrainingConfig(Section):
     clips of a step: accumulation then follows from that."""
     rollout_steps: Annotated[int, Field(ge=1, le=64)] = 2
     """Predictions of the rollout loss; the first is teacher-forced, each further one uses the previous prediction."""
-    loss: Annotated[str, AfterValidator(LOSSES.known), LOSSES.name_in_schema] = "l1"
-    """Distance of predicted and true latents. l1: absolute (released). l2: squared. smooth_l1: squared only below
-    smooth_l1_beta. Or a loss of your own (docs/extending.md)."""
-    loss_options: Annotated[dict[str, Any], LOSSES.options_of("loss"), LOSSES.options_in_schema] = {}
-    """Options of a loss of your own, where its class has some."""
-    smooth_l1_beta: Positive = 1.0
-    """Below this difference smooth_l1 is squared, above it is absolute; smooth_l1 only."""
+    loss: Annotated[Component, ComponentOf(LOSSES, "l1")] = Component("l1")
+    """Distance of predicted and true latents. l1: absolute (released). l2: squared. smooth_l1: squared only below its
+    option beta. Or a loss of your own (docs/extending.md)."""
     teacher_forcing_weight: NonNegative = 1.0
     """Factor of the teacher-forced loss, in the sum and in metrics.jsonl."""
     rollout_weight: NonNegative = 1.0
@@ -98,13 +95,12 @@ class TrainingConfig(Section):
     def _parts_fit(self) -> TrainingConfig:
         warmup, decay, schedule = self.warmup_steps, self.decay_steps, self.schedule
         decays, constant = schedule == "warmup_stable_decay", schedule == "constant"
-        weights, has_beta = self.teacher_forcing_weight + self.rollout_weight, self.smooth_l1_beta != 1.0
+        weights = self.teacher_forcing_weight + self.rollout_weight
         return self.refused(
             (warmup + decay > self.steps, f"warmup_steps {warmup} and decay_steps {decay} exceed steps {self.steps}"),
             (decay and not decays, f"decay_steps belongs to schedule warmup_stable_decay, not {schedule}"),
             (constant and self.final_learning_rate, "schedule constant has no final_learning_rate: leave it out"),
             (not weights, "teacher_forcing_weight and rollout_weight are both 0: nothing would be learned"),
-            (has_beta and self.loss != "smooth_l1", f"smooth_l1_beta belongs to loss smooth_l1, not {self.loss}"),
         )
 
 

@@ -184,7 +184,7 @@ class ClipChanges:
     @classmethod
     def of(cls, data: DataConfig, seed: int) -> ClipChanges:
         """Return the changes that a config describes; transforms are made once, in the process that starts workers."""
-        made = ((config.name, TRANSFORMS.function(config.name, config.options)) for config in data.transforms)
+        made = ((config.name, TRANSFORMS.make(config.name, config.options)) for config in data.transforms)
         return cls(tuple(made), data.augment, seed)
 
     def apply(self, clip: Clip, position: int) -> Clip:

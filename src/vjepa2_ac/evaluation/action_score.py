@@ -94,9 +94,16 @@ def planning_start(batch: LatentBatch, row: int, seed: int) -> PlanningStart:
     )
 
 
+def scored_space() -> SearchSpace:
+    """Return the search space of the Action Score, whose first samples of the gripper are narrow."""
+    space = pose_space(SCORED)
+    space.std[:, 6] = 0.1
+    return space
+
+
 def one_step_settings(config: PlanningConfig) -> PlanningConfig:
     """Return a config's settings for one step from one frame, without a time budget: no metric depends on a clock."""
-    fixed = {"horizon": 1, "action_repeat": 1, "context": 1, "warm_start": False, "budget_s": None}
+    fixed = {"horizon": 1, "action_repeat": 1, "warm_start": False, "budget_s": None}
     return config.model_copy(update=fixed)
 
 
@@ -118,7 +125,10 @@ def measure_plans(
         prior: Network of `planning.prior`, on the device of the starts: one-step plans start from it.
     """
     fixed = SCORED.energy.model_copy(update={"samples_at_once": config.energy.samples_at_once})
-    planner, scored = Planner(one_step_settings(config)), Planner(SCORED.model_copy(update={"energy": fixed}))
+    planner, scored = (
+        Planner(one_step_settings(config)),
+        Planner(SCORED.model_copy(update={"energy": fixed}), scored_space()),
+    )
     near, far = EnergyFunction.of(config.energy), EnergyFunction.of(fixed)
 
     def planned(start: PlanningStart) -> list[Plan]:
@@ -142,7 +152,7 @@ def measure_plans(
 
 def study_of(starts: Sequence[PlanningStart], config: PlanningConfig) -> PlanningStudy:
     """Return the references for plans: the demonstrated actions, and model-free plans."""
-    one, scored = pose_space(one_step_settings(config)), pose_space(SCORED)
+    one, scored = pose_space(one_step_settings(config)), scored_space()
     demonstrated = np.stack([start.demonstrated for start in starts])
     within = Plans(_allowed(one, demonstrated[:, :1])[None, :, 0], _allowed(scored, demonstrated)[None])
     return PlanningStudy(

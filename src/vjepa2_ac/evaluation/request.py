@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, parse_config
-from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.settings import require_limits, with_taught_limits
@@ -33,22 +34,17 @@ STEPS = 3  # of a scored plan
 FRAMES = STEPS + 1  # required of a clip
 FRAMES_SEEN = 2  # by the model at most, predicted ones included
 BEST_SCORE = 80.0
+_SCORED_CEM = {
+    **dict.fromkeys(("momentum_mean", "momentum_std", "momentum_mean_gripper", "momentum_std_gripper"), 0.0),
+    "try_mean": True,
+}
 SCORED = PlanningConfig(
-    planner="cem",
+    planner=Component("cem", _SCORED_CEM),
     horizon=STEPS,
     samples=300,
     iterations=15,
-    gripper_start_std=0.1,
     limits=LimitsConfig(xyz=(0.1, 0.1, 0.1), rotation=0.1, gripper=0.75, gripper_mode="free"),
-    energy=EnergyConfig(distance="l2", steps="last"),
-    cem=CemConfig(
-        elites=10,
-        momentum_mean=0.0,
-        momentum_std=0.0,
-        momentum_mean_gripper=0.0,
-        momentum_std_gripper=0.0,
-        try_mean=True,
-    ),
+    energy=EnergyConfig(distance=Component("l2"), steps="last"),
 )
 
 

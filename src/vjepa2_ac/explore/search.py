@@ -98,10 +98,8 @@ class Search:
     def _cost(self, teller: int, place: Place, goal: Tensor) -> Iterator[WorldModelCost]:
         """Yield the energy from a place; what is imagined there counts as seen."""
         explorer = self._explorer
-        state = torch.from_numpy(np.array(explorer.states(place)[-1:], dtype=np.float32))
-        latents = explorer.imagined(teller, place)[None]
-        no_actions = torch.zeros(0, len(explorer.spaces.action))
-        scene = Scene(latents, state, no_actions, explorer.camera(place))
+        state = torch.from_numpy(np.array(explorer.states(place)[-1], dtype=np.float32))
+        scene = Scene(explorer.imagined(teller, place), state, explorer.camera(place))
         with explorer.autocast(), explorer.contenders[teller].switched():
             goals, config = Goal(goal[None]), self.config.energy
             yield WorldModelCost(explorer.model(teller), scene, goals, config, spaces=explorer.spaces)

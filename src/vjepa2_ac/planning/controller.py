@@ -34,9 +34,9 @@ from vjepa2_ac.planning.surprise import Monitor, Surprise
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
-Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
+_PRIOR_STEPS = 3  # model steps in which the prior is to reach a goal that has no bound: fewer are bolder
 Fault = Literal["uniform frame", "frozen frame"]
-Why = Literal["planned", "as planned", "out of time", "at the goal", "no finite energy", "outside the workspace", Fault]
+Why = Literal["planned", "out of time", "at the goal", "no finite energy", "outside the workspace", Fault]
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Decision:
     """The decision, and its reason."""
 
     action: Float[np.ndarray, " dim"]  # for the next model step; nothing changes for some values of `why`
-    # as planned: the last plan is carried on. out of time: the best plan so far. at the goal, no finite energy, outside
+    # out of time: the best plan so far. at the goal, no finite energy, outside
     # the workspace, uniform frame (a camera's image has no contrast), frozen frame (it is the last one, although the
     # robot has moved): do nothing
     why: Why
@@ -117,7 +117,6 @@ class Controller:
         self._workspace = Workspace.of(self.config.limits, spaces.state)
         self._searched: dict[GripperMode | None, SearchSpace] = {None: self.space}
         self._goals: tuple[SubGoal, ...] = ()
-        self._seen: list[Seen] = []  # the newest `planning.context`
         self._cameras: tuple[CameraFrame, ...] = ()
         self._progress: GoalProgress | None = None  # at the last usable frame
         self._done = 0
@@ -245,7 +244,7 @@ class Controller:
         weights = self._weights(mask, goals[0].image)
         self._goals, self._goal_latents, self._patch_weights = ruled, torch.stack(latents), weights
         self._searched, self.space = searched, searched[None]
-        self._seen, self._cameras, self._progress, self._done, self.decision = [], (), None, 0, None
+        self._cameras, self._progress, self._done, self.decision = (), None, 0, None
 
     def act(
         self,
@@ -279,13 +278,12 @@ class Controller:
         cameras = newest_frames(split_views(frame[None], self.config.views), state, self._cameras)
         why = self._why_faulty(frame, cameras, state)
         if why is None:
-            seen = self._with(frame, state)
-            decision = self._decided(seen, samples, cancelled)
+            decision = self._decided(self.encoded(frame), state, samples, cancelled)
             self._progress = decision.progress
-        else:  # the context begins again: it would not be frames that are a model step apart
-            seen, decision = [], self._faulty(state, why)
+        else:
+            decision = self._faulty(state, why)
         # after an error nothing has changed
-        self._seen, self._cameras, self._done, self.decision = seen, cameras, self._done + 1, decision
+        self._cameras, self._done, self.decision = cameras, self._done + 1, decision
         return decision.action
 
     @torch.no_grad()
@@ -315,13 +313,13 @@ class Controller:
         """
         state = self._checked(frame, state)
         self.require_contrast(frame, where="frame")
-        seen = self._with(frame, state)
+        latents = self.encoded(frame)
         if chunks.ndim != 3 or 0 in chunks.shape or chunks.shape[2] != self.space.dim:
             needed = f"chunks x model steps x {self.space.dim}"
             raise InputError(where="chunks", found=f"an array of the shape {chunks.shape}", needed=needed)
-        progress = self._progressed(seen[-1][0])
-        still, _ = self._still(seen[-1][0], progress, chunks.shape[1])
-        cost = self._cost(seen, progress)
+        progress = self._progressed(latents)
+        still, _ = self._still(latents, progress, chunks.shape[1])
+        cost = self._cost(latents, state, progress)
         cost.progress = until_cancelled(cancelled)
         energies = cost(torch.from_numpy(np.concatenate([np.zeros_like(chunks[:1]), chunks])).float()).double()
         return ChunkScores(energies[1:].numpy(), float(energies[0]), self._over_steps(still), progress.place)
@@ -342,10 +340,6 @@ class Controller:
         state = self._known(np.asarray(state, dtype=np.float64))
         self.spaces.state.require_state(state, "state")
         return state
-
-    def _with(self, frame: np.ndarray, state: np.ndarray) -> list[Seen]:
-        """Return what the model sees at a decision: the present, and what is remembered."""
-        return [*self._seen, (self.encoded(frame), state)][-self.config.context :]
 
     def _shown(self, image: np.ndarray) -> UInt8[np.ndarray, "views height width 3"]:
         """Return the part of each camera's image that the model receives, without the bars of a letterbox."""
@@ -408,15 +402,23 @@ class Controller:
         still = distance(latents.expand_as(wanted), wanted, self._energy, goal.weights)
         return still, tuple(progress.place + goal.place(done + step) for step in range(steps))
 
-    def _cost(self, seen: Sequence[Seen], progress: GoalProgress) -> WorldModelCost:
+    def _cost(
+        self, latents: Float[Tensor, "tokens dim"], state: Float[np.ndarray, " numbers"], progress: GoalProgress
+    ) -> WorldModelCost:
         goal, done = self._goal_from(progress.place), self._done - progress.since
-        return WorldModelCost(self._model, self._scene(seen), goal, self._energy, done=done, spaces=self.spaces)
+        scene = Scene(latents, torch.from_numpy(state).float(), self._camera, self._axes, self.config.views)
+        return WorldModelCost(self._model, scene, goal, self._energy, done=done, spaces=self.spaces)
 
     def _over_steps(self, distances: Float[Tensor, " steps"]) -> float:
         return float(distances[-1] if self.config.energy.steps == "last" else distances.sum())
 
-    def _decided(self, seen: Sequence[Seen], samples: np.ndarray | None, cancelled: Cancelled) -> Decision:
-        latents, state = seen[-1]
+    def _decided(
+        self,
+        latents: Float[Tensor, "tokens dim"],
+        state: Float[np.ndarray, " numbers"],
+        samples: np.ndarray | None,
+        cancelled: Cancelled,
+    ) -> Decision:
         progress = self._progressed(latents)
         still, places = self._still(latents, progress, self.config.horizon)
         energy = self._over_steps(still)
@@ -427,16 +429,13 @@ class Controller:
         if self._workspace is not None and not is_allowed(self._workspace.way_back(state[:3]), self.config.limits):
             return replace(nothing, why="outside the workspace")
         self.space = self._searched[self._goals[progress.place].gripper]
-        cost, carried_on = self._cost(seen, progress), self._carried_on(nothing)
-        if carried_on is None:
-            plan = self._planned(state, cost, self._start(cost, progress, samples), cancelled)
-        else:
-            plan = self._inside(state, carried_on, cost)
+        cost = self._cost(latents, state, progress)
+        plan = self._planned(state, cost, self._start(cost, progress, samples), cancelled)
         why: Why = "planned" if plan.stopped == "finished" else plan.stopped
         return replace(
             nothing,
             action=self._command(state, plan.actions[0].double().numpy()),
-            why=why if carried_on is None else "as planned",
+            why=why,
             plan=plan,
             states=states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0].numpy(),
             cost=cost,
@@ -452,26 +451,16 @@ class Controller:
             predicted, _ = before.cost.imagine(before.plan.actions[None, :1])
         return Surprise.of(predicted[0, 0], latents, self._monitor)
 
-    def _carried_on(self, now: Decision) -> Plan | None:
-        """Return what is left of the last plan, where it is to be carried on and nothing departs from it."""
-        before = self.decision
-        if self.config.replan == "always" or before is None or before.plan is None or now.surprise is None:
-            return None
-        is_other = now.surprise.is_alarm or now.progress.place != before.progress.place
-        if is_other or len(before.plan.actions) < 2 or before.plan.stopped == "no finite energy":
-            return None
-        return replace(before.plan, actions=before.plan.actions[1:], evaluations=0, seconds=0.0)
-
     def _start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
         """Return where a search starts: what a policy or the prior says, or what is left of the last plan."""
         if samples is not None:
             return PlanStart.of_samples(torch.from_numpy(np.array(samples, dtype=np.float64)), self.space)
         if self._prior is not None:
             bound = self._goals[progress.place].at_most
-            left = self.config.prior_steps if bound is None else bound - (self._done - progress.since)
+            left = _PRIOR_STEPS if bound is None else bound - (self._done - progress.since)
             return self._prior.start(cost, self._goal_latents[progress.place], left, self.space)
         before = None if self.decision is None else self.decision.plan
-        return before.start_after(1) if before is not None and self.config.warm_start else None
+        return before.start_after() if before is not None and self.config.warm_start else None
 
     def _planned(self, state: np.ndarray, cost: WorldModelCost, start: PlanStart | None, cancelled: Cancelled) -> Plan:
         """Return what a search finds, inside the workspace if there is one; the energy is of what is sent."""
@@ -513,19 +502,6 @@ class Controller:
     def _command(self, state: np.ndarray, change: np.ndarray) -> Float[np.ndarray, " action_dim"]:
         """Return the action that changes the state so: the change itself, or the state that it leads to."""
         return state + change if self.spaces.action.follows == "target" else change
-
-    def _scene(self, seen: Sequence[Seen]) -> Scene:
-        states = np.stack([state for _, state in seen])
-        changes = self.spaces.state.differences(states) if len(states) > 1 else np.zeros((0, states.shape[1]))
-        actions = states[1:] if self.spaces.action.follows == "target" else changes
-        return Scene(
-            latents=torch.stack([latents for latents, _ in seen]),
-            states=torch.from_numpy(states).float(),
-            actions=torch.from_numpy(actions).float(),
-            extrinsics=self._camera,
-            axes=self._axes,
-            views=self.config.views,
-        )
 
     def _weights(self, mask: np.ndarray | None, like: np.ndarray) -> Float[Tensor, " tokens"] | None:
         if mask is None:

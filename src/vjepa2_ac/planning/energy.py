@@ -17,7 +17,6 @@ from torch.utils.checkpoint import checkpoint
 from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.model.distances import absolute_difference, squared_difference
-from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.planning.model_setup import Axes
@@ -78,11 +77,10 @@ def patch_weights(
 
 @dataclass(frozen=True)
 class Scene:
-    """The input of a decision: the last frames, up to the current one; of several views, one after another."""
+    """The input of a decision: the current frame, of several views one after another, and the state."""
 
-    latents: Float[Tensor, "context tokens dim"]
-    states: Float[Tensor, "context state_dim"]
-    actions: Float[Tensor, "context-1 action_dim"]
+    latents: Float[Tensor, "tokens dim"]
+    state: Float[Tensor, " state_dim"]
     extrinsics: Float[Tensor, " 6"] | None = None  # of the camera, which does not move
     axes: Axes | None = None  # the model's, where they are not the robot's
     views: int = 1
@@ -111,15 +109,11 @@ class EnergyFunction:
         """Return the function of a config; one that is there already is returned unchanged."""
         if isinstance(energy, EnergyFunction):
             return energy
-        return cls(energy, ENERGIES.function(energy.distance, energy.options))
+        return cls(energy, ENERGIES.make(energy.distance.name, energy.distance.options))
 
 
 class WorldModelCost:
-    """The energy of action sequences from a scene towards a goal.
-
-    Keys and values of frames before the current one are computed here, once. Those of the current frame depend on the
-    evaluated action, and are computed for every sample.
-    """
+    """The energy of action sequences from a scene towards a goal."""
 
     def __init__(
         self,
@@ -151,10 +145,9 @@ class WorldModelCost:
         self._model, self._energy, self._spaces, self._done = world_model, EnergyFunction.of(energy), spaces, done
         weights = None if goal.weights is None else goal.weights.to(device)
         self._goal = Goal(goal.latents.to(device), goal.durations, weights)
-        self._frame, self._state = scene.latents[-1].to(device), scene.states[-1].to(device)
+        self._frame, self._state = scene.latents.to(device), scene.state.to(device)
         self._camera = None if scene.camera is None else scene.camera.to(device)
         self._seen, self.views = scene.seen, scene.views
-        self._cache = self._past(scene)
         self.progress: Progress = no_progress  # after each part; it does not wait for the device
 
     def __call__(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
@@ -190,9 +183,8 @@ class WorldModelCost:
         dim = self._frame.shape[-1]
         views = self._frame.reshape(1, self.views, -1, dim)
         frame = views.expand(samples, -1, -1, -1).flatten(0, 1)[:, None]
-        cache = None if self._cache is None else self._cache.expanded(samples)
         given, before = (one.repeat_interleave(self.views, dim=0) for one in self._seen(given, states[:, :-1]))
-        predicted = self._model.rollout(frame, given, before, camera, cache=cache)
+        predicted = self._model.rollout(frame, given, before, camera)
         return predicted.reshape(samples, self.views, steps, -1, dim).transpose(1, 2).flatten(2, 3), states
 
     def _energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
@@ -202,19 +194,6 @@ class WorldModelCost:
             predicted, wanted = predicted[:, -1:], wanted[-1:]
         far = distance(predicted, wanted, self._energy, self._goal.weights)
         return far.sum(dim=1)
-
-    @torch.no_grad()
-    def _past(self, scene: Scene) -> KeyValueCache | None:
-        before = len(scene.latents) - 1
-        if not before:
-            return None
-        cache = KeyValueCache()
-        device = self._model.device
-        given = self._seen(scene.actions, scene.states[:-1])
-        latents, actions, states = (value.to(device)[None] for value in (scene.latents[:-1], *given))
-        camera = None if self._camera is None else self._camera.expand(1, before, -1)
-        self._model.predict(latents, actions, states, camera, cache=cache)
-        return cache
 
 
 def distance(

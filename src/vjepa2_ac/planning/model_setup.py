@@ -67,7 +67,7 @@ def goals_of(folder: GoalFolder, subject: Subject) -> tuple[SubGoal, ...]:
     """
     planning, has_noise = subject.config.planning, folder.noise is not None  # else no weights need to be hashed
     encoder = subject.world_model.fingerprints().encoder if has_noise else ""
-    goals = folder.for_model(encoder, planning.energy.distance) if has_noise else folder.goals
+    goals = folder.for_model(encoder, planning.energy.distance.name) if has_noise else folder.goals
     with_shares(goals, planning.goals, first=1)
     return goals
 

@@ -6,6 +6,7 @@ Axes: samples (action sequences), decisions (chosen actions), steps (of the mode
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -125,23 +126,41 @@ class Plan:
     evaluations: int  # number of evaluated action sequences
     seconds: float
 
-    def start_after(self, done: int) -> PlanStart:
-        """Return the start of the next search after some model steps of this plan were done.
+    def start_after(self) -> PlanStart:
+        """Return the start of the next search, one model step later.
 
         A decision of the next plan begins at the mean of what this plan would have done in its model steps: if an
-        action is repeated, a decision begins between two of this plan's. The last decision is repeated for the steps
-        that this plan did not reach. Steps of a plan that was carried on before, whose actions are gone, count as well.
+        action is repeated, a decision begins between two of this plan's. The last decision is repeated.
         """
-        done += len(self.mean) * self.repeat - len(self.actions)
         elites = self.iterations[-1].elites if self.iterations else self.mean[None][:0]
-        return PlanStart(_later(self.mean[None], done, self.repeat)[0], _later(elites, done, self.repeat))
+        return PlanStart(_one_step_later(self.mean[None], self.repeat)[0], _one_step_later(elites, self.repeat))
 
 
-def _later(decisions: Samples, by: int, repeat: int) -> Samples:
+def _one_step_later(decisions: Samples, repeat: int) -> Samples:
     steps = decisions.shape[1] * repeat
-    places = (torch.arange(steps) + by).clamp(max=steps - 1) // repeat
-    at_steps = decisions[:, places]
-    return reduce(at_steps, "samples (decisions repeat) dim -> samples decisions dim", "mean", repeat=repeat)
+    places = (torch.arange(steps) + 1).clamp(max=steps - 1) // repeat
+    return reduce(
+        decisions[:, places], "samples (decisions repeat) dim -> samples decisions dim", "mean", repeat=repeat
+    )
+
+
+def samples_of_iterations(config: PlanningConfig) -> tuple[int, ...]:
+    """Return the number of action sequences that each iteration evaluates, without those that icem reuses."""
+    one = torch.zeros(1, 1)
+    search = _solver(config, SearchSpace(one, one, one), Generator(), PlanStart(one, one[None]))
+    return _samples_of(search, config)
+
+
+def _solver(config: PlanningConfig, space: SearchSpace, generator: Generator, start: PlanStart | None) -> Solver:
+    name, given = config.planner.name, config.planner.options
+    search: Solver = PLANNERS.find(name)(space, config, generator, start, **PLANNERS.options(name, given))
+    return search
+
+
+def _samples_of(search: Solver, config: PlanningConfig) -> tuple[int, ...]:
+    """Return the samples of each iteration; a solver of a third party need not say how many it draws."""
+    number = getattr(search, "num_samples", lambda _: config.samples)
+    return tuple(itertools.takewhile(bool, map(number, range(config.iterations))))
 
 
 @dataclass
@@ -185,10 +204,10 @@ class Planner:
             ValueError: The cost does not return one number per sample.
         """
         began, config, space = self.clock(), self.config, space or self.space or pose_space(self.config)
-        options = PLANNERS.options(config.planner, config.planner_options)
-        search: Solver = PLANNERS.find(config.planner)(space, config, generator, start, **options)
+        search = _solver(config, space, generator, start)
         record: list[Iteration] = []
-        shares, total = config.sequences, sum(config.sequences)
+        shares = _samples_of(search, config)
+        total = sum(shares)
         self.progress(0, total)
         while len(record) < len(shares) and self._has_time(began, record):
             if cancelled():
@@ -208,7 +227,7 @@ class Planner:
             iterations=tuple(record),
             mean=search.mean,
             repeat=space.repeat,
-            planner=config.planner,
+            planner=config.planner.name,
             seed=generator.initial_seed(),
             evaluations=sum(one.samples for one in record) + evaluated,
             seconds=self.clock() - began,

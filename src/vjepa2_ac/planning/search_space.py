@@ -17,6 +17,7 @@ from vjepa2_ac.spaces import StateSpace
 Way = Float[np.ndarray, " 3"]  # of the flange
 
 GRIPPER = 6  # of a pose
+GRIPPER_ROUNDING = 0.25  # smaller changes of closedness become zero
 _ROUNDING = 4 * torch.finfo(torch.float32).eps  # a norm is rounded more than once
 
 
@@ -123,10 +124,9 @@ def pose_space(config: PlanningConfig) -> SearchSpace:
     upper = reach.repeat(decisions, 1)
     lower = -upper
     if limits.gripper_mode in {"open", "close"}:
-        first = limits.gripper_from // config.action_repeat
-        lower[first:, GRIPPER] = upper[first:, GRIPPER] = 1.0 if limits.gripper_mode == "close" else -1.0
+        lower[:, GRIPPER] = upper[:, GRIPPER] = 1.0 if limits.gripper_mode == "close" else -1.0
     std = config.start_std * reach
-    std[GRIPPER] = config.gripper_start_std
+    std[GRIPPER] = 1.0  # beyond the limit of the gripper, as upstream: samples then gather there
     return SearchSpace(
         lower=lower,
         upper=upper,
@@ -134,7 +134,7 @@ def pose_space(config: PlanningConfig) -> SearchSpace:
         repeat=config.action_repeat,
         ball=None if limits.ball == "none" else Ball(limits.ball, limits.radius),
         gripper=GRIPPER,
-        gripper_rounding=0.0 if limits.gripper_mode == "free" else limits.gripper_rounding,
+        gripper_rounding=0.0 if limits.gripper_mode == "free" else GRIPPER_ROUNDING,
     )
 
 

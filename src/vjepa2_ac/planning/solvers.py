@@ -1,24 +1,29 @@
 """Solvers: how the action sequence of lowest cost is searched. CEM, iCEM, MPPI, gradient descent.
 
-A solver samples decisions, is told their energies, and has a result; `planning.planner` has the loop around it. One of
-your own has the constructor, the attributes and the methods of `Solver`, which it need not inherit (docs/extending.md).
+A solver samples decisions, receives their energies, and has a result; `planning.planner` has the loop around it. A
+solver of your own has the constructor, the attributes and the methods of `Solver`, which it need not inherit
+(docs/extending.md). Its options are the fields of its class `Config`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import torch
 from einops import reduce
 from jaxtyping import Float
+from pydantic import BaseModel, Field
 from torch import Generator, Tensor
 
-from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.config.planning import ELITES, PlanningConfig
+from vjepa2_ac.config.section import Positive, PositiveInt, Section, Share, ZeroToOne
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.search_space import SearchSpace
 
 _NARROWEST = 0.1  # of the usual standard deviation: a prior is not as sure as it says
-Momentum = float | Float[Tensor, " dim"]  # share of the old mean or standard deviation in the new one
+Momentum = float | Tensor  # share of the old mean or standard deviation in the new one
+Elites = Annotated[int, Field(ge=2)]
 
 
 @dataclass(frozen=True)
@@ -72,19 +77,40 @@ class Solver:
         config: Its settings.
         generator: Of its samples.
         start: What the last decision left.
+        options: The options of a planner that has some.
     """
 
     uses_gradients = False
-    elites: int  # how many of the best are recorded
+    Config: type[BaseModel] | None = None  # the class of the options, if there are any
     mean: Float[Tensor, "decisions dim"]  # of the distribution
     std: Float[Tensor, "decisions dim"]
 
-    def __init__(self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: Before = None) -> None:
-        self._space, self._config, self._generator = space, config, generator
+    def __init__(
+        self,
+        space: SearchSpace,
+        config: PlanningConfig,
+        generator: Generator,
+        start: Before = None,
+        options: Any = None,
+    ) -> None:
+        self._space, self._config, self._generator, self._options = space, config, generator, options
         self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
         self.std = space.first_std
         if start is not None and start.std is not None:
             self.std = torch.minimum(torch.maximum(start.std, _NARROWEST * self.std), self.std)
+        self.begin(start)
+
+    @property
+    def elites(self) -> int:
+        """How many of the best are recorded."""
+        return int(getattr(self._options, "elites", ELITES))
+
+    def begin(self, start: Before) -> None:
+        """Prepare the search; `start` is what the last decision left."""
+
+    def num_samples(self, iteration: int) -> int:  # noqa: ARG002 - the same in all iterations
+        """Return how many decisions an iteration (from 0) evaluates, without reused ones; 0 ends the search."""
+        return self._config.samples
 
     def sample(self) -> Samples:
         """Return the next decisions to evaluate, all allowed."""
@@ -131,31 +157,42 @@ class CemSolver(Solver):
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, cem.
     """
 
-    def __init__(self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: Before = None) -> None:
-        super().__init__(space, config, generator, start)
-        cem = config.cem
-        self.elites = cem.elites
-        self._keep_mean = _momentum(space, cem.momentum_mean, cem.momentum_mean_gripper)
-        self._keep_std = _momentum(space, cem.momentum_std, cem.momentum_std_gripper)
+    class Config(Section):
+        """Options of cem: the cross-entropy method; the defaults are upstream's."""
+
+        elites: Elites = ELITES
+        """Best samples, which decide the next mean and standard deviation."""
+        momentum_mean: Share = 0.15
+        """Share of the old mean in the new one."""
+        momentum_std: Share = 0.15
+        """Share of the old standard deviation in the new one."""
+        momentum_mean_gripper: Share = 0.15
+        """The same share for the gripper."""
+        momentum_std_gripper: Share = 0.15
+        """The same share for the gripper."""
+        try_mean: bool = False
+        """Whether the mean itself replaces an iteration's first sample (facebookresearch/jepa-wms)."""
 
     def sample(self) -> Samples:
         """Return samples of the distribution, clipped to the allowed set."""
-        return self._around_mean(try_mean=self._config.cem.try_mean)
+        return self._around_mean(try_mean=self._options.try_mean)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Fit the distribution to the elites."""
-        self._fit(evaluated.best(self.elites).decisions, self._keep_mean, self._keep_std)
+        options = self._options
+        keep_mean = self._momentum(options.momentum_mean, options.momentum_mean_gripper)
+        keep_std = self._momentum(options.momentum_std, options.momentum_std_gripper)
+        self._fit(evaluated.best(self.elites).decisions, keep_mean, keep_std)
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
-        """Return the mean, or None to request the best."""
-        return self.mean if self._config.cem.answer == "mean" else None
+        """Return the mean."""
+        return self.mean
 
-
-def _momentum(space: SearchSpace, others: float, gripper: float) -> Float[Tensor, " dim"]:
-    momentum = torch.full((space.dim,), others)
-    if space.gripper is not None:
-        momentum[space.gripper] = gripper
-    return momentum
+    def _momentum(self, others: float, gripper: float) -> Float[Tensor, " dim"]:
+        momentum = torch.full((self._space.dim,), others)
+        if self._space.gripper is not None:
+            momentum[self._space.gripper] = gripper
+        return momentum
 
 
 class IcemSolver(Solver):
@@ -166,16 +203,35 @@ class IcemSolver(Solver):
     Source: Pinneri et al., Sample-efficient Cross-Entropy Method for Real-time Planning, arXiv 2008.06389, algorithm 1.
     """
 
-    def __init__(self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: Before = None) -> None:
-        super().__init__(space, config, generator, start)
-        self.elites, self._iteration = config.icem.elites, 0
+    class Config(Section):
+        """Options of icem: the improved cross-entropy method (arXiv 2008.06389); the defaults are the paper's."""
+
+        elites: Elites = ELITES
+        """Best samples, which decide the next mean and standard deviation."""
+        momentum: Share = 0.1
+        """Share of the old mean and standard deviation in the new ones."""
+        noise_exponent: Annotated[float, Field(ge=0.0, le=8.0)] = 2.0
+        """Power spectrum 1 / frequency^exponent along the plan: 0 is white, more is smoother."""
+        shrink: Annotated[float, Field(ge=1.0)] = 1.25
+        """Each iteration has as many samples as the last divided by this, and at least twice the elites."""
+        kept: ZeroToOne = 0.3
+        """Share of the elites that are reused, in the next iteration and, with warm_start, in the next decision."""
+
+    def begin(self, start: Before) -> None:
+        """Reuse the elites of the last decision."""
+        self._iteration = 0
         self._kept = self.mean[None][:0] if start is None else self._few(start.elites)
+
+    def num_samples(self, iteration: int) -> int:
+        """Return how many decisions are new: fewer in each iteration."""
+        return max(int(self._config.samples * self._options.shrink**-iteration), 2 * self.elites)
 
     def sample(self) -> Samples:
         """Return new samples, the reused elites, and in the last iteration the mean."""
-        icem, space = self._config.icem, self._space
-        count = icem.new_samples(self._config.samples, self._iteration)
-        noise = coloured_noise(count, space.decisions, space.dim, icem.noise_exponent, self._generator)
+        options, space = self._options, self._space
+        noise = coloured_noise(
+            self.num_samples(self._iteration), space.decisions, space.dim, options.noise_exponent, self._generator
+        )
         evaluated = [self.mean + self.std * noise, self._kept]
         self._iteration += 1
         if self._iteration == self._config.iterations:
@@ -184,13 +240,13 @@ class IcemSolver(Solver):
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Fit the distribution to the elites, and keep some of them."""
-        best, keep = evaluated.best(self.elites).decisions, self._config.icem.momentum
+        best, keep = evaluated.best(self.elites).decisions, self._options.momentum
         self._fit(best, keep, keep)
         if len(best):
             self._kept = self._few(best)
 
     def _few(self, elites: Float[Tensor, "elites decisions dim"]) -> Float[Tensor, "kept decisions dim"]:
-        return elites[: round(self._config.icem.kept * self.elites)]
+        return elites[: round(self._options.kept * self.elites)]
 
 
 def coloured_noise(samples: int, decisions: int, dim: int, exponent: float, generator: Generator) -> Samples:
@@ -221,7 +277,13 @@ class MppiSolver(Solver):
     Source: Williams et al., Information Theoretic MPC for Model-Based Reinforcement Learning, ICRA 2017, algorithm 2.
     """
 
-    elites = 10  # recorded; all samples decide
+    class Config(Section):
+        """Options of mppi: model predictive path integral control."""
+
+        temperature: Positive = 0.1
+        """Of the weights exp(-energy / temperature), in standard deviations of the samples' energies."""
+        std_decay: Annotated[float, Field(gt=0.0, le=1.0)] = 0.8
+        """Factor of the standard deviation after each iteration; 1: constant."""
 
     def sample(self) -> Samples:
         """Return the mean and samples around it."""
@@ -229,7 +291,7 @@ class MppiSolver(Solver):
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Move the mean to the weighted mean of the samples."""
-        energies, mppi = evaluated.energies, self._config.mppi
+        energies, mppi = evaluated.energies, self._options
         if not len(energies):
             return
         spread = energies.std(correction=0).clamp(min=torch.finfo(torch.float32).tiny)
@@ -249,10 +311,12 @@ class PriorSolver(Solver):
         InputError: There is no start: a command that loads no prior has nothing to say.
     """
 
-    elites = 1
+    def num_samples(self, iteration: int) -> int:
+        """Return one for the only iteration."""
+        return int(iteration == 0)
 
-    def __init__(self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: Before = None) -> None:
-        super().__init__(space, config, generator, start)
+    def begin(self, start: Before) -> None:
+        """Refuse a search without a prior."""
         if start is None:
             found, needed = "prior, in a command that loads none", "a planner that searches, such as cem"
             raise InputError(where="planning.planner", found=found, needed=needed)
@@ -274,10 +338,24 @@ class GradientSolver(Solver):
 
     uses_gradients = True
 
-    def __init__(self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: Before = None) -> None:
-        super().__init__(space, config, generator, start)
-        self.elites = config.gradient.starts
-        noise = white_noise(space, self.elites, generator)
+    class Config(Section):
+        """Options of gradient: gradient descent through the model."""
+
+        starts: PositiveInt = 8
+        """Sequences that are optimised at once: the first from the previous plan (or none), the others from random
+        ones."""
+        learning_rate: Positive = 0.1
+        """Of Adam at the first iteration, as a share of the limits; it decays linearly to zero."""
+
+    @property
+    def elites(self) -> int:
+        """All descents are recorded."""
+        return int(self._options.starts)
+
+    def begin(self, start: Before) -> None:
+        """Draw where the descents start."""
+        space, config, options = self._space, self._config, self._options
+        noise = white_noise(space, options.starts, self._generator)
         noise[0] = 0.0
         origin = torch.zeros_like(space.lower)
         if start is not None:
@@ -285,8 +363,12 @@ class GradientSolver(Solver):
         half = (space.upper - space.lower) / 2
         self._unit = torch.where(half > 0, half, 1.0)
         self._place = space.allowed(origin + self.std * noise) / self._unit
-        self._adam = torch.optim.Adam([self._place], lr=config.gradient.learning_rate)
+        self._adam = torch.optim.Adam([self._place], lr=options.learning_rate)
         self._fall = torch.optim.lr_scheduler.LambdaLR(self._adam, lambda step: max(0.0, 1 - step / config.iterations))
+
+    def num_samples(self, iteration: int) -> int:  # noqa: ARG002 - the same in all iterations
+        """Return the number of descents."""
+        return self.elites
 
     def sample(self) -> Samples:
         """Return the current decisions of each descent."""

@@ -162,5 +162,5 @@ def agent_of_server(client: PlanningClient) -> Agent:
         stride=stride,
         warnings=tuple(map(str, told.get("warnings", ()))),
         policy=lambda _, goals_of: ServedPlanner(client, client.url, goals_of),
-        goals_of=lambda folder: folder.for_model(str(told.get("encoder", "")), planning.energy.distance),
+        goals_of=lambda folder: folder.for_model(str(told.get("encoder", "")), planning.energy.distance.name),
     )

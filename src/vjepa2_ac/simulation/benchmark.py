@@ -28,6 +28,7 @@ from vjepa2_ac.planning.demonstrations.key_frames import (
     with_frames_between,
 )
 from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
+from vjepa2_ac.planning.planner import samples_of_iterations
 from vjepa2_ac.reporter import SILENT, Reporter, duration
 from vjepa2_ac.simulation.agent import Agent
 from vjepa2_ac.simulation.arm import SimulatedArm
@@ -221,7 +222,7 @@ def try_policies(
     preparations, so the second one counts, unless the first one is long.
     """
     work = f"{counted(trials.episodes, 'episode')} x {counted(trials.model_steps, 'decision')}"
-    work += f", {counted(sum(agent.planning.sequences), 'action sequence')} each"
+    work += f", {counted(sum(samples_of_iterations(agent.planning)), 'action sequence')} each"
     reporter.note(f"{work}; the first decision shows how long they take")
     results = list[ClosedLoopResult]()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -11,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import smooth_l1_loss
 
 from vjepa2_ac.config import TrainingConfig
+from vjepa2_ac.config.section import Positive, Section
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.network.predictor_network import KeyValueCache, LatentDynamics
@@ -34,9 +34,7 @@ class Objective(nn.Module):
         self.world_model = world_model
         self.weights = (training.teacher_forcing_weight, training.rollout_weight)
         self.rollout_steps = training.rollout_steps if training.rollout_weight else 1  # weight 0: no cost
-        distance: Callable[..., Tensor] = LOSSES.function(training.loss, training.loss_options)
-        is_smooth = training.loss == "smooth_l1"
-        self.distance = partial(distance, beta=training.smooth_l1_beta) if is_smooth else distance
+        self.distance: Distance = LOSSES.make(training.loss.name, training.loss.options)
 
     def forward(self, batch: LatentBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return (teacher forcing, rollout), each times its weight, so that the loss is their sum."""
@@ -73,8 +71,20 @@ def prediction_losses(
     return distance(forced, latents[:, 1:]).mean(), distance(rolled, latents[:, 1 : rollout_steps + 1]).mean()
 
 
-def smooth_difference(
-    predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"], beta: float
-) -> Float[Tensor, "batch time tokens dim"]:
-    """Return d**2 / (2 * beta) where a difference d is below beta, and d - beta / 2 above, computed in float32."""
-    return smooth_l1_loss(predicted.float(), true.float(), reduction="none", beta=beta)
+class SmoothL1:
+    """Half the squared difference d over beta, d**2 / (2 * beta), below beta, and d - beta / 2 above."""
+
+    class Config(Section):
+        """Options of the loss smooth_l1."""
+
+        beta: Positive = 1.0
+        """The difference below which the loss is squared."""
+
+    def __init__(self, options: Config) -> None:
+        self.beta = options.beta
+
+    def __call__(
+        self, predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"]
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return the loss of each number, computed in float32."""
+        return smooth_l1_loss(predicted.float(), true.float(), reduction="none", beta=self.beta)

@@ -20,7 +20,7 @@ from vjepa2_ac.planning.goals import read_goal_folder
 from vjepa2_ac.serving.about import read_kept_goals
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
-QUICK = ["planning.samples=8", "planning.iterations=2", "planning.cem.elites=4"]
+QUICK = ["planning.samples=8", "planning.iterations=2", "planning.planner.options.elites=4"]
 STATE = "0.4,0.0,0.3,3.1,0.0,0.1,0.2"
 
 

@@ -21,8 +21,9 @@ from torch import Tensor
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
+from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.distributed import make_accelerator, shared
@@ -246,7 +247,7 @@ def _turned_errors(
 _ROOM = 1.25  # extent of the search along each axis, relative to the longest executed move
 _LEAST_M = 0.01
 _MOVE = slice(0, 3)
-_SEARCH = PlanningConfig(samples=48, iterations=6, start_std=0.67, cem=CemConfig(elites=6))
+_SEARCH = PlanningConfig(samples=48, iterations=6, start_std=0.67, planner=Component("cem", {"elites": 6}))
 
 
 @torch.no_grad()

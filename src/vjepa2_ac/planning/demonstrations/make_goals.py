@@ -374,6 +374,6 @@ def _noise_floor(
     latents = _latents(session, shown.read, frames.tolist(), reporter.task("encoding frames of a resting arm"))
     one, other = latents[torch.from_numpy(places.reshape(taken.shape).T)]
     energies = energies_of(session, one, other)
-    kind = session.config.planning.energy.distance
+    kind = session.config.planning.energy.distance.name
     encoder = session.world_model.fingerprints().encoder
     return NoiseFloor(float(np.quantile(energies, _UPPER)), len(taken), encoder, kind)

@@ -143,7 +143,7 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
     for name, (level, colour, dashes) in levels.items():
         if np.isfinite(level):
             axes.axhline(level, color=colour, linestyle=dashes, label=f"{name}: {level:.4f}")
-    axes.set(title="Energy", xlabel="iteration", ylabel=f"energy ({answer.controller.config.energy.distance})")
+    axes.set(title="Energy", xlabel="iteration", ylabel=f"energy ({answer.controller.config.energy.distance.name})")
     axes.legend(fontsize=7)
 
 

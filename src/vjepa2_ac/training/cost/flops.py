@@ -56,15 +56,14 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
     return ClipFlops(frames * frame_flops(sizes), total.forward, total.backward)
 
 
-def plan_flops(sizes: ModelSizes, steps: int, before: int = 0) -> int:
+def plan_flops(sizes: ModelSizes, steps: int) -> int:
     """Return the operations of predicting the result of one action sequence, without an adapter beside the weights.
 
     Args:
         sizes: Of the model.
         steps: Actions of the sequence.
-        before: Frames before the current one, whose keys and values are cached.
     """
-    passes, seen = _Passes(sizes), range(before + 1, before + 1 + steps)
+    passes, seen = _Passes(sizes), range(1, 1 + steps)
     return sum(passes.over(1, keys=range(one, one + 1), fed_back=False).forward for one in seen)
 
 

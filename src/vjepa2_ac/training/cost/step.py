@@ -33,7 +33,7 @@ from vjepa2_ac.training.loss import Objective
 Kind = Literal["cpu", "cuda"]
 
 _BLOCKS = (2, 3)  # of the models that are measured
-_OF_LOSS = {"loss", "loss_options", "smooth_l1_beta", "teacher_forcing_weight", "rollout_weight", "rollout_steps"}
+_OF_LOSS = {"loss", "teacher_forcing_weight", "rollout_weight", "rollout_steps"}
 _WITH_EFFECT: Any = {
     "plugins": True, "adapter": True, "model": {"dtype"}, "data": {"frames"}, "validation": {"batch_size"},
     "training": {"attention", "precision", "batch_size", *_OF_LOSS},
