@@ -61,7 +61,7 @@ SHORTER = {  # by the first words of a command
     "train": FEW_STEPS,
     "evaluate runs/lora --planning": f"{FEW_SAMPLES} {FEW_CLIPS} --planning-clips 2",
     "evaluate": FEW_CLIPS,
-    "decoder": "decoder.steps=2 decoder.warmup_steps=0 data.workers=0",
+    "decoder": "decoder.steps=2 data.workers=0",
     "simulate record": "--episodes 10 --steps 33",
     "simulate": f"--episodes 1 --steps 1 {FEW_SAMPLES}",
     "plan": FEW_SAMPLES,

@@ -74,8 +74,7 @@ ORDERS: dict[str, list[str]] = {
     "decoding": [
         "network",
         "decoder_folder frame_pairs",
-        "imagine steps",
-        "training",
+        "imagine training",
     ],
     "evaluation.calibration": ["variants", "data axes"],
     "reports": ["metrics_json", "comparison paper", "figures", "write imagined sheet", "export"],

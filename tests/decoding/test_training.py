@@ -20,13 +20,11 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import DecoderConfig, ModelSizes
 from vjepa2_ac.data.sources.latents.cache_files import LatentFiles
 from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.decoding import steps as optimizer_steps
 from vjepa2_ac.decoding import training
 from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, load_decoder, read_card
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs
 from vjepa2_ac.decoding.network import as_images
-from vjepa2_ac.decoding.steps import DecoderSteps, learning_rate_at
-from vjepa2_ac.decoding.training import train_decoder
+from vjepa2_ac.decoding.training import DecoderSteps, learning_rate_at, train_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import psnr
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -51,8 +49,7 @@ def assert_same_decoder(one: Path, other: Path) -> None:
 
 
 def test_it_memorises_four_frames(make_decoder: MakeConfig, encode_split: EncodeSplit) -> None:
-    knobs = {"frames": 4, "steps": 80, "warmup_steps": 5, "noise": 0.0, "average": 0.9, "checkpoint_every": 1000}
-    config = make_decoder(knobs=knobs, data__cache_dtype="fp32")
+    config = make_decoder(knobs={"frames": 4, "steps": 80}, data__cache_dtype="fp32")
     pairs = encode_split(config, frames=4).read(range(4))
     decoder = load_decoder(train_decoder(config)).decoder
     assert psnr(decoder.decode(pairs.latents), as_images(pairs.images)).min() > 30
@@ -86,7 +83,7 @@ def test_of_shuffled_pairs_it_learns_the_mean_image_at_best(
     make_decoder: MakeConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else held-out figures would come from something that is not in the latents."""
-    knobs = {"frames": 120, "held_out_frames": 40, "steps": 40, "batch_size": 8, "warmup_steps": 5, "noise": 0.0}
+    knobs = {"frames": 120, "steps": 40, "batch_size": 8}
 
     def gains(folder: str) -> dict[str, float]:
         held_out = read_card(train_decoder(make_decoder(folder, knobs, data__validation_share=0.0))).held_out
@@ -108,21 +105,20 @@ def test_of_shuffled_pairs_it_learns_the_mean_image_at_best(
 
 
 @pytest.mark.usefixtures("default_signals")
-@pytest.mark.parametrize("at", [1, 4])
-def test_a_training_that_was_asked_to_stop_goes_on_as_if_it_had_not(
-    make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, at: int
+def test_a_training_that_was_asked_to_stop_resumes_exactly(
+    make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     learn = DecoderSteps.do
 
     def step(self: object, number: int, pairs: Pairs) -> dict:
-        if number == at:
+        if number == 3:
             os.kill(os.getpid(), signal.SIGTERM)
         return learn(self, number, pairs)  # type: ignore[arg-type]
 
     config = make_decoder()
     with monkeypatch.context() as patch:
         patch.setattr(DecoderSteps, "do", step)
-        with pytest.raises(StoppedError, match=f"stopped after step {at}"):
+        with pytest.raises(StoppedError, match="stopped after step 3"):
             train_decoder(config)
     assert not (tmp_path / "decoder" / CARD).exists()
     train_decoder(config)
@@ -149,8 +145,8 @@ def test_a_stop_while_frames_are_encoded_keeps_them_and_has_its_status(
     assert_same_decoder(whole_decoder, tmp_path / "decoder")
 
 
-@pytest.mark.parametrize("died_at", [(5, 12, 17), (25,), (35,), (45,)])
-def test_a_killed_training_goes_on_as_if_it_had_not(
+@pytest.mark.parametrize("died_at", [(5, 12, 17), (35,)])
+def test_a_killed_training_resumes_exactly(
     nursery: Nursery, make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, died_at: tuple[int, ...]
 ) -> None:
     (tmp_path / "config.yaml").write_text(as_yaml(make_decoder()))
@@ -227,47 +223,27 @@ def test_a_learning_rate_that_is_too_high_is_named(make_decoder: MakeConfig, mon
     def exploded(images: torch.Tensor, targets: torch.Tensor) -> tuple[torch.Tensor, dict]:
         return (images - targets).sum() * math.inf, {}
 
-    monkeypatch.setattr(optimizer_steps, "decoder_loss", exploded)
+    monkeypatch.setattr(training, "decoder_loss", exploded)
     with pytest.raises(InputError, match=r"decoder\.learning_rate: .*not finite"):
         train_decoder(make_decoder())
 
 
-# ---- schedule and noise --------------------------------------------------------------------------------------------
+# ---- schedule ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("steps", "warmup"), [(100, 10), (100, 0), (5, 500), (2, 1)])
-def test_the_learning_rate_rises_to_its_peak_and_falls_to_none(steps: int, warmup: int) -> None:
-    knobs = DecoderConfig(steps=steps, warmup_steps=warmup, learning_rate=0.5)
-    rates = [learning_rate_at(step, knobs) for step in range(1, steps + 1)]
-    peak = min(warmup, steps - 1)
-    assert all(0 <= rate <= 0.5 for rate in rates)
+@pytest.mark.parametrize(("steps", "peak"), [(150, 10), (10, 0), (20_000, 500)])
+def test_the_learning_rate_rises_to_its_peak_and_falls_to_none(steps: int, peak: int) -> None:
+    config = DecoderConfig(steps=steps, learning_rate=0.5)
+    rates = [learning_rate_at(step, config) for step in range(1, steps + 1)]
     assert rates[:peak] == pytest.approx([0.5 * (step + 1) / peak for step in range(peak)])
     assert rates[peak:] == sorted(rates[peak:], reverse=True)
     assert rates[-1] == pytest.approx(0.0, abs=1e-12)
-    if peak:
-        assert max(rates) == rates[peak - 1] == 0.5
+    assert max(rates) <= 0.5
 
 
-def test_noise_is_a_function_of_the_step(make_decoder: MakeConfig) -> None:
-    """A step of a resumed training has the noise that it would have had; another step another one."""
-    config = make_decoder()
-    ready = training._setup(config, SilentReporter())
-    one, other = ready.steps_from(None), ready.steps_from(None)
-    latents = torch.zeros(64, 4, 24)
-    one._noise(1, latents)
-    torch.rand(3)
-    assert torch.equal(one._noise(2, latents), other._noise(2, latents))
-    assert not torch.equal(one._noise(2, latents), one._noise(3, latents))
-    strengths = one._noise(5, latents).flatten(1).std(dim=1)
-    assert 0.07 < strengths.max() < 0.14  # up to decoder.noise
-    assert strengths.min() < 0.02
-
-
-def test_knobs_that_change_no_number_are_no_other_decoder(
+def test_settings_that_change_no_number_are_no_other_decoder(
     make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, reporter: SilentReporter
 ) -> None:
-    train_decoder(make_decoder(knobs={"checkpoint_every": 1}))
-    ours, theirs = (load_file(folder / WEIGHTS) for folder in (tmp_path / "decoder", whole_decoder))
-    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
-    train_decoder(make_decoder(knobs={"checkpoint_every": 5}, data__workers=1, training__steps=9), reporter)
+    shutil.copytree(whole_decoder, tmp_path / "decoder")
+    train_decoder(make_decoder(data__workers=1, training__steps=9), reporter)
     assert any("there already" in note for note in reporter.notes)

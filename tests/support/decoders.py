@@ -15,10 +15,7 @@ from vjepa2_ac.decoding.training import train_decoder
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, encode_files
 from vjepa2_ac.model.checkpoints.loading import load_base
 
-KNOBS = {
-    "size": "tiny", "frames": 40, "held_out_frames": 8, "steps": 6, "batch_size": 4, "learning_rate": 2e-3,
-    "warmup_steps": 2, "average": 0.5, "noise": 0.1, "checkpoint_every": 2,
-}  # fmt: skip
+KNOBS = {"size": "tiny", "frames": 40, "steps": 6, "batch_size": 4, "learning_rate": 2e-3}
 EncodeSplit = Callable[..., FramePairs]
 
 

@@ -25,6 +25,14 @@ REMOVED: dict[str, RemovedKey] = {
     "planning.limits.gripper_rounding": RemovedKey("0.25", (0.25,)),
     "planning.prior_steps": RemovedKey("3", (3,)),
     "planning.replan": RemovedKey("always", ("always",)),
+    "decoder.average": RemovedKey("0.999, less in a short training", (0.999, 0.998, 0.99)),
+    "decoder.checkpoint_every": RemovedKey("500, or a third of decoder.steps", (500, 200)),
+    "decoder.held_out_frames": RemovedKey("1,000", (1_000,)),
+    "decoder.max_grad_norm": RemovedKey("1", (1.0,)),
+    "decoder.noise": RemovedKey("0, no noise", (0.0,)),
+    "decoder.warmup_steps": RemovedKey("500, at most a 15th of decoder.steps", (500, 100, 30)),
+    "decoder.weight_decay": RemovedKey("0.05", (0.05,)),
+    # "training.betas": RemovedKey("(0.9, 0.999)", ([0.9, 0.999],)),
 }
 """RemovedKey keys and sections, by their dotted key. A row for a key of `data` also holds below `replay`."""
 

@@ -1,24 +1,26 @@
-"""Training of a decoder: from the first frame encoded to a folder that `--decoder` takes.
+"""Training of a decoder: from the first encoded frame to a folder that `--decoder` takes.
 
-The frames of a step and its noise are functions of (config, step), so what is saved on the way is weights, their
-average, AdamW's moments and the step; a training that was killed goes on as if it had not been.
+The frames of a step are a function of (config, step), so a checkpoint holds weights, their average, AdamW's moments and
+the step. A training that was killed resumes exactly.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import shutil
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, DecoderConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.sources.latents.cache_files import LatentFiles, bytes_per_frame
@@ -27,15 +29,14 @@ from vjepa2_ac.data.splits import SPLIT
 from vjepa2_ac.data.windows import permuted, require_frames, require_stride
 from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, read_card, save_decoder
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
-from vjepa2_ac.decoding.network import UPSAMPLED, Decoder, DecoderShape
-from vjepa2_ac.decoding.steps import SMALLEST, DecoderSteps
+from vjepa2_ac.decoding.network import UPSAMPLED, Decoder, DecoderShape, Images, as_images
 from vjepa2_ac.distributed import autocast, computing_device
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in, require_space
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.image_similarity import ms_ssim
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.pretrained_folder import first_not_finite
 from vjepa2_ac.process import StoppedError, StopRequest, stop_on_signals
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import read_torch, write_torch
@@ -45,11 +46,19 @@ from vjepa2_ac.storage import atomic_writer, try_writing_at, user_can_write, wri
 from vjepa2_ac.storage.structured import utc_now
 
 KEY, PAIRS, STATE = "key.json", "pairs", "training.pt"
-_LOG_EVERY = 50  # steps
+_LOG_EVERY, _CHECKPOINT_EVERY = 50, 500  # steps; in a short training there are three checkpoints
+_HELD_OUT_FRAMES = 1_000
+_STRUCTURE, _EDGES = 0.2, 0.1  # weights of the second and the third part of the loss
+_SMALLEST = 11  # pixels of an image's side: a window of MS-SSIM has to fit
+_SCALES = 3
+_WARMUP, _WARMUP_SHARE = 500, 15  # steps at most; at most one of 15 steps
+_WEIGHT_DECAY, _BETAS, _MAX_GRAD_NORM = 0.05, (0.9, 0.95), 1.0
+_AVERAGE, _AVERAGED_SHARE = 0.999, 4.5  # decay of the average; a short training averages over its last 22 %
+_YOUNG = 9.0  # steps: an average of fewer forgets the first ones faster
 
 
 def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bool = False) -> Path:
-    """Train the decoder of a config's encoder and data; go on where a former start stopped.
+    """Train the decoder of a config's encoder and data; resume what an earlier start has left.
 
     Args:
         config: Data, model and `decoder`.
@@ -61,7 +70,7 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
 
     Raises:
         InputError: An input cannot be used, or the folder holds something else.
-        StoppedError: A signal asked to stop; the same command goes on.
+        StoppedError: A signal asked to stop; the same command resumes.
     """
     ready = _setup(config, reporter)
     folder = ready.folder
@@ -91,10 +100,8 @@ def _make(ready: Setup, reporter: Reporter) -> None:
     with stop_on_signals() as stop:
         pairs, held_out = (_encoded(ready, split, reporter, stop) for split in ("train", "test"))
         linear = fit_linear(pairs, ready.shape, device, reporter.task("fitting the linear decoder"))
-        steps = ready.steps_from(linear)
+        steps = DecoderSteps(ready, linear)
         _train(ready, steps, pairs, reporter, stop)
-    if (name := first_not_finite(steps.average)) is not None:
-        raise InputError(where=str(ready.folder), found=f"{name} holds NaN or infinity", fix="Lower the learning rate")
     decoder = Decoder(ready.shape).to(device).eval()
     decoder.load_state_dict(steps.average)
     found: dict[str, Any] = {}
@@ -136,13 +143,6 @@ class Setup:
         """Frames and latents, while it is trained."""
         return LatentFiles(self.folder / PAIRS, self.key.digest)
 
-    def steps_from(self, linear: Decoder | None) -> DecoderSteps:
-        """Return its first optimizer steps, from the linear decoder or from fresh weights."""
-        config, device = self.config, self.encoder.device
-        needs_loss_scale = config.training.precision == "fp16"  # and there is none here
-        arithmetic = contextlib.nullcontext if needs_loss_scale else partial(autocast, config.training, device)
-        return DecoderSteps(self.shape, config.decoder, config.seed, device, arithmetic, linear)
-
 
 def _setup(config: Config, reporter: Reporter) -> Setup:
     """Check config, folder, data and model.
@@ -160,7 +160,7 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     wanted: dict[Split, list[FramesToEncode]] = {
         "train": wanted_frames(dataset, "train", frames=decoder.frames),
-        "test": wanted_frames(dataset, "test", frames=decoder.held_out_frames),  # may be none
+        "test": wanted_frames(dataset, "test", frames=_HELD_OUT_FRAMES),  # may be none
     }
     if not wanted["train"]:
         found, needed = "no frames of train episodes", "one episode or more that is as long as a clip"
@@ -169,11 +169,11 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
     reporter.task(LOADING)
     model = load_base(config.model, seed=config.seed)
     encoding, size, patch = encoding_of(model, config), model.image_size, model.sizes.patch_size
-    if patch % UPSAMPLED or size < SMALLEST:
-        needed = f"{SMALLEST} px or more, and patches of a multiple of {UPSAMPLED} px"
+    if patch % UPSAMPLED or size < _SMALLEST:
+        needed = f"{_SMALLEST} px or more, and patches of a multiple of {UPSAMPLED} px"
         raise InputError(where="model", found=f"images of {size} px in patches of {patch} px", needed=needed)
     key = CacheKey({
-        "decoder": decoder.model_dump(mode="json", exclude={"folder", "checkpoint_every"}),
+        "decoder": decoder.model_dump(mode="json", exclude={"folder"}),
         "seed": config.seed,
         "latents": dict(LatentCache.of(dataset, encoding).key.parts),
         "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
@@ -201,7 +201,7 @@ def _try_one_step(ready: Setup) -> None:
         shape, count = ready.shape, ready.config.decoder.batch_size
         latents = torch.zeros(count, shape.grid**2, shape.dim)
         images = torch.zeros(count, 3, shape.image_size, shape.image_size).byte()
-        ready.steps_from(None).do(1, Pairs(latents, images, ()))
+        DecoderSteps(ready, None).do(1, Pairs(latents, images, ()))
 
 
 def _encoded(ready: Setup, split: Split, reporter: Reporter, stop: StopRequest) -> FramePairs:
@@ -234,13 +234,14 @@ def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Repor
         MetricsLog(ready.folder, first_step=first) as log,
         contextlib.closing(_batches(pairs, ready.config, first)) as batches,
     ):
+        every = max(1, min(_CHECKPOINT_EVERY, config.steps // 3))
         for step, batch in batches:
             metrics = steps.do(step, batch)
             progress(step, config.steps)
             is_last = step == config.steps
             if step % _LOG_EVERY == 0 or is_last:
                 log.write("train", step, metrics)
-            if step % config.checkpoint_every == 0 or is_last or stop.reason is not None:
+            if step % every == 0 or is_last or stop.reason is not None:
                 with log.before_a_checkpoint(), user_can_write(saved), atomic_writer(saved) as file:
                     write_torch({"step": step, **steps.state()}, file)
             if stop.reason is not None and not is_last:
@@ -261,3 +262,97 @@ def _batches(pairs: FramePairs, config: Config, done: int) -> Generator[tuple[in
             batch = ahead.result()
             ahead = pool.submit(read, step + 1)
             yield step, batch
+
+
+# ---- one optimizer step ----
+
+
+def decoder_loss(images: Images, targets: Images) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+    """Return L1 + 0.2 (1 - MS-SSIM) + 0.1 L1 of the gradients along both axes; and the parts.
+
+    Args:
+        images: From the decoder, not clipped.
+        targets: The encoder's input, between 0 and 1.
+    """
+    scales = sum(images.shape[-1] >= _SMALLEST << scale for scale in range(_SCALES))
+    absolute = (images - targets).abs().mean()
+    structure = 1.0 - ms_ssim(images, targets, scales=scales).mean()
+    rows, columns = ((images.diff(dim=axis) - targets.diff(dim=axis)).abs().mean() for axis in (-2, -1))
+    edges = rows + columns
+    loss = absolute + _STRUCTURE * structure + _EDGES * edges
+    return loss, {"l1": absolute, "structure": structure, "edges": edges}
+
+
+def learning_rate_at(step: int, config: DecoderConfig) -> float:
+    """Return the learning rate of step 1 .. steps: a linear warm-up, then half a cosine down to none."""
+    warmup = min(_WARMUP, config.steps // _WARMUP_SHARE)
+    if step <= warmup:
+        return config.learning_rate * step / warmup
+    done = (step - warmup) / max(1, config.steps - warmup)
+    return config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done))
+
+
+class DecoderSteps:
+    """A decoder in training: its weights, their moving average, and AdamW.
+
+    Args:
+        setup: How it is trained.
+        linear: The decoder from which it starts; None: fresh weights.
+    """
+
+    def __init__(self, setup: Setup, linear: Decoder | None) -> None:
+        self._config, self._device = setup.config, setup.encoder.device
+        self.decoder = Decoder(setup.shape)
+        self.decoder.initialise(torch.Generator().manual_seed(setup.config.seed))
+        if linear is not None:
+            self.decoder.start_from(linear)
+        self.decoder.to(self._device)
+        matrices = [one for one in self.decoder.parameters() if one.ndim > 1]
+        others = [one for one in self.decoder.parameters() if one.ndim <= 1]
+        groups = [{"params": matrices, "weight_decay": _WEIGHT_DECAY}, {"params": others, "weight_decay": 0.0}]
+        self.optimizer = torch.optim.AdamW(groups, lr=setup.config.decoder.learning_rate, betas=_BETAS)
+        self.average = {name: one.detach().clone() for name, one in self.decoder.state_dict().items()}
+
+    def do(self, step: int, pairs: Pairs) -> dict[str, float]:
+        """Do one optimizer step, counted from 1, and return its metrics.
+
+        Raises:
+            InputError: Loss or gradients are not finite; nothing was changed.
+        """
+        latents, images = pairs.latents.to(self._device), as_images(pairs.images.to(self._device))
+        learning_rate = learning_rate_at(step, self._config.decoder)
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate
+        needs_loss_scale = self._config.training.precision == "fp16"  # and there is none here
+        with contextlib.nullcontext() if needs_loss_scale else autocast(self._config.training, self._device):
+            shown = self.decoder(latents)
+        loss, parts = decoder_loss(shown, images)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]  # torch
+        norm = torch.nn.utils.clip_grad_norm_(self.decoder.parameters(), _MAX_GRAD_NORM)
+        numbers = {"loss": loss, **parts, "gradient_norm": norm}
+        read = torch.stack([value.detach().float() for value in numbers.values()]).tolist()  # waits for the device once
+        metrics = dict(zip(numbers, read, strict=True))
+        if not math.isfinite(metrics["gradient_norm"]):
+            found = f"{self._config.decoder.learning_rate:g}: loss or gradients of step {step} are not finite"
+            fix = "Lower it, delete the newest checkpoint if it was written by then, and start again"
+            raise InputError(where="decoder.learning_rate", found=found, fix=fix)
+        self.optimizer.step()
+        self._add_to_average(step)
+        return metrics | {"learning_rate": learning_rate}
+
+    def state(self) -> dict[str, Any]:
+        """Return weights, their average and AdamW's moments, for a checkpoint."""
+        return {"decoder": self.decoder.state_dict(), "average": self.average, "optimizer": self.optimizer.state_dict()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a checkpoint of the same decoder."""
+        self.decoder.load_state_dict(state["decoder"])
+        self.average = {name: state["average"][name].to(self._device) for name in self.average}
+        self.optimizer.load_state_dict(state["optimizer"])
+
+    @torch.no_grad()
+    def _add_to_average(self, step: int) -> None:
+        decay = min(_AVERAGE, 1 - _AVERAGED_SHARE / self._config.decoder.steps, step / (step + _YOUNG))
+        for name, one in self.decoder.state_dict().items():
+            self.average[name].lerp_(one, 1.0 - decay)
