@@ -62,7 +62,7 @@ ORDERS: dict[str, list[str]] = {
         "rows summary evaluate",
         "decoded",
         "evaluate_run",
-        "imagined imagined_plan",
+        "imagined",
     ],
     "explore": [
         "messages",
@@ -77,7 +77,7 @@ ORDERS: dict[str, list[str]] = {
         "imagine training",
     ],
     "evaluation.calibration": ["variants", "data axes"],
-    "reports": ["metrics_json", "comparison paper", "figures", "write imagined sheet", "export"],
+    "reports": ["metrics_json", "comparison paper", "figures", "write sheet", "export"],
     "cli": [
         "console",
         "options next_command",

@@ -11,7 +11,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import Start, rolled_out, shown
-from vjepa2_ac.evaluation.imagined_plan import imagine_plan, imagined_next
+from vjepa2_ac.evaluation.imagined import imagine_plan, imagined_next
 from vjepa2_ac.model.state_integration import counterfactual_states
 from vjepa2_ac.planning.counterfactual import named_actions
 from vjepa2_ac.spaces import POSE

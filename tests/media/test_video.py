@@ -14,10 +14,10 @@ import pytest
 from paths import GOLDEN
 from recordings import write_mp4
 from synthetic import draw_frame, synthetic_states
+from vjepa2_ac.decoding import imagine
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media import video as video_reader
 from vjepa2_ac.media.video import Clock, frame_times, is_same_rate, read_frames, read_header, write_video
-from vjepa2_ac.reports import imagined
 
 STEPS = 40
 FRAMES = [draw_frame(state, size=(36, 64)) for state in synthetic_states(STEPS)]
@@ -399,10 +399,10 @@ def test_a_film_without_pyav_is_a_gif_and_a_note(tmp_path: Path, monkeypatch: py
     noted: list[str] = []
     monkeypatch.setitem(sys.modules, "av", None)
     for name, value in (("draw_strip", FRAMES[0]), ("film_frames", FRAMES[:2]), ("loop_of", [(1, 0.1), (0, 0.1)])):
-        monkeypatch.setattr(imagined, name, lambda *_, value=value, **__: value)
+        monkeypatch.setattr(imagine, name, lambda *_, value=value, **__: value)
     for name in ("strip_of", "_as_dict"):
-        monkeypatch.setattr(imagined, name, lambda _: {})
-    written = imagined.write_film_of(None, tmp_path, reporter=SimpleNamespace(note=noted.append))  # type: ignore[arg-type]
-    assert imagined.VIDEO not in {path.name for path in written}
+        monkeypatch.setattr(imagine, name, lambda _: {})
+    written = imagine.write_imagination(None, tmp_path, reporter=SimpleNamespace(note=noted.append))  # type: ignore[arg-type]
+    assert imagine.VIDEO not in {path.name for path in written}
     assert all(path.is_file() for path in written)
     assert "pip install" in noted[0]

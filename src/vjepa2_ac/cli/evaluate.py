@@ -242,14 +242,14 @@ def _imagine(options: argparse.Namespace) -> None:
     """
     _require_one_start(options)
 
-    from vjepa2_ac.reports.imagined import write_film_of
+    from vjepa2_ac.decoding.imagine import write_imagination
     from vjepa2_ac.runs.folder import is_run
 
     home = Path(options.subject) if is_run(options.subject) else Path()
     out = options.out or home / "imagined"
     with cli.reporter() as reporter:
         imagination = _of_image(options) if options.image is not None else _of_clip(options, out, reporter)
-        written = write_film_of(imagination, out, reporter=reporter)
+        written = write_imagination(imagination, out, reporter=reporter)
     cli.show(*imagination.notes, files=written)
 
 
@@ -272,7 +272,7 @@ def _words(options: argparse.Namespace) -> tuple[str, ...]:
 def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imagination:
     from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
     from vjepa2_ac.evaluation.request import EvaluationOptions, settle
-    from vjepa2_ac.simulation.counterfactual import with_what_happens
+    from vjepa2_ac.simulation.counterfactual import simulated_outcome
 
     cli.say_places_elsewhere(options.subject)
     data = None if options.data is None else cli.read_config(options.data)
@@ -289,7 +289,7 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
         ),
     )
     cli.require_subject(options.subject, settle(options.subject, asked.evaluation), options.words)
-    return with_what_happens(imagine_clip(options.subject, asked, reporter=reporter)).imagination
+    return imagine_clip(options.subject, asked, simulate=simulated_outcome, reporter=reporter)
 
 
 def _of_image(options: argparse.Namespace) -> Imagination:

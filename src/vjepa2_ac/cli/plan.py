@@ -87,7 +87,7 @@ def _plan(options: argparse.Namespace) -> int:
     start, mask = _images(options, goals.goals[0].image)
 
     from vjepa2_ac.cli.console.tables import plan_table
-    from vjepa2_ac.evaluation.imagined_plan import imagine_plan
+    from vjepa2_ac.evaluation.imagined import imagine_plan
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
     from vjepa2_ac.planning.model_setup import goals_of

@@ -226,6 +226,11 @@ def spread(size: int, count: int) -> list[int]:
     return [(2 * number + 1) * size // (2 * count) for number in range(count)]
 
 
+def spread_with_ends(size: int, count: int) -> list[int]:
+    """Return at most `count` of `range(size)`, evenly spread, each once, the first and the last among them."""
+    return sorted({round(place) for place in np.linspace(0, size - 1, min(size, count))})
+
+
 def far_neighbours(items: list[int]) -> list[int]:
     """Return sorted items in an order in which neighbours are about half the list apart."""
     half = (len(items) + 1) // 2

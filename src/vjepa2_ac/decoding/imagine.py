@@ -1,4 +1,4 @@
-"""What a model or a planner imagines: the images of a rollout from one frame, under actions taken, planned or neither.
+"""Rollouts from one frame as images: a strip, a video and a GIF, under any actions.
 
 The first frame and its state are given; nothing after them is. The states along the way are integrated from the first
 one: those of a recording would tell a model what did happen.
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import groupby
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,17 +19,25 @@ from torch import Tensor
 from vjepa2_ac.decoding.decoder_folder import DecoderCard
 from vjepa2_ac.decoding.network import Decoder, as_pixels
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.media.film import FilmStrip, StripRow
+from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.media.film import FilmStrip, StripRow, draw_strip, film_frames, loop_of
+from vjepa2_ac.media.images import encode_png
+from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
+from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
+from vjepa2_ac.storage import user_can_write, write_atomically
+from vjepa2_ac.storage.structured import json_text
 
 Actions = Float[np.ndarray, "steps action_dim"]
 Image = UInt8[np.ndarray, "size size 3"]  # as the encoder sees it
 Film = UInt8[np.ndarray, "steps size size 3"]
 
+STRIP, VIDEO, GIF, JSON = "imagined.png", "imagined.mp4", "imagined.gif", "imagined.json"
 AS_RECORDED = "as recorded"
 _HAPPENS, _TITLE = "what really happens", "One frame is given, the rest is imagined"
 _MUCH_WORSE_DB = 5.0
+_RATE_HZ = 15.0  # of the video
 _LONGEST_NAME = 44  # characters
 _LEAST_CM, _LEAST_GRIP = 0.15, 0.05  # smaller parts of an action are not named
 _POSE = 7  # numbers
@@ -176,3 +185,39 @@ def _short(name: str) -> str:
     """Return the end of an episode's name; of DROID's, which name several files, that of the first folder."""
     own = name.split("--", maxsplit=1)[0].removesuffix("/recordings/MP4").rstrip("/")
     return own if len(own) <= _LONGEST_NAME else f"...{own[-_LONGEST_NAME:]}"
+
+
+def write_imagination(imagination: Imagination, folder: Path, *, reporter: Reporter = SILENT) -> list[Path]:
+    """Write image strip, video, GIF and the actions as JSON; return the files. Without PyAV a note replaces the MP4.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    strip = strip_of(imagination)
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / STRIP, encode_png(draw_strip(strip)))
+        images, loop = list(film_frames(strip)), loop_of(strip)
+        frames, seconds = [images[place] for place, _ in loop], [shown_s for _, shown_s in loop]
+        times = [max(1, round(shown_s * _RATE_HZ)) for shown_s in seconds]  # that a video repeats each frame
+        written = [folder / STRIP, write_gif(folder / GIF, frames, seconds=seconds)]
+        try:
+            written.append(write_video(folder / VIDEO, np.repeat(frames, times, axis=0), rate_hz=_RATE_HZ))
+        except UnreachableError as error:  # PyAV is not installed
+            reporter.note(f"No {VIDEO}: {error}")
+        write_atomically(folder / JSON, json_text(_as_dict(imagination)))
+    return [*written, folder / JSON]
+
+
+def _as_dict(imagination: Imagination) -> dict[str, object]:
+    return {
+        "subject": imagination.subject,
+        "episode": imagination.episode_id,
+        "start": imagination.start,
+        "seconds_per_step": imagination.seconds_per_step,
+        "rollouts": [
+            {"model": one.model, "name": one.name, "actions": one.actions.tolist(), "truth": one.truth is not None}
+            for one in imagination.rollouts
+        ],
+        "notes": list(imagination.notes),
+    }

@@ -1,10 +1,9 @@
-"""What a run or a model imagines of a held-out clip, or from an image and a state: load, choose, roll out, decode."""
+"""The predicted frames of a held-out clip, of an image and a state, or of a plan: load, choose, roll out, decode."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,23 +16,31 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.sources.indexed_source import measured_space
 from vjepa2_ac.data.transforms import frames_as_seen, split_views, view
-from vjepa2_ac.data.windows import require_frames
-from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.data.windows import require_frames, spread_with_ends
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown, worth_knowing
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch
-from vjepa2_ac.errors import InputError, counted
+from vjepa2_ac.errors import InputError, UserError, counted
 from vjepa2_ac.evaluation.evaluate_run import load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
+from vjepa2_ac.planning.controller import Decision
 from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, named_actions, read_actions
+from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.spaces import StateSpace
 
 _RATE_HZ = 15.0  # of a robot, where nobody says: DROID's
 _SEARCHED = 64  # clips, among which the one with the most motion is shown
+_MOST_PLAN_STEPS = 8
+Image = UInt8[np.ndarray, "height width 3"]
 Frames = UInt8[np.ndarray, "time h w 3"]
+Outcome = Callable[[Float[np.ndarray, "steps 7"]], tuple[Frames, Bool[np.ndarray, "time h w"]]]
+"""Actions -> the camera's frames from the start on, and which pixels show the arm."""
+Simulate = Callable[[Dataset, int, int], Outcome | None]
+"""Data set, episode, control step -> what really happens from there; None: the data were not simulated."""
 TRUE = "true"  # the word for the recorded actions
 
 
@@ -82,7 +89,8 @@ def imagine_image(
     latents = encode_frames(model, seen.image[None], config.data.crop, views=views)
     state = np.asarray(seen.state, dtype=np.float64)
     starts = [Start(one, state, space, camera) for one in latents[0].chunk(views)]
-    first = np.concatenate(_as_seen(config, model.image_size, split_views(seen.image[None], views)), axis=1)
+    cut = view(split_views(seen.image[None], views), config.data.crop)
+    first = np.concatenate(frames_as_seen(cut, model.image_size), axis=1)
     decoded_first = shown(decoder.decoder, latents, views)[0]
 
     def imagined(taken: Float[np.ndarray, "steps 7"]) -> Frames:
@@ -140,40 +148,15 @@ class ImagineOptions:
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, against
 
 
-@dataclass(frozen=True, eq=False)
-class Film:
-    """An imagination, and where its start comes from: for those who can say what really happens."""
-
-    imagination: Imagination
-    dataset: Dataset
-    episode: int
-    as_seen: Callable[[Frames], UInt8[np.ndarray, "time size size 3"]]  # by the encoder
-
-    def with_outcomes(self, outcomes: Mapping[str, tuple[Frames, Bool[np.ndarray, "time h w"]]]) -> Film:
-        """Return the film with what really happens.
-
-        Args:
-            outcomes: The name of actions that were not recorded -> the frames of the camera from the start on, and
-                which pixels show the arm.
-        """
-        told = self.imagination
-
-        def with_outcome(one: Imagined) -> Imagined:
-            if one.name == AS_RECORDED:
-                return replace(one, truth=told.truth)
-            frames, arm = outcomes[one.name]
-            seen = self.as_seen(np.repeat(np.uint8(255) * arm[..., None], 3, axis=-1))
-            return replace(one, truth=self.as_seen(frames)[1:], outlines=seen[..., 0] > 127)
-
-        return replace(self, imagination=replace(told, rollouts=tuple(map(with_outcome, told.rollouts))))
-
-
-def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SILENT) -> Film:
+def imagine_clip(
+    subject: str, asked: ImagineOptions, *, simulate: Simulate | None = None, reporter: Reporter = SILENT
+) -> Imagination:
     """Imagine a held-out clip of a run or a model: under the recorded actions, by base and adapter, and under others.
 
     Args:
         subject: The folder of a run; or a model, with data in `evaluation`.
         asked: What is to be imagined.
+        simulate: Simulates the data; if this fails, a note says why.
         reporter: Shows the progress.
 
     Raises:
@@ -188,25 +171,34 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     require_frames(config.data, to="show what is true")
     window = _window(dataset, asked)
     reporter.task(LOADING)
-    loaded = load_models(subject, config, asked.evaluation, dataset, decoder)
-    loaded.put_on(accelerator.device)
+    models = load_models(subject, config, asked.evaluation, dataset, decoder)
+    models.put_on(accelerator.device)
     decoder.to(accelerator.device)
     (batch,) = batches_of(dataset, [window], batch_size=1)
-    size = loaded.world_model.image_size
+    size = models.world_model.image_size
     chosen = _actions_of(asked, batch, dataset, limits=config.planning.limits)
-    rollouts: list[Imagined] = []
-    with accelerator.autocast():
-        latents = encode_batch(loaded.world_model, batch, device=accelerator.device, chunk=config.model.encode_chunk)
-        start, states = Start.of(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
-        for name, actions in chosen.items():
-            for one in loaded.contenders:
-                with one.switched():
-                    rolled = rolled_out(one.model.rollout, start, actions, states if name == AS_RECORDED else None)
-                rollouts.append(Imagined(one.name, name, actions, shown(decoder.decoder, rolled)))
-        decoded = shown(decoder.decoder, latents.latents[0])
     assert batch.frames is not None  # noqa: S101  # refused above: a cache
     frames = frames_as_seen(batch.frames[0].numpy(), size)
-    imagination = Imagination(
+    truths: dict[str, tuple[Frames, np.ndarray | None]] = {AS_RECORDED: (frames[1:], None)}
+    notes: tuple[str, ...] = ()
+    try:
+        if simulate is not None and (outcome := simulate(dataset, *window)) is not None:
+            for name in chosen.keys() - truths:
+                truths[name] = _as_seen(*outcome(chosen[name]), config=config, size=size)
+    except UserError as error:
+        notes = (f"What really happens under other actions is not known: {error}",)
+    rollouts: list[Imagined] = []
+    with accelerator.autocast():
+        latents = encode_batch(models.world_model, batch, device=accelerator.device, chunk=config.model.encode_chunk)
+        start, states = Start.of(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
+        for name, actions in chosen.items():
+            for one in models.contenders:
+                with one.switched():
+                    rolled = rolled_out(one.model.rollout, start, actions, states if name == AS_RECORDED else None)
+                truth = truths.get(name, (None, None))
+                rollouts.append(Imagined(one.name, name, actions, shown(decoder.decoder, rolled), *truth))
+        decoded = shown(decoder.decoder, latents.latents[0])
+    return Imagination(
         subject=subject,
         episode_id=batch.episode_ids[0],
         start=batch.starts[0],
@@ -216,9 +208,8 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
         rollouts=tuple(rollouts),
         truth=frames[1:],
         decoded_truth=decoded[1:],
-        notes=worth_knowing(decoder.card, frames[0], decoded[0]),
+        notes=(*worth_knowing(decoder.card, frames[0], decoded[0]), *notes),
     )
-    return Film(imagination, dataset, window[0], partial(_as_seen, config, size))
 
 
 def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig) -> dict[str, np.ndarray]:
@@ -274,6 +265,58 @@ def _motion(dataset: Dataset, episode: int, start: int) -> float:
     return dataset.spaces.state.path_length(states)
 
 
-def _as_seen(config: Config, size: int, frames: Frames) -> UInt8[np.ndarray, "time size size 3"]:
-    """Return camera frames as the encoder sees them."""
-    return frames_as_seen(view(frames, config.data.crop), size)
+def _as_seen(
+    frames: Frames, arm: Bool[np.ndarray, "time h w"], *, config: Config, size: int
+) -> tuple[Frames, Bool[np.ndarray, "time size size"]]:
+    """Return frames after the first one, and silhouettes of all, cut and resized as the encoder's input."""
+    silhouettes = np.repeat(np.uint8(255) * arm[..., None], 3, axis=-1)
+    seen, outlines = (frames_as_seen(view(one, config.data.crop), size) for one in (frames, silhouettes))
+    return seen[1:], outlines[..., 0] > 127
+
+
+# ---- of a plan ----
+
+
+@dataclass(frozen=True, eq=False)
+class ImaginedPlan:
+    """Images of a plan, all as the encoder sees them."""
+
+    start: Image  # decoded
+    steps: dict[int, Image]  # imagined after so many model steps; empty without a plan
+    goal: Image  # the one that applies at the end
+    decoded_goal: Image
+
+
+def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
+    """Decode the rollout of a plan, of some steps if there are many, and what it started from and aimed at.
+
+    Args:
+        answer: The decision.
+        decoder: Of the model's encoder; it is moved to the model's device.
+    """
+    controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]].image
+    decoder.to(controller.device)
+    given = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
+    start, decoded_goal = shown(decoder.decoder, given, controller.config.views)
+    frames = _rollout(answer.decision, decoder, steps=answer.space.steps)
+    places = spread_with_ends(len(frames), _MOST_PLAN_STEPS)
+    views = view(split_views(goal[None], controller.config.views), controller.crop)
+    seen = np.concatenate(frames_as_seen(views, decoder.card.shape.image_size), axis=1)
+    return ImaginedPlan(start, {place + 1: frames[place] for place in places}, seen, decoded_goal)
+
+
+def imagined_next(decision: Decision, decoder: TrainedDecoder) -> Image | None:
+    """Return the next frame as the planner imagined it when it decided; None: it imagined none."""
+    frames = _rollout(decision, decoder, steps=1)
+    return frames[0] if len(frames) else None
+
+
+@torch.no_grad()
+def _rollout(decision: Decision, decoder: TrainedDecoder, *, steps: int) -> Frames:
+    """Return the images after the first steps of a plan; none without a plan, or if the predictions are not finite."""
+    side = decoder.card.shape.image_size
+    none = np.zeros((0, side, side, 3), np.uint8)
+    if decision.plan is None or decision.cost is None:
+        return none
+    latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.imagine(decision.plan.actions[None, :steps])[0][0]
+    return shown(decoder.decoder, latents, decision.cost.views) if bool(torch.isfinite(latents).all()) else none

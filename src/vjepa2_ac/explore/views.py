@@ -13,12 +13,12 @@ from torch import Tensor
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.episode import Progress, short_names
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.explore.explorer import Explorer, Moment, Pixels, Place, goal_moment, relative_spread, token_errors
 from vjepa2_ac.explore.messages import MOST_STEPS, Image, PageRequest, packed, shown_units
 from vjepa2_ac.explore.search import Search
-from vjepa2_ac.media.film import spread_with_ends
 from vjepa2_ac.planning.planner import Cancelled
 
 _QUICK = {"samples": 64, "iterations": 4}  # of a plan: docs/planning.md says how good it is

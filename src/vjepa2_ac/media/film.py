@@ -64,11 +64,6 @@ class FilmStrip:
         return "; white line: where the arm really is" * any(row.outlines is not None for row in self.rows)
 
 
-def spread_with_ends(size: int, count: int) -> list[int]:
-    """Return at most `count` of `range(size)`, evenly spread, each once, the first and the last among them."""
-    return sorted({round(place) for place in np.linspace(0, size - 1, min(size, count))})
-
-
 def draw_strip(film: FilmStrip, *, side: int = 116) -> Pixels:
     """Return all rows below each other, time from left to right; of many times some, evenly spread.
 
@@ -96,7 +91,7 @@ def draw_strip(film: FilmStrip, *, side: int = 116) -> Pixels:
 
 def draw_rows(figure: Any, film: FilmStrip) -> None:
     """Draw the rows of a strip on a figure, or on a part of one."""
-    places = spread_with_ends(len(film.seconds), _MOST_COLUMNS)
+    places = np.unique(np.linspace(0, len(film.seconds) - 1, _MOST_COLUMNS).round().astype(int)).tolist()
     grid = figure.subplots(len(film.rows), len(places), squeeze=False)
     for row, beside in zip(film.rows, grid, strict=True):
         for place, axes in zip(places, beside, strict=True):

@@ -6,7 +6,8 @@ the arm carries out other actions as in the closed loop (`closed_loop.rollout.se
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.decoding.imagine import AS_RECORDED
 from vjepa2_ac.episode import Episode
-from vjepa2_ac.errors import InputError, UserError
-from vjepa2_ac.evaluation.imagined import Film
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
 from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
 from vjepa2_ac.simulation.arm import SimulatedArm
@@ -120,21 +119,22 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
     return again
 
 
-def with_what_happens(film: Film) -> Film:
-    """Return the film with the truth of every sequence of actions, or with a note that says why there is none."""
-    config = film.dataset.config
+def simulated_outcome(dataset: Dataset, episode: int, start: int) -> Callable[[np.ndarray], tuple[Any, Any]] | None:
+    """Return what happens from a control step on: actions -> frames and silhouettes; None: data were not simulated.
+
+    Raises:
+        InputError, UnreachableError: As `resimulate`.
+    """
+    config = dataset.config
     if not (Path(config.path) / SIMULATION_FILE).is_file():
-        return film
-    camera = config.cameras[0]
-    try:
-        recording = film.dataset.source.read(film.episode, camera)
-        arm = resimulate(config.path, recording, film.imagination.start, camera)
-    except UserError as error:
-        note = f"What really happens under other actions is not known: {error}"
-        return replace(film, imagination=replace(film.imagination, notes=(*film.imagination.notes, note)))
-    stride, rollouts = film.dataset.config.model_stride, film.imagination.rollouts
-    outcomes = {one.name: arm.under(one.actions, stride) for one in rollouts if one.name != AS_RECORDED}
-    return film.with_outcomes({name: (one.frames, one.silhouettes) for name, one in outcomes.items()})
+        return None
+    arm = resimulate(config.path, dataset.source.read(episode, config.cameras[0]), start, config.cameras[0])
+
+    def outcome(actions: np.ndarray) -> tuple[Any, Any]:
+        happens = arm.under(actions, config.model_stride)
+        return happens.frames, happens.silhouettes
+
+    return outcome
 
 
 class SimulatedFutures:

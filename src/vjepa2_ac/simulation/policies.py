@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.data.transforms import frame_of_seen, split_views
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-from vjepa2_ac.evaluation.imagined_plan import imagined_next
+from vjepa2_ac.evaluation.imagined import imagined_next
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.arm import Block, SimulatedArm, State

@@ -19,11 +19,10 @@ from torch import Tensor
 from vjepa2_ac import __version__
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.windows import require_frames
+from vjepa2_ac.data.windows import require_frames, spread_with_ends
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.episode import FrameReader, Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.media.film import spread_with_ends
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import read_frames, read_header
 from vjepa2_ac.planning.demonstrations.key_frames import (

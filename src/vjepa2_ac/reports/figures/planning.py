@@ -20,7 +20,7 @@ from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
     from vjepa2_ac.evaluation.calibration.axes import AxisFit
-    from vjepa2_ac.evaluation.imagined_plan import ImaginedPlan
+    from vjepa2_ac.evaluation.imagined import ImaginedPlan
     from vjepa2_ac.evaluation.policies.monitor import WatchedEpisode
     from vjepa2_ac.planning.demonstrations.make_goals import EnergyCourse, MadeGoals
     from vjepa2_ac.planning.planner import Plan
