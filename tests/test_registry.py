@@ -4,7 +4,7 @@ import importlib
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import pytest
 
@@ -12,7 +12,6 @@ from run_fixtures import as_yaml
 from vjepa2_ac import registry as doors
 from vjepa2_ac.config import DataConfig, Section
 from vjepa2_ac.config.loading import load_config, parse_config
-from vjepa2_ac.config.section import Affects
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.settings import planning_settings
 from vjepa2_ac.registry import LOSSES, import_plugins
@@ -125,7 +124,7 @@ def test_a_source_of_this_package_cannot_be_defined_again(site: Path) -> None:
     with pytest.raises(InputError, match=r"form of data 'npz': registered by vjepa2_ac\.config\.sources already"):
 
         class Again(DataConfig):
-            source: Annotated[Literal["npz"], Affects.EPISODES] = "npz"
+            source: Literal["npz"] = "npz"
 
     install(site, "p_npz", "[vjepa2_ac.sources]\nnpz = p_npz:thing\n")
     with pytest.raises(InputError, match=r"'npz': registered by vjepa2_ac\.config\.sources and by p_npz"):
@@ -133,14 +132,14 @@ def test_a_source_of_this_package_cannot_be_defined_again(site: Path) -> None:
 
 
 class Options(Section):
-    size: Annotated[int, Affects.EPISODES] = 3
+    size: int = 3
 
 
 @pytest.mark.parametrize("name", ["idle", "frames", "cameras"])
 @pytest.mark.filterwarnings("ignore:Field name")
 def test_a_section_cannot_have_the_name_of_a_key_of_all_forms(name: str) -> None:
     values = {"source": "p_own", name: Options(), "first_camera": "a", "__module__": __name__}
-    kinds = {"source": Annotated[Literal["p_own"], Affects.EPISODES], name: Options, "first_camera": ClassVar[str]}
+    kinds = {"source": Literal["p_own"], name: Options, "first_camera": ClassVar[str]}
     with pytest.raises(TypeError, match=rf"Own\.{name}: all forms of data have a key of this name"):
         type(DataConfig)("Own", (DataConfig,), {**values, "__annotations__": kinds})
     assert "p_own" not in DataConfig.kinds

@@ -117,16 +117,6 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Augmentation:
-    """Changes of a training clip, the same for all its frames; applied on the device."""
-
-    box: tuple[int, int, int, int]  # top, left, height, width within the clip's frames, in pixels
-    brightness: float = 1.0  # factors; 1: unchanged
-    contrast: float = 1.0
-    saturation: float = 1.0
-
-
-@dataclass(frozen=True)
 class Skipped:
     """A clip of a batch that could not be read (`data.broken_episodes: skip`)."""
 
@@ -146,7 +136,6 @@ class Clip:
     episode_id: str
     start: int  # first control step
     stride: int  # control steps per model step
-    augmentation: Augmentation | None = None
     latents: StoredLatents | None = None
     camera: str | None = None  # None: the config's first
 
@@ -161,7 +150,6 @@ class Batch:
     extrinsics: Float32[Tensor, "batch time 6"] | None
     episode_ids: tuple[str, ...]
     starts: tuple[int, ...]
-    augmentations: tuple[Augmentation, ...] = ()  # one per clip, or none at all
     bytes_fetched: int = 0  # over the network, for these clips
     latents: StoredLatents | None = None
     cameras: tuple[str | None, ...] = ()  # one per clip; None: the config's first

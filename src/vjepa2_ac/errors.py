@@ -129,8 +129,8 @@ def refusal_of(error: OSError) -> tuple[str, str]:
     said = error.strerror or str(error)
     if error.errno in _NO_MORE_FILES:
         limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-        fix = "Raise the limit where the program is started, as with `ulimit -n 4096`, or lower data.workers and"
-        return f"too many open files: this process may have {limit} at once (ulimit -n)", f"{fix} data.connections"
+        fix = "Raise the limit where the program is started, as with `ulimit -n 4096`, or lower"
+        return f"too many open files: this process may have {limit} at once (ulimit -n)", f"{fix} data.workers"
     if error.errno not in _CLOSED or error.filename is None:
         return said, "Check its permissions, and the disk"
     path = Path(str(error.filename)).absolute()

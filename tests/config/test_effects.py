@@ -17,7 +17,7 @@ from run_fixtures import TINY
 from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
 from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.loading import changed_keys, config_as_dict, config_as_yaml, parse_config
-from vjepa2_ac.config.section import Affects, Section, knobs_that_affect, mark_of, marks_of
+from vjepa2_ac.config.section import Affects, Section, mark_of, marks_of, values_that_affect
 from vjepa2_ac.data import idle as idle_ranges
 from vjepa2_ac.data.index import EpisodeInfo, EpisodeTable
 from vjepa2_ac.data.sources.indexed_source import open_source
@@ -34,7 +34,6 @@ OTHERS = {
     "planning.limits.workspace": ((0.3, -0.3, 0.1), (0.6, 0.3, 0.5)),
     "data.camera": {"npz": "pixels", "rlds": "wrist_left", "lerobot": "wrist_left", "droid_raw": "right"},
     "data.path": "elsewhere",
-    "data.augment.crop_scale": (0.5, 1.0),
     "data.transforms": (Component("noise"),),
     "data.stride_candidates": (2, 3),
     "planning.budget_s": 1.0,
@@ -58,6 +57,8 @@ OTHERS = {
     "data.lerobot.fps": 7.0,
 }  # fmt: skip
 ONLY_REMOTE = {"data.outcome"}  # where reading the episodes costs something
+OF_THE_INDEX = {"camera", "states", "actions", "pose_frame"}
+NOT_OF_THE_INDEX = {"fields.language", "fields.joint_velocity", "fields.control_rate_hz"}
 
 
 class Found(Exception):  # noqa: N818 - it carries what was asked for
@@ -169,18 +170,18 @@ def test_a_knob_that_does_not_say_what_it_affects_is_an_error() -> None:
         workers: int = 1
 
     with pytest.raises(TypeError, match=r"workers: say what it affects"):
-        knobs_that_affect(Affects.RUN, Forgotten())
+        values_that_affect(Affects.RUN, Forgotten())
 
 
-def test_the_mark_of_a_plug_ins_section_holds_for_its_knobs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_options_of_a_plug_in_are_a_part_of_the_key_of_a_cache(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(DataConfig, "kinds", dict(DataConfig.kinds))
 
     class WallOptions(Section):
         size: int = 32
 
     class WallData(DataConfig):
-        source: Annotated[Literal["wall"], Affects.EPISODES] = "wall"
-        wall: Annotated[WallOptions, Affects.EPISODES] = WallOptions()
+        source: Literal["wall"] = "wall"
+        wall: WallOptions = WallOptions()
         first_camera: ClassVar[str] = "front"
 
     encoding = encoding_of(world_model(), config_of("rlds", "x", Path()))
@@ -199,40 +200,38 @@ def test_a_knob_that_changes_makes_strangers_of_what_it_affects_and_of_nothing_e
     config = config_of(source, sets[source], tmp_path, **(recorded_by(source) if states == "vector" else {}))
     usual, own = keys_of(config), tuple(f"data.{name}." for name in config.data.own_sections())
     assert None not in usual.values()
-    marks, changed = marks_of(Config), {}
+    changed: dict[str, set[str]] = {}
     for key in knobs_of(config) - {"data.source", "data.path"} - ONLY_REMOTE:
         found = keys_of(with_other(config, key, key, source))
-        if None in found.values():  # refused, not mistaken
-            continue
-        changed[key] = {name for name in usual if found[name] != usual[name]}
-        mark = marks[key]
-        told = {"index"} if Affects.INDEX in mark else set()
-        told |= {"idle"} if Affects.INDEX in mark or Affects.IDLE in mark else set()
-        told |= {"latents"} if Affects.INDEX in mark or Affects.LATENTS in mark else set()
-        if key.startswith(own) or "index" in changed[key] or Affects.INDEX not in mark:
-            assert changed[key] <= told, key
-        if Affects.INDEX not in mark:  # a form of data may not have what the others index by
-            assert changed[key] >= told, key
-    assert {key for key, what in changed.items() if "index" in what}
-    assert len(changed) > 60
+        if None not in found.values():  # else refused, not mistaken
+            changed[key] = {name for name in usual if found[name] != usual[name]}
+    for key, names in changed.items():
+        name, is_latents = key.removeprefix("data."), Affects.LATENTS in marks_of(Config)[key]
+        is_index = name in OF_THE_INDEX or (key.startswith(own) and name not in NOT_OF_THE_INDEX)
+        assert names <= {"latents"} or is_latents, key
+        assert "latents" in names or not is_latents, key
+        assert "index" not in names or is_index, key
+        assert ("idle" in names) == ("index" in names or key.startswith((*own, "data.idle."))), key
+    assert {key for key, names in changed.items() if "index" in names}
+    assert len(changed) > 50
 
 
-def test_each_knob_that_is_said_to_matter_to_an_index_does_in_one_form_of_data(
+def test_each_key_that_is_said_to_matter_to_an_index_does_in_one_form_of_data(
     sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path
 ) -> None:
-    matters = set()
+    matters, owned = set(), set()
     for source in WRITERS:
         for recorded in ({}, recorded_by(source)):
             if source == "droid_raw" and recorded:
                 continue
             config = config_of(source, sets[source], tmp_path, **recorded)
-            usual = keys_of(config)
+            usual, own = keys_of(config), tuple(f"{name}." for name in config.data.own_sections())
             for key in knobs_of(config):
-                if Affects.INDEX in marks_of(Config)[key]:
+                if (name := key.removeprefix("data.")) in OF_THE_INDEX or name.startswith(own):
+                    owned.add(name)
                     found = keys_of(with_other(config, key, key, source))
-                    matters |= {key} if found["index"] != usual["index"] else set()
-    said = {key for key, mark in marks_of(Config).items() if Affects.INDEX in mark}
-    assert said - matters == ONLY_REMOTE | {"data.source"}, "data of one form are not read as another"
+                    matters |= {name} if found["index"] != usual["index"] else set()
+    assert owned - matters == NOT_OF_THE_INDEX
 
 
 @pytest.mark.parametrize("source", WRITERS)
@@ -287,7 +286,7 @@ def test_a_run_goes_on_only_where_no_knob_that_decides_it_has_changed(tmp_path: 
             check_run_folder(other)
 
 
-def test_planning_takes_the_knobs_that_affect_a_decision_and_names_them() -> None:
+def test_planning_takes_the_values_that_affect_a_decision_and_names_them() -> None:
     for key, mark in marks_of(Config).items():
         named = key in USED or key.startswith(tuple(one.removesuffix("…") for one in USED if one.endswith("…")))
         assert (Affects.PLAN in mark) == named, key
@@ -298,15 +297,17 @@ def test_planning_takes_the_knobs_that_affect_a_decision_and_names_them() -> Non
 
 def test_a_mark_of_a_section_holds_for_its_knobs_and_a_value_has_that_of_its_knob() -> None:
     assert mark_of("tracking.project", Config) == Affects.NOTHING
-    assert mark_of("data.fields.cameras.left", Config) == mark_of("data.fields.cameras", Config) == Affects.EPISODES
+    assert mark_of("data.fields.cameras.left", Config) == mark_of("data.fields.cameras", Config) == Affects.CLIPS
+    assert mark_of("replay.data.frames", Config) == mark_of("replay.data", Config) == Affects.RUN
+    assert mark_of("replay.data.path", Config) == Affects.NOTHING
     assert mark_of("training", Config) == Affects.RUN | Affects.LATENTS | Affects.PLAN
     with pytest.raises(KeyError):
         mark_of("nothing.of.the.kind", Config)
 
 
-def test_the_knobs_that_affect_something_are_given_with_their_values(tmp_path: Path) -> None:
+def test_the_values_that_affect_something_are_given_with_their_values(tmp_path: Path) -> None:
     config = config_of("rlds", tmp_path, tmp_path)
-    found = knobs_that_affect(Affects.PLAN, config)
+    found = values_that_affect(Affects.PLAN, config)
     assert sorted(found) == ["data", "model", "planning", "seed", "training"]
     assert found["training"] == {"device": "auto"}
     assert found["data"] == {"stride": 4, "crop": "released"}

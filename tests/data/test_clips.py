@@ -117,12 +117,6 @@ def test_a_pickled_data_set_reads_the_same_clips(droid: Path) -> None:
     np.testing.assert_array_equal(copy[7].frames, clips[7].frames)
 
 
-def test_the_seed_and_changes_of_training_clips_do_not_matter(droid: Path) -> None:
-    plain, changed = (opened(droid, **keys).clips() for keys in ({}, {"augment": {"brightness": 0.5}}))
-    assert changed[3].augmentation is None
-    np.testing.assert_array_equal(changed[3].frames, plain[3].frames)
-
-
 @pytest.mark.parametrize("policy", ["error", "skip"])
 def test_a_broken_episode_is_named_with_a_fix_that_works(
     spoiled: Callable[[Callable[[Any], None]], Path], policy: str

@@ -256,18 +256,6 @@ def test_the_camera_of_a_validation_clip_stays() -> None:
     assert len(set(cameras().values())) == 2  # the names of the exterior cameras are as long
 
 
-def test_training_clips_are_changed_by_their_position_and_validation_clips_never() -> None:
-    knobs = {"augment": {"crop_scale": (0.3, 1.0), "brightness": 0.4}, "validation_share": 0.5}
-    dataset = open_in_memory(MemorySource([30] * 10), **knobs)
-    whole = [one for batch in first(dataset, 20) for one in batch.augmentations]
-    resumed = [one for batch in first(dataset, 5, start_position=30) for one in batch.augmentations]
-    assert len(set(whole)) == 40
-    assert resumed == whole[30:]
-    validation = list(validation_batches(dataset, "validation", clips=4, batch_size=2))
-    assert all(batch.augmentations == () for batch in validation)
-    assert first(open_in_memory(MemorySource([30])), 1)[0].augmentations == ()
-
-
 @pytest.mark.parametrize("crop", ["released", "square", "letterbox"])
 def test_the_crop_is_the_configs(crop: str) -> None:
     sizes = {"released": (4, 5), "square": (4, 4), "letterbox": (5, 5)}
@@ -356,7 +344,6 @@ def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(spoiled: C
     config = config_of(
         spoiled(spoil), validation_share=0.0, broken_episodes="skip", camera=CAMERAS, crop="letterbox",
         idle={"rule": "motion", "shortest_kept_steps": 2, "cut_last_steps": 6},
-        augment={"crop_scale": (0.3, 1.0), "brightness": 0.4},
     )  # fmt: skip
     alone = take(40, config)
     assert sum(len(batch.starts) for batch in alone) < 80
@@ -366,7 +353,6 @@ def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(spoiled: C
         (take(10, config.model_copy(update={"workers": 1}), start_position=60), 30),
     ):
         assert_same(found, alone[start : start + len(found)])
-        assert [one.augmentations for one in found] == [one.augmentations for one in alone[start : start + len(found)]]
 
 
 def test_clips_of_a_set_that_lies_elsewhere_are_read_several_at_once() -> None:

@@ -119,7 +119,7 @@ def bimanual(number: int, steps: int) -> Recorded:
 @pytest.mark.parametrize("write", [write_v30, write_v21], ids=["v3.0", "v2.1"])
 def test_lerobot_gives_the_columns_that_are_named(tmp_path: Path, write: Callable[..., Path]) -> None:
     folder = write(tmp_path / "set", [bimanual(number, 12) for number in range(4)])
-    lerobot = {"state": ["observation.state"], "joint_velocity": None, "success": None}
+    lerobot = {"state": ["observation.state"], "success": None}
     dataset = open_dataset(knobs(folder, source="lerobot", lerobot=lerobot, **recorded_by("last")))
     assert dataset.widths == Widths(14, 16)
     clip = clip_at(dataset, 2, 1)

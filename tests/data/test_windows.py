@@ -20,7 +20,6 @@ from vjepa2_ac.data.splits import in_split
 from vjepa2_ac.data.windows import ClipOrder, Windows, clip_starts, far_neighbours, permuted, spread
 from vjepa2_ac.data.windows import windows_of as windows_of_starts
 from vjepa2_ac.episode import EpisodeInfo
-from vjepa2_ac.errors import InputError
 
 
 def settings_of(**knobs: Any) -> DataConfig:
@@ -138,12 +137,6 @@ def test_short_episodes_are_left_out_counted_and_named(caplog: pytest.LogCapture
     assert windows.episodes.tolist() == [1]
     assert "2 of 3 train episodes are shorter than a clip of 10 control steps" in caplog.text
     assert "episode 2" in caplog.text
-
-
-def test_short_episodes_stop_the_run_when_told_to() -> None:
-    config = settings_of(short_episodes="error", **ALL_TRAIN)
-    with pytest.raises(InputError, match=r"2 of 3 train episodes.*episode 0, has 9 steps.*needed: 10 steps.*skip"):
-        windows_of(episodes(9, 10, 3), config, "train")
 
 
 @settings(max_examples=50)

@@ -41,21 +41,19 @@ def shared_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     return set_free
 
 
-def data(workers: int, prefetch: int = 2) -> DataConfig:
-    return DataConfig(path="none", workers=workers, prefetch=prefetch)
+def data(workers: int) -> DataConfig:
+    return DataConfig(path="none", workers=workers)
 
 
-@pytest.mark.parametrize(("workers", "prefetch", "processes"), [(4, 2, 1), (1, 5, 1), (2, 3, 2)])
-def test_shared_memory_must_hold_the_batches_of_all_workers(
-    shared_memory: Any, workers: int, prefetch: int, processes: int
-) -> None:
-    needed = 1000 * workers * prefetch * processes
+@pytest.mark.parametrize(("workers", "processes"), [(4, 1), (2, 2)])
+def test_shared_memory_must_hold_the_batches_of_all_workers(shared_memory: Any, workers: int, processes: int) -> None:
+    needed = 1000 * workers * streams.PREFETCH * processes
     shared_memory(needed)
-    require_shared_memory(data(workers, prefetch), 1000, processes)
+    require_shared_memory(data(workers), 1000, processes)
     shared_memory(needed - 1)
     with pytest.raises(UnreachableError, match=r"--shm-size=8g or --ipc=host.*data\.workers=0"):
-        require_shared_memory(data(workers, prefetch), 1000, processes)
-    require_shared_memory(data(0, prefetch), 1000, processes)
+        require_shared_memory(data(workers), 1000, processes)
+    require_shared_memory(data(0), 1000, processes)
 
 
 def test_a_system_without_shared_memory_is_not_checked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -182,7 +182,6 @@ def test_a_folder_of_another_cache_is_refused_and_what_differs_is_named(
     ("changes", "words"),
     [
         ({"data__stride": "auto"}, "data.stride: auto"),
-        ({"data__augment": {"brightness": 0.1}}, "data.augment"),
         ({"data__source": "latents"}, "encoded already"),
     ],
 )

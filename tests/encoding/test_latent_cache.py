@@ -594,8 +594,6 @@ def test_a_cache_can_be_checked_and_inspected(a_cache: tuple[Dataset, Dataset, P
 @pytest.mark.parametrize(
     ("knobs", "reported"),
     [
-        ({"augment": {"brightness": 0.1}, "cache": "auto"}, "augment"),
-        ({"augment": {"brightness": 0.1}, "source": "latents", "cache": "off"}, "augment"),
         ({"source": "latents", "cache": "require"}, "itself a cache"),
         ({"source": "latents", "cache": "off", "stride": "auto"}, "stride auto"),
     ],

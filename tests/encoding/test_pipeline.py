@@ -18,7 +18,7 @@ from vjepa2_ac.data.sources.latents.cache_files import CacheType, LatentFiles, u
 from vjepa2_ac.encoding import batch as batches
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
-from vjepa2_ac.episode import Augmentation, Batch, LatentBatch
+from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.model.network.world_model import WorldModel
 
@@ -80,7 +80,7 @@ TINY = {
 }
 
 
-def batch(frames: torch.Tensor, *augmentations: Augmentation) -> Batch:
+def batch(frames: torch.Tensor) -> Batch:
     clips, time = frames.shape[:2]
     return Batch(
         frames=frames,
@@ -89,22 +89,7 @@ def batch(frames: torch.Tensor, *augmentations: Augmentation) -> Batch:
         extrinsics=None,
         episode_ids=tuple("ab"[:clips]),
         starts=(0,) * clips,
-        augmentations=augmentations,
     )
-
-
-def test_an_augmented_batch_gives_the_latents_of_the_cropped_frames() -> None:
-    model = WorldModel.random(ModelSizes.model_validate(TINY), seed=0)
-    frames = torch.randint(0, 256, (2, 2, 40, 50, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-
-    def latents(of: Batch) -> torch.Tensor:
-        return encode_batch(model, of, device=torch.device("cpu"), chunk=4).latents
-
-    whole, part = Augmentation((0, 0, 40, 50)), Augmentation((4, 6, 30, 36))
-    found = latents(batch(frames, part, whole))
-    torch.testing.assert_close(found[:1], latents(batch(frames[:1, :, 4:34, 6:42])))
-    torch.testing.assert_close(found[1:], latents(batch(frames))[1:])
-    assert not torch.allclose(found[0], latents(batch(frames))[0], atol=1e-3)
 
 
 def test_what_is_on_its_way_to_the_device_is_taken_from_there() -> None:

@@ -145,7 +145,7 @@ def test_values_of_an_excerpt_of_bridge(shared: Path) -> None:
 
 def test_values_of_a_lerobot_set(shared: Path) -> None:
     columns = {
-        "state": ("observation.state",), "cameras": {"front": "observation.images.front"}, "joint_velocity": None,
+        "state": ("observation.state",), "cameras": {"front": "observation.images.front"},
         "success": None,
     }  # fmt: skip
     pinned: Values = {

@@ -89,6 +89,9 @@ def test_a_replayed_set_of_an_older_run_keeps_its_drawn_splits(make_config, repo
     with open_run(config, reporter) as opened:
         opened.begin(opened.config, RunState(step=0))
     file = Path(config.run_dir) / "config.yaml"
-    file.write_text(file.read_text().replace("    splits: dataset\n", ""))
+    older = {"check_crc": "once", "connections": 16, "prefetch": 2, "short_episodes": "skip"}  # keys of its time
+    values = yaml.safe_load(file.read_text())
+    values["replay"]["data"] = config.replay.data.model_dump(mode="json", exclude={"splits"}) | older
+    file.write_text(yaml.safe_dump(values))
     with open_run(config, reporter) as opened:
         assert [one.splits for one in opened.config.data_sets] == ["dataset", "hash"]

@@ -1,6 +1,7 @@
 """Replay: a share of the clips from a second data set, in an order that resumes exactly; misfits are refused."""
 
 import itertools
+import json
 import shutil
 from pathlib import Path
 
@@ -153,6 +154,38 @@ def test_a_clip_that_cannot_be_read_counts_for_its_own_data_set(replaying, monke
 def test_a_second_data_set_that_cannot_fit_is_refused_when_the_config_is_read(replaying, changes, complaint) -> None:
     with pytest.raises(InputError, match=complaint):
         replaying(**changes)
+
+
+def test_a_second_data_set_takes_the_settings_of_the_first_and_writes_what_differs(tmp_path: Path) -> None:
+    data = {"path": "one", "frames": 4, "camera": "wrist_left", "exclude": ["a"], "fields": {"control_rate_hz": 5.0}}
+    second = {"path": "two", "stride": 2, "fields": {"gripper_open": 2.0}}
+    values = {"run_dir": str(tmp_path), "model": {"base": "base"}, "data": data, "replay": {"data": second}}
+    config = parse_config(values, ["replay.data.idle.rule=motion"], where="")
+    replayed = config.replay.data
+    assert (replayed.frames, replayed.camera, replayed.stride, replayed.exclude) == (4, "wrist_left", 2, ())
+    assert (replayed.fields.control_rate_hz, replayed.fields.gripper_open) == (5.0, 2.0)
+    written = config_as_dict(config)
+    assert written["replay"]["data"] == {"source": "rlds", **second, "idle": {"rule": "motion"}}
+    assert parse_config(written, where="") == config
+    values["replay"]["data"] = {"source": "lerobot", "path": "two"}
+    other = parse_config(values, where="").replay.data
+    assert (other.frames, other.camera, other.source) == (4, None, "lerobot")
+    assert "fields" not in config_as_dict(parse_config(values, where=""))["replay"]["data"]
+
+
+def test_a_run_of_0_1_with_a_complete_second_section_and_removed_keys_loads(replaying, caplog) -> None:
+    config = replaying()
+    folder = Path(config.run_dir)
+    folder.mkdir()
+    values, gone = (
+        config_as_dict(config),
+        {"check_crc": "once", "connections": 16, "prefetch": 4, "short_episodes": "skip"},
+    )
+    values["data"] |= gone
+    values["replay"]["data"] = config.replay.data.model_dump(mode="json") | gone | {"validation_share": 0.0}
+    (folder / "config.yaml").write_text(json.dumps(values))
+    assert read_run_config(folder) == config
+    assert "data.prefetch was 4; this version always uses 2" in caplog.text
 
 
 def test_steps_of_another_length_are_refused_with_the_stride_that_fits(replaying, reporter) -> None:

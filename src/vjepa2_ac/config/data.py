@@ -26,7 +26,6 @@ from vjepa2_ac.registry import SOURCES, TRANSFORMS
 # A serial number is a name, also where YAML takes it for a number.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
-_PartOfAFrame = Annotated[float, Field(gt=0.0, le=1.0)]
 Split = Literal["train", "validation", "test"]
 _STRIDES_AT_15_HZ = (4, 8, 15)
 _JOINED = "to sum (deltas), mean (velocities) or last (absolute targets)"
@@ -74,34 +73,6 @@ class IdleConfig(Section):
         return self.refused((is_broken, "rule published and ranges (a file or URL) belong together"))
 
 
-class AugmentConfig(Section):
-    """Random changes of training clips, the same for all frames of a clip. The released recipe has none."""
-
-    crop_scale: tuple[_PartOfAFrame, _PartOfAFrame] | None = None
-    """Random resized crop: least and greatest share of the frame's area; null: no random crop."""
-    crop_aspect: tuple[Positive, Positive] = (0.75, 1.35)
-    """Random resized crop: narrowest and widest width over height."""
-    brightness: Share = 0.0
-    """Colour jitter: brightness is multiplied by 1 - this .. 1 + this."""
-    contrast: Share = 0.0
-    """Colour jitter: contrast likewise."""
-    saturation: Share = 0.0
-    """Colour jitter: saturation likewise."""
-
-    @property
-    def is_on(self) -> bool:
-        """Whether anything is changed."""
-        return self.crop_scale is not None or max(self.brightness, self.contrast, self.saturation) > 0
-
-    @model_validator(mode="after")
-    def _pairs_are_ordered(self) -> AugmentConfig:
-        least, most = self.crop_scale or (0, 1)
-        return self.refused(
-            (least > most, f"crop_scale: {least} is more than {most}"),
-            (self.crop_aspect[0] > self.crop_aspect[1], "crop_aspect: {} is more than {}".format(*self.crop_aspect)),
-        )
-
-
 class DiskCacheConfig(Section):
     """The cache on this machine: remote data, and indexes of data sets."""
 
@@ -133,6 +104,7 @@ class DataConfig(Section):
     A subclass has the default of its `source`, a section for its own knobs where it has some, and its abilities.
     """
 
+    affects: ClassVar[Affects] = Affects.CLIPS
     kinds: ClassVar[dict[str, type[DataConfig]]] = {}  # of the forms that there are, by the name of their source
     reader: ClassVar[str]  # the class that reads the episodes, as module:class; imported when the data are opened
     is_cache: ClassVar[bool] = False  # of latents, by a LatentSource; no frames, one stride
@@ -140,30 +112,31 @@ class DataConfig(Section):
     has_vectors: ClassVar[bool] = True  # states may be other numbers than a pose
     same_identity_fix: ClassVar[str] = ""  # the way out where two episodes are named alike
     gripper_fix: ClassVar[str] = "write 1 - gripper"  # the way out where the gripper is inverted
+    constants: ClassVar[dict[str, dict[str, Any]]] = {}  # options of its sections in 0.1: part of keys of caches
 
-    source: Annotated[str, Affects.FORM]
+    source: str
     """Form of the data set."""
     path: Annotated[Place, Affects.NOTHING]
     """Folder of the data set: on this machine, or a URL such as gs://bucket/folder or hf://datasets/owner/name. A run
     goes on with a folder that was moved, for it is known by what it holds."""
-    camera: Annotated[_CameraName | tuple[_CameraName, ...] | None, Affects.INDEX | Affects.CLIPS] = None
+    camera: _CameraName | tuple[_CameraName, ...] | None = None
     """Which camera the model sees; of several, one is drawn for each clip. null: the source's first, for DROID the left
     exterior camera, which the released weights saw. rlds, lerobot: a name in `cameras`. droid_raw: left, right, wrist,
     ext1, ext2 or a serial number. npz: the name of an array of frames."""
-    states: Annotated[Literal["pose", "vector"], Affects.INDEX | Affects.CLIPS] = "pose"
+    states: Literal["pose", "vector"] = "pose"
     """Kind of state. pose: 7 numbers, position, rotation and gripper, which the released weights know. vector: the
     source's own numbers, unchanged, of any width, for other robots: two arms, joints, a mobile base."""
-    actions: Annotated[Literal["difference", "recorded"], Affects.INDEX | Affects.CLIPS] = "difference"
+    actions: Literal["difference", "recorded"] = "difference"
     """difference: the change from a state to the next. recorded: the source's commands, of any width; for vectors."""
     join_actions: Annotated[Literal["sum", "mean", "last"] | None, Affects.MEASURED | Affects.RUN] = None
     """How the recorded commands of a model step's control steps become one action. sum: deltas. mean: velocities. last:
     absolute targets. Must be given unless `stride` is 1."""
-    frames: Annotated[int, Field(ge=2, le=256), Affects.CLIPS] = 16
+    frames: Annotated[int, Field(ge=2, le=256)] = 16
     """Frames of a clip, one per model step."""
     stride: Annotated[PositiveInt | Literal["auto"], Affects.CLIPS | Affects.PLAN] = 4
     """Control steps per model step. Unsettled for the released weights: 4, 8 and 15 are candidates. auto: before the
     first step the model chooses among `stride_candidates` by its prediction error over persistence."""
-    start_every: Annotated[PositiveInt, Affects.LATENTS | Affects.RUN] = 1
+    start_every: PositiveInt = 1
     """Clips start at multiples of this many control steps, counted from the first step of their episode that
     `data.idle` keeps. With the stride's own number, only every stride-th frame is ever needed: a small latent cache."""
     stride_candidates: Annotated[Annotated[tuple[PositiveInt, ...], Field(min_length=1)] | None, Affects.RUN] = None
@@ -180,12 +153,10 @@ class DataConfig(Section):
     """What keeps related episodes in one split, so that training reveals nothing about held-out ones: a field (lab, day
     or folder, as the identity says; task, scene, building, operator or day where the data set does), or a regular
     expression with one group, which is searched in the identity. null: each episode is drawn independently."""
-    outcome: Annotated[Literal["all", "success", "failure"], Affects.INDEX | Affects.RUN] = "all"
+    outcome: Annotated[Literal["all", "success", "failure"], Affects.RUN] = "all"
     """Which demonstrations are used, if the data set records success and failure."""
-    idle: Annotated[IdleConfig, Affects.IDLE | Affects.LATENTS | Affects.RUN] = IdleConfig()
+    idle: IdleConfig = IdleConfig()
     """Which steps are excluded because the robot stands still."""
-    short_episodes: Annotated[Literal["skip", "error"], Affects.RUN] = "skip"
-    """What to do with episodes shorter than a clip: skip them and report how many, or stop."""
     broken_episodes: Annotated[Literal["error", "skip"], Affects.NOTHING] = "error"
     """What to do with an episode that cannot be read. error: stop and name it. skip: leave its clips out, name and
     count it. The run stops where more are broken than 3 episodes or 1 %, whichever is larger; or, of fewer than 6
@@ -194,35 +165,26 @@ class DataConfig(Section):
     """Identities of episodes to leave out, as errors name them."""
     motion_limits: Annotated[MotionLimits, Affects.NOTHING] = MotionLimits()
     """Speeds of a pose that no arm reaches: a warning of `data check`, for padding, dropouts and joined recordings."""
-    pose_frame: Annotated[Literal["base", "camera"], Affects.INDEX | Affects.CLIPS] = "base"
+    pose_frame: Literal["base", "camera"] = "base"
     """Frame of the poses: the robot's base (the released recipe), or the camera, where its extrinsics are known."""
     crop: Annotated[Literal["released", "square", "letterbox"], Affects.CLIPS | Affects.PLAN] = "released"
     """How a frame that is not square is cropped. released: its centre, 1.35 times as wide as high at most, squashed.
     square: its central square (upstream's evaluation). letterbox: all of it, with black bars."""
-    augment: Annotated[AugmentConfig, Affects.RUN] = AugmentConfig()
-    """Random changes of training clips."""
     transforms: Annotated[tuple[Annotated[Component, ComponentOf(TRANSFORMS)], ...], Affects.RUN] = ()
-    """Changes of training clips by code of your own, in this order, before `augment` (docs/extending.md). Each is given
-    a random generator that depends on the seed and the position of the clip in the run."""
+    """Changes of training clips by code of your own, in this order (docs/extending.md). Each is given a random
+    generator that depends on the seed and the position of the clip in the run."""
     cache: Annotated[Literal["off", "auto", "require"], OFF, Affects.RUN] = "off"
     """Whether the frozen encoder's latents are cached on disk, so that each frame is encoded once. off: no. auto: those
     that are not there yet are encoded before the first step. require: refuse to start where they are not there."""
-    cache_dtype: Annotated[Literal["bf16", "fp32", "int8"], Affects.LATENTS | Affects.RUN] = "bf16"
+    cache_dtype: Literal["bf16", "fp32", "int8"] = "bf16"
     """Storage type of latents: bf16; fp32, which takes twice as much room; int8 with a scale per token, half."""
     cache_dir: Annotated[Place | None, Affects.NOTHING] = None
     """Folder for latent caches, on this machine or a URL such as gs://bucket/folder, one folder in it for each; null:
     `latents` in the folder of `disk_cache`."""
-    check_crc: Annotated[Literal["once", "always", "never"], Affects.NOTHING] = "once"
-    """When the CRC-32C of a local TFRecord's data is checked: the first time that it is read on this machine, every
-    time, or never. The CRC of a record's length is always checked."""
     disk_cache: Annotated[DiskCacheConfig, Affects.NOTHING] = DiskCacheConfig()
     """The cache on this machine."""
     workers: Annotated[int, Field(ge=0, le=256), Affects.NOTHING] = 4
     """Loader processes; 0 loads in the training process. The data does not depend on it."""
-    prefetch: Annotated[PositiveInt, Affects.NOTHING] = 2
-    """Batches that each loader process prefetches."""
-    connections: Annotated[int, Field(ge=1, le=256), Affects.NOTHING] = 16
-    """Concurrent reads per process, for remote data."""
 
     def __new__(cls, **values: Any) -> DataConfig:
         """Make the config of the form of data that `source` names; of RLDS where it is not given."""
@@ -264,10 +226,7 @@ class DataConfig(Section):
             (unknown, f"camera: source {self.source} has no {unknown[:1]}; it has {', '.join(known or ())}"),
             (self.is_cache and self.stride == "auto", "stride auto: a latent cache has one stride; give its number"),
             (self.is_cache and self.cache != "off", f"source {self.source} is itself a cache: set cache: off"),
-            (
-                self.changes_clips and self.takes_latents,
-                f"{self.changes_clips} changes frames, and latents in a cache stay: choose one",
-            ),
+            (self.transforms and self.takes_latents, "transforms change frames, latents in a cache stay: choose one"),
             (splits >= 1.0, "validation_share and test_share leave nothing to train on"),
             (
                 of_camera and not self.has_camera_poses,
@@ -339,9 +298,10 @@ class DataConfig(Section):
         return {name: kind for name, kind in own if isinstance(kind, type) and issubclass(kind, Section)}
 
     @property
-    def changes_clips(self) -> str:
-        """The key that changes training clips, augment or transforms; empty if none does."""
-        return "augment" if self.augment.is_on else "transforms" if self.transforms else ""
+    def own_values(self) -> dict[str, dict[str, Any]]:
+        """The values of its own sections, as the keys of indexes and caches have them."""
+        values = self.model_dump(mode="json", include=set(self.own_sections()))
+        return {name: values.get(name, {}) | self.constants.get(name, {}) for name in {**values, **self.constants}}
 
     @property
     def takes_latents(self) -> bool:

@@ -18,8 +18,8 @@ from pydantic import ValidationError
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import source_of
 from vjepa2_ac.config.removed import drop_removed_keys, move_component_options, why_removed
-from vjepa2_ac.config.run import ReplayConfig
-from vjepa2_ac.config.section import marks_of
+from vjepa2_ac.config.run import ReplayConfig, with_complete_replay
+from vjepa2_ac.config.section import key_of_data, marks_of
 from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.registry import SOURCES, UNKNOWN_OPTION, import_plugins
 from vjepa2_ac.storage import read_bounded
@@ -121,7 +121,8 @@ def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, wh
         drop_removed_keys(given, where)
         move_component_options(given)
     try:
-        return Config.model_validate_json(_as_json(with_plugins(given, where=where, here=here), where))
+        given = with_plugins(given, where=where, here=here)
+        return Config.model_validate_json(_as_json(with_complete_replay(given), where))
     except ValidationError as error:
         lines = _wrong_values(error)
     found = "\n  ".join([f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong", *lines]) + "\n"
@@ -352,7 +353,10 @@ def _wrong_values(error: ValidationError) -> list[str]:
             key = _key_of(detail["loc"]) + ".source" * (detail["type"] == "union_tag_invalid")
             *others, last = dict.fromkeys([*found.get(key, ()), _explain(key, detail)])
             found[key] = [*(line.split(" (found ")[0] for line in others), last]  # all of the same value
-    return [f"{key}: {', or '.join(lines)}".removeprefix(": ") for key, lines in found.items()]
+    inherited = {
+        key for key, lines in found.items() if key_of_data(key) != key and found.get(key_of_data(key)) == lines
+    }
+    return [f"{key}: {', or '.join(lines)}".removeprefix(": ") for key, lines in found.items() if key not in inherited]
 
 
 def all_keys() -> list[str]:
@@ -366,7 +370,7 @@ def _key_of(location: Sequence[Any]) -> str:
     parts: list[str] = []
     for before, part in zip(["", *location], map(str, location), strict=False):
         is_form = before == "data" and part in DataConfig.kinds
-        if not is_form and not (_TYPE_OF_A_UNION.fullmatch(part) and ".".join(parts) in all_keys()):
+        if not is_form and not (_TYPE_OF_A_UNION.fullmatch(part) and key_of_data(".".join(parts)) in all_keys()):
             parts.append(part)
     return ".".join(parts)
 
@@ -380,6 +384,7 @@ def _explain(key: str, detail: Any) -> str:
         return str(detail["msg"])
     if detail["type"] != "extra_forbidden":
         return message_of(detail)
+    key = key_of_data(key)
     section, dot, name = key.rpartition(".")
     if (why := why_removed(key)) is not None:
         return why

@@ -33,6 +33,18 @@ REMOVED: dict[str, RemovedKey] = {
     "decoder.warmup_steps": RemovedKey("500, at most a 15th of decoder.steps", (500, 100, 30)),
     "decoder.weight_decay": RemovedKey("0.05", (0.05,)),
     # "training.betas": RemovedKey("(0.9, 0.999)", ([0.9, 0.999],)),
+    "data.augment": RemovedKey(
+        "off; use data.transforms",
+        ({"crop_scale": None, "crop_aspect": [0.75, 1.35], "brightness": 0.0, "contrast": 0.0, "saturation": 0.0},),
+    ),
+    "data.check_crc": RemovedKey("once", ("once",)),
+    "data.connections": RemovedKey("16", (16,)),
+    "data.droid_raw": RemovedKey("drop, at 15 Hz", ({"skip_action": "drop", "control_rate_hz": 15.0},)),
+    "data.lerobot.joint_velocity": RemovedKey(
+        "action.joint_velocity, if there is one", ("action.joint_velocity", None)
+    ),
+    "data.prefetch": RemovedKey("2", (2,)),
+    "data.short_episodes": RemovedKey("skip", ("skip",)),
 }
 """RemovedKey keys and sections, by their dotted key. A row for a key of `data` also holds below `replay`."""
 

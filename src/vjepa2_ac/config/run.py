@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from vjepa2_ac.config.data import DataConfig
+from vjepa2_ac.config.data import DataConfig, source_of
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.config.section import Affects, AtMost, Section
+from vjepa2_ac.config.section import Affects, Section
 from vjepa2_ac.config.sources import RldsData  # noqa: F401 - all forms of data
 from vjepa2_ac.config.training import CheckpointConfig, DecoderConfig, TrackingConfig, TrainingConfig, ValidationConfig
 from vjepa2_ac.storage import places
@@ -32,9 +33,10 @@ class ReplayConfig(Section):
 
     share: Annotated[float, Field(gt=0.0, lt=1.0), Affects.RUN] = 0.25
     """Share of the training clips that come from it, evenly spread over the run."""
-    data: Annotated[DataConfig, AtMost(Affects.RUN)]
-    """The second data set, with the knobs of `data`: as many frames, the same kind of states and actions, and latents
-    of a cache if the first one's clips are. Only its training split is used; `workers` and `prefetch` are not."""
+    data: Annotated[DataConfig, Affects.RUN]
+    """The second data set: its `path`, and the keys of `data` that differ; the others are those of `data`, except
+    `exclude`, and `camera` if the source differs. As many frames, the same kind of states and actions, and latents of a
+    cache if the first one's clips are. Only its training split is used, and its `workers` are not."""
 
     def misfits(self, first: DataConfig) -> list[str]:
         """Return why clips of both cannot be in one micro-batch, as far as their configs say."""
@@ -79,6 +81,18 @@ class Config(Section):
     decoder: Annotated[DecoderConfig, Affects.NOTHING] = DecoderConfig()
     """The decoder of `vjepa2-ac decoder`; training does not use it."""
 
+    @model_serializer(mode="wrap")
+    def _shorten_replay(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Write the keys of `replay.data` that differ from those of `data`, with its source and path."""
+        values: dict[str, Any] = handler(self)
+        if values.get("replay") and values.get("data"):
+            second = values["replay"]["data"]
+            inherited = _inherited(values["data"], second) | {"source": None, "path": None}
+            if not second["exclude"]:
+                inherited["exclude"] = second["exclude"]
+            values["replay"] = {**values["replay"], "data": _differences(inherited, second)}
+        return values
+
     @model_validator(mode="after")
     def _parts_fit(self) -> Config:
         training, adapter, model, best = self.training, self.adapter, self.model, self.checkpoint.keep_best
@@ -121,3 +135,40 @@ class Config(Section):
         if self.replay is None:
             raise ValueError("a config without replay")
         return self.model_copy(update={"data": self.replay.data, "replay": None})
+
+
+def with_complete_replay(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the plain values of a config in which `replay.data` has the keys of `data` that it does not give."""
+    data, replay = values.get("data"), values.get("replay")
+    if not (isinstance(data, dict) and isinstance(replay, dict) and isinstance(second := replay.get("data"), dict)):
+        return values
+    return {**values, "replay": {**replay, "data": _merged(_inherited(data, second), second)}}
+
+
+def _inherited(data: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of `data` that a second data set takes where it gives none."""
+    dropped = {"path", "exclude"}
+    source = second.get("source", source_of(data))
+    if source != source_of(data):
+        kind = DataConfig.kinds.get(source_of(data), DataConfig)
+        dropped |= {"source", "camera", *kind.own_sections()}
+    return {key: value for key, value in data.items() if key not in dropped}
+
+
+def _merged(base: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of both, those of the second where both have some; sections are merged key by key."""
+    sections = {key for key in base.keys() & other if isinstance(base[key], dict) and isinstance(other[key], dict)}
+    return {**base, **other, **{key: {**base[key], **other[key]} for key in sections}}
+
+
+def _differences(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that `_merged` needs to make them of a base; of sections likewise."""
+    differing = {}
+    for key, value in values.items():
+        before = base.get(key)
+        if isinstance(value, dict) and isinstance(before, dict):
+            if inner := {name: one for name, one in value.items() if name not in before or one != before[name]}:
+                differing[key] = inner
+        elif key not in base or value != before:
+            differing[key] = value
+    return differing

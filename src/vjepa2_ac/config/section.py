@@ -1,20 +1,18 @@
-"""Base class of config sections: frozen, strict, every knob documented; and what each knob affects.
+"""Base class of config sections: frozen, strict, every key documented; and what each key affects.
 
-That is said at the knob, as `Annotated[…, Affects.RUN]`, and asked for wherever two things compare. A mark of a section
-holds for the knobs in it that have none of their own. `AtMost` limits those that have.
+A section has one mark: `Section.affects`, or `Annotated[…, Affects.RUN]` where it is used. A key that differs has its
+own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from enum import Flag, auto
 from functools import cache, reduce
 from operator import or_
-from typing import Annotated, Any, Self, get_args
+from typing import Annotated, Any, ClassVar, Self, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
-from pydantic.fields import FieldInfo
 
 from vjepa2_ac.storage import places
 
@@ -30,8 +28,21 @@ Local = Annotated[str, AfterValidator(places.on_this_machine)]  # likewise, but 
 LocalOrBuiltin = Annotated[str, AfterValidator(places.of_a_model)]  # likewise, or a part of the package
 
 
+class Affects(Flag):
+    """What changes when a config key has another value."""
+
+    NOTHING = 0  # how fast, where, what is written
+    LATENTS = auto()  # a latent cache
+    MEASURED = auto()  # what a validation measures, besides its clips, which are compared themselves
+    RUN = auto()  # what a run computes: it does not resume with another value
+    PLAN = auto()  # a decision of the planner
+    CLIPS = LATENTS | MEASURED | RUN
+
+
 class Section(BaseModel):
-    """A group of knobs: frozen, and unknown keys are errors."""
+    """A group of config keys: frozen, and unknown keys are errors."""
+
+    affects: ClassVar[Affects | None] = None  # the mark of its keys and sections that have none; None: the outer one
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -49,101 +60,79 @@ class Section(BaseModel):
         return self
 
 
-class Affects(Flag):
-    """What is no longer the same when a knob has another value. What depends on the index changes with it."""
-
-    NOTHING = 0  # how fast, where, what is written
-    INDEX = auto()  # what is known of the episodes of a data set
-    IDLE = auto()  # the steps in which the robot moves
-    LATENTS = auto()  # a latent cache
-    MEASURED = auto()  # what a validation measures, besides its clips, which are compared themselves
-    RUN = auto()  # what a run computes: it does not go on with another value
-    PLAN = auto()  # a decision: planning has no use for the others
-    CLIPS = LATENTS | MEASURED | RUN
-    FORM = INDEX | IDLE | LATENTS | RUN
-    EPISODES = FORM | CLIPS
-
-
-@dataclass(frozen=True)
-class AtMost:
-    """What the knobs of a section affect at most where it stands, whatever their own marks are."""
-
-    mark: Affects
-
-
-_ALL = AtMost(~Affects.NOTHING)
+OVERLAY = "replay.data"  # the keys of `data` that differ in a second data set
 
 
 @cache
-def marks_of(knobs: type[BaseModel]) -> Mapping[str, Affects]:
-    """Return the mark of each knob of a section and of those in it, by its dotted key.
+def marks_of(section: type[BaseModel]) -> Mapping[str, Affects]:
+    """Return the mark of each key of a section and of the sections in it, by its dotted key.
 
     Raises:
-        TypeError: A knob has none: nobody could say what depends on it.
+        TypeError: A key has none.
     """
-    return dict(_marks(knobs, None, "", ~Affects.NOTHING))
+    return dict(_marks(section, getattr(section, "affects", None), ""))
 
 
 @cache
-def mark_of(key: str, knobs: type[BaseModel]) -> Affects:
-    """Return the mark of a knob, or of that which holds a value, such as data.fields.cameras.left.
+def mark_of(key: str, section: type[BaseModel]) -> Affects:
+    """Return the mark of a key, or of the key that has a value such as data.fields.cameras.left.
 
-    That of a section is all that its knobs affect.
+    The mark of a section combines those of its keys. The keys of `replay.data` are those of `data`; a second data set
+    affects the run only.
 
     Raises:
-        KeyError: There is no such knob.
+        KeyError: There is no such key.
     """
-    wanted = f"{key}."
-    known = ((f"{name}.", mark) for name, mark in marks_of(knobs).items())
-    found = [mark for name, mark in known if name.startswith(wanted) or wanted.startswith(name)]
-    if not found:
+    if (of_data := key_of_data(key)) != key:
+        return mark_of(of_data, section) & Affects.RUN
+    known = ((f"{name}.", mark) for name, mark in marks_of(section).items())
+    marks = [mark for name, mark in known if name.startswith(f"{key}.") or f"{key}.".startswith(name)]
+    if not marks:
         raise KeyError(key)
-    return reduce(or_, found)
+    return reduce(or_, marks)
 
 
-def knobs_that_affect(what: Affects, section: BaseModel) -> dict[str, Any]:
-    """Return the knobs of a section, and of those in it, that affect any of these, as plain values.
+def key_of_data(key: str) -> str:
+    """Return the key of `data` that a key of `replay.data` overlays; any other key is returned unchanged."""
+    return f"data.{key.removeprefix(f'{OVERLAY}.')}" if key.startswith(f"{OVERLAY}.") else key
+
+
+def values_that_affect(what: Affects, section: BaseModel) -> dict[str, Any]:
+    """Return the values of the keys of a section that affect any of these, as nested plain values.
 
     Raises:
         TypeError: As `marks_of`.
     """
-    return _that_affect(what, section, type(section), "")
+    plain: dict[str, Any] = section.model_dump(mode="json")
+    chosen: dict[str, Any] = {}
+    for key, mark in marks_of(type(section)).items():
+        *outer, name = key.split(".")
+        values, target = plain, chosen
+        for part in outer:
+            values = values.get(part) or {}
+        if what & mark and name in values:
+            for part in outer:
+                target = target.setdefault(part, {})
+            target[name] = values[name]
+    return chosen
 
 
-def _that_affect(what: Affects, section: BaseModel, knobs: type[BaseModel], prefix: str) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name in type(section).model_fields:
-        value = getattr(section, name)
-        if isinstance(value, BaseModel):
-            if inner := _that_affect(what, value, knobs, f"{prefix}{name}."):
-                found[name] = inner
-        elif what & mark_of(prefix + name, knobs):
-            found[name] = section.model_dump(mode="json", include={name})[name]
-    return found
-
-
-def _marks(
-    section: type[BaseModel], outer: Affects | None, prefix: str, most: Affects
-) -> Iterator[tuple[str, Affects]]:
+def _marks(section: type[BaseModel], outer: Affects | None, prefix: str) -> Iterator[tuple[str, Affects]]:
     for name, field in section.model_fields.items():
-        mark = _noted(field, Affects, outer)
-        inner = sections_in(field.annotation)
-        inner = [kind for one in inner for kind in [*getattr(one, "kinds", {}).values()] or [one]]
-        for one in inner:
-            yield from _marks(one, mark, f"{prefix}{name}.", most & _noted(field, AtMost, _ALL).mark)
-        if not inner and mark is None:
-            raise TypeError(f"{prefix}{name}: say what it affects, as in Annotated[int, Affects.RUN]")
-        if not inner and mark is not None:
-            yield prefix + name, mark & most
-
-
-def _noted(field: FieldInfo, kind: type[Any], otherwise: Any) -> Any:
-    """Return the note of a kind at a knob."""
-    return next((one for one in field.metadata if isinstance(one, kind)), otherwise)
+        mark = next((one for one in field.metadata if isinstance(one, Affects)), None)
+        inner = [] if prefix + name == OVERLAY else sections_in(field.annotation)
+        for one in (kind for base in inner for kind in [*getattr(base, "kinds", {}).values()] or [base]):
+            marks = (mark, getattr(one, "affects", None), outer)
+            yield from _marks(one, next((known for known in marks if known is not None), None), f"{prefix}{name}.")
+        if not inner:
+            mark = outer if mark is None else mark
+            if mark is None:
+                raise TypeError(f"{prefix}{name}: say what it affects, as in Annotated[int, Affects.RUN]")
+            yield prefix + name, mark
 
 
 def sections_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the sections that a knob of this type may hold."""
+    """Return the sections that a key of this type may hold."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [section for one in get_args(annotation) for section in sections_in(one)]

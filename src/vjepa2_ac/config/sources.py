@@ -1,15 +1,17 @@
-"""Source knobs: the forms of data, where each stores what the model needs, and what each can."""
+"""Source options: the forms of data, where each stores what the model needs, and what each can."""
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from vjepa2_ac.config.data import DataConfig
-from vjepa2_ac.config.section import Affects, Count, Section
+from vjepa2_ac.config.section import Count, Section
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
+RAW_RATE_HZ = 15.0  # control steps of raw DROID; an MP4 holds one frame for each, whatever its header says
+JOINT_VELOCITY = "action.joint_velocity"  # LeRobot's column of commanded joint velocities, which the idle filter reads
 
 RECORD: Literal["record"] = "record"  # as an identity
 RotationFormat = Literal["euler_xyz", "euler_xyz_degrees", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw"]
@@ -20,16 +22,16 @@ _Names = Annotated[tuple[str, ...], Field(min_length=1)]
 class PoseFields(Section):
     """How the numbers of a data set form a pose: which of them, in which units, and with which rotation."""
 
-    select: Annotated[tuple[Count, ...] | None, Affects.EPISODES] = None
+    select: tuple[Count, ...] | None = None
     """Which numbers of `state`, in this order, are x, y, z, rotation (3 or 4), gripper; or the vector; null: all."""
-    rotation: Annotated[RotationFormat, Affects.EPISODES] = "euler_xyz"
+    rotation: RotationFormat = "euler_xyz"
     """Rotation format: extrinsic xyz Euler angles in radians or degrees; a rotation vector (axis times angle in
     radians); or a unit quaternion with w first or last."""
-    position_unit: Annotated[Literal["m", "cm", "mm"], Affects.EPISODES] = "m"
+    position_unit: Literal["m", "cm", "mm"] = "m"
     """Unit of the position. The model's states and actions are in metres."""
-    gripper_open: Annotated[float, Affects.EPISODES] = 0.0
+    gripper_open: float = 0.0
     """The gripper's value when it is open."""
-    gripper_closed: Annotated[float, Affects.EPISODES] = 1.0
+    gripper_closed: float = 1.0
     """The gripper's value when it is closed; smaller than gripper_open if the sign is inverted."""
 
     @model_validator(mode="after")
@@ -47,31 +49,31 @@ class PoseFields(Section):
 class RldsFields(PoseFields):
     """Where an RLDS data set stores what the model needs; the defaults are DROID's."""
 
-    state: Annotated[_Names, Affects.EPISODES] = (
+    state: _Names = (
         "steps/observation/cartesian_position",
         "steps/observation/gripper_position",
     )
     """Features whose numbers, concatenated, hold position, rotation and gripper of the *measured* state; for
     `states: vector` any numbers."""
-    action: Annotated[_Names, Affects.INDEX | Affects.CLIPS] = ("steps/action",)
+    action: _Names = ("steps/action",)
     """For `actions: recorded`: features that form, concatenated, the *commanded* action of each control step."""
-    identity: Annotated[_Names | Literal["record"], Affects.EPISODES] = (
+    identity: _Names | Literal["record"] = (
         "episode_metadata/recording_folderpath",
         "episode_metadata/file_path",
     )
     """Features that name an episode; the split into train, validation and test is a hash of them. record: split, file
     and number of the record, for sets without such features; the split then changes if the set is written again."""
-    cameras: Annotated[dict[str, str], Field(min_length=1), Affects.EPISODES] = {
+    cameras: Annotated[dict[str, str], Field(min_length=1)] = {
         "exterior_1_left": "steps/observation/exterior_image_1_left",
         "exterior_2_left": "steps/observation/exterior_image_2_left",
         "wrist_left": "steps/observation/wrist_image_left",
     }
     """Camera name -> feature with its frames."""
-    language: Annotated[str | None, Affects.IDLE | Affects.CLIPS] = "steps/language_instruction"
+    language: str | None = "steps/language_instruction"
     """Feature stored in the episode's metadata; the model does not use it."""
-    joint_velocity: Annotated[str | None, Affects.IDLE | Affects.CLIPS] = "steps/action_dict/joint_velocity"
+    joint_velocity: str | None = "steps/action_dict/joint_velocity"
     """Feature with the *commanded* joint velocities, read by the idle filter; null: there is none."""
-    control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0), Affects.IDLE | Affects.CLIPS] = 15.0
+    control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 15.0
     """Control steps per second (RLDS does not say)."""
 
     @property
@@ -80,36 +82,25 @@ class RldsFields(PoseFields):
         return () if self.identity == RECORD else self.identity
 
 
-class RawDroidOptions(Section):
-    """How raw DROID (trajectory.h5, metadata_*.json, recordings/MP4) is read."""
-
-    skip_action: Annotated[Literal["drop", "keep"], Affects.EPISODES] = "drop"
-    """Steps at which the operator was not in control: drop them, as DROID's own loader does, or keep them."""
-    control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0), Affects.EPISODES] = 15.0
-    """Control steps per second; the MP4 holds one frame for each, whatever its header says."""
-
-
 class LeRobotFields(PoseFields):
     """Where a LeRobot data set stores what the model needs; the defaults are those of DROID's ports."""
 
-    state: Annotated[_Names, Affects.EPISODES] = (
+    state: _Names = (
         "observation.state.cartesian_position",
         "observation.state.gripper_position",
     )
     """Columns that hold position, rotation and gripper of the *measured* state; for `states: vector` any numbers."""
-    action: Annotated[_Names, Affects.INDEX | Affects.CLIPS] = ("action",)
+    action: _Names = ("action",)
     """For `actions: recorded`: columns that form, concatenated, the *commanded* action of each control step."""
-    cameras: Annotated[dict[str, str], Field(min_length=1), Affects.EPISODES] = {
+    cameras: Annotated[dict[str, str], Field(min_length=1)] = {
         "exterior_1_left": "observation.images.exterior_1_left",
         "exterior_2_left": "observation.images.exterior_2_left",
         "wrist_left": "observation.images.wrist_left",
     }
     """Camera name -> video feature."""
-    joint_velocity: Annotated[str | None, Affects.EPISODES] = "action.joint_velocity"
-    """Column with the *commanded* joint velocities, read by the idle filter if there is one."""
-    success: Annotated[str | None, Affects.EPISODES] = "is_episode_successful"
+    success: str | None = "is_episode_successful"
     """Column with the episode's success, used if there is one."""
-    fps: Annotated[Annotated[float, Field(gt=0.0, le=1000.0)] | None, Affects.EPISODES] = None
+    fps: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
     """Control steps per second; null: what meta/info.json says."""
 
 
@@ -123,7 +114,7 @@ class RldsData(DataConfig):
         "Add a feature to data.fields.identity that differs between them, or set data.fields.identity: record"
     )
 
-    source: Annotated[Literal["rlds"], Affects.FORM] = "rlds"
+    source: Literal["rlds"] = "rlds"
     """rlds: TFRecord shards with a dataset_info.json, as TFDS writes them."""
     fields: RldsFields = RldsFields()
     """Names of the features."""
@@ -145,11 +136,12 @@ class RawDroidData(DataConfig):
     reader: ClassVar[str] = "vjepa2_ac.data.sources.droid_raw:RawDroidSource"
     has_vectors: ClassVar[bool] = False
     same_identity_fix: ClassVar[str] = "Name a smaller folder in data.path"
+    constants: ClassVar[dict[str, dict[str, Any]]] = {
+        "droid_raw": {"skip_action": "drop", "control_rate_hz": RAW_RATE_HZ}
+    }
 
-    source: Annotated[Literal["droid_raw"], Affects.FORM] = "droid_raw"
+    source: Literal["droid_raw"] = "droid_raw"
     """droid_raw: DROID's folders with trajectory.h5 and MP4."""
-    droid_raw: RawDroidOptions = RawDroidOptions()
-    """Which steps are used."""
 
     @property
     def offered_cameras(self) -> tuple[str, ...]:
@@ -162,9 +154,10 @@ class LeRobotData(DataConfig):
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.lerobot.source:LeRobotSource"
     gripper_fix: ClassVar[str] = "exchange data.lerobot.gripper_open and gripper_closed"
+    constants: ClassVar[dict[str, dict[str, Any]]] = {"lerobot": {"joint_velocity": JOINT_VELOCITY}}
     has_camera_poses: ClassVar[bool] = False
 
-    source: Annotated[Literal["lerobot"], Affects.FORM] = "lerobot"
+    source: Literal["lerobot"] = "lerobot"
     """lerobot: LeRobotDataset v2.1 or v3.0."""
     lerobot: LeRobotFields = LeRobotFields()
     """Names and conventions of the columns."""
@@ -185,7 +178,7 @@ class NpzData(DataConfig):
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.npz:NpzSource"
 
-    source: Annotated[Literal["npz"], Affects.FORM] = "npz"
+    source: Literal["npz"] = "npz"
     """npz: a folder of .npz episodes."""
 
     @property
@@ -201,7 +194,7 @@ class LatentsData(DataConfig):
     is_cache: ClassVar[bool] = True
     gripper_fix: ClassVar[str] = "change the convention of the data set that the cache was made from"
 
-    source: Annotated[Literal["latents"], Affects.FORM] = "latents"
+    source: Literal["latents"] = "latents"
     """latents: a latent cache alone, without the data set that it was made from."""
 
     @property

@@ -155,7 +155,6 @@ def collate(clips: Sequence[Clip]) -> Batch:
         extrinsics=torch.from_numpy(np.stack(extrinsics)) if len(extrinsics) == len(clips) else None,
         episode_ids=tuple(clip.episode_id for clip in clips),
         starts=tuple(clip.start for clip in clips),
-        augmentations=tuple(clip.augmentation for clip in clips if clip.augmentation is not None),
         latents=joined_latents(latents, torch.stack) if latents else None,
         cameras=tuple(clip.camera for clip in clips),
     )

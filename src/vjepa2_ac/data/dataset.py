@@ -87,7 +87,7 @@ class Dataset:
 
         Clip i is always the same one: clips are sorted by the identity of their episode and then by their first control
         step, whatever the seed; of several cameras one is drawn by a hash of the clip. Clips are as recorded:
-        `data.augment` and `data.transforms` belong to the order of a training run.
+        `data.transforms` belongs to the order of a training run.
 
         Returns:
             `len(clips)` clips; `clips[i]` is an `episode.Clip` of `frames` (time x height x width x 3, uint8, RGB,

@@ -18,6 +18,7 @@ from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
 from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
+CONNECTIONS = 16  # concurrent reads of a process, for remote data
 DEEPEST = 8  # folders below the data set's
 _QUEUED = 4096  # results and tasks that wait at once: of a hundred thousand episodes not all
 
@@ -79,7 +80,7 @@ class EpisodeFiles:
 
 def connections_to(config: DataConfig) -> int:
     """Return how many files are read at once: behind a URL, where each is waited for, several."""
-    return config.connections if storage.is_url(config.path) else 1
+    return CONNECTIONS if storage.is_url(config.path) else 1
 
 
 def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> Iterator[Result]:

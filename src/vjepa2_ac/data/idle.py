@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, IdleConfig
-from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, fingerprint_of, get_or_make, key_of
 from vjepa2_ac.data.selection import StepSelection, as_error, as_problem
@@ -35,8 +34,8 @@ def find_ranges(
     Raises:
         InputError: The list of ranges cannot be read or belongs to another data set; or the rule fits no episode.
     """
-    knobs = knobs_that_affect(Affects.IDLE, config)
-    parts: dict[str, object] = {"found": "idle ranges", "table": fingerprint_of(table), "data": knobs}
+    values = {"idle": config.idle.model_dump(mode="json"), **config.own_values}
+    parts: dict[str, object] = {"found": "idle ranges", "table": fingerprint_of(table), "data": values}
     make = partial(_computed, source, table, config, progress or no_progress)
     if config.idle.rule == "published":
         path = str(config.idle.ranges)

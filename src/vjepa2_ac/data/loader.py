@@ -273,4 +273,4 @@ def prefetch_next(batches: Iterator[Batch]) -> None:
 def _micro_batches(
     clips: _MicroBatches, positions: Iterator[list[int]], workers: int, *, pinned: bool = False
 ) -> Generator[Batch | UserError, None, None]:
-    return results_of_workers(clips, positions, workers, clips.dataset.config.prefetch, pinned=pinned)
+    return results_of_workers(clips, positions, workers, pinned=pinned)

@@ -35,10 +35,11 @@ from vjepa2_ac.process import safe_imports, stop_request
 _T = TypeVar("_T")
 Change = Callable[[Tensor], Tensor]
 SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where PyTorch puts the batches of workers, on Linux
+PREFETCH = 2  # batches that each worker prepares in advance
 _POLL_S = 1.0  # between two checks of workers and signals, while waiting for a batch
 _GRACE_S = 5.0  # a signal waits this long for a batch, for the step to be finished
 _NO_WORKERS = "data.workers=0"
-_ROOM = f"With Docker add --shm-size=8g or --ipc=host to `docker run`, lower data.prefetch, or set {_NO_WORKERS}"
+_ROOM = f"With Docker add --shm-size=8g or --ipc=host to `docker run`, set {_NO_WORKERS}"
 
 
 # ---- copies to the device ----
@@ -137,7 +138,7 @@ def copies_for(device: torch.device) -> ToDevice | None:
 
 
 def results_of_workers(
-    items: TorchDataset[Any], positions: Iterator[list[int]], workers: int, prefetch: int, *, pinned: bool = False
+    items: TorchDataset[Any], positions: Iterator[list[int]], workers: int, *, pinned: bool = False
 ) -> Generator[Any, None, None]:
     """Yield `items.__getitems__` of each list of positions, in order, computed by worker processes.
 
@@ -145,7 +146,6 @@ def results_of_workers(
         items: The data set.
         positions: What each result is made of.
         workers: Number of processes; 0: this one.
-        prefetch: Results that each worker prepares in advance.
         pinned: Put tensors into pinned memory.
 
     Raises:
@@ -165,7 +165,7 @@ def results_of_workers(
         multiprocessing_context=context,
         worker_init_fn=_prepare_worker if workers else None,
         timeout=_POLL_S if workers else 0,
-        prefetch_factor=prefetch if workers else None,
+        prefetch_factor=PREFETCH if workers else None,
         pin_memory=pinned,
     )
     others = set(multiprocessing.active_children())
@@ -195,7 +195,7 @@ def _next_row(rows: Iterator[Any], workers: Iterable[BaseProcess]) -> Any:
         except RuntimeError as error:
             if dead := [worker for worker in workers if not worker.is_alive()]:
                 found = f"a loader worker has ended unexpectedly (exit code {dead[0].exitcode})"
-                fix = f"If memory is full, lower data.workers or data.prefetch. With {_NO_WORKERS} there are no workers"
+                fix = f"If memory is full, lower data.workers. With {_NO_WORKERS} there are no workers"
                 raise UnreachableError(where="data.workers", found=found, fix=fix) from error
             if "timed out" not in str(error):
                 raise
@@ -274,10 +274,10 @@ def require_shared_memory(data: DataConfig, batch_bytes: float, processes: int =
     Raises:
         UnreachableError: There is less room.
     """
-    needed = processes * data.workers * data.prefetch * batch_bytes
+    needed = processes * data.workers * PREFETCH * batch_bytes
     free = shutil.disk_usage(SHARED_MEMORY).free if SHARED_MEMORY.is_dir() else math.inf
     if needed > free:
-        text = f"{counted(processes * data.workers, 'worker')} x {data.prefetch} batches of {_megabytes(batch_bytes)}"
+        text = f"{counted(processes * data.workers, 'worker')} x {PREFETCH} batches of {_megabytes(batch_bytes)}"
         text = f"{_megabytes(needed)}, for {text} in advance"
         raise UnreachableError(where=str(SHARED_MEMORY), found=f"{_megabytes(free)} free", needed=text, fix=_ROOM)
 

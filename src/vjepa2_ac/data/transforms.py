@@ -1,8 +1,7 @@
-"""Camera frames to encoder input: crop, transforms, augmentation, scaling, normalisation.
+"""Camera frames to encoder input: crop, the user's transforms, scaling, normalisation.
 
 The crop is taken in the loader, on uint8, and the user's transforms are applied there; everything else runs on the
-device, on a whole batch. Augmentation of training clips, a random crop and colour jitter, is drawn once per clip in the
-loader and applied on the device.
+device, on a whole batch.
 
 Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/transforms.py and src/datasets/utils/video/transforms.py. The
 recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, is always taken: nothing is random.
@@ -10,9 +9,8 @@ recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, i
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
@@ -21,8 +19,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.config import AugmentConfig, DataConfig
-from vjepa2_ac.episode import Augmentation, Clip
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import require_bounded
 from vjepa2_ac.registry import TRANSFORMS
@@ -34,9 +32,7 @@ NARROWEST, WIDEST = 0.75, 1.35  # width over height that the recipe leaves uncro
 
 _MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)  # of ImageNet, as the encoder was trained
 _STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
-_BRIGHTNESS = (0.299, 0.587, 0.114)  # weights of red, green and blue, ITU-R BT.601
-_STREAM = 0xA6  # separates the random numbers of augmentation from others of the same seed and position
-_TRANSFORMS_STREAM = 0x7F  # likewise those of transforms
+_STREAM = 0x7F  # separates the random numbers of transforms from others of the same seed and position
 
 
 @dataclass(frozen=True)
@@ -106,32 +102,20 @@ def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.nda
 
 
 def pixels_to_input(
-    frames: UInt8[Tensor, "batch time height width 3"], image_size: int, augmentations: Sequence[Augmentation] = ()
+    frames: UInt8[Tensor, "batch time height width 3"], image_size: int
 ) -> Float[Tensor, "batch time 3 size size"]:
     """Return cropped frames as encoder input: squashed to a square (bilinear), ImageNet mean 0 and std 1.
 
     Args:
         frames: Results of `view`, stacked, on any device.
         image_size: Height and width of a result, in pixels.
-        augmentations: One for each clip, applied before; or none.
-
-    Raises:
-        ValueError: There are some augmentations, but not one for each clip.
     """
-    batch, time = frames.shape[:2]
-    if not augmentations:
-        resized = _resized(frames.flatten(0, 1), image_size)
-    elif len(augmentations) == batch:
-        parts = []
-        for clip, augmentation in zip(frames, augmentations, strict=True):
-            top, left, height, width = augmentation.box
-            part = clip[:, top : top + height, left : left + width]
-            parts.append(jittered(_resized(part, image_size), augmentation))
-        resized = torch.cat(parts)
-    else:
-        raise ValueError(f"{len(augmentations)} augmentations for {batch} clips")
+    pixels = frames.flatten(0, 1).permute(0, 3, 1, 2).to(torch.float32)
+    resized = torch.nn.functional.interpolate(
+        pixels, size=(image_size, image_size), mode="bilinear", align_corners=False, antialias=False
+    )
     normalised: Tensor = (resized - per_channel(_MEAN, frames.device)) / per_channel(_STD, frames.device)
-    return normalised.reshape(batch, time, 3, image_size, image_size)
+    return normalised.reshape(*frames.shape[:2], 3, image_size, image_size)
 
 
 def input_to_pixels(inputs: Float[Tensor, "*batch 3 size size"]) -> UInt8[Tensor, "*batch 3 size size"]:
@@ -166,26 +150,18 @@ def frame_of_seen(
     return frame
 
 
-def _resized(frames: UInt8[Tensor, "count height width 3"], size: int) -> Float[Tensor, "count 3 size size"]:
-    pixels = frames.permute(0, 3, 1, 2).to(torch.float32)
-    return torch.nn.functional.interpolate(
-        pixels, size=(size, size), mode="bilinear", align_corners=False, antialias=False
-    )
-
-
 @dataclass(frozen=True)
 class ClipChanges:
-    """Changes of the training clips of a run: the user's transforms, then augmentation."""
+    """The user's transforms of the training clips of a run."""
 
     transforms: tuple[tuple[str, Transform], ...]  # by name, in the config's order
-    augment: AugmentConfig
     seed: int
 
     @classmethod
     def of(cls, data: DataConfig, seed: int) -> ClipChanges:
         """Return the changes that a config describes; transforms are made once, in the process that starts workers."""
         made = ((config.name, TRANSFORMS.make(config.name, config.options)) for config in data.transforms)
-        return cls(tuple(made), data.augment, seed)
+        return cls(tuple(made), seed)
 
     def apply(self, clip: Clip, position: int) -> Clip:
         """Return the changed clip: a pure function of the clip, the seed and its position in the run.
@@ -194,13 +170,10 @@ class ClipChanges:
             InputError: A transform returned something that training cannot use.
         """
         for number, (name, transform) in enumerate(self.transforms):
-            before, generator = clip, np.random.default_rng([_TRANSFORMS_STREAM, number, self.seed, position])
+            before, generator = clip, np.random.default_rng([_STREAM, number, self.seed, position])
             clip = transform(before, generator)
             _require_same_form(clip, before, name)
-        if clip.frames is None:
-            return clip
-        height, width = clip.frames.shape[1:3]
-        return replace(clip, augmentation=draw(self.augment, height, width, seed=self.seed, position=position))
+        return clip
 
 
 def _require_same_form(result: object, before: Clip, name: str) -> None:
@@ -217,78 +190,6 @@ def _form(clip: object, part: str) -> str:
     if part == "frames":
         shape[1:3] = ["height", "width"]
     return f"{part} of {array.dtype}, {' x '.join(shape)}"
-
-
-def draw(config: AugmentConfig, height: int, width: int, *, seed: int, position: int) -> Augmentation | None:
-    """Return the augmentation of the clip at a position of the run, or None if there is none.
-
-    A pure function of its arguments: neither workers nor resuming change it. The crop's share of the area is uniform,
-    the logarithm of its aspect likewise, among the aspects with which that area fits into the frame; where none of
-    `crop_aspect` fits, the nearest one that fits is used. So no draw falls back to the whole frame.
-
-    Args:
-        config: The ranges of the changes.
-        height: Of the clip's frames, in pixels, after `transforms.view`.
-        width: Likewise.
-        seed: Of the run.
-        position: Of the clip in the run.
-
-    Source: the random resized crop of Szegedy et al. (arXiv 1409.4842, section 6), without its rejections.
-    """
-    if not config.is_on:
-        return None
-    numbers = np.random.default_rng([_STREAM, seed, position]).random(7)
-    brightness, contrast, saturation = (
-        1 + reach * (2 * float(number) - 1)
-        for reach, number in zip((config.brightness, config.contrast, config.saturation), numbers[4:], strict=True)
-    )
-    return Augmentation(_box(config, height, width, numbers), brightness, contrast, saturation)
-
-
-def _box(
-    config: AugmentConfig, height: int, width: int, numbers: Float[np.ndarray, " numbers"]
-) -> tuple[int, int, int, int]:
-    if config.crop_scale is None:
-        return 0, 0, height, width
-    least, greatest = config.crop_scale
-    share = least + (greatest - least) * float(numbers[0])
-    shape = width / height
-    fits = share * shape, shape / share  # the narrowest and the widest box of this area
-    low, high = (math.log(min(max(aspect, fits[0]), fits[1])) for aspect in config.crop_aspect)
-    aspect = math.exp(low + (high - low) * float(numbers[1]))
-    area = share * height * width
-    box_height = min(height, max(1, round(math.sqrt(area / aspect))))
-    box_width = min(width, max(1, round(math.sqrt(area * aspect))))
-    top = int(numbers[2] * (height - box_height + 1))
-    left = int(numbers[3] * (width - box_width + 1))
-    return top, left, box_height, box_width
-
-
-def jittered(
-    pixels: Float[Tensor, "time 3 height width"], augmentation: Augmentation
-) -> Float[Tensor, "time 3 height width"]:
-    """Return a clip, 0..255, with changed brightness, contrast and saturation; a factor of 1 changes nothing.
-
-    Each blends the frame with another one and clamps: brightness with black, contrast with the mean grey,
-    saturation with the frame in grey. The mean grey is the whole clip's, so that every frame changes alike.
-
-    Source: the formulas of torchvision's adjust_brightness, adjust_contrast and adjust_saturation, in this order.
-    """
-    if augmentation.brightness != 1:
-        pixels = _blend(pixels, torch.zeros_like(pixels), augmentation.brightness)
-    if augmentation.contrast != 1:
-        pixels = _blend(pixels, _grey(pixels).mean(), augmentation.contrast)
-    if augmentation.saturation != 1:
-        pixels = _blend(pixels, _grey(pixels), augmentation.saturation)
-    return pixels
-
-
-def _blend(pixels: Tensor, plainer: Tensor, factor: float) -> Tensor:
-    return (factor * pixels + (1 - factor) * plainer).clamp(0, 255)
-
-
-def _grey(pixels: Tensor) -> Float[Tensor, "time 1 height width"]:
-    return (pixels * per_channel(_BRIGHTNESS, pixels.device)).sum(dim=1, keepdim=True)
 
 
 @lru_cache(maxsize=32)

@@ -93,25 +93,23 @@ def windows_of(
         table: The episodes.
         members: Which of them are used, and belong to the split: at least one.
         starts: The result of `clip_starts`, at least of these.
-        config: What to do with short episodes.
+        config: The length of a clip.
         split: The name of the split.
 
     Raises:
-        InputError: The split has only short episodes, or none with a clip's length of kept steps, or
-            `data.short_episodes` forbids short ones.
+        InputError: The split has only short episodes, or none with a clip's length of kept steps.
     """
     where, count = f"data.path: {config.path}", int(members.sum())
     length = f"{counted(config.clip_steps, 'step')} for a clip of {config.frames} frames at stride {config.stride}"
     short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
     short = short[np.argsort(table.id_rank[short])]
     names = tuple(table.identity(place) for place in short[: NAMED + 1].tolist())
-    if len(short) and (config.short_episodes == "error" or len(short) == count):
+    if len(short) == count:
         longest = int(short[np.argmax(table.num_steps[short])])
-        found = f"{len(short)} of {count} {split} episodes are shorter than a clip; the longest of these,"
+        found = f"all {count} {split} episodes are shorter than a clip; the longest,"
         found += f" {table.identity(longest)}, has {counted(table.num_steps[longest], 'step')}."
         found += f" Too short: {named(names, len(short))}"
-        skip = ", or set data.short_episodes: skip" if len(short) < count else ""
-        raise InputError(where=where, found=found, needed=length, fix=f"Lower data.frames or data.stride{skip}")
+        raise InputError(where=where, found=found, needed=length, fix="Lower data.frames or data.stride")
     if len(short):
         _warn_of_short(config.path, split, config.clip_steps, count, len(short), names)
     own = starts.of(members[starts.episode])

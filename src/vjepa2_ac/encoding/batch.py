@@ -25,7 +25,7 @@ from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, wi
 
 @torch.no_grad()
 def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int) -> LatentBatch:
-    """Encode the frames of a batch on the device, each independently; a training batch is also augmented there.
+    """Encode the frames of a batch on the device, each independently.
 
     Latents of a batch from a cache are used unchanged: `require_same_encoder` has compared the encoders.
 
@@ -44,9 +44,7 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
     if batch.latents is not None:
         latents = unpack_latents(batch.latents)
     elif batch.frames is not None:
-        latents = world_model.encode(
-            pixels_to_input(batch.frames, world_model.image_size, batch.augmentations), chunk=chunk
-        )
+        latents = world_model.encode(pixels_to_input(batch.frames, world_model.image_size), chunk=chunk)
     else:
         raise ValueError("a batch with neither frames nor latents")
     return LatentBatch(

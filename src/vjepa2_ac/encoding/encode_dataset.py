@@ -108,9 +108,9 @@ def require_encodable(config: Config) -> None:
         raise InputError(where="data.source", found="latents: they are encoded already", needed="a data set of frames")
     fix = "`vjepa2-ac data calibrate CONFIG` finds one; or let the run encode by itself, with data.cache: auto"
     require_stride(data, to="know which frames are needed", fix=fix)
-    if key := data.changes_clips:
+    if data.transforms:
         found = "clips that look different every time, and a cache holds one latent of each frame"
-        raise InputError(where=f"data.{key}", found=found, fix=f"Leave data.{key} out")
+        raise InputError(where="data.transforms", found=found, fix="Leave data.transforms out")
 
 
 def begin_encoding(cache: LatentCache, left: Sequence[FramesToEncode], reporter: Reporter) -> None:

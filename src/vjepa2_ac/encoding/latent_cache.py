@@ -12,7 +12,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.dataset import Dataset, through_latents
-from vjepa2_ac.data.files import fetched_data, in_parallel
+from vjepa2_ac.data.files import CONNECTIONS, fetched_data, in_parallel
 from vjepa2_ac.data.idle import find_ranges
 from vjepa2_ac.data.index import cache_folder, fingerprint_of
 from vjepa2_ac.data.sources.latents.cache_files import CACHE, EPISODES, KEPT, LatentFiles, bytes_per_frame, read_key
@@ -89,8 +89,7 @@ class LatentCache:
             return list(self.wanted)
         files = self.files
         is_there = files.has if retry else files.is_done
-        connections = self.dataset.config.connections
-        there = in_parallel(lambda one: is_there(one.episode, one.camera), self.wanted, connections)
+        there = in_parallel(lambda one: is_there(one.episode, one.camera), self.wanted, CONNECTIONS)
         return [one for one, is_whole in zip(self.wanted, there, strict=True) if not is_whole]
 
     @property

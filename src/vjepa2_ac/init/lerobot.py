@@ -11,6 +11,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
+from vjepa2_ac.config.sources import JOINT_VELOCITY
 from vjepa2_ac.data.files import EpisodeFiles
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled, list_by_template, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
@@ -46,7 +47,6 @@ def look_at_lerobot(path: str) -> FoundData:
     pose = find_pose(columns, samples, control_rate_hz=info.fps, range_of=partial(_range_of, path))
     if pose and _DROID_GRIPPER in pose["state"].value and info.features.keys() >= _OF_DROID:
         pose |= {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
-    velocity = next((name for name in columns if "joint_vel" in name and name.startswith("action")), None)
     success = next((name for name in info.features if "success" in name), None)
     return FoundData(
         source="lerobot",
@@ -56,7 +56,6 @@ def look_at_lerobot(path: str) -> FoundData:
             "lerobot": {
                 **(pose or vector_state(columns, info.where)),
                 "cameras": all_cameras,
-                "joint_velocity": Knob(velocity),
                 "success": Knob(success),
             },
         },
@@ -64,7 +63,7 @@ def look_at_lerobot(path: str) -> FoundData:
         states="pose" if pose else "vector",
         episodes=info.episodes,
         steps=info.frames,
-        idle=idle_rule(has_velocities=velocity is not None) if pose else None,
+        idle=idle_rule(has_velocities=JOINT_VELOCITY in columns) if pose else None,
         about=(f"LeRobot {info.version}, {counted(info.episodes, 'episode')} at {info.fps:g} a second",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
     )

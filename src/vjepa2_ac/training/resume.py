@@ -11,7 +11,7 @@ from typing import Any
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import flat
-from vjepa2_ac.config.section import Affects, knobs_that_affect
+from vjepa2_ac.config.section import Affects, values_that_affect
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import validation_windows
@@ -117,7 +117,7 @@ def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any]
 
 def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
     """Return what determines the measurements of a validation, by readable names."""
-    settings = {key: json.dumps(value) for key, value in flat(knobs_that_affect(Affects.MEASURED, config)).items()}
+    settings = {key: json.dumps(value) for key, value in flat(values_that_affect(Affects.MEASURED, config)).items()}
     windows = validation_windows(dataset, "validation", clips=config.validation.clips)
     clips = [(dataset.table.identity(episode), int(start)) for episode, start in windows]
     return {**settings, "its clips": hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}

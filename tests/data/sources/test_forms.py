@@ -19,6 +19,7 @@ from lerobot_sets import STATE, Recorded, write_v21, write_v30
 from recordings import write_raw_droid
 from synthetic import draw_frame, synthetic_episode
 from vjepa2_ac.config import Config, DataConfig
+from vjepa2_ac.data import files
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.encoding.encode_dataset import encode_config
@@ -201,7 +202,8 @@ def test_what_cannot_be_reached_arrives_from_every_seam(
         return usual(where, *given, **named)
 
     monkeypatch.setattr(retries, "with_retries", asked)
-    knobs = {"idle": MOTION, "broken_episodes": "skip", "connections": 2}
+    knobs = {"idle": MOTION, "broken_episodes": "skip"}
+    monkeypatch.setattr(files, "CONNECTIONS", 2)
 
     def use(number: int) -> None:
         cache = {"dir": str(tmp_path / f"cache{number}"), "limit_gb": 0.0}

@@ -17,9 +17,8 @@ from jaxtyping import Float, Shaped, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import RawDroidData
-from vjepa2_ac.config.section import Affects, knobs_that_affect
-from vjepa2_ac.config.sources import RAW_CAMERAS
-from vjepa2_ac.data.files import DEEPEST, in_parallel, list_folder
+from vjepa2_ac.config.sources import RAW_CAMERAS, RAW_RATE_HZ
+from vjepa2_ac.data.files import CONNECTIONS, DEEPEST, in_parallel, list_folder
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key, key_of, summary_of
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Scanned, require_as_indexed
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
@@ -88,7 +87,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             info=info,
             states=states,
             read_frames=FramesByStep(info.num_steps, video, frames),
-            control_rate_hz=self._config.droid_raw.control_rate_hz,
+            control_rate_hz=RAW_RATE_HZ,
             extrinsics=numbers.get(serial),
             joint_velocities=numbers.get("velocities"),
             metadata={} if task is None else {"language": task},
@@ -112,7 +111,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
     def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
         """Return the cached table, or scan every episode; a changed local file changes the key."""
         config, root = self._config, self._config.path
-        folders = find_episodes(root, config.connections)
+        folders = find_episodes(root, CONNECTIONS)
         if not folders:
             needed = f"folders LAB/success|failure/DATE/TIME with a {TRAJECTORY}"
             fix = "DROID's are in gs://gresearch/robotics/droid_raw/1.0.1"
@@ -123,7 +122,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         parts = {
             "source": "droid_raw",
             "cameras": config.cameras,
-            "droid_raw": knobs_that_affect(Affects.INDEX, config.droid_raw),
+            **config.own_values,
             "pose_frame": config.pose_frame,
             "folders": listed,
         }
@@ -154,7 +153,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             place={"place": json.dumps(vars(place)).encode()},
             states=summary_of(states),
             labels=_labels(metadata),
-            rate_hz=self._config.droid_raw.control_rate_hz,
+            rate_hz=RAW_RATE_HZ,
         )
 
     def _counted(self, folder: str, listed: EpisodeFolder, serials: tuple[str, ...]) -> dict[str, int]:
@@ -188,7 +187,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             needed, fix = "observation/camera_extrinsics of the camera", "Set data.pose_frame: base"
             raise InputError(where=path, found="no poses of the camera", needed=needed, fix=fix)
         used = np.arange(min(steps, *place.frames.values()))
-        if self._config.droid_raw.skip_action == "drop" and "skipped" in found:
+        if "skipped" in found:
             used = used[found["skipped"][used, 0] == 0]
         numbers = {name: values[used] for name, values in found.items()} | {"frame": used}
         POSE.require_plausible(_states_of(numbers), path, fix=_FIX)

@@ -36,7 +36,7 @@ from jaxtyping import Float64, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.files import walk
+from vjepa2_ac.data.files import CONNECTIONS, walk
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key, summary_of
 from vjepa2_ac.data.sources.indexed_source import (
     FramesByStep,
@@ -128,7 +128,7 @@ class NpzSource(IndexedSource[DataConfig, None]):
         config, root = self._config, self._config.path
         listed = sorted(
             (storage.join(folder, file.name), file.size, file.version)
-            for folder, file in walk(root, config.connections)
+            for folder, file in walk(root, CONNECTIONS)
             if file.name.endswith(_SUFFIX)
         )
         if not listed:

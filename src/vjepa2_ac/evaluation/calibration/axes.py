@@ -324,7 +324,7 @@ def calibrate_axes(
     """
     require_axes_in(config.data)
     accelerator = make_accelerator(config)
-    settings = config.data.model_copy(update={"frames": 2, "short_episodes": "skip"})
+    settings = config.data.model_copy(update={"frames": 2})
     dataset = open_dataset(settings, progress=reporter.task(INDEXING))
     reporter.task(LOADING)
     world_model = load_named(config, dataset, model)

@@ -370,7 +370,7 @@ def calibrate(
         InputError: The split is empty, no stride fits into any of its episodes, or a clip cannot be read.
     """
     frames, split, rate = sample.frames_of(dataset.config), sample.split, dataset.control_rate_hz
-    settings = dataset.config.model_copy(update={"frames": frames, "short_episodes": "skip"})
+    settings = dataset.config.model_copy(update={"frames": frames})
     strides = sorted(set(dataset.config.strides_to_try(rate)))
     views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}
     possible, impossible = _possible(views, split)

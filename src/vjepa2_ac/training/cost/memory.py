@@ -170,7 +170,7 @@ def _knobs(config: Config) -> Iterator[tuple[str, dict[str, dict[str, Any]]]]:
     bf16 = {"model": {"dtype": "bfloat16"}, "training": {"precision": "bf16"}}
     yield "model.dtype=bfloat16 with training.precision=bf16", bf16
     yield "model.encode_chunk=4", {"model": {"encode_chunk": min(4, config.model.encode_chunk)}}
-    if not (config.data.changes_clips or config.data.takes_latents):
+    if not (config.data.transforms or config.data.takes_latents):
         yield "data.cache=auto", {"data": {"cache": "auto"}}
     fewest = max(8, config.training.rollout_steps + 1)
     yield "data.frames=8", {"data": {"frames": min(config.data.frames, fewest)}}

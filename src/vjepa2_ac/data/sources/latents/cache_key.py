@@ -11,14 +11,14 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.section import Affects, knobs_that_affect
+from vjepa2_ac.config.section import Affects, values_that_affect
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.storage.structured import read_json_object
 
 FORMAT = 2  # of the files of a cache
 NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: increase it when one of them changes
 
-_OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # the other knobs are of clips
+_OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # the other keys are of clips
 _NOT_OF_ENCODING = ("data", "format")  # how the names of the other parts begin
 
 
@@ -89,7 +89,6 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
         fingerprint: Of its episodes.
         encoding: How frames become latents.
     """
-    knobs = knobs_that_affect(Affects.LATENTS, config)
     return CacheKey({
         "format": FORMAT,
         **encoding.parts,
@@ -97,20 +96,15 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
         "data.cache_dtype": config.cache_dtype,
         "data.camera": list(config.cameras),
         "data.pose_frame": config.pose_frame,
-        "data set": {
-            "source": config.source,
-            "episodes": fingerprint,
-            **{name: knobs.get(name, {}) for name in config.own_sections()},
-        },
+        "data set": {"source": config.source, "episodes": fingerprint, **config.own_values},
     })  # fmt: skip
 
 
 def clip_parts(config: DataConfig) -> dict[str, Any]:
     """Return the parts that determine which frames and other data clips need: checked when a cache is used alone."""
-    knobs = knobs_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
-    return {
-        f"data.{name}": knobs[name] for name in sorted(knobs.keys() - _OF_THE_FRAMES - config.own_sections().keys())
-    }
+    values = values_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
+    names = values.keys() - _OF_THE_FRAMES - config.own_sections().keys()
+    return {f"data.{name}": values[name] for name in sorted(names)}
 
 
 def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: str) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Shaped, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
-from vjepa2_ac.config.section import Affects, knobs_that_affect
+from vjepa2_ac.config.sources import JOINT_VELOCITY
 from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.index import EpisodeTable, StatesSummary, get_or_build, index_key, summary_of
 from vjepa2_ac.data.poses import poses_from
@@ -43,7 +43,7 @@ _DATA_BYTES = "data_bytes"  # total size of the Parquet files with rows
 _CHECKS = 2  # of episodes while a data set is indexed, and of how frames are chosen: a new number rebuilds all indexes
 
 _FIX = "Copy the file again, or leave the episode out"
-_FIX_VECTORS = "Leave the episode out, check data.lerobot: state, action, or set data.lerobot.joint_velocity: null"
+_FIX_VECTORS = "Leave the episode out, or check data.lerobot: state, action"
 
 Content = dict[str, Any]
 """The data of an episode except its frames, by the names of `Episode`: states, commands, joint_velocities."""
@@ -110,7 +110,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         for key in keys:
             if info.features[key].dtype == "video":
                 files |= listed(info.video_path or "", key)
-        fields = knobs_that_affect(Affects.INDEX, config.lerobot)
+        fields = config.own_values["lerobot"]
         fields.pop("action")  # where it matters, it is among the columns
         parts = {
             **({"vector": wanted_columns(config)} if config.states == "vector" else {}),
@@ -217,7 +217,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
 def wanted_columns(config: LeRobotData) -> list[str]:
     """Return the columns that are read if a file has them."""
     fields = config.lerobot
-    optional = [name for name in (fields.joint_velocity, fields.success) if name is not None]
+    optional = [JOINT_VELOCITY, *((fields.success,) if fields.success else ())]
     commands = fields.action if config.actions == "recorded" else ()
     return [EPISODE, FRAME, TIME, *fields.state, *commands, *optional]
 
@@ -256,7 +256,7 @@ def content_of(
     content = {
         "states": poses_from(states, fields, where, section="data.lerobot") if config.states == "pose" else states,
         "commands": joined(fields.action) if config.actions == "recorded" else None,
-        "joint_velocities": joined([str(fields.joint_velocity)]) if has(fields.joint_velocity) else None,
+        "joint_velocities": joined([JOINT_VELOCITY]) if has(JOINT_VELOCITY) else None,
     }
     return content, bool(rows[str(fields.success)].any()) if has(fields.success) else None
 

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int64
 from vjepa2_ac import storage
 from vjepa2_ac.config import RldsData, RldsFields
 from vjepa2_ac.config.sources import RECORD
-from vjepa2_ac.data.files import in_parallel
+from vjepa2_ac.data.files import CONNECTIONS, in_parallel
 from vjepa2_ac.data.index import UNKNOWN, UNREAD, EpisodeProblem, EpisodeTable, hash_of_states, summary_of
 from vjepa2_ac.data.poses import num_rotation_numbers, poses_from, require_selection
 from vjepa2_ac.data.selection import as_problem
@@ -45,7 +45,7 @@ from vjepa2_ac.spaces import require_finite, zero_steps
 IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
 STEP_FLAG = "steps/is_first"
 _MOST_BYTES = 1 << 28  # of a feature that is read whole: numbers and texts
-FEWEST_IN_FLIGHT = 128  # reads behind a URL: they are small, and sequential within a shard
+_IN_FLIGHT = 128  # reads behind a URL: they are small, and sequential within a shard
 _SAMPLES = 4
 _NUMBERS: tuple[Kind, ...] = ("float_list", "int64_list")  # booleans are stored as integers
 _FIX_IDENTITY = "Name text or integer features in data.fields.identity, or set data.fields.identity: record"
@@ -264,7 +264,7 @@ def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str
         UnreachableError: The network fails.
     """
     is_far = storage.is_url(config.path)
-    threads = max(config.connections, FEWEST_IN_FLIGHT) if is_far else config.connections
+    threads = _IN_FLIGHT if is_far else CONNECTIONS
     if is_far:
         _require_fitting(shards, config, cameras)
 

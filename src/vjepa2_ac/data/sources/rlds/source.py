@@ -21,7 +21,6 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig, RldsData
-from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.files import fetched_data, open_cache
 from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build, index_key
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource
@@ -44,8 +43,8 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
     """The episodes of an RLDS data set, in the order of its shards.
 
     `infos` scans every record once and caches the result; `read` reads the states only, and images are read and decoded
-    on request: each camera must have one for every step. With `check_crc: once` a local record is read completely the
-    first time on this machine, and its CRC is checked.
+    on request: each camera must have one for every step. A local record is read completely the first time
+    on this machine, and its CRC is checked.
 
     Behind a URL only parts of a record are fetched, and parts have no CRC: checked are the CRCs of the lengths, the
     nesting of features and images, and the images' format; the rest is left to the transport.
@@ -74,8 +73,7 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
             return episode_of(record, config, info, images, where)
         with open_shard(shard) as read:
             checked = cache_folder(config.disk_cache) / "index" / f"{table.texts['index']}.checked"
-            is_checked = config.check_crc == "once" and _is_marked(checked, index)
-            if config.check_crc != "never" and not is_checked:
+            if not _is_marked(checked, index):
                 require_intact(read, span)
                 _mark(checked, index)
             record = Record(read, span)
@@ -89,7 +87,7 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
         parts = {
             "source": "rlds",
             "kinds": [config.states, config.actions],
-            **knobs_that_affect(Affects.INDEX, fields),
+            **fields.model_dump(mode="json", exclude={"language", "joint_velocity", "control_rate_hz"}),
             "cameras": cameras,
             "shards": [(shard.name, shard.episodes, shard.size, shard.version) for shard in shards],
         }
