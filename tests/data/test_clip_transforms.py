@@ -140,7 +140,7 @@ def values(**data: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("data", [{"cache": "auto"}, {"cache": "require"}, {"source": "latents"}])
 def test_cached_latents_cannot_be_transformed(data: dict[str, str]) -> None:
-    with pytest.raises(InputError, match="transforms changes frames, and latents in a cache stay"):
+    with pytest.raises(InputError, match="transforms change frames, latents in a cache stay"):
         parse_config(values(transforms=[{"name": "halve"}], **data), where="")
     parse_config(values(transforms=[], **data), where="")
     with pytest.raises(InputError, match=r"data\.transforms: .*Leave data\.transforms out"):

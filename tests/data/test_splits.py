@@ -201,6 +201,7 @@ def test_the_config_of_an_older_run_draws_its_splits() -> None:
     resolved = config_as_dict(new)
     assert parse_config(resolved, where="here") == new
     del resolved["data"]["splits"]
+    resolved["data"] |= {"check_crc": "once", "connections": 16, "prefetch": 2, "short_episodes": "skip"}
     resolved["replay"] = {"share": 0.1, "data": dict(resolved["data"])}
-    older = parse_config(resolved, where="here")
+    older = parse_config(resolved, where="here", here=False)
     assert [data.splits for data in older.data_sets] == ["hash", "hash"]

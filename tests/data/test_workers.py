@@ -63,15 +63,17 @@ def test_a_system_without_shared_memory_is_not_checked(monkeypatch: pytest.Monke
 
 def test_a_run_is_refused_before_its_first_step(make_config: Any, shared_memory: Any) -> None:
     frames = 2 * 4 * 36 * 49 * 3  # a batch of two clips of 4 frames, and 49 numbers of states and actions each
-    shared_memory(2 * (frames + 2 * 4 * (4 * 7 + 3 * 7)) - 1)
-    with pytest.raises(UnreachableError, match=r"2 workers x 1 batches of 0\.0427 MB"):
-        set_up(make_config(data__workers=2, data__prefetch=1))
+    shared_memory(2 * streams.PREFETCH * (frames + 2 * 4 * (4 * 7 + 3 * 7)) - 1)
+    with pytest.raises(UnreachableError, match=r"2 workers x 2 batches of 0\.0427 MB"):
+        set_up(make_config(data__workers=2))
     set_up(make_config(data__workers=0))
 
 
 def test_latents_that_are_not_encoded_yet_are_counted(make_config: Any, shared_memory: Any, tmp_path: Path) -> None:
-    shared_memory(2 * 2 * 4 * 4 * 24 * 2 - 1)  # two workers: a batch of two clips of 4 frames, 4 tokens of 24 numbers
-    changes = {"data__cache": "auto", "data__cache_dir": str(tmp_path / "cache"), "data__prefetch": 1}
+    shared_memory(
+        streams.PREFETCH * 2 * 2 * 4 * 4 * 24 * 2 - 1
+    )  # two workers: a batch of two clips of 4 frames, 4 tokens of 24 numbers
+    changes = {"data__cache": "auto", "data__cache_dir": str(tmp_path / "cache")}
     with pytest.raises(UnreachableError, match=r"batches of 0\.00154 MB"):
         set_up(make_config(**changes, data__workers=2), check_only=True)
 
@@ -90,7 +92,7 @@ def test_a_batch_without_room_in_shared_memory_is_an_error_of_the_worker(monkeyp
 
 
 def take_all(failure: str) -> list[list[int]]:
-    return list(results_of_workers(Rows(failure), ([number] for number in range(4)), 1, 2))
+    return list(results_of_workers(Rows(failure), ([number] for number in range(4)), 1))
 
 
 def test_a_worker_that_dies_or_cannot_send_ends_the_run() -> None:

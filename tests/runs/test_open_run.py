@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
+import yaml
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
@@ -12,6 +13,12 @@ from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.folder import RunLock, read_run_config
 from vjepa2_ac.runs.open_run import open_run
 
+OLDER = {
+    "check_crc": "once",
+    "connections": 16,
+    "prefetch": 2,
+    "short_episodes": "skip",
+}  # as before `splits`
 OPEN_REMOTE = "vjepa2_ac.runs.open_run.open_remote"
 
 
@@ -72,7 +79,10 @@ def test_an_older_run_keeps_its_drawn_splits_unless_the_config_says_otherwise(ma
     with open_run(make_config(), reporter) as opened:
         assert opened.config.data.splits == "dataset"
     file = Path(make_config().run_dir) / "config.yaml"
-    file.write_text(file.read_text().replace("  splits: dataset\n", ""))  # as a version without the key wrote it
+    values = yaml.safe_load(file.read_text())
+    del values["data"]["splits"]
+    values["data"] |= OLDER
+    file.write_text(yaml.safe_dump(values))
     assert read_run_config(file.parent).data.splits == "hash"
     with open_run(make_config(), reporter) as opened:
         assert opened.config.data.splits == "hash"
@@ -89,9 +99,8 @@ def test_a_replayed_set_of_an_older_run_keeps_its_drawn_splits(make_config, repo
     with open_run(config, reporter) as opened:
         opened.begin(opened.config, RunState(step=0))
     file = Path(config.run_dir) / "config.yaml"
-    older = {"check_crc": "once", "connections": 16, "prefetch": 2, "short_episodes": "skip"}  # keys of its time
     values = yaml.safe_load(file.read_text())
-    values["replay"]["data"] = config.replay.data.model_dump(mode="json", exclude={"splits"}) | older
+    values["replay"]["data"] = config.replay.data.model_dump(mode="json", exclude={"splits"}) | OLDER
     file.write_text(yaml.safe_dump(values))
     with open_run(config, reporter) as opened:
         assert [one.splits for one in opened.config.data_sets] == ["dataset", "hash"]
