@@ -70,9 +70,7 @@ def test_a_run_is_refused_before_its_first_step(make_config: Any, shared_memory:
 
 
 def test_latents_that_are_not_encoded_yet_are_counted(make_config: Any, shared_memory: Any, tmp_path: Path) -> None:
-    shared_memory(
-        streams.PREFETCH * 2 * 2 * 4 * 4 * 24 * 2 - 1
-    )  # two workers: a batch of two clips of 4 frames, 4 tokens of 24 numbers
+    shared_memory(streams.PREFETCH * 2 * 2 * 4 * 4 * 24 * 2 - 1)
     changes = {"data__cache": "auto", "data__cache_dir": str(tmp_path / "cache")}
     with pytest.raises(UnreachableError, match=r"batches of 0\.00154 MB"):
         set_up(make_config(**changes, data__workers=2), check_only=True)
