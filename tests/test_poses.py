@@ -1,7 +1,10 @@
 """Poses and actions: equal to the official code, and laws of every trajectory (golden/DATA_ORIGIN.md)."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -77,13 +80,13 @@ def test_adding_whole_turns_to_the_angles_changes_no_action() -> None:
     np.testing.assert_allclose(actions_from_states(turned), actions_from_states(states), atol=1e-9)
 
 
-def test_euler_angles_are_extrinsic_xyz() -> None:
-    roll, pitch, yaw = 0.3, -0.5, 2.0
-    expected = (
-        Rotation.from_rotvec([0, 0, yaw]) * Rotation.from_rotvec([0, pitch, 0]) * Rotation.from_rotvec([roll, 0, 0])
-    ).as_matrix()
-    np.testing.assert_allclose(matrices_from_euler(np.array([roll, pitch, yaw])), expected, atol=1e-12)
-    np.testing.assert_allclose(euler_from_matrices(expected), [roll, pitch, yaw], atol=1e-12)
+@pytest.mark.parametrize("library", [np.asarray, torch.from_numpy], ids=["numpy", "torch"])
+def test_euler_angles_are_those_of_scipy(library: Any) -> None:
+    angles = np.random.default_rng(0).uniform(-3, 3, (500, 3))
+    expected = Rotation.from_euler("xyz", angles)
+    matrices = matrices_from_euler(library(angles))
+    np.testing.assert_allclose(np.asarray(matrices), expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(np.asarray(euler_from_matrices(matrices)), expected.as_euler("xyz"), atol=1e-9)
 
 
 def test_a_camera_at_the_base_sees_the_base_frame() -> None:

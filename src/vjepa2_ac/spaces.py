@@ -7,9 +7,10 @@ robot's joints, two arms, a mobile base. Whoever needs a part asks for it: `spac
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +21,7 @@ from vjepa2_ac.errors import InputError
 
 REACH_M = 5.0  # larger positions are not in metres
 ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
+_LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
 GRIPPER_SLACK = 0.1  # a measured closedness may exceed 0 .. 1 by this
 CONVERSIONS = {  # how to bring numbers in other units to metres and radians
     "millimetres": "divide them by 1000",
@@ -31,19 +33,47 @@ _MOST_CM, _MOST_MM, _MOST_DEGREES = 100.0, 5000.0, 360.5  # of positions and ang
 Follows = Literal["change", "target", "unknown"]
 
 
-# ---- poses: Euler angles wrap at pi, so differences are computed with rotation matrices ----
+# ---- poses, as NumPy arrays or tensors; Euler angles wrap at pi, so differences are those of rotation matrices ----
 
 
-def matrices_from_euler(angles: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Return rotation matrices of extrinsic xyz Euler angles in radians: R = Rz(yaw) @ Ry(pitch) @ Rx(roll)."""
-    flat = Rotation.from_euler("xyz", angles.reshape(-1, 3)).as_matrix()
-    return np.asarray(flat).reshape(*angles.shape[:-1], 3, 3)
+def matrices_from_euler(angles: Any) -> Any:
+    """Return rotation matrices [*batch 3 3] of extrinsic xyz Euler angles [*batch 3] in radians.
+
+    R = Rz(yaw) @ Ry(pitch) @ Rx(roll).
+    """
+    array = _array_library(angles)
+    sine, cosine = array.sin(angles), array.cos(angles)
+    (sr, sp, sy), (cr, cp, cy) = ([one[..., axis] for axis in range(3)] for one in (sine, cosine))
+    rows = [
+        array.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], -1),
+        array.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], -1),
+        array.stack([-sp, cp * sr, cp * cr], -1),
+    ]
+    return array.stack(rows, -2)
 
 
-def euler_from_matrices(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Return extrinsic xyz Euler angles in radians; roll and yaw in (-pi, pi], pitch in [-pi/2, pi/2]."""
-    flat = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_euler("xyz")
-    return np.asarray(flat).reshape(*matrices.shape[:-2], 3)
+def euler_from_matrices(matrices: Any) -> Any:
+    """Return extrinsic xyz Euler angles [*batch 3] in radians of rotation matrices [*batch 3 3].
+
+    Roll and yaw are in (-pi, pi], pitch in [-pi/2, pi/2]; where the pitch is pi/2 or -pi/2, the yaw is zero. Gradients
+    are finite everywhere.
+    """
+    array = _array_library(matrices)
+    flat = array.hypot(matrices[..., 0, 0], matrices[..., 1, 0])  # cos(pitch), which is never negative
+    locked = flat < _LOCKED
+    cosine = array.hypot(*(array.where(locked, 1.0, matrices[..., row, 0]) for row in (0, 1)))
+    pitch = array.arctan2(-matrices[..., 2, 0], array.where(locked, 0.0, cosine))
+    roll = array.arctan2(
+        array.where(locked, -matrices[..., 1, 2], matrices[..., 2, 1]),
+        array.where(locked, matrices[..., 1, 1], matrices[..., 2, 2]),
+    )
+    yaw = array.arctan2(array.where(locked, 0.0, matrices[..., 1, 0]), array.where(locked, 1.0, matrices[..., 0, 0]))
+    return array.stack([roll, pitch, yaw], -1)
+
+
+def _array_library(values: Any) -> Any:
+    """Return NumPy or PyTorch, whichever the values belong to; the functions used here have the same names in both."""
+    return np if isinstance(values, np.ndarray) else sys.modules["torch"]
 
 
 def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time-1 7"]:
@@ -63,7 +93,7 @@ def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray
 def rotation_differences(angles: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time-1 3"]:
     """Return R[t+1] @ R[t].T as extrinsic xyz Euler angles."""
     rotations = matrices_from_euler(angles)
-    return euler_from_matrices(rotations[1:] @ rotations[:-1].swapaxes(-1, -2))
+    return np.asarray(euler_from_matrices(rotations[1:] @ rotations[:-1].swapaxes(-1, -2)))
 
 
 def rotation_angles(rotations: Float[np.ndarray, "count 3"]) -> Float[np.ndarray, " count"]:
@@ -78,17 +108,14 @@ def step_sizes(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time-1
     return np.column_stack([np.linalg.norm(moved, axis=1), turned])
 
 
-def apply_action(
-    state: Float[np.ndarray, "*batch 7"], action: Float[np.ndarray, "*batch 7"]
-) -> Float[np.ndarray, "*batch 7"]:
-    """Return the state that an action leads to: xyz and gripper add, R' = R_delta @ R.
+def apply_action(state: Any, action: Any) -> Any:
+    """Return the poses [*batch 7] that actions [*batch 7] lead to: xyz and gripper add, R' = R_delta @ R.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.
     """
     rotation = matrices_from_euler(action[..., 3:6]) @ matrices_from_euler(state[..., 3:6])
-    return np.concatenate(
-        [state[..., :3] + action[..., :3], euler_from_matrices(rotation), state[..., 6:] + action[..., 6:]], axis=-1
-    )
+    parts = [state[..., :3] + action[..., :3], euler_from_matrices(rotation), state[..., 6:] + action[..., 6:]]
+    return _array_library(state).concatenate(parts, -1)
 
 
 def states_in_camera_frame(

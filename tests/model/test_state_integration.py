@@ -1,4 +1,4 @@
-"""Pose integration equals the official code and geometry.py, and gradients flow through it."""
+"""Pose integration equals the official code, and gradients flow through it."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from paths import GOLDEN
 from synthetic import synthetic_states
-from vjepa2_ac.model.state_integration import apply_actions, euler_from_matrices, matrices_from_euler, states_along
-from vjepa2_ac.spaces import actions_from_states, apply_action
+from vjepa2_ac.model.state_integration import apply_actions, states_along
+from vjepa2_ac.spaces import actions_from_states, euler_from_matrices, matrices_from_euler
 
 
 def assert_same_poses(found: torch.Tensor, expected: np.ndarray, tolerance: float) -> None:
@@ -25,15 +25,6 @@ def test_composed_poses_are_the_official_ones(which: int, dtype: torch.dtype, to
     with np.load(GOLDEN / "poses.npz") as official:
         poses, deltas = (torch.from_numpy(official[f"{name}_{which}"]).to(dtype) for name in ("poses", "deltas"))
         assert_same_poses(apply_actions(poses[:-1], deltas), official[f"composed_{which}"], tolerance)
-
-
-def test_poses_are_those_of_geometry_but_for_the_grippers_ends() -> None:
-    generator = np.random.default_rng(0)
-    states, actions = generator.uniform(-3, 3, (2, 500, 7))
-    states[:, 6], actions[:, 6] = generator.uniform(0, 1, 500), generator.uniform(-0.75, 0.75, 500)
-    expected = apply_action(states, actions)
-    expected[:, 6] = expected[:, 6].clip(0, 1)
-    assert_same_poses(apply_actions(torch.from_numpy(states), torch.from_numpy(actions)), expected, 1e-7)
 
 
 def test_a_trajectorys_actions_lead_along_it() -> None:

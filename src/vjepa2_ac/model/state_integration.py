@@ -1,7 +1,6 @@
 """State integration: states after a sequence of changes, batched, on any device, and differentiable.
 
-Of poses the same as `spaces.apply_action` (NumPy, SciPy), except that the gripper is limited to between open and
-closed. Vectors add.
+For poses the same as `spaces.apply_action`, except that the gripper is limited to between open and closed. Vectors add.
 """
 
 from __future__ import annotations
@@ -11,9 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.spaces import POSE, StateSpace
-
-_LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
+from vjepa2_ac.spaces import POSE, StateSpace, apply_action
 
 
 def apply_actions(
@@ -25,15 +22,12 @@ def apply_actions(
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.
     """
-    after = list((states + actions).unbind(dim=-1))
-    if space.rotation is not None:
-        with torch.autocast(states.device.type, enabled=False):
-            turn, now = (matrices_from_euler(one[..., space.rotation]) for one in (actions, states))
-            rotation = turn @ now
-        after[space.rotation] = euler_from_matrices(rotation).unbind(dim=-1)
-    if space.gripper is not None:
-        after[space.gripper] = after[space.gripper].clamp(0.0, 1.0)
-    return torch.stack(after, dim=-1)
+    with torch.autocast(states.device.type, enabled=False):
+        after: Tensor = states + actions if space.rotation is None else apply_action(states, actions)
+    if space.gripper is None:
+        return after
+    closed = after[..., space.gripper :].clamp(0.0, 1.0)  # the last number
+    return torch.cat([after[..., : space.gripper], closed], dim=-1)
 
 
 def states_along(
@@ -69,31 +63,3 @@ def feasible_actions(
     if space.gripper is not None:
         feasible[:, space.gripper] = np.diff(counterfactual_states(state, actions, space)[:, space.gripper])
     return feasible
-
-
-def matrices_from_euler(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return rotation matrices of extrinsic xyz Euler angles in radians: R = Rz(yaw) @ Ry(pitch) @ Rx(roll)."""
-    (sr, sp, sy), (cr, cp, cy) = angles.sin().unbind(-1), angles.cos().unbind(-1)
-    rows = [
-        torch.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], dim=-1),
-        torch.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], dim=-1),
-        torch.stack([-sp, cp * sr, cp * cr], dim=-1),
-    ]
-    return torch.stack(rows, dim=-2)
-
-
-def euler_from_matrices(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Return extrinsic xyz Euler angles in radians; where the pitch is pi/2 or -pi/2, the yaw is zero.
-
-    Gradients are finite everywhere.
-    """
-    flat = torch.hypot(matrices[..., 0, 0], matrices[..., 1, 0])  # cos(pitch), which is never negative
-    locked = flat < _LOCKED
-    cosine = torch.hypot(*(torch.where(locked, 1.0, matrices[..., row, 0]) for row in (0, 1)))
-    pitch = torch.atan2(-matrices[..., 2, 0], torch.where(locked, 0.0, cosine))
-    roll = torch.atan2(
-        torch.where(locked, -matrices[..., 1, 2], matrices[..., 2, 1]),
-        torch.where(locked, matrices[..., 1, 1], matrices[..., 2, 2]),
-    )
-    yaw = torch.atan2(torch.where(locked, 0.0, matrices[..., 1, 0]), torch.where(locked, 1.0, matrices[..., 0, 0]))
-    return torch.stack([roll, pitch, yaw], dim=-1)

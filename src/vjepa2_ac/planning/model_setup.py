@@ -17,11 +17,11 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import merge_adapter, unadapted_copy
 from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import Fingerprints, WorldModel
-from vjepa2_ac.model.state_integration import euler_from_matrices, matrices_from_euler
 from vjepa2_ac.planning.goals import GoalFolder, SubGoal, with_shares
 from vjepa2_ac.planning.settings import planning_settings, read_axes, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.subject import Subject, load_subject
+from vjepa2_ac.spaces import euler_from_matrices, matrices_from_euler
 
 _POSITION, _ROTATION = slice(0, 3), slice(3, 6)
 
@@ -136,4 +136,5 @@ class Axes:
             return torch.cat([actions[..., _POSITION] @ turn.T, rotation, actions[..., 6:]], dim=-1)
 
     def _turn(self, like: Tensor) -> Float[Tensor, "3 3"]:
-        return matrices_from_euler(like.new_tensor([0.0, 0.0, self.yaw]))
+        turn: Tensor = matrices_from_euler(like.new_tensor([0.0, 0.0, self.yaw]))
+        return turn
