@@ -32,7 +32,7 @@ base: $(SIMULATION)  ## make the demo's base model again (about an hour); replac
 	test -e base/data || $(BIN)/vjepa2-ac simulate record base/data --domain random --episodes 800 --seed 3 --workers 2
 	$(BIN)/vjepa2-ac train configs/demo_base.yaml
 	rm -rf base/model && $(BIN)/vjepa2-ac export base/run base/model
-	$(BIN)/vjepa2-ac decoder configs/demo_base.yaml model.random=null model.base=base/model
+	$(BIN)/vjepa2-ac decoder configs/demo_base.yaml model.base=base/model
 	rm -rf src/vjepa2_ac/assets/sim-tiny && cp -r base/model src/vjepa2_ac/assets/sim-tiny
 	mkdir src/vjepa2_ac/assets/sim-tiny/decoder
 	cp base/decoder/decoder.json base/decoder/decoder.safetensors base/decoder/linear.safetensors src/vjepa2_ac/assets/sim-tiny/decoder

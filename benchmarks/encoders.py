@@ -29,7 +29,7 @@ from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.sources.latents.cache_files import bytes_per_frame
 from vjepa2_ac.distributed import matmul_speed
 from vjepa2_ac.encoding.latent_cache import picture_bytes
-from vjepa2_ac.model.checkpoints.published import PUBLISHED
+from vjepa2_ac.model.model_files import PUBLISHED
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.cost.flops import frame_flops
@@ -46,7 +46,7 @@ PREDICTORS = {
 RUN = {  # a predictor that is trained whole, from frames
     "run_dir": "run",
     "data": {"path": "set", "frames": 8},
-    "model": {"random": {}},
+    "model": {"base": "random"},
     "adapter": {"kind": "none"},
     "training": {"batch_size": 2, "gradient_checkpointing": True},
 }

@@ -27,7 +27,7 @@ from torch.nn.functional import layer_norm
 from vjepa2_ac.config import AdapterConfig, ModelSizes, TrainingConfig
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import lora_layers
-from vjepa2_ac.model.checkpoints.meta_file import official_name
+from vjepa2_ac.model.checkpoints import official_name
 from vjepa2_ac.model.network.blocks import NORM_EPSILON
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.loss import Objective

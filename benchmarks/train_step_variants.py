@@ -34,7 +34,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.model.checkpoints.loading import to_official
+from vjepa2_ac.model.checkpoints import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.training.cost.flops import clip_flops

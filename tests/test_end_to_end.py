@@ -44,7 +44,9 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("workshop")
     data = str(folder / "data")
     assert main(["simulate", "record", data, "--domain", "B", "--episodes", "10", "--steps", "14"]) == 0
-    scratch = write_config(folder, "scratch", model={"random": TINY, "dtype": "float32"}, adapter={"kind": "none"})
+    scratch = write_config(
+        folder, "scratch", model={"base": "random", "sizes": TINY, "dtype": "float32"}, adapter={"kind": "none"}
+    )
     assert main(["train", scratch]) == 0
     assert main(["export", str(folder / "scratch"), str(folder / "base")]) == 0
     lora = write_config(folder, "lora", model={"base": str(folder / "base"), "dtype": "float32"})

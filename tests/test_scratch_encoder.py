@@ -12,13 +12,14 @@ from killable import KILLED, Nursery
 from paths import GOLDEN
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelConfig
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.runs.subject import load_subject
 
 ENCODER = {"path": str(GOLDEN / "encoders" / "vjepa2_1_distilled.pt"), "heads": 4}
 MODEL = {
+    "base": "random",
     "encoder": ENCODER,
-    "random": {"image_size": 96, "predictor": {"width": 64, "depth": 2, "heads": 4}},
+    "sizes": {"image_size": 96, "predictor": {"width": 64, "depth": 2, "heads": 4}},
     "dtype": "float32",
 }
 
@@ -61,7 +62,7 @@ def test_a_predictor_that_cannot_start_near_copying_is_said_to(
 ) -> None:
     for width, is_narrow in ((64, False), (32, True)):
         config = write_config(workshop, "narrow")
-        assert main(["train", config, "--check", f"model.random.predictor.width={width}"]) == 0
+        assert main(["train", config, "--check", f"model.sizes.predictor.width={width}"]) == 0
         printed = " ".join(capsys.readouterr().out.split())
         assert (f"a predictor of width {width} cannot copy latents of width 64" in printed) == is_narrow
 

@@ -28,7 +28,7 @@ from vjepa2_ac.evaluation.calibration.axes import calibrate_axes
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import PredictionErrors, Way
 from vjepa2_ac.model.adapter.lora import base_only, merge_adapter
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import Axes

@@ -17,7 +17,7 @@ from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.encoding.encode_dataset import encode_config, with_latents_if_there
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.export import export_run
@@ -81,7 +81,7 @@ def prepare_world(folder: Path, task: str, reporter: Reporter = SILENT) -> None:
     keep_latents(data_of(folder, task, "after"), BUILTIN)
     if not base.exists():
         config = load_config(BASE_CONFIG, [f"run_dir={folder / f'run-{base.name}'}", *OF_A_WORLD])
-        start = config.model.model_copy(update={"base": BUILTIN, "random": None})  # has seen an arm, no such world
+        start = config.model.with_base(BUILTIN)  # has seen an arm, no such world
         config = config.model_copy(update={"data": data_of(folder, task, "before"), "model": start})
         export_run(train(config, reporter), base)
 
@@ -153,6 +153,6 @@ def _without_a_past(folder: Path, seed: int, layer: int | None = None) -> None:
         whole = folder.with_name(f"scratch-{seed}")
         sizes = load_base(ModelConfig(base=str(whole), dtype="float32"), seed=0).sizes
         fresh = {"image_size": sizes.image_size, "predictor": sizes.predictor.model_dump()}
-        cut = {"encoder": {"path": str(whole), "layer": layer}, "random": fresh, "random_start": "persistence"}
+        cut = {"encoder": {"path": str(whole), "layer": layer}, "base": "random", "sizes": fresh}
         model = load_base(ModelConfig.model_validate({**cut, "dtype": "float32"}), seed=1000 + seed)
     model.save_pretrained(folder)

@@ -43,6 +43,13 @@ def test_removed_section_of_data_is_dropped_from_replay_too() -> None:
     assert "blur" not in values["replay"]["data"]
 
 
+def test_model_section_of_version_0_1_has_the_meaning_of_today() -> None:
+    scratch, sizes = {**VALUES, "adapter": {"kind": "none"}}, {"predictor": {"width": 64, "depth": 2, "heads": 4}}
+    older = {"base": None, "random": sizes, "encoder_weights": "target_encoder", "random_start": "persistence"}
+    found = parse_config({**scratch, "model": older}, where="run/config.yaml", here=False)
+    assert found == parse_config({**scratch, "model": {"base": "random", "sizes": sizes}}, where="today")
+
+
 def test_no_removed_key_is_a_key_of_today() -> None:
     assert not set(REMOVED) & set(all_keys())
 

@@ -16,7 +16,7 @@ from vjepa2_ac.decoding.network import Decoder, DecoderShape, as_images, as_pixe
 from vjepa2_ac.encoding.latent_cache import needed_frames
 from vjepa2_ac.episode import no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 
 
 def test_the_image_is_the_encoder_input_up_to_rounding() -> None:

@@ -24,7 +24,7 @@ from vjepa2_ac.data.sources.latents import cache_key
 from vjepa2_ac.encoding.encode_dataset import encode_config, with_latents_if_there
 from vjepa2_ac.encoding.latent_cache import LatentCache
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.training.loop import train
 
 URL = "gs://bucket/caches"

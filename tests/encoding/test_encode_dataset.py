@@ -26,7 +26,7 @@ from vjepa2_ac.encoding.encode_dataset import EncodedSet, encode_config
 from vjepa2_ac.encoding.latent_cache import needed_frames
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.storage import files as writing
 from vjepa2_ac.training.loop import train
 

@@ -21,7 +21,7 @@ from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.reports.metrics_json import read_metrics
@@ -175,7 +175,7 @@ def test_strides_are_calibrated_where_it_is_asked_for(run: str, tmp_path: Path) 
 def test_a_run_without_a_base_is_measured_alone_unless_a_base_is_asked_for(
     make_config: MakeConfig,
 ) -> None:
-    config = make_config(model__base=None, model__random=TINY, adapter__kind="none")
+    config = make_config(model__base="random", model__sizes=TINY, adapter__kind="none")
     folder, dataset = write_adapted_run(config), open_dataset(config.data)
     assert [one.role for one in load_models(str(folder), config, asked(), dataset).contenders] == ["trained"]
     with pytest.raises(InputError, match=r"--against base: a model without a base"):

@@ -96,8 +96,8 @@ def test_hours_follow_from_the_measured_speed_and_not_from_the_cards_name() -> N
 def test_a_fresh_predictor_and_its_cache_are_as_wide_as_the_encoders_latents(name: str, width: int) -> None:
     model = choose_model("scratch", f"checkpoints/{name}.pt")
     made = make_draft(FOUND, MACHINE, model, run_dir="run")
-    assert made.config.model.random is not None
-    assert made.config.model.random.predictor.width == width
+    assert made.config.model.is_random
+    assert made.config.model.sizes.predictor.width == width
     assert model.bytes_a_frame == 2 * 256 * width
 
 

@@ -13,7 +13,7 @@ from vjepa2_ac.config.loading import config_as_dict, config_as_yaml
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.planning.controller import Controller
@@ -76,7 +76,7 @@ def test_a_model_needs_no_config_and_takes_one(make_config, base_folder: Path, t
 def test_the_model_that_was_named_is_loaded_not_that_of_the_config(make_config, base_folder, tmp_path: Path) -> None:
     sizes = config_as_dict(make_config())["model"]["sizes"] | {"image_size": 32}
     sizes["encoder"] = {"width": 12, "depth": 1, "heads": 1}
-    fresh = make_config(model={"random": sizes, "dtype": "float32"}, adapter__kind="none")
+    fresh = make_config(model={"base": "random", "sizes": sizes, "dtype": "float32"}, adapter__kind="none")
     path = tmp_path / "its.yaml"
     path.write_text(config_as_yaml(fresh))
     assert load_to_plan(str(base_folder), config=path).world_model.latent_dim == 24

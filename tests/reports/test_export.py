@@ -23,7 +23,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.evaluation.summary import Summary, not_measured
 from vjepa2_ac.model.adapter.lora import base_only
-from vjepa2_ac.model.checkpoints.loading import load_official
+from vjepa2_ac.model.checkpoints import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports import export
 from vjepa2_ac.reports.export import CARD, Exported, export_run

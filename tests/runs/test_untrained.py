@@ -16,7 +16,7 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.adapter.adapter_folder import save_trained
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import fit_heads
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.reports.comparison import compare
@@ -28,7 +28,7 @@ from vjepa2_ac.runs.folder import CONFIG
 from vjepa2_ac.runs.subject import load_subject
 
 SELECTED = "The selected checkpoint is the base model: fine-tuning did not improve action ranking."
-SCRATCH = {"model__base": None, "model__random": TINY, "adapter__kind": "none"}
+SCRATCH = {"model__base": "random", "model__sizes": TINY, "adapter__kind": "none"}
 FEW = EvaluationOptions(clips=3, probes=ProbeOptions(ranking_clips=0, examples=0))
 
 

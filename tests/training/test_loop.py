@@ -20,7 +20,7 @@ from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.subject import load_subject

@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from paths import GOLDEN
 from vjepa2_ac.config import ModelSizes, TrainingConfig
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.checkpoints.loading import load_official
+from vjepa2_ac.model.checkpoints import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.loss import Objective, prediction_losses
 

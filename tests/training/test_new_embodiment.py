@@ -18,8 +18,8 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.variants import calibrate_config
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.model.base_model import read_sizes
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
+from vjepa2_ac.model.model_files import read_sizes
 from vjepa2_ac.model.network.world_model import widths_of_model
 from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
@@ -131,7 +131,7 @@ def test_a_head_that_nothing_trains_is_refused_before_the_model_is_loaded(
 
 def test_a_fresh_model_gets_heads_for_the_robot(make_robot: MakeConfig, reporter: Any, base_folder: Path) -> None:
     sizes = read_sizes(base_folder).model_dump(mode="json")
-    config = make_robot(model__base=None, model__random=sizes, adapter__kind="none", training__steps=1)
+    config = make_robot(model__base="random", model__sizes=sizes, adapter__kind="none", training__steps=1)
     assert widths_of_model(load_subject(train(config, reporter)).world_model.sizes) == Widths(14, 14)
 
 

@@ -60,7 +60,7 @@ def test_a_check_only_run_writes_no_choice(make_config: Make, reporter: Any) -> 
 
 
 def test_a_model_that_has_learned_nothing_is_not_asked(make_config: Make, reporter: Any) -> None:
-    config = make_config(data__stride="auto", model__base=None, model__random={}, adapter__kind="none")
+    config = make_config(data__stride="auto", model__base="random", model__sizes={}, adapter__kind="none")
     with pytest.raises(InputError, match=r"learned nothing.*Set data\.stride to a number"):
         train(config, reporter)
 

@@ -172,7 +172,12 @@ def test_a_model_that_hardly_uses_the_actions_is_said_to_once_after_warm_up_and_
         "encoder": {"width": 24, "depth": 1, "heads": 2},
         "predictor": {"width": 24, "depth": 1, "heads": 2},
     }
-    copying = {"model__base": None, "model__random": sizes, "adapter__kind": "none", "training__learning_rate": 1e-12}
+    copying = {
+        "model__base": "random",
+        "model__sizes": sizes,
+        "adapter__kind": "none",
+        "training__learning_rate": 1e-12,
+    }
     config = make_config(**EVERY_STEP, **copying, training__warmup_steps=2)
     notes = Notes()
     train(config, notes)

@@ -16,7 +16,7 @@ from vjepa2_ac.config import Config, LimitsConfig, ModelConfig, ModelSizes, Plan
 from vjepa2_ac.episode import STATE_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
@@ -44,7 +44,7 @@ def start_of(kind: str, base: Path) -> dict[str, Any]:
     """Return the knobs of a run of an adapter on a base, or from scratch."""
     if kind == "lora":
         return {"model__base": str(base), "adapter__modules_to_save": ["action_encoder"]}
-    return {"model__base": None, "model__random": SIZES, "adapter__kind": "none"}
+    return {"model__base": "random", "model__sizes": SIZES, "adapter__kind": "none"}
 
 
 def with_states(base: Path, width: int) -> WorldModel:

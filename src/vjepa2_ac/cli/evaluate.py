@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.cli.next_command import next_simulation, option_words
+from vjepa2_ac.config.model import RANDOM
 from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.process import is_first
 
@@ -140,7 +141,7 @@ def _next(measured: Evaluated, options: argparse.Namespace, reporter: ConsoleRep
     config = options.data or f"{about.subject}/config.yaml"
     words = ["data", "check", config]
     if not about.checkpoint:
-        is_other = cli.read_config(config).model.base not in {None, about.subject}
+        is_other = cli.read_config(config).model.base not in {RANDOM, about.subject}
         words = ["train", config, *[f"model.base={about.subject}"] * is_other]
     elif not summary.predicts.needs and (
         about.is_base or "no" in {verdict.conclusion for verdict in summary.verdicts[:3]}

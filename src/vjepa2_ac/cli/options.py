@@ -239,7 +239,7 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
         InputError: The config is wrong, or one of them is not there.
     """
     from vjepa2_ac.config.loading import load_config, load_config_of_run
-    from vjepa2_ac.model.base_model import require_model
+    from vjepa2_ac.model.model_files import require_model
 
     config = load_config_of_run(Path(path), overrides) if of_run else load_config(path, overrides)
     data = config.data.path
@@ -263,7 +263,7 @@ def require_subject(subject: str, config: Config | None = None, command: Sequenc
     Raises:
         InputError: There is no such run or model, or the base of the run is gone.
     """
-    from vjepa2_ac.model.base_model import find_base, require_base_of_run
+    from vjepa2_ac.model.model_files import find_base, require_base_of_run
     from vjepa2_ac.runs.folder import is_run, read_run_config
 
     if is_run(subject):

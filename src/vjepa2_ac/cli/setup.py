@@ -89,7 +89,7 @@ def _init(options: argparse.Namespace) -> int:
         try_writing_at(out.parent)
 
     from vjepa2_ac.init.look import look_at, measured, simulated
-    from vjepa2_ac.model.base_model import find_base, find_encoder_path
+    from vjepa2_ac.model.model_files import find_base, find_encoder_path
 
     if options.model is not None:
         (find_encoder_path if form == "scratch" else find_base)(options.model)
@@ -203,7 +203,7 @@ def _download(options: argparse.Namespace) -> None:
     It goes on where it stopped; its size is checked.
     """
     from vjepa2_ac.cli.console.setup import PUBLISHED_NOTES, published_summary, published_table
-    from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, download, find_published
+    from vjepa2_ac.model.model_files import OFFICIAL, PUBLISHED, download, find_published
     from vjepa2_ac.storage.places import literal
 
     if options.list:
@@ -239,7 +239,7 @@ def _doctor(options: argparse.Namespace) -> int:
     from vjepa2_ac.cli.console.setup import memory_lines, verdict
     from vjepa2_ac.data.streams import require_shared_memory
     from vjepa2_ac.distributed import slow_bf16
-    from vjepa2_ac.model.checkpoints.loading import base_sizes
+    from vjepa2_ac.model.checkpoints import base_sizes
     from vjepa2_ac.training.cost.memory import USUAL_GPU, batch_bytes, estimate_memory, ways_to_fit
 
     sizes = base_sizes(config.model)

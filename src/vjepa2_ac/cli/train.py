@@ -56,7 +56,7 @@ def _train(options: argparse.Namespace) -> None:
     SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step, write a checkpoint, end with status 75; the same command goes
     on from there. A second signal: end at once.
     """
-    from vjepa2_ac.model.base_model import require_base_of_run
+    from vjepa2_ac.model.model_files import require_base_of_run
     from vjepa2_ac.runs.folder import is_run, read_run_config
 
     path = Path(options.config)

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import source_of
+from vjepa2_ac.config.model import RANDOM
 from vjepa2_ac.config.removed import drop_removed_keys, move_component_options, why_removed
 from vjepa2_ac.config.run import ReplayConfig, with_complete_replay
 from vjepa2_ac.config.section import key_of_data, marks_of
@@ -117,6 +118,8 @@ def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, wh
         _set(given, key.split("."), parse_yaml(text, where=f"override {key}"), override)
     _keep_drawn_splits(given)
     _replace_older_keys(given)
+    if isinstance(given.get("model"), dict):
+        _replace_keys_of_model(given["model"])
     if not here:
         drop_removed_keys(given, where)
         move_component_options(given)
@@ -247,6 +250,12 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
 
 
 _OLDER_GRIPPERS = {"closedness": {}, "openness": {"gripper_open": 1.0, "gripper_closed": 0.0}}
+
+
+def _replace_keys_of_model(model: dict[str, Any]) -> None:
+    """Replace the key `random` of 0.1, the sizes of a fresh predictor, by `base: random` and `sizes`."""
+    if (sizes := model.pop("random", None)) is not None:
+        model.update(base=RANDOM, sizes=sizes)
 
 
 def _replace_older_keys(values: dict[str, Any]) -> None:

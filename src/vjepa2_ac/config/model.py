@@ -1,4 +1,4 @@
-"""Model knobs: the base model, and which parts of it are trained."""
+"""Config of the model: the base model, and which parts of it are trained."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ _USUAL_ALPHA = 32.0  # of every config here, at any rank
 Family = Literal["v2", "v2.1"]
 FramePath = Literal["tubelet", "image"]
 EncoderKey = Literal["ema_encoder", "target_encoder", "encoder"]
-EncoderWeights = Literal["target_encoder", "encoder"]
+
+RANDOM = "random"
+"""The value of `model.base` that stands for a fresh predictor; a folder of this name is `./random`."""
 
 
 class EncoderSizes(Section):
@@ -43,7 +45,8 @@ class EncoderSizes(Section):
     family: Family = "v2"
     """V-JEPA 2, or 2.1: other rotary positions, and a learned vector for the kind of input."""
     frame: FramePath = "tubelet"
-    """How a frame enters. tubelet: twice, as a video of two equal frames. image (2.1 only): as one image."""
+    """How a frame enters. tubelet: twice, as a video of two equal frames, as all published predictors had it. image
+    (with family v2.1): as one image, through patches of its own."""
 
 
 class PredictorSizes(Section):
@@ -98,7 +101,7 @@ class ModelSizes(Section):
         if self.predictor.width >= self.encoder.width:
             return None
         return (
-            f"model.random_start persistence: a predictor of width {self.predictor.width} cannot copy latents of width"
+            f"model.base random: a predictor of width {self.predictor.width} cannot copy latents of width"
             f" {self.encoder.width}; it starts from a random part of them. A predictor as wide starts near copying"
         )
 
@@ -159,37 +162,31 @@ class EncoderConfig(Section):
 class ModelConfig(Section):
     """Which world model to start from."""
 
-    base: Annotated[Annotated[str, AfterValidator(places.of_a_model)] | None, Affects.PLAN] = None
+    base: Annotated[str, AfterValidator(places.of_a_model), Affects.PLAN]
     """The model to adapt: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny
     model of the demo, which comes with the package). A run resumes with a path to which its base was moved: the
-    fingerprint of the weights decides."""
+    fingerprint of the weights decides. random: a fresh predictor of these `sizes`, close to copying the last frame, on
+    `encoder` or else a random encoder; with `adapter.kind: none` that is training from scratch."""
     encoder: Annotated[EncoderConfig | None, Affects.RUN] = None
-    """A pretrained encoder, for a fresh predictor (`random`) or one that comes without (a `base` that holds a predictor
-    alone); null: the base's own. Its family, width, depth, heads and MLP are the file's."""
-    encoder_weights: Annotated[EncoderWeights, Affects.RUN | Affects.PLAN] = "target_encoder"
-    """The encoder of an official `.pt` that holds two different ones. Meta's code trains the predictor on
-    `target_encoder`; a file with one encoder, or with two equal ones, gives the same model with either value."""
-    random: Annotated[ModelSizes | None, Affects.RUN] = None
-    """Instead of `base`: a fresh predictor of these sizes, and, without `encoder`, a random encoder; with
-    `adapter.kind: none` that is training from scratch."""
-    random_start: Annotated[Literal["persistence", "released"], Affects.RUN] = "persistence"
-    """Initialisation of a `random` model: close to copying the last frame, which needs a predictor as wide as a latent,
-    or as in the released recipe."""
+    """A pretrained encoder, for `base: random` or a base that holds a predictor alone; null: the base's own. Family,
+    width, depth and MLP are the file's."""
     sizes: Annotated[ModelSizes, Affects.RUN | Affects.PLAN] = ModelSizes()
-    """What an official `.pt` does not contain: image size and heads. Everything else is read from its tensors."""
+    """The sizes for `base: random`; of an official `.pt` what the file does not contain: the image size, the heads, and
+    whether the camera pose is an input. All other sizes are read from the file."""
     dtype: Annotated[Literal["float32", "bfloat16"], Affects.LATENTS | Affects.RUN | Affects.PLAN] = "bfloat16"
     """Type of the frozen weights; trained weights are always float32. Planning computes in it."""
     encode_chunk: Annotated[PositiveInt, Affects.RUN] = 16
     """Frames that go through the encoder at once: bounds its memory."""
 
-    @model_validator(mode="after")
-    def _one_start(self) -> ModelConfig:
-        is_broken = (self.base is None) == (self.random is None)
-        return self.refused((is_broken, "give either base (a model to adapt) or random (sizes of a fresh one)"))
+    @property
+    def is_random(self) -> bool:
+        """Whether the predictor is a fresh one."""
+        return self.base == RANDOM
 
     def with_base(self, name: str) -> ModelConfig:
         """Return the config of another model that is there, with the other settings of this one."""
-        return self.model_copy(update={"base": name, "random": None, "encoder": None})
+        sizes = ModelSizes() if self.is_random else self.sizes
+        return self.model_copy(update={"base": name, "encoder": None, "sizes": sizes})
 
 
 PEFT_NAMES = {  # of the knobs below

@@ -32,6 +32,8 @@ REMOVED: dict[str, RemovedKey] = {
     "decoder.noise": RemovedKey("0, no noise", (0.0,)),
     "decoder.warmup_steps": RemovedKey("500, at most a 15th of decoder.steps", (500, 100, 30)),
     "decoder.weight_decay": RemovedKey("0.05", (0.05,)),
+    "model.encoder_weights": RemovedKey("target_encoder, if the file has it", ("target_encoder",)),
+    "model.random_start": RemovedKey("persistence", ("persistence",)),
     # "training.betas": RemovedKey("(0.9, 0.999)", ([0.9, 0.999],)),
     "data.augment": RemovedKey(
         "off; use data.transforms",

@@ -96,7 +96,7 @@ class Config(Section):
     @model_validator(mode="after")
     def _parts_fit(self) -> Config:
         training, adapter, model, best = self.training, self.adapter, self.model, self.checkpoint.keep_best
-        predictor, steps, lora = (model.random or model.sizes).predictor, training.rollout_steps, adapter.kind == "lora"
+        predictor, steps, lora = model.sizes.predictor, training.rollout_steps, adapter.kind == "lora"
         graph, fp32, compiled = training.cuda_graph, training.precision == "fp32", training.compile != "off" and lora
         draws_or_scales = training.precision == "fp16" or adapter.dropout > 0  # which a graph would repeat
         patient, ranked = training.patience is not None, self.validation.ranking_clips > 0
@@ -106,7 +106,7 @@ class Config(Section):
         misfits = [] if self.replay is None else self.replay.misfits(self.data)
         return self.refused(
             (steps >= self.data.frames, f"training.rollout_steps {steps} needs data.frames of at least {steps + 1}"),
-            (model.random and lora, "model.random with adapter.kind lora would adapt noise; set adapter.kind: none"),
+            (model.is_random and lora, "model.base random with adapter.kind lora adapts noise; set adapter.kind: none"),
             (fp32 and model.dtype != "float32", "training.precision fp32 needs model.dtype float32"),
             (compiled and adapter.dora, "training.compile blocks cannot trace adapter.dora; set one of them off"),
             (graph and draws_or_scales, "training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"),

@@ -36,7 +36,7 @@ from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in, require_spac
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import ms_ssim
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.process import StoppedError, StopRequest, stop_on_signals
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import read_torch, write_torch

@@ -22,7 +22,7 @@ from vjepa2_ac.encoding.encode_dataset import begin_encoding, require_shared
 from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.reporter import Reporter
 
 _MOST_AT_ONCE = 16  # requests in a task: the next one is decoded while one is encoded

@@ -91,12 +91,12 @@ def load_models(
     against = asked.against if asked.against is not None else (BASE,) * is_of_run
     against = tuple(other for other in against if other != BASE) if is_base else against  # it is measured once
     found: list[Contender] = []
-    if BASE in against and config.model.base is None:
+    if BASE in against and config.model.is_random:
         if asked.against is not None:
-            absent, needed = "a model without a base (model.base is not set)", "a base to compare with"
+            absent, needed = "a model without a base (model.base: random)", "a base to compare with"
             raise InputError(where="--against base", found=absent, needed=needed, fix="Leave out --against base")
     elif BASE in against and not is_of_run:
-        found.append(_contender(BASE, "base", _like(name, world_model, str(config.model.base), config, dataset.widths)))
+        found.append(_contender(BASE, "base", _like(name, world_model, config.model.base, config, dataset.widths)))
     elif BASE in against and world_model.fresh_heads is not None:
         notes.append(_NO_BASE)
     elif BASE in against:

@@ -12,12 +12,12 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import Config, EncoderConfig, ModelConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.config.model import ModelSizes
+from vjepa2_ac.config.model import RANDOM, ModelSizes
 from vjepa2_ac.errors import counted
 from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
 from vjepa2_ac.intervals import ENOUGH_EPISODES
-from vjepa2_ac.model.checkpoints.loading import base_sizes
-from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED
+from vjepa2_ac.model.checkpoints import base_sizes
+from vjepa2_ac.model.model_files import OFFICIAL, PUBLISHED
 from vjepa2_ac.reporter import duration
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.training.cost.flops import clip_flops, frame_flops
@@ -130,7 +130,7 @@ def choose_model(kind: str, path: str | None) -> ModelChoice:
     path = path or (SCRATCH_ENCODER if is_scratch else RELEASED)
     config = ModelConfig(base=path)
     if is_scratch and not path.startswith(BUILTIN):
-        config = ModelConfig(encoder=EncoderConfig(path=path, frame="tubelet"), random=ModelSizes())
+        config = ModelConfig(base=RANDOM, encoder=EncoderConfig(path=path))
     return ModelChoice(path, is_scratch, base_sizes(config))
 
 
@@ -269,9 +269,9 @@ def _model(model: ModelChoice, machine: Machine) -> Knobs:
     path = Knob(model.path, ": ".join(model.download or ()))
     if model.is_scratch:
         return {
+            "base": Knob(RANDOM, "a fresh predictor, which starts close to copying the last frame"),
             "encoder": {"path": path} if model.is_tiny else {"path": path, "frame": Knob("tubelet")},
-            "random": _fresh_predictor(model),
-            "random_start": Knob("persistence", "the first steps are not spent on learning to copy"),
+            "sizes": _fresh_predictor(model),
             "dtype": dtype,
         }
     if model.is_tiny:

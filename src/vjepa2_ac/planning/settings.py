@@ -24,7 +24,7 @@ from vjepa2_ac.storage.structured import read_json_object, record_of
 logger = logging.getLogger(__name__)
 
 USED = (
-    "planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype", "model.encoder_weights",
+    "planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype",
     "training.device", *MOVABLE,
 )  # fmt: skip
 _ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it

@@ -21,14 +21,14 @@ from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.evaluation.summary import with_closed_loop
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import merge_adapter, trainable_report
-from vjepa2_ac.model.checkpoints.loading import to_official
-from vjepa2_ac.model.network.pretrained_folder import require_finite
+from vjepa2_ac.model.checkpoints import to_official
 from vjepa2_ac.model.network.world_model import widths_as_text, widths_of_model
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state, write_torch
 from vjepa2_ac.runs.subject import Subject, load_subject, run_config_of
 from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, try_writing_at, user_can_write, write_atomically
+from vjepa2_ac.storage.tensors import require_finite
 
 Form = Literal["merged", "official", "hub"]
 

@@ -35,6 +35,7 @@ from filelock import FileLock, Timeout
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config_of_run
+from vjepa2_ac.config.model import RANDOM
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
@@ -199,7 +200,9 @@ def _seen_from_start(config: Config, folder: Path) -> Iterator[tuple[str, str]]:
     starts = [str(start.get("folder")) for start in reversed(_earlier_starts(folder / ENVIRONMENT))]
     for key in _PATHS:
         path = flat.get(key)
-        if path is None or key in only_names or is_url(path) or path.startswith(BUILTIN) or Path(path).exists():
+        if path is None or path == RANDOM or key in only_names or is_url(path) or path.startswith(BUILTIN):
+            continue
+        if Path(path).exists():
             continue
         there = next((found for start in starts if (found := Path(start, path)).exists()), None)
         if there is not None:

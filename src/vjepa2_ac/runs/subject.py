@@ -13,8 +13,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_of_model
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_folder import CARD, load_trained
-from vjepa2_ac.model.base_model import require_base_of_run
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
+from vjepa2_ac.model.model_files import require_base_of_run
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.process import is_first
 from vjepa2_ac.runs.checkpoint import ADAPTER, BEST, NEWEST, SELECTED, SelectedCheckpoint, select_checkpoint, step_of
@@ -108,7 +108,7 @@ def untrained_model(config: Config, checkpoint: Path) -> str:
     Raises:
         InputError: The card of the trained weights is damaged.
     """
-    if config.model.random is not None:
+    if config.model.is_random:
         return "untrained model"
     if "fresh_heads" in read_json_object(checkpoint / ADAPTER / CARD, needed="the card of trained weights"):
         return f"{BASE_MODEL} with untrained input heads"
@@ -126,7 +126,7 @@ def note_about(config: Config, chosen: SelectedCheckpoint) -> str:
         return f"{'The newest checkpoint' if chosen.by == NEWEST else 'Checkpoint 0'} is the {untrained}."
     if state.step < min(config.validation.every, config.training.steps):
         return f"The selected checkpoint is the {untrained}: no later checkpoint has been validated."
-    training = "training" if config.model.base is None else "fine-tuning"
+    training = "training" if config.model.is_random else "fine-tuning"
     measure = "the prediction error" if state.best_rank is None else "action ranking"
     return f"The selected checkpoint is the {untrained}: {training} did not improve {measure}."
 

@@ -36,7 +36,7 @@ from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import add_adapter, trainable_report
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
-from vjepa2_ac.model.checkpoints.loading import base_sizes, load_base
+from vjepa2_ac.model.checkpoints import base_sizes, load_base
 from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.reporter import LOADING, SILENT, Reporter
@@ -169,7 +169,7 @@ def set_up(
     first_only(accelerator, lambda: require_same_base(config, world_model))
     extrinsics_for(world_model, clip)
     if decoder is not None:
-        decoder.require_fit(world_model, config.data, subject=str(config.model.base or "the random model"))
+        decoder.require_fit(world_model, config.data, subject=config.model.base)
 
     _require_shared_memory(config, clip, world_model.sizes, accelerator)
     for replayed in others:
@@ -215,7 +215,7 @@ def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, r
     reporter.note(str(trainable_report(world_model)))
     if unusual := config.adapter.out_of_line:
         reporter.note(f"Warning: {unusual}.")
-    copies = config.model.random is not None and config.model.random_start == "persistence"
+    copies = config.model.is_random
     if copies and (narrow := world_model.sizes.too_narrow_to_copy):
         reporter.note(f"Warning: {narrow}.")
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
@@ -264,7 +264,7 @@ def _fit_heads(world_model: WorldModel, config: Config, dataset: Dataset, report
     heads = heads_to_replace(world_model.sizes, dataset.widths)
     for line in fit_heads(world_model, dataset.widths, config.seed):
         reporter.note(line)
-    if config.data.states != "vector" or config.adapter.kind == "none" or config.model.random is not None:
+    if config.data.states != "vector" or config.adapter.kind == "none" or config.model.is_random:
         return
     for name in ("state_encoder", "action_encoder") if world_model.sizes.predictor.use_states else ("action_encoder",):
         if name not in {*heads, *config.adapter.modules_to_save}:

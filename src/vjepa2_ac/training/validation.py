@@ -163,7 +163,7 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
     reporter.task("measuring the model before the first step")
     found = validate(run, reporter)
     config, error = run.config, one_step_over_persistence(found.errors).value
-    if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:
+    if error < 1.0 or config.training.allow_weak_base or config.model.is_random:
         return found
     if run.world_model.fresh_heads is not None:
         reporter.note(_NOT_ASKED)

@@ -225,7 +225,8 @@ def test_every_form_is_encoded_whole(forms: Path, form: str, tmp_path: Path) -> 
     }  # fmt: skip
     data = opened(forms, form).config
     config = Config.model_validate(
-        {"run_dir": "none", "data": data, "model": {"random": sizes, "dtype": "float32", "encode_chunk": 9},
+        {"run_dir": "none", "data": data,
+         "model": {"base": "random", "sizes": sizes, "dtype": "float32", "encode_chunk": 9},
          "adapter": {"kind": "none"}, "training": {"device": "cpu", "precision": "fp32"}},
     )  # fmt: skip
     encoded = encode_config(config, out=tmp_path / "latents")

@@ -12,7 +12,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.pretrained_folder import open_safetensors
+from vjepa2_ac.storage.tensors import open_safetensors
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 12345678\n"
 FORMS = WRITERS | {

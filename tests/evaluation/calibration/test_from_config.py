@@ -14,7 +14,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.evaluation.calibration.data import VariantProbe, probe_config
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 
 MakeConfig = Callable[..., Config]
 Printed = pytest.CaptureFixture[str]

@@ -18,8 +18,8 @@ from hub import serve_hub
 from paths import GOLDEN
 from vjepa2_ac.config import EncoderSizes, ModelConfig
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
-from vjepa2_ac.model.base_model import beyond_tensors, find_base, identified
-from vjepa2_ac.model.checkpoints.loading import load_base, load_official, to_official
+from vjepa2_ac.model.checkpoints import load_base, load_official, to_official
+from vjepa2_ac.model.model_files import beyond_tensors, find_base, identified
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 
 FILES = GOLDEN / "encoders"
@@ -44,10 +44,10 @@ def golden(request: pytest.FixtureRequest) -> Golden:
 def model_of(path: Path | str, size: int = 96, dtype: str = "float32", **encoder: Any) -> WorldModel:
     """Return a model with the encoder of a file, and a small fresh predictor."""
     known = {"heads": HEADS[path]} if path in HEADS else {}
-    predictor = {"width": 24, "depth": 1, "heads": 2}
     config = {
+        "base": "random",
         "encoder": {"path": str(path), **known, **encoder},
-        "random": {"image_size": size, "predictor": predictor},
+        "sizes": {"image_size": size, "predictor": {"width": 24, "depth": 1, "heads": 2}},
         "dtype": dtype,
     }
     return load_base(ModelConfig.model_validate(config), seed=0)
@@ -357,9 +357,9 @@ def test_only_the_encoder_is_read_from_a_large_file(tmp_path: Path) -> None:
     code = f"""
 import resource, torch
 from vjepa2_ac.config import ModelConfig
-from vjepa2_ac.model.checkpoints.loading import load_base
-model = {{"encoder": {{"path": {str(tmp_path / "large.pt")!r}, "heads": 4}}, "dtype": "float32",
-         "random": {{"image_size": 96, "predictor": {{"width": 24, "depth": 1, "heads": 2}}}}}}
+from vjepa2_ac.model.checkpoints import load_base
+model = {{"base": "random", "encoder": {{"path": {str(tmp_path / "large.pt")!r}, "heads": 4}}, "dtype": "float32",
+         "sizes": {{"image_size": 96, "predictor": {{"width": 24, "depth": 1, "heads": 2}}}}}}
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 load_base(ModelConfig.model_validate(model), seed=0)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)

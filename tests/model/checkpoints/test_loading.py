@@ -13,16 +13,15 @@ from predictor_files import write_predictor_file
 from tiny_models import draw, tiny_model
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model import base_model
-from vjepa2_ac.model.checkpoints.loading import load_base, load_official
-from vjepa2_ac.model.network.pretrained_folder import ENCODER, PREDICTOR
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model import model_files
+from vjepa2_ac.model.checkpoints import load_base, load_official
+from vjepa2_ac.model.network.world_model import ENCODER, PREDICTOR, WorldModel
 
 
 @pytest.fixture
 def assets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Stand in for the folder of models that come with the package; there is none in it."""
-    monkeypatch.setattr(base_model, "ASSETS", tmp_path / "assets")
+    monkeypatch.setattr(model_files, "ASSETS", tmp_path / "assets")
     return tmp_path / "assets"
 
 

@@ -12,8 +12,8 @@ import pytest
 from vjepa2_ac import storage
 from vjepa2_ac.cli import main
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.model.checkpoints import published
-from vjepa2_ac.model.checkpoints.published import PUBLISHED, VIT_B, Published, download, find_published, published_as
+from vjepa2_ac.model import model_files
+from vjepa2_ac.model.model_files import PUBLISHED, VIT_B, Published, download, find_published, published_as
 from vjepa2_ac.storage.retries import RetryPolicy
 
 
@@ -253,7 +253,7 @@ def test_disk_space_for_the_rest_is_checked_before_the_first_byte(
 def test_the_command_says_what_the_file_is_and_which_knob_takes_it(
     serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(published, "PUBLISHED", (MADE_UP,))
+    monkeypatch.setattr(model_files, "PUBLISHED", (MADE_UP,))
     monkeypatch.chdir(tmp_path)
     assert main(["download", "made_up", "--url", serve(Behaviour())]) == 0
     shown = capsys.readouterr().out

@@ -13,7 +13,7 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.attention import TokenLayout, rotary_tables
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model

@@ -19,7 +19,7 @@ from vjepa2_ac import __version__
 from vjepa2_ac.errors import counted
 
 if TYPE_CHECKING:
-    from vjepa2_ac.model.checkpoints.published import Published
+    from vjepa2_ac.model.model_files import Published
     from vjepa2_ac.training.cost.memory import MemoryEstimate
 
 _MILLION, _GIGABYTE = 10**6, 10**9

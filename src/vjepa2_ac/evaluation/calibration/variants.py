@@ -30,7 +30,7 @@ from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.evaluation.measure import ONE_STEP, ClipSample, Predictor, measured
 from vjepa2_ac.evaluation.result import L1, Row
 from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
@@ -217,10 +217,10 @@ def require_learned(model: ModelConfig) -> None:
     Raises:
         InputError: It is.
     """
-    if model.base is None:
+    if model.is_random:
         found, needed = "a model that has learned nothing", "one that can say which stride it was trained at"
         fix = "Set data.stride to a number, or name another model with model.base (data calibrate: --model)"
-        raise InputError(where="model.random", found=found, needed=needed, fix=fix)
+        raise InputError(where="model.base: random", found=found, needed=needed, fix=fix)
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,10 @@ from vjepa2_ac.model.adapter.lora import (
     train_everything,
     wrap,
 )
-from vjepa2_ac.model.network.pretrained_folder import read_tensors, save_tensors
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads
 from vjepa2_ac.model.quiet_imports import quiet_imports
 from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 
 with quiet_imports():
     from peft import set_peft_model_state_dict
@@ -148,7 +148,7 @@ def read_card(folder: Path, model: WorldModel) -> Card:
         if found != needed:
             own, others = f"{found[:12]}{this}", f"{needed[:12]}{trained_on}"
             said = f"an adapter trained on another {part} ({others}) than this model's ({own})"
-            fix = "Set model.base (or model.encoder, model.encoder_weights) to what it was trained on"
+            fix = "Set model.base (or model.encoder) to what it was trained on"
             raise InputError(where=str(path), found=said, fix=fix)
     if model.adaptation is not None and model.adaptation.kind != card.kind:
         said = f"an adapter of kind {card.kind}, and the model has one of kind {model.adaptation.kind}"

@@ -6,10 +6,11 @@ And input heads for robots with other states or actions than the base: new encod
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from einops import rearrange
@@ -19,18 +20,24 @@ from torch import Generator, Tensor, nn
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.base_model import EncoderOrigin, beyond_tensors, described, identified, read_sizes
+from vjepa2_ac.model.model_files import (
+    CONFIG,
+    FORMAT,
+    EncoderOrigin,
+    beyond_tensors,
+    described,
+    identified,
+    read_encoder_origin,
+    read_sizes,
+)
 from vjepa2_ac.model.network.blocks import initialise
 from vjepa2_ac.model.network.encoder import Encoder
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
 from vjepa2_ac.model.network.predictor_network import LatentDynamics, normalise_latents, predictor_fields
-from vjepa2_ac.model.network.pretrained_folder import (
-    ENCODER,
-    PREDICTOR,
-    load_safetensors,
-    read_encoder_origin,
-    write_folder,
-)
+from vjepa2_ac.storage import folder_writer
+from vjepa2_ac.storage.tensors import read_tensors, save_tensors
+
+ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
 
 
 @dataclass(frozen=True)
@@ -73,7 +80,7 @@ class WorldModel(LatentDynamics):
     Latents and predictions are layer-normalised over `dim` without affine, and float32 whatever the weights' type:
     inputs are cast inside. `model.adapter.lora.add_adapter` selects the trained weights; before that there are none.
 
-    Create one with `random`, `from_pretrained` or `model.checkpoints.loading.load_official`.
+    Create one with `random`, `from_pretrained` or `model.checkpoints.load_official`.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
@@ -132,12 +139,16 @@ class WorldModel(LatentDynamics):
         folder = Path(folder)
         model = cls.empty(read_sizes(folder))
         model.encoder_origin = read_encoder_origin(folder)
-        load_safetensors(model.encoder, folder / ENCODER, dtype)
-        load_safetensors(model.predictor, folder / PREDICTOR, dtype)
+        needed, fix = "the weights of a world model", "Copy or write the folder again"
+        for part, name in ((model.encoder, ENCODER), (model.predictor, PREDICTOR)):
+            weights = read_tensors(folder / name, part.state_dict(), needed=needed, fix=fix, dtype=dtype)
+            part.load_state_dict(weights, assign=True)
         return model
 
     def save_pretrained(self, folder: str | Path) -> None:
         """Write config.json, encoder.safetensors and predictor/ (which transformers can load by itself).
+
+        The folder is written elsewhere, then moved, config.json last: a folder that has one is complete.
 
         Raises:
             InputError: The folder cannot be written.
@@ -146,10 +157,18 @@ class WorldModel(LatentDynamics):
         """
         if self.predictor is not self.base_predictor:
             raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_trained saves it alone")
-        card = {"sizes": self.sizes.model_dump(mode="json")}
+        card: dict[str, Any] = {"format": FORMAT, "sizes": self.sizes.model_dump(mode="json")}
         if self.encoder_origin is not None:
             card["encoder_origin"] = asdict(self.encoder_origin)
-        write_folder(Path(folder), card, self.present_encoder, self.predictor)
+        encoder = self.present_encoder
+        predictor: Any = self.predictor
+        with folder_writer(Path(folder), CONFIG) as fresh:
+            (fresh / PREDICTOR).parent.mkdir()
+            save_tensors(encoder.state_dict(), fresh / ENCODER)
+            save_tensors(predictor.state_dict(), fresh / PREDICTOR)
+            predictor.config.architectures = [type(predictor).__name__]
+            predictor.config.save_pretrained(fresh / "predictor")
+            (fresh / CONFIG).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
     @property
     def image_size(self) -> int:

@@ -21,12 +21,12 @@ from torch.nn.functional import gelu
 
 from vjepa2_ac import __version__
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.pretrained_folder import read_tensors, save_tensors
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.solvers import PlanStart
 from vjepa2_ac.storage import folder_writer
 from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 
 CARD, WEIGHTS = "prior.json", "prior.safetensors"
 POINTS, VALUES, WIDTH, BLOCKS = 16, 16, 256, 2  # points of an image, numbers of each; the network's width and depth

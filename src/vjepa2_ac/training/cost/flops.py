@@ -43,7 +43,7 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
 
     Args:
         config: What is trained, frames and rollout.
-        sizes: Sizes of its model, such as `model.checkpoints.loading.base_sizes` gives.
+        sizes: Sizes of its model, such as `model.checkpoints.base_sizes` gives.
     """
     passes = _Passes(sizes, config)
     frames, training = config.data.frames, config.training

@@ -121,7 +121,7 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
 
     Args:
         config: The run.
-        sizes: Sizes of its model, such as `model.checkpoints.loading.base_sizes` gives.
+        sizes: Sizes of its model, such as `model.checkpoints.base_sizes` gives.
 
     Raises:
         InputError: A knob of the adapter does not fit the predictor.
@@ -175,7 +175,7 @@ def _knobs(config: Config) -> Iterator[tuple[str, dict[str, dict[str, Any]]]]:
     fewest = max(8, config.training.rollout_steps + 1)
     yield "data.frames=8", {"data": {"frames": min(config.data.frames, fewest)}}
     yield "training.optimizer=adamw_8bit", {"training": {"optimizer": "adamw_8bit"}}
-    if not config.model.random:
+    if not config.model.is_random:
         yield "adapter.kind=lora", {"adapter": {"kind": "lora"}}
 
 

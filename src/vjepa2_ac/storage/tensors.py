@@ -1,12 +1,8 @@
-"""The folder of a world model: config.json, encoder.safetensors and predictor/ as transformers writes it.
-
-And what every file of weights is checked for: names, shapes, and that each number is finite.
-"""
+"""Safetensors files: written whole; read with names, shapes and types checked, and every number finite."""
 
 from __future__ import annotations
 
 import errno
-import json
 import re
 import stat
 from collections.abc import Iterator, Mapping
@@ -17,37 +13,13 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.base_model import CONFIG, FORMAT, NEEDED_MODEL, EncoderOrigin
-from vjepa2_ac.storage.structured import read_json_object, record_of
 
 _FLOAT = "dense weights in float16, bfloat16, float32 or float64"
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
-
-
-def write_folder(folder: Path, card: dict[str, Any], encoder: nn.Module, predictor: Any) -> None:
-    """Write a model to a temporary folder, then move it, config.json last: a folder that has one is complete.
-
-    Args:
-        folder: Where the model goes; an existing one is replaced.
-        card: Sizes of the model, and the origin of its encoder where that is known.
-        encoder: The encoder.
-        predictor: The predictor: a transformers model.
-
-    Raises:
-        InputError: The folder cannot be created or written, or the disk is full.
-    """
-    with storage.folder_writer(folder, CONFIG) as fresh:
-        (fresh / PREDICTOR).parent.mkdir()
-        save_tensors(encoder.state_dict(), fresh / ENCODER)
-        save_tensors(predictor.state_dict(), fresh / PREDICTOR)
-        predictor.config.architectures = [type(predictor).__name__]
-        predictor.config.save_pretrained(fresh / "predictor")
-        (fresh / CONFIG).write_text(json.dumps({"format": FORMAT, **card}, indent=1) + "\n", encoding="utf-8")
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
@@ -65,28 +37,6 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
     except SafetensorError as error:  # whose text alone has the system's number
         number = re.search(r"os error (\d+)", str(error))
         raise OSError(int(number[1]) if number else errno.EIO, str(error), str(path)) from None
-
-
-def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
-    """Return where the encoder of a model in a folder came from; None: nobody knows, or it belongs to the model.
-
-    Raises:
-        InputError: The folder says it in a way that nobody understands.
-    """
-    told = read_json_object(folder / CONFIG, needed=NEEDED_MODEL).get("encoder_origin")
-    where, needed = f"{folder / CONFIG}: encoder_origin", "file, key and licence of an encoder"
-    return None if told is None else record_of(EncoderOrigin, told, where=where, needed=needed)
-
-
-def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -> None:
-    """Fill a module (which may be on the meta device) from a file, every name and shape matched.
-
-    Raises:
-        InputError: The file is missing or damaged, its tensors are not those of the module, or one is not finite.
-    """
-    fix = "Copy or write the folder again"
-    weights = read_tensors(path, module.state_dict(), needed="the weights of a world model", fix=fix, dtype=dtype)
-    module.load_state_dict(weights, assign=True)
 
 
 def read_tensors(

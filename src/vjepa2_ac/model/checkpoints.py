@@ -1,0 +1,590 @@
+"""The world model that a config starts from, and the formats of checkpoints that it can be read from.
+
+Meta's `.pt` of either family, a transformers folder, the same from the Hub, and a folder of this project all end in one
+record for an encoder, `FoundEncoder`; a network is filled from it alone. Every tensor is matched or refused.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import BaseModel, Field
+from torch import Tensor, nn
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes
+from vjepa2_ac.config.model import Depth, EncoderConfig, Family, FramePath, Heads, Ratio, Width
+from vjepa2_ac.episode import POSE_WIDTHS
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.model_files import (
+    CONFIG,
+    ENCODER_NEEDED,
+    FORMAT,
+    HEADS,
+    EncoderOrigin,
+    check_sizes,
+    find_base,
+    find_encoder_path,
+    published_as,
+    read_encoder_origin,
+    read_sizes,
+)
+from vjepa2_ac.model.network.blocks import mlp_ratio_of
+from vjepa2_ac.model.network.world_model import ENCODER, WorldModel, widths_as_text, widths_of_model
+from vjepa2_ac.storage.places import BUILTIN
+from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.tensors import check_tensors, open_safetensors, require_finite, require_floats
+from vjepa2_ac.storage.transfer import from_hub
+
+logger = logging.getLogger(__name__)
+
+ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
+"""Where an encoder can be in a file. The first that is there is taken: an average of weights, which Meta's own use is
+of; `encoder` is the one that was trained by gradient."""
+FIX = "`vjepa2-ac download --list` shows those that are published; the Hub has facebook/vjepa2-vitl-fpc64-256"
+
+Part = Literal["encoder", "encoder 2.1", "predictor"]
+Rename = Callable[[str], tuple[str, int | None]]
+"""Our name of a tensor -> the file's, and which third of a fused one it is (None: all of it)."""
+
+_PARTS = 'both parts, as of torch.save({"encoder": ..., "predictor": ...}, FILE), or model.encoder.path for the encoder'
+_NEEDED = "a checkpoint of V-JEPA 2, 2.1 or 2-AC as Meta publishes it"
+_SPLIT = ("q", "k", "v")
+_PREFIXES = re.compile(r"^(?:(?:module|backbone|_orig_mod)\.)+|_orig_mod\.")  # the last: of torch.compile, anywhere
+_IGNORED = "pos_embed"  # may be in a file: a network with rotary positions does not use it
+_ENCODER = [
+    (r"^vit\.embeddings\.patch_embeddings\.", "patch_embed."),
+    (r"^vit\.layer\.", "blocks."),
+    (r"\.attention\.(q|k|v)(?:uery|ey|alue)\.", r".attn.\1."),
+    (r"\.attention\.proj\.", ".attn.proj."),
+]
+_NAMES: dict[Part, list[tuple[str, str]]] = {  # ours -> Meta's, as (pattern, replacement), applied in turn
+    "encoder": [(r"^vit\.layernorm\.", "norm."), *_ENCODER],
+    "encoder 2.1": [
+        (r"^vit\.layernorm\.", "norms_block.3."),
+        (r"^vit\.level_norms\.", "norms_block."),
+        (r"^vit\.embeddings\.patch_embeddings\.proj\.of_images\.", "patch_embed_img.proj."),
+        (r"^vit\.embeddings\.patch_embeddings\.proj\.video_kind$", "video_mod_embed"),
+        (r"^vit\.embeddings\.patch_embeddings\.proj\.image_kind$", "img_mod_embed"),
+        *_ENCODER,
+    ],
+    "predictor": [(r"^blocks\.", "predictor_blocks."), (r"\.attn\.o\.", ".attn.proj.")],
+}
+_ON_THE_HUB = [CONFIG, "*.safetensors"]
+_PREFIXES_ON_THE_HUB = ("vjepa2.encoder.", "encoder.")  # of a classification model, of a plain one
+_BLOCK = re.compile(r"(?:^|\.)(?:blocks|layer)\.(\d+)\.")  # in the names of Meta's files, of transformers, and of ours
+_ONLY_2_1 = ("norms_block.", "video_mod_embed", "img_mod_embed", "patch_embed_img.")
+_NON_COMMERCIAL = "The weights that jepa-wms publishes so are CC-BY-NC 4.0: for non-commercial use only"
+
+
+def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
+    """Return the world model to start from, on the CPU.
+
+    It is `model.base`; or, for `random`, a fresh predictor of `model.sizes` on `model.encoder` or on a random encoder.
+
+    Raises:
+        InputError: There is no such model or encoder, it cannot be read, or contradicts the config.
+    """
+    dtype = torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
+    encoder = None if config.encoder is None else find_encoder(config.encoder)
+    if config.is_random:
+        if encoder is None:
+            return WorldModel.random(config.sizes, seed, dtype, at_persistence=True)
+        model = _on_encoder(encoder, sizes_with(encoder, config.sizes), dtype)
+        model.draw_predictor(torch.Generator().manual_seed(seed), dtype, at_persistence=True)
+        return model
+    path = find_base(config.base)
+    file = None if path.is_dir() else MetaFile.open(path)
+    if encoder is not None and (file is None or any(key in file.parts for key in ENCODER_KEYS)):
+        said = f"an encoder of its own, and model.encoder names another ({encoder.where}), on which it predicts noise"
+        fix = "Leave out model.encoder; or train a fresh predictor on it, with model.base: random"
+        raise InputError(where=f"model.base: {config.base}", found=said, fix=fix)
+    if file is not None:
+        model = _with_predictor(file, encoder or _own_encoder(file, config.sizes), config.sizes, dtype)
+        if encoder is not None:
+            _warn_of_unknown_encoder(model, file, encoder)
+        return model
+    check_sizes(read_sizes(path), config.sizes, where=f"model.base: {config.base}")
+    return WorldModel.from_pretrained(path, dtype=dtype)
+
+
+def base_sizes(config: ModelConfig) -> ModelSizes:
+    """Return the sizes of the model that `load_base` would give, without reading a weight.
+
+    For an official `.pt`, or where nothing is there yet, they are those of `model.sizes`.
+
+    Raises:
+        InputError: There is a folder, but it is not a world model; or `model.encoder` names none.
+    """
+    if config.encoder is not None:
+        return expected_sizes(config.encoder, config.sizes)
+    if config.is_random:
+        return config.sizes
+    is_there = config.base.startswith(BUILTIN) or Path(config.base).exists()
+    path = find_base(config.base) if is_there else Path(config.base)
+    return read_sizes(path) if path.is_dir() else config.sizes
+
+
+def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:
+    """Read Meta's checkpoint. Every tensor is matched; only a `pos_embed` of the encoder may remain.
+
+    The file is mapped: in addition to the weights in `dtype` memory holds only pages of the file, which the system can
+    take back. If there are several encoders, the first of `ENCODER_KEYS` is used: Meta's code trains the predictor on
+    `target_encoder`.
+
+    Args:
+        path: The `.pt` file.
+        sizes: Sizes that tensors do not show: image size, heads, extrinsics. Any other size that differs from both the
+            default and the tensors is a contradiction.
+        dtype: Type of the weights in memory.
+
+    Raises:
+        InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
+    """
+    file, given = MetaFile.open(Path(path)), sizes or ModelSizes()
+    return _with_predictor(file, _own_encoder(file, given), given, dtype)
+
+
+def to_official(model: WorldModel) -> dict[str, Any]:
+    """Return the weights by Meta's names, q, k and v fused: `torch.save` of it is an official checkpoint.
+
+    Raises:
+        InputError: States and actions differ in width from Meta's code, which has no predictor without states either.
+        ValueError: There is an adapter: merge it first.
+    """
+    if model.predictor is not model.base_predictor:
+        raise ValueError("an adapter is on: merge_adapter first")
+    if not model.sizes.predictor.use_states or widths_of_model(model.sizes) != POSE_WIDTHS:
+        found = f"a model that takes {widths_as_text(model.sizes)}"
+        needed = f"states and actions of {POSE_WIDTHS.state} numbers: Meta's code has no other predictor"
+        fix = "Export it with --to merged (WorldModel.save_pretrained), which `model.base` takes"
+        raise InputError(where="the official format", found=found, needed=needed, fix=fix)
+    encoder = to_official_names(model.present_encoder.state_dict(), part_of(model.sizes.encoder.family))
+    return {
+        "encoder": encoder,
+        "target_encoder": dict(encoder),
+        "predictor": to_official_names(model.predictor.state_dict(), "predictor"),
+        "epoch": 0,
+    }
+
+
+def _own_encoder(file: MetaFile, given: ModelSizes) -> FoundEncoder:
+    """Return the encoder of a file that holds a predictor, too."""
+    return encoder_in_file(file, None, given.encoder.frame, given.encoder.heads)
+
+
+def _warn_of_unknown_encoder(model: WorldModel, file: MetaFile, encoder: FoundEncoder) -> None:
+    """Warn that a file holds a predictor alone, and that nothing shows which encoder it was trained on."""
+    model.encoder_origin = encoder.origin
+    if not model.sizes.predictor.use_states:
+        logger.warning("%s: a predictor without states and without an encoder. %s", file.path, _NON_COMMERCIAL)
+    logger.warning(
+        "%s does not say which encoder its predictor was trained on: on any other than %s it predicts noise. The first"
+        " validation shows it (its error beside that of persistence).",
+        file.path,
+        encoder.origin,
+    )
+
+
+def _with_predictor(file: MetaFile, found: FoundEncoder, given: ModelSizes, dtype: torch.dtype) -> WorldModel:
+    """Return the model of the predictor in a file and an encoder."""
+    predictor = file.tensors("predictor")
+    if "mask_tokens" in {name.partition(".")[0] for name in predictor} and "action_encoder.weight" not in predictor:
+        said = "a checkpoint of pretraining: its predictor fills in masked patches, and knows no actions"
+        fix = "Its encoder can be used: set model.encoder.path to this file, and model.base: random for a fresh"
+        fix += " predictor (configs/scratch_vitb.yaml)"
+        raise InputError(where=f"model.base: {file.path}", found=said, fix=fix)
+    model = _on_encoder(found, _sizes(file, predictor, found, given), dtype)
+    model.encoder_origin = None  # the file is the model's own
+    fill(
+        model.predictor,
+        predictor,
+        partial(official_name, part="predictor"),
+        dtype,
+        where=f"{file.path}: predictor",
+        fix="Check model.base, model.sizes, and model.encoder: the predictor's latents are of one encoder",
+    )
+    logger.info("read %s: %s", file.path, model.sizes.model_dump())
+    return model
+
+
+def _on_encoder(found: FoundEncoder, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
+    """Return a model with this encoder, and a predictor without weights."""
+    model = WorldModel.empty(sizes)
+    fix = f"Get the original file. {FIX}"
+    fill(model.present_encoder, found.weights(), found.rename, dtype, where=found.where, fix=fix)
+    if found.is_cut:
+        model.present_encoder.reset_last_norm()
+    model.encoder_origin = found.origin
+    return model
+
+
+def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: FoundEncoder, given: ModelSizes) -> ModelSizes:
+    """Return the sizes of the tensors; heads, image size and extrinsics are those given."""
+    own = given.predictor
+    try:
+        width, hidden = len(predictor["action_encoder.weight"]), len(predictor["predictor_blocks.0.mlp.fc1.weight"])
+        depth = depth_of(predictor, "predictor_blocks")
+    except KeyError as missing:
+        raise file.lacks(f"tensor {missing}", part="predictor") from None
+    told = {
+        "image_size": given.image_size,
+        "patch_size": encoder.patch_size,
+        "encoder": encoder.sizes.model_dump(),
+        "predictor": {
+            "width": width,
+            "depth": depth,
+            "heads": own.heads,
+            "mlp_ratio": mlp_ratio_of(width, hidden, own.mlp_ratio),
+            "use_extrinsics": own.use_extrinsics,
+            "use_states": any(name.startswith("state_encoder.") for name in predictor),
+        },
+    }
+    fix = "Set image size and heads in model.sizes: the tensors cannot tell"
+    found = record_of(ModelSizes, told, where=str(file.path), needed="sizes that go with model.sizes", fix=fix)
+    check_sizes(found, given, where=str(file.path))
+    return found
+
+
+# ---- encoders ----
+
+
+@dataclass(frozen=True, eq=False)
+class FoundEncoder:
+    """An encoder whose values are not read yet."""
+
+    where: str  # for messages
+    sizes: EncoderSizes
+    patch_size: int
+    image_size: int | None  # that it was trained at last, if somebody says so
+    origin: EncoderOrigin
+    weights: Callable[[], Mapping[str, Tensor]]  # mapped, by the file's names
+    rename: Rename
+    is_cut: bool = False  # after a block before the last: the weights of the last norm are not its own
+
+    def up_to(self, layer: int) -> FoundEncoder:
+        """Return the same encoder without the blocks after a layer.
+
+        Raises:
+            InputError: It has fewer blocks.
+        """
+        depth = self.sizes.depth
+        if layer > depth:
+            needed = f"at most {depth}, its number of blocks"
+            raise InputError(where="model.encoder.layer", found=f"{layer}, of {self.where}", needed=needed)
+        if layer == depth:
+            return self
+
+        def weights() -> dict[str, Tensor]:
+            blocks = {name: (tensor, _BLOCK.search(name)) for name, tensor in self.weights().items()}
+            return {name: tensor for name, (tensor, block) in blocks.items() if not block or int(block[1]) < layer}
+
+        return replace(self, sizes=self.sizes.model_copy(update={"depth": layer}), weights=weights, is_cut=True)
+
+
+def find_encoder(config: EncoderConfig) -> FoundEncoder:
+    """Return the encoder that a config names; from the Hub it is downloaded first. No weight is read.
+
+    Raises:
+        InputError: There is none, it is of another kind or damaged, or the config contradicts it.
+        UnreachableError: The Hub cannot be reached, and the repository is not in its cache.
+    """
+    path = find_encoder_path(config.path)
+    if path is not None and not path.is_dir():
+        found = encoder_in_file(MetaFile.open(path), config.key, config.frame, config.heads)
+    else:
+        folder = path or from_hub(config.path, _ON_THE_HUB, where=f"model.encoder.path: {config.path}")
+        name = config.path if path is None else path.name
+        found = _in_folder(folder, config, name=name)
+    if config.heads not in {None, found.sizes.heads}:
+        said = f"{found.sizes.heads} attention heads, and model.encoder.heads says {config.heads}"
+        raise InputError(where=found.where, found=said, fix="Leave out model.encoder.heads")
+    return found if config.layer is None else found.up_to(config.layer)
+
+
+def sizes_with(found: FoundEncoder, given: ModelSizes) -> ModelSizes:
+    """Return the sizes of a model with this encoder, at the given image size.
+
+    Raises:
+        InputError: The given sizes contradict those of the file, or do not fit its patches, frame path or heads.
+    """
+    own = {"encoder": found.sizes.model_dump(), "patch_size": found.patch_size}
+    sizes = record_of(ModelSizes, given.model_dump() | own, where=found.where, needed=ENCODER_NEEDED)
+    check_sizes(sizes, given, where=found.where)
+    if found.image_size not in {None, given.image_size}:
+        logger.warning(
+            "%s was trained at %d px, and frames are encoded at %d px (image_size): other positions than it knows",
+            found.origin, found.image_size, given.image_size,
+        )  # fmt: skip
+    return sizes
+
+
+def expected_sizes(config: EncoderConfig, given: ModelSizes) -> ModelSizes:
+    """Return the sizes of a model with this encoder; of a published file that is not here yet, from its name.
+
+    Raises:
+        InputError: As `find_encoder`.
+    """
+    known = published_as(Path(config.path).name)
+    if known is None or Path(config.path).exists():
+        return sizes_with(find_encoder(config), given)
+    encoder = known.encoder.sizes(known.family, config.frame).model_dump()
+    encoder["depth"] = min(encoder["depth"], config.layer or encoder["depth"])
+    return record_of(ModelSizes, given.model_dump() | {"encoder": encoder}, where=f"model.encoder: {config.path}")
+
+
+def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: int | None) -> FoundEncoder:
+    """Return the encoder in one of Meta's files.
+
+    Args:
+        file: The file.
+        key: Which encoder; None: the first that is there.
+        frame: How a frame enters.
+        heads: The attention heads of an encoder that is not as wide as a published one.
+
+    Raises:
+        InputError: There is no such key, what is there is no encoder, or nobody knows the heads.
+    """
+    there = [name for name in ENCODER_KEYS if name in file.parts]
+    if key is None and there:
+        key = there[0]
+        logger.info("%s: the encoder under %s (there are: %s)", file.path, key, ", ".join(there))
+    if key not in there:
+        fix = f"Set model.encoder.key to one of {', '.join(there)}, or leave it out" if there else FIX
+        raise file.lacks(key or "encoder", fix)
+    tensors = file.tensors(key)
+    family: Family = "v2.1" if any(name.startswith(_ONLY_2_1) for name in tensors) else "v2"
+    try:
+        width, *_, patch_size = tensors["patch_embed.proj.weight"].shape
+        hidden, depth = tensors["blocks.0.mlp.fc1.weight"].shape[0], depth_of(tensors, "blocks")
+    except (KeyError, ValueError) as missing:
+        raise file.lacks(f"tensor {missing}", part=key) from None
+    heads = HEADS.get(width, heads)
+    if heads is None:
+        said = f"an encoder of width {width}, which is none of the published ones: the tensors do not show its heads"
+        fix = "Set model.encoder.heads to those it was trained with: others give other latents without an error"
+        raise InputError(where=str(file.path), found=said, fix=fix)
+    known = published_as(file.path.name)
+    return FoundEncoder(
+        where=f"{file.path}: {key}",
+        sizes=EncoderSizes(
+            width=width,
+            depth=depth,
+            heads=heads,
+            mlp_ratio=mlp_ratio_of(width, hidden, EncoderSizes().mlp_ratio),
+            family=family,
+            frame=frame,
+        ),
+        patch_size=patch_size,
+        image_size=known.image_size if known else None,
+        origin=EncoderOrigin(file.path.name, key, known.licence if known else ""),
+        weights=lambda: tensors,
+        rename=partial(official_name, part=part_of(family)),
+    )
+
+
+class _Told(BaseModel):
+    """What the config.json of a V-JEPA 2 model of transformers says; only what this project computes is taken."""
+
+    model_type: Literal["vjepa2"]
+    hidden_size: Width
+    num_hidden_layers: Depth
+    num_attention_heads: Heads
+    mlp_ratio: Ratio
+    crop_size: Annotated[int, Field(ge=1, le=8_192)] = 256
+    patch_size: Annotated[int, Field(ge=1, le=1_024)] = 16
+    tubelet_size: Literal[2] = 2
+    in_chans: Literal[3] = 3
+    qkv_bias: Literal[True] = True
+    hidden_act: Literal["gelu"] = "gelu"
+    layer_norm_eps: Annotated[float, Field(ge=0.99e-6, le=1.01e-6)] = 1e-6
+
+
+def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> FoundEncoder:
+    """Return the encoder in a folder of transformers or of this project; `name` is what the user called it."""
+    card = read_json_object(folder / CONFIG, needed=ENCODER_NEEDED, fix=FIX)
+    if config.key is not None:
+        found = f"{name}, a folder, which holds one encoder"
+        raise InputError(where=f"model.encoder.key: {config.key}", found=found, fix="Leave the key out")
+    if card.get("format") != FORMAT:
+        return _of_transformers(folder, card, config.frame, name)
+    model = read_sizes(folder)
+    return FoundEncoder(
+        where=str(folder / ENCODER),
+        sizes=model.encoder.model_copy(update={"frame": config.frame}),
+        patch_size=model.patch_size,
+        image_size=model.image_size,
+        origin=read_encoder_origin(folder) or EncoderOrigin(name, heads_are_told=False),  # so it stays the same encoder
+        weights=partial(_mapped, [folder / ENCODER]),
+        rename=lambda ours: (ours, None),
+    )
+
+
+def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, name: str) -> FoundEncoder:
+    """Return the encoder of a plain or a classification model; its masked predictor and its head are left alone."""
+    told = record_of(_Told, card, where=str(folder / CONFIG), needed=ENCODER_NEEDED, fix=FIX)
+    tensors = _mapped(sorted(folder.glob("*.safetensors")))
+    prefix = next((one for one in _PREFIXES_ON_THE_HUB if any(tensor.startswith(one) for tensor in tensors)), None)
+    if prefix is None:
+        found = "no tensor of an encoder in *.safetensors"
+        raise InputError(where=str(folder), found=found, needed=ENCODER_NEEDED, fix=FIX)
+    return FoundEncoder(
+        where=str(folder),
+        sizes=EncoderSizes(
+            width=told.hidden_size,
+            depth=told.num_hidden_layers,
+            heads=told.num_attention_heads,
+            mlp_ratio=told.mlp_ratio,
+            frame=frame,
+        ),
+        patch_size=told.patch_size,
+        image_size=told.crop_size,
+        origin=EncoderOrigin(name),
+        weights=lambda: {one: value for one, value in tensors.items() if one.startswith(prefix)},
+        rename=lambda ours: (prefix + ours.removeprefix("vit."), None),
+    )
+
+
+def _mapped(files: list[Path]) -> dict[str, Tensor]:
+    """Return the tensors of safetensors files, mapped: their values are read when they are used."""
+    found: dict[str, Tensor] = {}
+    for path in files:
+        with open_safetensors(path, needed=ENCODER_NEEDED) as file:
+            found |= {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no iterator
+    return found
+
+
+# ---- Meta's files ----
+
+
+@dataclass(frozen=True)
+class MetaFile:
+    """A mapped checkpoint."""
+
+    path: Path
+    parts: Mapping[str, Any]  # by its keys
+
+    @classmethod
+    def open(cls, path: Path) -> MetaFile:
+        """Map a file; reads no values, and executes nothing.
+
+        Raises:
+            InputError: There is no such file, or it is of another kind, truncated, a git-lfs pointer or a pipe.
+            UnreachableError: It cannot be read.
+        """
+        with storage.user_can_read(path, needed=_NEEDED, fix=FIX):
+            try:
+                whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+            except Exception as error:  # a damaged pickle ends in any of them
+                if storage.is_refusal(error):
+                    raise
+                found, fix = _problem_of(path, error)
+                raise InputError(where=str(path), found=found, needed=_NEEDED, fix=fix) from None
+        if not isinstance(whole, dict):
+            raise InputError(where=str(path), found=f"a {type(whole).__name__}", needed=_NEEDED, fix=FIX)
+        return cls(path, {str(key): value for key, value in whole.items()})
+
+    def tensors(self, key: str) -> dict[str, Tensor]:
+        """Return the tensors of a part by Meta's names without prefixes.
+
+        Raises:
+            InputError: There is no such part, it holds more than tensors, or nothing.
+        """
+        part = self.parts.get(key)
+        if not isinstance(part, dict) or not part or not all(isinstance(value, Tensor) for value in part.values()):
+            raise self.lacks(key if key not in self.parts else f"weights under {key!r}")
+        named = {_PREFIXES.sub("", str(name)): value for name, value in part.items()}
+        named.pop(_IGNORED, None)
+        require_floats(named, where=f"{self.path}: {key}", fix=FIX)
+        return named
+
+    def lacks(self, what: str, fix: str = FIX, *, part: str | None = None) -> InputError:
+        """Return the error of a file without a part, or of a part without a tensor, with the names that are there."""
+        names = ", ".join(list(self.parts if part is None else self.tensors(part))[:8])
+        found = f"no {what} (keys: {names})" if part is None else f"no {what} in {part} (its tensors: {names})"
+        return InputError(where=str(self.path), found=found, needed=_PARTS, fix=fix)
+
+
+def part_of(family: Family) -> Part:
+    """Return the names of an encoder of a family."""
+    return "encoder" if family == "v2" else "encoder 2.1"
+
+
+def official_name(name: str, part: Part) -> tuple[str, int | None]:
+    """Return Meta's name of one of our tensors, and which third of a fused one it is (None: all of it)."""
+    for pattern, replacement in _NAMES[part]:
+        name = re.sub(pattern, replacement, name)
+    fused = re.sub(r"\.attn\.[qkv]\.", ".attn.qkv.", name)
+    return fused, None if fused == name else _SPLIT.index(name.split(".attn.")[1][0])
+
+
+def fill(
+    network: nn.Module, weights: Mapping[str, Tensor], rename: Rename, dtype: torch.dtype, *, where: str, fix: str
+) -> None:
+    """Load mapped weights into a network on the meta device, each cast as it is read; none requires a gradient.
+
+    Raises:
+        InputError: A tensor is missing, unknown or of another shape, or a weight is not finite.
+    """
+    own = network.state_dict()
+    names = {ours: rename(ours) for ours in own}
+    needed = {
+        theirs: own[ours].shape if third is None else (3 * len(own[ours]), *own[ours].shape[1:])
+        for ours, (theirs, third) in names.items()
+    }
+    check_tensors({name: value.shape for name, value in weights.items()}, needed, where=where, fix=fix)
+    require_floats(weights, where=where, fix=fix)
+    for ours, (theirs, third) in names.items():
+        value = weights[theirs] if third is None else weights[theirs].chunk(3)[third]
+        own[ours] = value.to(dtype, copy=True)
+    require_finite(own, where=where, fix=fix)
+    network.load_state_dict(own, assign=True)
+    network.requires_grad_(False)
+
+
+def to_official_names(weights: Mapping[str, Tensor], part: Part) -> dict[str, Tensor]:
+    """Return our weights by Meta's names, q, k and v fused."""
+    pieces: dict[str, list[Tensor]] = {}
+    for name, value in weights.items():  # q, k and v in this order, as everywhere
+        pieces.setdefault(official_name(name, part)[0], []).append(value.detach())
+    return {f"module.{name}": own[0] if len(own) == 1 else torch.cat(own) for name, own in pieces.items()}
+
+
+def depth_of(names: Mapping[str, object], blocks: str) -> int:
+    """Return the number of blocks whose tensors are there.
+
+    Raises:
+        KeyError: None is.
+    """
+    numbers = [int(name.split(".")[1]) for name in names if re.match(rf"{blocks}\.\d{{1,6}}\.", name)]
+    if not numbers:
+        raise KeyError(f"{blocks}.0")
+    return 1 + max(numbers)
+
+
+def _problem_of(path: Path, error: Exception) -> tuple[str, str]:
+    """Return what a file is that torch did not load (its beginning shows a web page, for example), and the fix."""
+    refused = re.search(r"GLOBAL ([\w.]+)", str(error))
+    if refused:
+        found = f"a pickle that would call {refused[1]}: it was refused, since loading it could run foreign code"
+        old, new, keys = map(
+            json.dumps, (str(path), str(path.with_suffix(".weights.pt")), [*ENCODER_KEYS, "predictor"])
+        )
+        code = f'import torch; old = torch.load({old}, map_location="cpu", weights_only=False)'
+        code += f"; torch.save({{key: old[key] for key in {keys} if key in old}}, {new})"
+        return found, f"If you trust the file, save its weights alone: `python -c {shlex.quote(code)}`"
+    with path.open("rb") as file:
+        head = file.read(24)
+    reason = next(iter(str(error).splitlines()), type(error).__name__)[:120]
+    size = path.stat().st_size / 1e9
+    found = f"{size:.2f} GB, beginning with {head!r}, that torch cannot read ({reason}): truncated, or of another kind"
+    return found, FIX

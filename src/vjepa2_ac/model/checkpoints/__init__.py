@@ -1,1 +1,0 @@
-"""Checkpoints of base models: downloaded, read and written by Meta's names."""
