@@ -49,7 +49,7 @@ ORDERS: dict[str, list[str]] = {
         "about server",
     ],
     "model": [
-        "base_model quiet_imports state_integration distances",
+        "model_files quiet_imports state_integration distances",
         "network",
         "adapter",
         "checkpoints",
