@@ -86,7 +86,7 @@ def test_training_loads_the_core_only() -> None:
     assert "vjepa2_ac.model.adapter.lora" in loaded
     rooms = {name.split(".")[1] for name in loaded if "." in name}
     assert len(loaded) <= 120
-    beside = "simulation init serving inspection calibration demonstrations console cli export"
+    beside = "simulation init serving inspection calibration goals policies console cli export"
     assert not rooms & set(beside.split())
 
 

@@ -25,7 +25,7 @@ from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.checkpoints import load_base, load_official, to_official
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.prior.action_prior import ActionPrior, PriorCard, PriorSizes, load_prior, save_prior
+from vjepa2_ac.policies.action_prior import ActionPrior, PriorCard, PriorSizes, load_prior, save_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.reports.metrics_json import read_metrics

@@ -30,9 +30,9 @@ from vjepa2_ac.evaluation.result import PredictionErrors, Way
 from vjepa2_ac.model.adapter.lora import base_only, merge_adapter
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.axes import Axes
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.model_setup import Axes
-from vjepa2_ac.planning.prior.train_prior import train_prior
+from vjepa2_ac.policies.train_prior import train_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.subject import load_subject

@@ -214,6 +214,12 @@ ENERGIES = Registry(
 METRICS = Registry("metric", "vjepa2_ac.metrics", {"l1": "evaluation.result:L1", "l2": "evaluation.result:L2"})
 TRACKERS = Registry("tracker", "vjepa2_ac.trackers", {})
 TRANSFORMS = Registry("transform", "vjepa2_ac.transforms", {})
+PLANNING_FILES = Registry(
+    "file of planning",
+    "vjepa2_ac.planning_files",
+    {"prior": "policies.action_prior:read_for_planning", "monitor": "policies.monitor:read_for_planning"},
+)
+"""Readers of the files that `planning` names and that packages beside the core make."""
 REGISTRIES = (SOURCES, LOSSES, PLANNERS, ENERGIES, METRICS, TRACKERS, TRANSFORMS)
 
 

@@ -17,7 +17,7 @@ import pytest
 from paths import ROOT
 from vjepa2_ac.config import ValidationConfig
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.planning.prior.train_prior import PriorOptions, train_prior
+from vjepa2_ac.policies.train_prior import PriorOptions, train_prior
 from vjepa2_ac.simulation.domains import DOMAIN_A
 from vjepa2_ac.simulation.record import RecordingSpec
 from vjepa2_ac.simulation.worlds import TRIES

@@ -17,7 +17,7 @@ from vjepa2_ac.evaluation import action_score as measure
 from vjepa2_ac.evaluation import evaluate
 from vjepa2_ac.evaluation.request import SCORED, EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.prior.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
+from vjepa2_ac.policies.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
 from vjepa2_ac.reports.write import evaluate_subject
 
 QUICK = {"ranking_clips": 0, "examples": 0}

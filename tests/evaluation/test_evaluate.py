@@ -24,7 +24,7 @@ from vjepa2_ac.evaluation.result import L1, L2, MODES, Evaluation, PredictionErr
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import Estimate
-from vjepa2_ac.planning.model_setup import Axes
+from vjepa2_ac.planning.axes import Axes
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.spaces import vector_actions
 from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, about, again, clips_batch

@@ -13,7 +13,7 @@ import pytest
 from installing import install
 from paths import ROOT
 from served import STATE, controller, image, serving, session
-from vjepa2_ac.planning.chunks import changes_of_chunks
+from vjepa2_ac.policies.score import changes_of_chunks
 from vjepa2_ac.serving.session import SessionOptions
 
 HERE = Path(__file__).parent

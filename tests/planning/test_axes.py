@@ -19,9 +19,10 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.axes import TRIED_DEGREES, fit_axes
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import apply_actions
+from vjepa2_ac.planning.axes import Axes
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import WorldModelCost
-from vjepa2_ac.planning.model_setup import Axes, load_to_plan
+from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.spaces import CAMERA_POSE, POSE_CHANGE, Spaces
 

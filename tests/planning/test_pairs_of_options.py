@@ -29,9 +29,9 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, decide
 from vjepa2_ac.planning.goals import timed
-from vjepa2_ac.planning.prior.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
 from vjepa2_ac.planning.solvers import CemSolver
-from vjepa2_ac.planning.surprise import Monitor
+from vjepa2_ac.policies.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
+from vjepa2_ac.policies.monitor import Monitor
 from vjepa2_ac.registry import ENERGIES, PLANNERS
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.simulation.policies import Moves, Planning

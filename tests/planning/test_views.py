@@ -16,8 +16,8 @@ from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.imagined import Seen, imagine_image
+from vjepa2_ac.goals.make_goals import recording_of_episode
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.demonstrations.make_goals import recording_of_episode
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.serving.about import warm_up

@@ -13,9 +13,9 @@ from hypothesis.extra.numpy import arrays
 from served import STATE, controller, image, request, session, vector_controller
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.chunks import changes_of_chunks
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.policies.score import changes_of_chunks
 from vjepa2_ac.serving.session import (
     ActionForm,
     GoneError,

@@ -150,9 +150,9 @@ def _tls(options: argparse.Namespace) -> ssl.SSLContext | None:
 def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np.ndarray | None) -> Served:
     """Load the model, and make a first decision; runs in the planning thread."""
     from vjepa2_ac.data.windows import require_stride
-    from vjepa2_ac.evaluation.policies.score import is_blind, ranking_of_run
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.model_setup import goals_of
+    from vjepa2_ac.policies.score import is_blind, ranking_of_run
     from vjepa2_ac.serving.about import in_words, metadata_of, roboarena_metadata, warm_up
     from vjepa2_ac.serving.recording import Recorder
     from vjepa2_ac.serving.request import IMAGE_KEYS

@@ -238,7 +238,7 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
             raise InputError(where=f"--{name}", found="--axes beside it", needed=needed)
     cli.require_subject(options.axes)
 
-    from vjepa2_ac.planning.settings import AXES_FILE, require_axes_in
+    from vjepa2_ac.planning.axes import AXES_FILE, require_axes_in
 
     require_axes_in(config.data)
     cli.make_folder(options.out)

@@ -153,7 +153,7 @@ def _goals_of(options: argparse.Namespace, config: Config) -> GoalFolder:
             raise InputError(where="--durations", found=found, needed=needed)
         return read_goal_folder(options.goals)
     if options.goal_from is not None:
-        from vjepa2_ac.planning.demonstrations.make_goals import frame_of_episode
+        from vjepa2_ac.goals.make_goals import frame_of_episode
 
         return GoalFolder(timed([frame_of_episode(config.data, options.goal_from)], []))
     images, count = [read_image(path) for path in options.goal], len(options.goal)
@@ -182,13 +182,13 @@ def _goals(options: argparse.Namespace) -> None:
     stride = _stride(options, config)
 
     from vjepa2_ac.cli.console.tables import goals_notes, goals_table
-    from vjepa2_ac.planning.demonstrations.alike import demonstrations_alike, ending_with
-    from vjepa2_ac.planning.demonstrations.make_goals import (
+    from vjepa2_ac.goals.make_goals import (
         KeyFrameOptions,
         make_goals,
         recording_of_episode,
         recording_of_film,
     )
+    from vjepa2_ac.goals.nearest import demonstrations_alike, ending_with
     from vjepa2_ac.planning.model_setup import load_to_plan
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
@@ -219,7 +219,7 @@ def _goals(options: argparse.Namespace) -> None:
 def _goals_by_label(options: argparse.Namespace) -> None:
     config = cli.read_config(options.source, options.overrides)
 
-    from vjepa2_ac.planning.demonstrations.make_goals import goals_by_label
+    from vjepa2_ac.goals.make_goals import goals_by_label
 
     with cli.reporter() as reporter:
         found, folder = goals_by_label(config.data, options.task, options.out, reporter)

@@ -100,12 +100,11 @@ def _kinematics(words: str | None) -> Callable[[np.ndarray], np.ndarray]:
 def _score_chunks(options: argparse.Namespace, to_poses: Callable[[np.ndarray], np.ndarray]) -> int:
     from vjepa2_ac.cli.console.progress import MetricsTable
     from vjepa2_ac.data.windows import require_stride
-    from vjepa2_ac.evaluation.policies.score import CHANCE, is_blind, ranking_of_run, read_chunks
     from vjepa2_ac.media.images import read_image
-    from vjepa2_ac.planning.chunks import changes_of_chunks
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
     from vjepa2_ac.planning.model_setup import goals_of
+    from vjepa2_ac.policies.score import CHANCE, changes_of_chunks, is_blind, ranking_of_run, read_chunks
     from vjepa2_ac.storage import write_atomically
     from vjepa2_ac.storage.structured import json_text
 
@@ -152,8 +151,8 @@ def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray]
     from vjepa2_ac.cli.console.progress import MetricsTable
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.data.windows import require_frames
-    from vjepa2_ac.evaluation.policies.score import CHANCE, read_policy_chunks, score_policies
     from vjepa2_ac.planning.controller import Controller
+    from vjepa2_ac.policies.score import CHANCE, read_policy_chunks, score_policies
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.storage import write_atomically
     from vjepa2_ac.storage.structured import json_text
@@ -212,9 +211,8 @@ def _monitor(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.cli.console.progress import MetricsTable
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.evaluation.policies.monitor import calibrate_monitor, watch_episodes
-    from vjepa2_ac.planning.demonstrations.make_goals import number_of_episode
-    from vjepa2_ac.planning.surprise import MONITOR, Monitor
+    from vjepa2_ac.goals.make_goals import number_of_episode
+    from vjepa2_ac.policies.monitor import MONITOR, Monitor, calibrate_monitor, watch_episodes
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.figures.planning import MONITOR_IMAGE, most_surprising, plot_watched
     from vjepa2_ac.storage import write_atomically
@@ -267,7 +265,7 @@ def _prior(options: argparse.Namespace) -> None:
     file = Path(options.subject) / CONFIG if run else options.subject
     config = cli.read_config(file, options.overrides, base=True, of_run=run)
 
-    from vjepa2_ac.planning.prior.train_prior import PriorOptions, train_prior
+    from vjepa2_ac.policies.train_prior import PriorOptions, train_prior
 
     folder = options.out or Path(options.subject if run else config.run_dir) / "prior"
     with cli.reporter() as reporter:

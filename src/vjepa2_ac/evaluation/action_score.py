@@ -25,9 +25,9 @@ from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.planning.energy import EnergyFunction, distance
 from vjepa2_ac.planning.planner import Plan, Planner
-from vjepa2_ac.planning.prior.action_prior import ActionPrior
 from vjepa2_ac.planning.search_space import SearchSpace, pose_space
 from vjepa2_ac.planning.solvers import PlanStart
+from vjepa2_ac.policies.action_prior import ActionPrior
 from vjepa2_ac.spaces import POSE
 
 _RANDOM_PLANS = 64  # of each start: their mean error is the random plan's

@@ -32,7 +32,7 @@ from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurement, Role, TrainingCurve
 from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.prior.action_prior import load_prior
+from vjepa2_ac.policies.action_prior import load_prior
 from vjepa2_ac.reporter import LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run

@@ -28,7 +28,7 @@ from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.folder import is_of_moved, is_run, read_run_config
 
 if TYPE_CHECKING:
-    from vjepa2_ac.planning.prior.action_prior import ActionPrior
+    from vjepa2_ac.policies.action_prior import ActionPrior
 
 STEPS = 3  # of a scored plan
 FRAMES = STEPS + 1  # required of a clip

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -15,38 +15,62 @@ from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.sources.indexed_source import spaces_of
-from vjepa2_ac.data.transforms import Crop, split_views, view
-from vjepa2_ac.encoding.batch import encode_frames
+from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.camera_check import CameraFrame, has_moved, is_uniform, newest_frames, require_contrast
-from vjepa2_ac.media.images import require_image, require_mask
+from vjepa2_ac.media.images import require_image
 from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.state_integration import states_along
-from vjepa2_ac.planning.chunks import ChunkScores
-from vjepa2_ac.planning.energy import EnergyFunction, Goal, Scene, WorldModelCost, distance, patch_weights
+from vjepa2_ac.planning.axes import Axes, require_base_frame
+from vjepa2_ac.planning.cameras import Cameras, Fault
+from vjepa2_ac.planning.energy import ChunkScores, EnergyFunction, Goal, Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
-from vjepa2_ac.planning.model_setup import Axes, prepare_for_planning
+from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, until_cancelled
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
-from vjepa2_ac.planning.settings import require_base_frame, warn_beyond_taught, with_taught_limits
+from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.solvers import PlanStart
-from vjepa2_ac.planning.surprise import Monitor, Surprise
+from vjepa2_ac.registry import PLANNING_FILES
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
 _PRIOR_STEPS = 3  # model steps in which the prior is to reach a goal that has no bound: fewer are bolder
-Fault = Literal["uniform frame", "frozen frame"]
+State = Float[np.ndarray, " numbers"]
+Latents = Float[Tensor, "tokens dim"]
 Why = Literal["planned", "out of time", "at the goal", "no finite energy", "outside the workspace", Fault]
+
+
+@dataclass(frozen=True)
+class Surprise:
+    """The difference between a frame and its prediction."""
+
+    score: float
+    errors: Float[Tensor, " tokens"]  # of each patch, row by row
+    is_alarm: bool  # the score is above the threshold
+
+
+class PlanningPrior(Protocol):
+    """A network that proposes actions, of `planning.prior`."""
+
+    def start(self, cost: WorldModelCost, wanted: Latents, remaining: int, space: SearchSpace) -> PlanStart:
+        """Return where a search towards the latents of a goal starts, with so many model steps left."""
+        ...
+
+
+class PlanningMonitor(Protocol):
+    """A threshold for differences between predictions and frames, of `planning.monitor`."""
+
+    def compare(self, predicted: Latents, seen: Latents) -> Surprise:
+        """Return the difference."""
+        ...
 
 
 @dataclass(frozen=True)
 class Decision:
     """The decision, and its reason."""
 
-    action: Float[np.ndarray, " dim"]  # for the next model step; nothing changes for some values of `why`
-    # out of time: the best plan so far. at the goal, no finite energy, outside
-    # the workspace, uniform frame (a camera's image has no contrast), frozen frame (it is the last one, although the
-    # robot has moved): do nothing
+    action: Float[np.ndarray, " dim"]  # for the next model step; zero for some values of `why`
+    # out of time: the best plan so far. With all others but `planned` the action is zero. uniform frame: an image of a
+    # camera has no contrast. frozen frame: an image equals the last one, although the robot has moved
     why: Why
     energy_now: float  # of the current image, if nothing changed: to compare with the plan's; NaN for a faulty frame
     goals: tuple[int, ...]  # index of the goal that applies now, and after each model step of a plan
@@ -56,7 +80,7 @@ class Decision:
     cost: WorldModelCost | None = None  # to evaluate other actions
     done: bool = False  # the last goal is reached: no motion
     from_samples: bool = False  # the search started from what a policy would do
-    surprise: Surprise | None = None  # how far the frame is from what was predicted; None: nothing was, or no monitor
+    surprise: Surprise | None = None  # None: no monitor, or nothing was predicted
 
 
 class Controller:
@@ -98,47 +122,39 @@ class Controller:
                 compiled; or vectors have no limits, or a workspace; or `planning.axes` are not
                 this model's.
         """
-        _require_spaces(world_model, spaces)
-        if extrinsics is not None:
-            EXTRINSICS.require_state(extrinsics, "extrinsics")
-        if (uses := world_model.sizes.predictor.use_extrinsics) != (extrinsics is not None):
-            found, needed = f"{uses}, camera pose given: {not uses}", "a camera pose exactly where the model uses it"
-            raise InputError(where="model: predictor.use_extrinsics", found=found, needed=needed)
         self.config = config or PlanningConfig()
-        if uses and self.config.views > 1:
-            found, needed = f"{self.config.views}, and a model that is told one camera's pose", "1"
-            raise InputError(where="planning.views", found=found, needed=needed)
-        self._model, self.seed, self.crop = prepare_for_planning(world_model, self.config), seed, crop
-        self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
-        self.spaces, self._energy = spaces, EnergyFunction.of(self.config.energy)
-        self._load_what_is_its(world_model)
+        self.seed, self.crop, self.spaces = seed, crop, spaces
+        _require_spaces(world_model, spaces)
+        _require_camera_pose(world_model, extrinsics, self.config.views)
+        self._model = prepare_for_planning(world_model, self.config)
+        self.cameras = Cameras(self._model, crop, self.config.views)
+        self._camera_pose = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
+        self._energy = EnergyFunction.of(self.config.energy)
+        self._load_files(world_model)
         self.space = search_space(self.config, spaces.state)  # the allowed changes of the state, of the last decision
         self.planner = Planner(self.config, self.space)
         self._workspace = Workspace.of(self.config.limits, spaces.state)
         self._searched: dict[GripperMode | None, SearchSpace] = {None: self.space}
         self._goals: tuple[SubGoal, ...] = ()
-        self._cameras: tuple[CameraFrame, ...] = ()
         self._progress: GoalProgress | None = None  # at the last usable frame
         self._done = 0
         self.decision: Decision | None = None  # the last one
 
-    def _load_what_is_its(self, world_model: WorldModel) -> None:
+    def _load_files(self, world_model: WorldModel) -> None:
         """Read axes, monitor and prior, which belong to one model: its weights are hashed once for all of them."""
-        config, self._axes, self._monitor, self._prior = self.config, None, None, None
+        config, self._axes = self.config, None
+        self._monitor: PlanningMonitor | None = None
+        self._prior: PlanningPrior | None = None
         if config.axes is None and config.monitor is None and config.prior is None:
             return
-        if config.axes is not None:
-            require_base_frame(f"planning.axes: {config.axes}", is_base=self.spaces.state.is_base_pose)
         known = world_model.fingerprints()
         if config.axes is not None:
+            require_base_frame(f"planning.axes: {config.axes}", is_base=self.spaces.state.is_base_pose)
             self._axes = Axes.read(config.axes, known)
         if config.monitor is not None:
-            self._monitor = Monitor.read(config.monitor, known, tokens=world_model.num_tokens, where="planning.monitor")
+            self._monitor = PLANNING_FILES.find("monitor")(config.monitor, known, self.cameras)
         if config.prior is not None:
-            from vjepa2_ac.planning.prior.action_prior import load_prior
-
-            prior = load_prior(config.prior, where="planning.prior")
-            self._prior = prior.of(known.encoder, self.crop).to(self._model.device)
+            self._prior = PLANNING_FILES.find("prior")(config.prior, known, self.cameras)
 
     @classmethod
     def of_run(
@@ -156,10 +172,10 @@ class Controller:
         Raises:
             InputError: As `Controller`.
         """
-        its = run.config if config is None else run.config.model_copy(update={"planning": config})
-        its = with_taught_limits(its, Path(its.run_dir))
-        warn_beyond_taught(its, Path(its.run_dir))
-        return cls.of_subject(replace(run, config=its), seed=seed, extrinsics=extrinsics)
+        settings = run.config if config is None else run.config.model_copy(update={"planning": config})
+        settings = with_taught_limits(settings, Path(settings.run_dir))
+        warn_beyond_taught(settings, Path(settings.run_dir))
+        return cls.of_subject(replace(run, config=settings), seed=seed, extrinsics=extrinsics)
 
     @classmethod
     def of_subject(
@@ -232,19 +248,17 @@ class Controller:
         """
         if not goals:
             raise ValueError("no goal")
-        for place, goal in enumerate(goals):
-            require_image(goal.image, where=f"goal {place}", like=goals[0].image if place else None)
-            self.require_contrast(goal.image, where=f"goal {place}")
+        self.cameras.require_goals([goal.image for goal in goals])
         ruled = with_shares(goals, self.config.goals)
         searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
         report, latents = until_cancelled(cancelled), []
         for place, goal in enumerate(goals):
             report(place, len(goals))
             latents.append(self.encoded(goal.image))
-        weights = self._weights(mask, goals[0].image)
+        weights = self.cameras.weights(mask, goals[0].image)
         self._goals, self._goal_latents, self._patch_weights = ruled, torch.stack(latents), weights
         self._searched, self.space = searched, searched[None]
-        self._cameras, self._progress, self._done, self.decision = (), None, 0, None
+        self.cameras.newest, self._progress, self._done, self.decision = (), None, 0, None
 
     def act(
         self,
@@ -265,7 +279,7 @@ class Controller:
             frame: What the camera sees, of the goal image's size.
             state: Measured: pose and gripper, or the vector; a vector of any width where the model has no states and an
                 action is a change.
-            samples: What a policy would do, as changes of each model step (`planning.chunks`): the search starts from
+            samples: What a policy would do, as changes of each model step (`policies.score`): the search starts from
                 their mean, as wide as they are apart. None: from `planning.prior`, if any.
             cancelled: Asked before every iteration: whether nobody waits for the action any more.
 
@@ -275,15 +289,15 @@ class Controller:
             ValueError: No goal was set.
         """
         state = self._checked(frame, state)
-        cameras = newest_frames(split_views(frame[None], self.config.views), state, self._cameras)
-        why = self._why_faulty(frame, cameras, state)
-        if why is None:
+        newest, largest = self.cameras.newest_with(frame, state), self.space.upper[0].double().numpy()
+        fault = self.cameras.fault(frame, newest, state, self.spaces.state, largest)
+        if fault is None:
             decision = self._decided(self.encoded(frame), state, samples, cancelled)
             self._progress = decision.progress
         else:
-            decision = self._faulty(state, why)
+            decision = self._faulty(state, fault)
         # after an error nothing has changed
-        self._cameras, self._done, self.decision = cameras, self._done + 1, decision
+        self.cameras.newest, self._done, self.decision = newest, self._done + 1, decision
         return decision.action
 
     @torch.no_grad()
@@ -303,7 +317,7 @@ class Controller:
         Args:
             frame: As of `act`.
             state: As of `act`.
-            chunks: Changes of each model step (`planning.chunks.changes_of_chunks`), any number of steps.
+            chunks: Changes of each model step (`policies.score.changes_of_chunks`), any number of steps.
             cancelled: Asked after every `planning.energy.samples_at_once` chunks.
 
         Raises:
@@ -312,7 +326,7 @@ class Controller:
             ValueError: No goal was set.
         """
         state = self._checked(frame, state)
-        self.require_contrast(frame, where="frame")
+        self.cameras.require_contrast(frame, where="frame")
         latents = self.encoded(frame)
         if chunks.ndim != 3 or 0 in chunks.shape or chunks.shape[2] != self.space.dim:
             needed = f"chunks x model steps x {self.space.dim}"
@@ -324,14 +338,6 @@ class Controller:
         energies = cost(torch.from_numpy(np.concatenate([np.zeros_like(chunks[:1]), chunks])).float()).double()
         return ChunkScores(energies[1:].numpy(), float(energies[0]), self._over_steps(still), progress.place)
 
-    def require_contrast(self, image: UInt8[np.ndarray, "height width 3"], *, where: str) -> None:
-        """Refuse an image in which one of the cameras shows nothing; see `camera_check.is_uniform`.
-
-        Raises:
-            InputError: One is uniform.
-        """
-        require_contrast(self._shown(image), where=where)
-
     def _checked(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " dim"]:
         """Return the measured state; refuse a frame or a state that cannot be used, and a controller without a goal."""
         if not self._goals:
@@ -340,19 +346,6 @@ class Controller:
         state = self._known(np.asarray(state, dtype=np.float64))
         self.spaces.state.require_state(state, "state")
         return state
-
-    def _shown(self, image: np.ndarray) -> UInt8[np.ndarray, "views height width 3"]:
-        """Return the part of each camera's image that the model receives, without the bars of a letterbox."""
-        views = split_views(image[None], self.config.views)
-        return views if self.crop == "letterbox" else view(views, self.crop)
-
-    def _why_faulty(self, frame: np.ndarray, cameras: Sequence[CameraFrame], state: np.ndarray) -> Fault | None:
-        """Return why a frame must not move the robot: one faulty camera of several is enough. None: it may."""
-        if any(map(is_uniform, self._shown(frame))):
-            return "uniform frame"
-        space, largest = self.spaces.state, self.space.upper[0].double().numpy()
-        is_frozen = any(has_moved(before, state, space, largest) for _, before in cameras)
-        return "frozen frame" if is_frozen else None
 
     def _faulty(self, state: np.ndarray, why: Fault) -> Decision:
         """Return the decision to do nothing; goals make no progress, since the frame shows nothing about them."""
@@ -366,15 +359,15 @@ class Controller:
         width = len(self.spaces.state)
         return state if is_needed or self.spaces.state.is_pose or state.shape == (width,) else np.zeros(width)
 
-    def encoded(self, image: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "tokens dim"]:
-        """Return the latents of what the model sees of an image, on its device; of several views one after another.
+    def encoded(self, image: UInt8[np.ndarray, "height width 3"]) -> Latents:
+        """Return the latents of an image on the model's device; those of several views follow one another.
 
         Raises:
             InputError: Its width is not that of so many views.
         """
-        return encode_frames(self._model, image[None], self.crop, views=self.config.views)[0]
+        return self.cameras.encode(image[None])[0]
 
-    def _progressed(self, latents: Float[Tensor, "tokens dim"]) -> GoalProgress:
+    def _progressed(self, latents: Latents) -> GoalProgress:
         """Return which goal applies to the current image."""
 
         def energy(place: int) -> float:
@@ -394,7 +387,7 @@ class Controller:
         return Goal(self._goal_latents[place : place + len(durations) + 1], tuple(durations), self._patch_weights)
 
     def _still(
-        self, latents: Float[Tensor, "tokens dim"], progress: GoalProgress, steps: int
+        self, latents: Latents, progress: GoalProgress, steps: int
     ) -> tuple[Float[Tensor, " steps"], tuple[int, ...]]:
         """Return how far the current image is from the goal of each of so many steps, and which goals these are."""
         goal, done = self._goal_from(progress.place), self._done - progress.since
@@ -402,11 +395,9 @@ class Controller:
         still = distance(latents.expand_as(wanted), wanted, self._energy, goal.weights)
         return still, tuple(progress.place + goal.place(done + step) for step in range(steps))
 
-    def _cost(
-        self, latents: Float[Tensor, "tokens dim"], state: Float[np.ndarray, " numbers"], progress: GoalProgress
-    ) -> WorldModelCost:
+    def _cost(self, latents: Latents, state: State, progress: GoalProgress) -> WorldModelCost:
         goal, done = self._goal_from(progress.place), self._done - progress.since
-        scene = Scene(latents, torch.from_numpy(state).float(), self._camera, self._axes, self.config.views)
+        scene = Scene(latents, torch.from_numpy(state).float(), self._camera_pose, self._axes, self.config.views)
         return WorldModelCost(self._model, scene, goal, self._energy, done=done, spaces=self.spaces)
 
     def _over_steps(self, distances: Float[Tensor, " steps"]) -> float:
@@ -414,8 +405,8 @@ class Controller:
 
     def _decided(
         self,
-        latents: Float[Tensor, "tokens dim"],
-        state: Float[np.ndarray, " numbers"],
+        latents: Latents,
+        state: State,
         samples: np.ndarray | None,
         cancelled: Cancelled,
     ) -> Decision:
@@ -442,14 +433,14 @@ class Controller:
             from_samples=samples is not None,
         )
 
-    def _surprise(self, latents: Float[Tensor, "tokens dim"]) -> Surprise | None:
+    def _surprise(self, latents: Latents) -> Surprise | None:
         """Return how far what is seen is from what the last decision predicted."""
         before = self.decision
         if self._monitor is None or before is None or before.cost is None or before.plan is None:
             return None
         with torch.no_grad():
             predicted, _ = before.cost.imagine(before.plan.actions[None, :1])
-        return Surprise.of(predicted[0, 0], latents, self._monitor)
+        return self._monitor.compare(predicted[0, 0], latents)
 
     def _start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
         """Return where a search starts: what a policy or the prior says, or what is left of the last plan."""
@@ -503,17 +494,15 @@ class Controller:
         """Return the action that changes the state so: the change itself, or the state that it leads to."""
         return state + change if self.spaces.action.follows == "target" else change
 
-    def _weights(self, mask: np.ndarray | None, like: np.ndarray) -> Float[Tensor, " tokens"] | None:
-        if mask is None:
-            return None
-        require_mask(mask, where="mask", like=like)
-        grid = self._model.image_size // self._model.sizes.patch_size
-        image = split_views(np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1), self.config.views)
-        seen = torch.from_numpy(np.ascontiguousarray(view(image, self.crop)[..., 0]))
-        try:
-            return patch_weights(seen > 0, grid).to(self._model.device)
-        except ValueError:
-            raise InputError(where="mask", found="nothing of what the model sees counts") from None
+
+def _require_camera_pose(model: WorldModel, extrinsics: np.ndarray | None, views: int) -> None:
+    if extrinsics is not None:
+        EXTRINSICS.require_state(extrinsics, "extrinsics")
+    if (uses := model.sizes.predictor.use_extrinsics) != (extrinsics is not None):
+        found, needed = f"{uses}, camera pose given: {not uses}", "a camera pose exactly where the model uses it"
+        raise InputError(where="model: predictor.use_extrinsics", found=found, needed=needed)
+    if uses and views > 1:
+        raise InputError(where="planning.views", found=f"{views}, and a model that takes one camera's pose", needed="1")
 
 
 def _require_spaces(model: WorldModel, spaces: Spaces) -> None:

@@ -106,7 +106,7 @@ def decide(
     controller.follow(question.goals, mask=question.mask)
     times.append(time.perf_counter())
     controller.act(question.start, question.state)
-    controller.require_contrast(question.start, where="start")
+    controller.cameras.require_contrast(question.start, where="start")
     times.append(time.perf_counter())
     decision = controller.decision
     if decision is None:

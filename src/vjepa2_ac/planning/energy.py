@@ -6,10 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, cosine_similarity
 from torch.utils.checkpoint import checkpoint
@@ -19,7 +20,7 @@ from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.model.distances import absolute_difference, squared_difference
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import states_along
-from vjepa2_ac.planning.model_setup import Axes
+from vjepa2_ac.planning.axes import Axes
 from vjepa2_ac.planning.planner import Cost, reporting
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.registry import ENERGIES
@@ -30,6 +31,7 @@ Wanted = Float[Tensor, "*wanted tokens dim"]
 OfTokens = Float[Tensor, "*batch tokens"]
 OfEach = Float[Tensor, "*batch"]
 Weights = Float[Tensor, " tokens"]  # of each patch
+SAME_ENERGY = 1e-6  # relative difference below which energies are equal: it is within rounding
 
 
 @dataclass(frozen=True)
@@ -223,6 +225,42 @@ def mean_square(predicted: Latents, wanted: Wanted) -> OfTokens:
 def one_minus_cosine(predicted: Latents, wanted: Wanted) -> OfTokens:
     """Return 1 - cosine of each token."""
     return 1 - cosine_similarity(predicted, wanted, dim=-1)
+
+
+@dataclass(frozen=True)
+class ChunkScores:
+    """Energies of chunks towards a goal: lower is better."""
+
+    energies: Float[np.ndarray, " chunks"]  # predicted, of each chunk
+    doing_nothing: float  # predicted, of no motion for as long
+    now: float  # of the current image, as it is
+    goal: int  # index of the goal that applies
+
+    @property
+    def order(self) -> Int[np.ndarray, " chunks"]:
+        """The chunks, best first; of equal ones the first comes first."""
+        return np.argsort(self.energies, kind="stable")
+
+    @property
+    def best(self) -> int:
+        """The chunk of lowest energy."""
+        return int(self.order[0])
+
+    @property
+    def tied(self) -> int:
+        """How many chunks share the lowest energy, up to rounding."""
+        lowest = self.energies.min()
+        return int((self.energies <= lowest + SAME_ENERGY * abs(lowest)).sum())
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the energies over the energy now; 0: the model sees no difference."""
+        return float(self.energies.std() / max(self.now, 1e-12))
+
+    def as_dict(self, *, is_blind: bool) -> dict[str, Any]:
+        """Return plain values; no best chunk for a model that cannot rank actions."""
+        values = {name: getattr(self, name) for name in ("energies", "doing_nothing", "now", "spread", "tied")}
+        return {**values, "best": None if is_blind else self.best, "is_blind": is_blind}
 
 
 _BEYOND = 1.25  # how far a slice reaches beyond the limits

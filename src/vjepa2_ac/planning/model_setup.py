@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_type_of_weights
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import merge_adapter, unadapted_copy
 from vjepa2_ac.model.network.compilation import require_compiler
-from vjepa2_ac.model.network.world_model import Fingerprints, WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.goals import GoalFolder, SubGoal, with_shares
-from vjepa2_ac.planning.settings import planning_settings, read_axes, warn_beyond_taught
+from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.subject import Subject, load_subject
-from vjepa2_ac.spaces import euler_from_matrices, matrices_from_euler
 
 _POSITION, _ROTATION = slice(0, 3), slice(3, 6)
 
@@ -91,50 +86,3 @@ def prepare_for_planning(world_model: WorldModel, config: PlanningConfig) -> Wor
         require_compiler(world_model.device.type, where="planning.compile")
     world_model.set_compiled("always" if config.compile == "blocks" else "never")
     return world_model.eval()
-
-
-@dataclass(frozen=True)
-class Axes:
-    """A turn about a vertical axis, from the robot's axes into the model's.
-
-    Plans are searched among the robot's own actions, so limits hold for what is executed; the model is given each
-    action and state turned.
-
-    Source: arXiv 2506.09985, appendix B.4, which rotates inferred moves by a measured angle.
-    """
-
-    yaw: float  # radians, counterclockwise from above
-    centre_m: tuple[float, float] = (0.0, 0.0)  # x, y that stay where they are; the robot's base
-
-    @classmethod
-    def read(cls, path: str, known: Fingerprints) -> Axes:
-        """Return the axes of a file that were fitted for a model.
-
-        Raises:
-            InputError: They cannot be planned by, or are another model's.
-        """
-        axes = read_axes(path)
-        if (axes.model.encoder, axes.model.predictor) != (known.encoder, known.predictor):
-            found = f"axes that were fitted for another model, {axes.model.subject}"
-            fix = "Fit them anew: `vjepa2-ac data calibrate CONFIG --axes MODEL`"
-            raise InputError(where=f"planning.axes: {path}", found=found, fix=fix)
-        return cls(math.radians(axes.yaw_degrees.value), axes.centre_m)
-
-    def poses(self, poses: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch numbers"]:
-        """Return poses as the model sees them: x, y, z, three angles, and what does not turn (a gripper)."""
-        with torch.autocast(poses.device.type, enabled=False):
-            turn, centre = self._turn(poses), poses.new_tensor([*self.centre_m, 0.0])
-            rotation = euler_from_matrices(turn @ matrices_from_euler(poses[..., _ROTATION]))
-            position = (poses[..., _POSITION] - centre) @ turn.T + centre
-            return torch.cat([position, rotation, poses[..., 6:]], dim=-1)
-
-    def actions(self, actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
-        """Return actions as the model sees them: the move and the axis of the rotation are turned."""
-        with torch.autocast(actions.device.type, enabled=False):
-            turn = self._turn(actions)
-            rotation = euler_from_matrices(turn @ matrices_from_euler(actions[..., _ROTATION]) @ turn.T)
-            return torch.cat([actions[..., _POSITION] @ turn.T, rotation, actions[..., 6:]], dim=-1)
-
-    def _turn(self, like: Tensor) -> Float[Tensor, "3 3"]:
-        turn: Tensor = matrices_from_euler(like.new_tensor([0.0, 0.0, self.yaw]))
-        return turn

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.chunks import ChunkForm
 from vjepa2_ac.planning.goals import GripperMode, SubGoal
+from vjepa2_ac.policies.score import ChunkForm
 
 IMAGE_KEYS = ("observation/exterior_image_1_left", "observation/exterior_image_0_left", "observation/image")
 """Where the picture of the camera is looked for: the first that is there. DROID's, RoboArena's, everybody's."""

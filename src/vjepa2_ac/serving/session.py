@@ -21,11 +21,11 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.chunks import changes_of_chunks
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
 from vjepa2_ac.planning.search_space import Workspace, is_allowed
+from vjepa2_ac.policies.score import changes_of_chunks
 from vjepa2_ac.serving.recording import Recorder
 from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, Request, read_request
 from vjepa2_ac.serving.wire import WireError, pack, unpack

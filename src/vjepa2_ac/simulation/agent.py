@@ -18,8 +18,8 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.decoding.decoder_folder import SIMULATED, TrainedDecoder
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.goals.nearest import StartAndGoal, goals_alike
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.demonstrations.alike import StartAndGoal, goals_alike
 from vjepa2_ac.planning.goals import GoalFolder, SubGoal
 from vjepa2_ac.planning.model_setup import goals_of
 from vjepa2_ac.reporter import Reporter

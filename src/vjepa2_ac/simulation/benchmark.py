@@ -17,16 +17,16 @@ from vjepa2_ac import __version__
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE, Verdict, closed_loop
-from vjepa2_ac.media.film import below_each_other, side_by_side
-from vjepa2_ac.media.images import encode_png
-from vjepa2_ac.media.video import video_library, write_video
-from vjepa2_ac.planning.demonstrations.key_frames import (
+from vjepa2_ac.goals.key_frames import (
     OF_MODEL_STEPS,
     Timing,
     gripper_key_frames,
     sub_goals_of,
     with_frames_between,
 )
+from vjepa2_ac.media.film import below_each_other, side_by_side
+from vjepa2_ac.media.images import encode_png
+from vjepa2_ac.media.video import video_library, write_video
 from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
 from vjepa2_ac.planning.planner import samples_of_iterations
 from vjepa2_ac.reporter import SILENT, Reporter, duration

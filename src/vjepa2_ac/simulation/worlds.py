@@ -28,14 +28,14 @@ from pydantic import Field
 
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.media.video import video_library
-from vjepa2_ac.planning.demonstrations.key_frames import (
+from vjepa2_ac.goals.key_frames import (
     OF_MODEL_STEPS,
     Timing,
     every_key_frame,
     gripper_key_frames,
     sub_goals_of,
 )
+from vjepa2_ac.media.video import video_library
 from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.agent import Agent

@@ -37,9 +37,8 @@ from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.model.distances import squared_difference
-from vjepa2_ac.planning.model_setup import Axes
+from vjepa2_ac.planning.axes import AXES_FORMAT, Axes, require_axes_in
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.settings import AXES_FORMAT, require_axes_in
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.storage.structured import utc_now
 

@@ -21,10 +21,9 @@ from vjepa2_ac.spaces import POSE
 if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
     from vjepa2_ac.evaluation.calibration.axes import AxisFit
     from vjepa2_ac.evaluation.imagined import ImaginedPlan
-    from vjepa2_ac.evaluation.policies.monitor import WatchedEpisode
-    from vjepa2_ac.planning.demonstrations.make_goals import EnergyCourse, MadeGoals
+    from vjepa2_ac.goals.make_goals import EnergyCourse, MadeGoals
     from vjepa2_ac.planning.planner import Plan
-    from vjepa2_ac.planning.surprise import Monitor
+    from vjepa2_ac.policies.monitor import Monitor, WatchedEpisode
 
 PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
 

@@ -17,7 +17,7 @@ from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.prior.action_prior import (
+from vjepa2_ac.policies.action_prior import (
     CARD,
     WEIGHTS,
     ActionPrior,
@@ -26,7 +26,7 @@ from vjepa2_ac.planning.prior.action_prior import (
     load_prior,
     save_prior,
 )
-from vjepa2_ac.planning.prior.train_prior import PriorOptions, _Pairs, prior_loss, train_prior
+from vjepa2_ac.policies.train_prior import PriorOptions, _Pairs, prior_loss, train_prior
 
 SIZES = PriorSizes(grid=3, dim=24, state=7, action=7, ahead=3)
 MEAN = (0.03, -0.02, 0.01, 0.0, 0.0, 0.0, 0.3)

@@ -236,7 +236,7 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(
 def test_of_a_long_film_every_so_many_frames_are_looked_at(
     workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("vjepa2_ac.planning.demonstrations.make_goals._MOST_ENCODED", 10)
+    monkeypatch.setattr("vjepa2_ac.goals.make_goals._MOST_ENCODED", 10)
     given = ["--model", str(workshop / "model"), "--stride", "2", "--apart", "6"]
     status, file = goals(workshop, tmp_path / "goals", *given, source="film.mp4")
     assert status == 0

@@ -14,16 +14,16 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.policies.score import (
+from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.energy import ChunkScores
+from vjepa2_ac.policies.score import (
     PolicyChunks,
     is_blind,
     ranking_of_run,
     read_policy_chunks,
     score_policies,
 )
-from vjepa2_ac.intervals import Estimate
-from vjepa2_ac.planning.chunks import ChunkScores
-from vjepa2_ac.planning.controller import Controller
 
 STRIDE, EPISODES, STEPS = 2, 4, 14
 

@@ -26,7 +26,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.intervals import Estimate, ratio
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.prior.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
+from vjepa2_ac.policies.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces
 from vjepa2_ac.storage.structured import utc_now

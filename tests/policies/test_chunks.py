@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from decisions import QUICK, STATE, image
 from tiny_models import tiny_model
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.chunks import ChunkScores, changes_of_chunks
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.energy import ChunkScores
+from vjepa2_ac.policies.score import changes_of_chunks
 from vjepa2_ac.spaces import actions_from_states, apply_action, vector_states
 
 

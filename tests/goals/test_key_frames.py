@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vjepa2_ac.planning.demonstrations.key_frames import (
+from vjepa2_ac.goals.key_frames import (
     OF_MODEL_STEPS,
     KeyFrame,
     Timing,

@@ -21,6 +21,8 @@ from torch.nn.functional import gelu
 
 from vjepa2_ac import __version__
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.world_model import Fingerprints
+from vjepa2_ac.planning.cameras import Cameras
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.solvers import PlanStart
@@ -196,3 +198,13 @@ def load_prior(folder: str | Path, *, where: str) -> TrainedPrior:
     prior = ActionPrior(card.sizes).eval().requires_grad_(False)
     prior.load_state_dict(read_tensors(path / WEIGHTS, prior.state_dict(), needed=_NEEDED, fix=_FIX))
     return TrainedPrior(card, prior, f"{where}: {folder}")
+
+
+def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> ActionPrior:
+    """Return the prior of `planning.prior`, on the device of the model.
+
+    Raises:
+        InputError: As `load_prior` and `TrainedPrior.of`.
+    """
+    prior = load_prior(path, where="planning.prior").of(known.encoder, cameras.crop)
+    return prior.to(cameras.model.device)

@@ -23,9 +23,7 @@ from vjepa2_ac.data.windows import require_frames, spread_with_ends
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.episode import FrameReader, Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.media.images import encode_png
-from vjepa2_ac.media.video import read_frames, read_header
-from vjepa2_ac.planning.demonstrations.key_frames import (
+from vjepa2_ac.goals.key_frames import (
     KeyFrame,
     StillRule,
     Timing,
@@ -36,6 +34,10 @@ from vjepa2_ac.planning.demonstrations.key_frames import (
     resting_pairs,
     sub_goals_of,
 )
+from vjepa2_ac.media.film import spread_with_ends
+from vjepa2_ac.media.images import encode_png
+from vjepa2_ac.media.video import read_frames, read_header
+from vjepa2_ac.planning.cameras import read_views, require_views
 from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.goals import NoiseFloor, SubGoal, write_goals
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
@@ -92,18 +94,6 @@ def recording_of_episode(
     return recording_of(dataset, number_of_episode(dataset, wanted), views)
 
 
-def require_views(config: DataConfig, views: int, *, to: str = "make goals of") -> None:
-    """Refuse data without frames, or of fewer cameras than are seen side by side.
-
-    Raises:
-        InputError: They are.
-    """
-    require_frames(config, to=to)
-    if len(config.cameras) < views:
-        found, needed = ", ".join(config.cameras), f"{views} cameras, from left to right, as planning.views says"
-        raise InputError(where="data.camera", found=found, needed=needed)
-
-
 def recording_of(dataset: Dataset, index: int, views: int = 1) -> Recording:
     """Return an episode of an open data set, with so many of its cameras side by side.
 
@@ -111,14 +101,10 @@ def recording_of(dataset: Dataset, index: int, views: int = 1) -> Recording:
         InputError: It cannot be read.
     """
     config, name = dataset.config, dataset.table.identity(index)
-    seen = [dataset.source.read(index, camera) for camera in config.cameras[:views]]
+    episode = dataset.source.read(index, config.cameras[0])
     origin = {"data": config.path, "episode": name, "camera": config.camera}
-    states = seen[0].states if config.states == "pose" else None
-
-    def read(frames: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
-        return np.concatenate([episode.read_frames(frames) for episode in seen], axis=2)
-
-    return Recording(name, len(seen[0].states), read, states, origin)
+    states = episode.states if config.states == "pose" else None
+    return Recording(name, len(episode.states), partial(read_views, dataset, index, views), states, origin)
 
 
 def number_of_episode(dataset: Dataset, wanted: str) -> int:

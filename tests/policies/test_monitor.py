@@ -11,8 +11,7 @@ import pytest
 from vjepa2_ac.api import load_run, open_dataset
 from vjepa2_ac.cli import main
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.evaluation.policies.monitor import calibrate_monitor, watch_episodes
-from vjepa2_ac.planning.surprise import MONITOR
+from vjepa2_ac.policies.monitor import MONITOR, calibrate_monitor, watch_episodes
 
 STRIDE = 2
 

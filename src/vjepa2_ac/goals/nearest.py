@@ -15,16 +15,16 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.images import require_image
-from vjepa2_ac.planning.demonstrations.make_goals import (
+from vjepa2_ac.goals.make_goals import (
     KeyFrameOptions,
     MadeGoals,
     Recording,
     energies_of,
     make_goals,
     recording_of,
-    require_views,
 )
+from vjepa2_ac.media.images import require_image
+from vjepa2_ac.planning.cameras import require_views
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.subject import Subject

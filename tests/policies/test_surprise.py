@@ -1,4 +1,4 @@
-"""Surprise is what departs from the prediction; its threshold keeps its promise; plans are carried on without it."""
+"""The surprise of a frame, and the threshold with the promised rate of false alarms."""
 
 import json
 from dataclasses import asdict
@@ -14,7 +14,7 @@ from decisions import QUICK, STATE, image
 from tiny_models import tiny_model
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.surprise import MONITOR, Monitor, Surprise, conformal_threshold, surprise_of
+from vjepa2_ac.policies.monitor import MONITOR, Monitor, conformal_threshold, surprise_of
 from vjepa2_ac.serving.session import Session
 from vjepa2_ac.serving.wire import pack, unpack
 
@@ -61,8 +61,8 @@ def test_the_score_is_what_patches_are_farther_off_than_usual() -> None:
 def test_what_is_not_a_number_is_an_alarm(tmp_path: Path) -> None:
     monitor = Monitor.read(written(tmp_path, 9.0), tiny_model().fingerprints(), tokens=9, where="test")
     still = torch.zeros(9, 5)
-    assert not Surprise.of(still, still, monitor).is_alarm
-    assert Surprise.of(still, torch.full_like(still, float("nan")), monitor).is_alarm
+    assert not monitor.compare(still, still).is_alarm
+    assert monitor.compare(still, torch.full_like(still, float("nan"))).is_alarm
 
 
 def test_what_the_last_decision_predicted_is_compared_with_what_is_seen(tmp_path: Path) -> None:

@@ -10,26 +10,32 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.intervals import Estimate, mean_of, ratio, ratio_difference
-from vjepa2_ac.planning.chunks import ChunkForm, changes_of_chunks
+from vjepa2_ac.model.state_integration import apply_actions, states_along
+from vjepa2_ac.planning.cameras import read_views, require_views
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.demonstrations.make_goals import recording_of, require_views
 from vjepa2_ac.runs.checkpoint import step_of
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.spaces import POSE, StateSpace
 from vjepa2_ac.storage.structured import plain
 
 CHANCE = 0.5  # share of other actions with a lower energy than the true ones, for a model that ignores actions
 _OTHERS = 16  # actions of other places, in addition to the true ones
 _NEEDED = "arrays `episodes` (names), `frames` (control steps) and `chunks` (places x chunks x control steps x numbers)"
+
+ChunkForm = Literal["targets", "deltas", "offsets"]
+"""targets: states to be reached, one after another. deltas: the change from each target to the next. offsets: of all
+targets from the present state."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +112,50 @@ def read_chunks(path: Path) -> Float[np.ndarray, "chunks steps dim"]:
     if not isinstance(found, np.ndarray) or found.ndim != 3 or found.dtype.kind not in "fiu":
         raise InputError(where=str(path), found="another kind of array", needed=needed)
     return found.astype(np.float64)
+
+
+def changes_of_chunks(
+    chunks: np.ndarray,
+    state: Float[np.ndarray, " dim"],
+    *,
+    form: ChunkForm,
+    control_steps: int,
+    space: StateSpace = POSE,
+) -> Float[np.ndarray, "chunks model_steps dim"]:
+    """Return the change of each model step, as the planner's actions are.
+
+    Rotations act on the left (R' = R_delta @ R), as in `vjepa2_ac.episode`. Control steps at the end that fill no model
+    step are left out.
+
+    Args:
+        chunks: What the policy would do, chunks x control steps x dim: poses in metres, radians and closedness, or
+            vectors.
+        state: Where the robot is.
+        form: What the numbers mean.
+        control_steps: Of a model step, in steps of the chunk: `data.stride` where both have one rate.
+        space: What a state is.
+
+    Raises:
+        InputError: A chunk has other numbers than a state, one that no robot has, or is shorter than a model step; or
+            the state is none.
+    """
+    state = np.array(state, dtype=np.float64)
+    space.require_state(state, "state")
+    found = np.array(chunks, dtype=np.float64)
+    if found.ndim != 3 or not len(found) or found.shape[2] != len(space) or not np.isfinite(found).all():
+        needed = f"finite numbers, chunks x control steps x {len(space)}: {', '.join(space.names)}"
+        raise InputError(where="chunks", found=f"an array of the shape {found.shape}", needed=needed)
+    if found.shape[1] < control_steps:
+        needed = f"{control_steps} at least, which are one model step"
+        raise InputError(where="chunks", found=counted(found.shape[1], "control step"), needed=needed)
+    now, given = torch.from_numpy(state), torch.from_numpy(found)
+    if form == "deltas":
+        targets = states_along(now, given, space)[:, 1:].numpy()
+    else:
+        targets = found if form == "targets" else apply_actions(now.expand_as(given), given, space).numpy()
+    space.require_plausible(targets.reshape(-1, len(space)), "chunks")
+    ends = targets[:, control_steps - 1 :: control_steps]
+    return np.stack([space.differences(np.concatenate([state[None], one])) for one in ends])
 
 
 def is_blind(error: Estimate | None) -> bool:
@@ -245,7 +295,7 @@ class _Place:
 
     def frames(self, dataset: Dataset, views: int) -> np.ndarray:
         """Return the images of the first `views` cameras at this position, side by side, and the goal image."""
-        return recording_of(dataset, self.index, views).read([self.place[1], self.place[1] + self.ahead])
+        return read_views(dataset, self.index, views, [self.place[1], self.place[1] + self.ahead])
 
 
 def _drawn(rng: np.random.Generator, number: int, episodes: Sequence[str]) -> Int[np.ndarray, " others"]:

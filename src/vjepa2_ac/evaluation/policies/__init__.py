@@ -1,1 +1,0 @@
-"""Judged by a world model: which policy is better, and when reality departs from what was predicted."""

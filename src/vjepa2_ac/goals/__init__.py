@@ -1,0 +1,1 @@
+"""Goals from demonstrations: key frames, sub-goals, and the nearest demonstration."""

@@ -1,0 +1,135 @@
+"""Cameras: the part of an image that the model receives, its latents, and images by which nothing can be planned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.transforms import Crop, split_views, view
+from vjepa2_ac.data.windows import require_frames
+from vjepa2_ac.encoding.batch import encode_frames
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.camera_check import CameraFrame, has_moved, is_uniform, newest_frames, require_contrast
+from vjepa2_ac.media.images import require_image, require_mask
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.energy import patch_weights
+from vjepa2_ac.spaces import StateSpace
+
+Image = UInt8[np.ndarray, "height width 3"]
+Fault = Literal["uniform frame", "frozen frame"]
+
+
+@dataclass
+class Cameras:
+    """One camera, or several whose images are side by side, as a world model receives them."""
+
+    model: WorldModel
+    crop: Crop
+    views: int = 1
+    newest: tuple[CameraFrame, ...] = field(default=(), init=False)  # of each camera; empty after a reset
+
+    def encode(self, images: UInt8[np.ndarray, "time height width 3"]) -> Float[Tensor, "time tokens dim"]:
+        """Return the latents of images on the model's device; the tokens of several views follow one another.
+
+        Raises:
+            InputError: The width is not that of so many views.
+        """
+        return encode_frames(self.model, images, self.crop, views=self.views)
+
+    def require_goals(self, images: Sequence[np.ndarray]) -> None:
+        """Refuse goal images that are invalid, have different sizes, or have no contrast.
+
+        Raises:
+            InputError: The message names the first such image.
+        """
+        for place, image in enumerate(images):
+            require_image(image, where=f"goal {place}", like=images[0] if place else None)
+            self.require_contrast(image, where=f"goal {place}")
+
+    def require_contrast(self, image: Image, *, where: str) -> None:
+        """Refuse an image in which one of the cameras has no contrast; see `camera_check.is_uniform`.
+
+        Raises:
+            InputError: One is uniform.
+        """
+        require_contrast(self._received(image), where=where)
+
+    def newest_with(self, frame: Image, state: Float[np.ndarray, " numbers"]) -> tuple[CameraFrame, ...]:
+        """Return the newest frame of each camera once a frame has arrived."""
+        return newest_frames(split_views(frame[None], self.views), state, self.newest)
+
+    def fault(
+        self,
+        frame: Image,
+        newest: Sequence[CameraFrame],
+        state: Float[np.ndarray, " numbers"],
+        space: StateSpace,
+        largest: Float[np.ndarray, " numbers"],
+    ) -> Fault | None:
+        """Return why a frame must not move the robot; None: it may. One faulty camera of several is enough.
+
+        Args:
+            frame: The frame.
+            newest: The newest frame of each camera, with this one.
+            state: The measured state.
+            space: The meaning of its numbers.
+            largest: The largest change of each number in a model step.
+        """
+        if any(map(is_uniform, self._received(frame))):
+            return "uniform frame"
+        is_frozen = any(has_moved(before, state, space, largest) for _, before in newest)
+        return "frozen frame" if is_frozen else None
+
+    def weights(self, mask: np.ndarray | None, like: Image) -> Float[Tensor, " tokens"] | None:
+        """Return the weight of each patch by a mask over an image; None: no mask.
+
+        Raises:
+            InputError: The mask is invalid, or leaves nothing of what the model receives.
+        """
+        if mask is None:
+            return None
+        require_mask(mask, where="mask", like=like)
+        pixels = np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1)
+        received = np.ascontiguousarray(view(split_views(pixels, self.views), self.crop)[..., 0])
+        grid = self.model.image_size // self.model.sizes.patch_size
+        try:
+            return patch_weights(torch.from_numpy(received) > 0, grid).to(self.model.device)
+        except ValueError:
+            raise InputError(where="mask", found="nothing of what the model sees counts") from None
+
+    def _received(self, image: Image) -> UInt8[np.ndarray, "views rows columns 3"]:
+        """Return the part of each camera's image that the model receives, without the bars of a letterbox."""
+        views = split_views(image[None], self.views)
+        return views if self.crop == "letterbox" else view(views, self.crop)
+
+
+def require_views(config: DataConfig, views: int, *, to: str = "make goals of") -> None:
+    """Refuse data without frames, or of fewer cameras than are seen side by side.
+
+    Raises:
+        InputError: They are.
+    """
+    require_frames(config, to=to)
+    if len(config.cameras) < views:
+        found, needed = ", ".join(config.cameras), f"{views} cameras, from left to right, as planning.views says"
+        raise InputError(where="data.camera", found=found, needed=needed)
+
+
+def read_views(
+    dataset: Dataset, index: int, views: int, frames: Sequence[int]
+) -> UInt8[np.ndarray, "frames height width 3"]:
+    """Return frames of an episode, with so many of its cameras side by side, from the first on.
+
+    Raises:
+        InputError: The episode cannot be read.
+    """
+    cameras = dataset.config.cameras[:views]
+    return np.concatenate([dataset.source.read(index, camera).read_frames(frames) for camera in cameras], axis=2)
