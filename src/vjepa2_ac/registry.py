@@ -216,7 +216,7 @@ TRACKERS = Registry("tracker", "vjepa2_ac.trackers", {})
 TRANSFORMS = Registry("transform", "vjepa2_ac.transforms", {})
 PLANNING_FILES = Registry(
     "file of planning",
-    "vjepa2_ac.planning_files",
+    "",  # no entry points
     {"prior": "policies.action_prior:read_for_planning", "monitor": "policies.monitor:read_for_planning"},
 )
 """Readers of the files that `planning` names and that packages beside the core make."""

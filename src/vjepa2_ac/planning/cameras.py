@@ -23,7 +23,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import patch_weights
 from vjepa2_ac.spaces import StateSpace
 
-Image = UInt8[np.ndarray, "height width 3"]
+Image = UInt8[np.ndarray, "rows columns 3"]
 Fault = Literal["uniform frame", "frozen frame"]
 
 
@@ -105,7 +105,7 @@ class Cameras:
         except ValueError:
             raise InputError(where="mask", found="nothing of what the model sees counts") from None
 
-    def _received(self, image: Image) -> UInt8[np.ndarray, "views rows columns 3"]:
+    def _received(self, image: Image) -> UInt8[np.ndarray, "views height width 3"]:
         """Return the part of each camera's image that the model receives, without the bars of a letterbox."""
         views = split_views(image[None], self.views)
         return views if self.crop == "letterbox" else view(views, self.crop)
