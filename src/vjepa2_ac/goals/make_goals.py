@@ -34,7 +34,6 @@ from vjepa2_ac.goals.key_frames import (
     resting_pairs,
     sub_goals_of,
 )
-from vjepa2_ac.media.film import spread_with_ends
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import read_frames, read_header
 from vjepa2_ac.planning.cameras import read_views, require_views
