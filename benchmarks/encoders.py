@@ -32,8 +32,8 @@ from vjepa2_ac.encoding.latent_cache import picture_bytes
 from vjepa2_ac.model.model_files import PUBLISHED
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.training.cost.flops import frame_flops
-from vjepa2_ac.training.cost.memory import GIGABYTE, count_parameters, estimate_memory
+from vjepa2_ac.training.cost import GIGABYTE, count_parameters, estimate_memory
+from vjepa2_ac.training.flops import frame_flops
 
 IMAGE_SIZES = (256, 384)  # pixels
 QUICK = {"only": "ViT-B", "repeats": 1, "warm_up": 0, "threads": 1, "frames": 1}

@@ -30,7 +30,7 @@ from vjepa2_ac.model.adapter.lora import lora_layers
 from vjepa2_ac.model.checkpoints import official_name
 from vjepa2_ac.model.network.blocks import NORM_EPSILON
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.training.loss import Objective
+from vjepa2_ac.training.step import Objective
 
 TARGETS = ["qkv", "proj", "fc1", "fc2"]
 PREDICTOR = Path("src/models/ac_predictor.py")  # of a checkout

@@ -17,7 +17,7 @@ ours/N     ours, N samples through the predictor at once; plain takes as many as
 Before anything is timed all must choose the same actions, on the same weights with the same seed,
 in float32: what chooses others, or finds other energies, gets no ratio. A ratio over 1 means faster than plain, or than
 the official one. All take turns; on a CPU the process's own time over its threads counts, else wall time; the median,
-and the fastest. MFU: the model FLOPs of `training.cost.flops` over what the device does in a product of matrices,
+and the fastest. MFU: the model FLOPs of `training.flops` over what the device does in a product of matrices,
 measured first; the same for every way. `retries`: how often the allocator had to give memory back while a way was
 timed, whose time then does not count. Peak memory, weights included, is of two decisions in a pass of its own, after
 all times: each line alone on the device, or on a CPU in a process of its own.

@@ -25,7 +25,7 @@ from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Cost, Plan, Planner
 from vjepa2_ac.spaces import apply_action
-from vjepa2_ac.training.cost.flops import plan_flops
+from vjepa2_ac.training.flops import plan_flops
 
 POSE = (0.45, 0.10, 0.35, 3.0, 0.1, -0.4, 0.3)  # of an arm that points down
 WANTED = (0.03, -0.02, 0.04, 0.0, 0.0, 0.0, 0.3)  # the action of each step that leads to the goal

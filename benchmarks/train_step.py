@@ -12,7 +12,7 @@ must give the same loss and gradients on the same weights, else there is no rati
 baseline is our own step with a dense mask. A ratio over 1 means faster than the baseline.
 
 All take turns, so that a busy machine slows them alike. On a CPU the process's own time over its threads counts, else
-wall time; `ms` is the median, `min` the fastest. MFU: the model FLOPs of `training.cost.flops` over what the device
+wall time; `ms` is the median, `min` the fastest. MFU: the model FLOPs of `training.flops` over what the device
 does in a product of matrices, measured first. `retries`: how often the allocator had to give memory back while a way
 was timed, whose time then does not count. --profile counts, in a step of each way of ours, how often the host waits
 for the device, how long its kernels ran, and what was compiled after warm-up; beside it the seconds of a setting's

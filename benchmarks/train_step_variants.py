@@ -37,12 +37,12 @@ from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.model.checkpoints import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import RunState
-from vjepa2_ac.training.cost.flops import clip_flops
-from vjepa2_ac.training.cost.memory import ALLOWANCE, estimate_memory
-from vjepa2_ac.training.loss import Objective
+from vjepa2_ac.training.cost import ALLOWANCE, estimate_memory
+from vjepa2_ac.training.cuda_graph import GraphedMicroStep
+from vjepa2_ac.training.flops import clip_flops
 from vjepa2_ac.training.optim import make_optimizer
-from vjepa2_ac.training.setup import Run
-from vjepa2_ac.training.step import training_step
+from vjepa2_ac.training.run import Run
+from vjepa2_ac.training.step import Objective, micro_step, training_step
 
 OFFICIAL = "official"
 OFFICIAL_FULL = "official_full"  # every weight of its predictor is trained
@@ -263,6 +263,7 @@ class Bench:
             accelerator=self._accelerator(config),
             world_model=self.model,
             objective=Objective(self.model, config.training),
+            micro_step=GraphedMicroStep() if graph else micro_step,
             optimizer=make_optimizer(self.model, config.training),
             scaler=torch.amp.GradScaler(self.device.type, enabled=False),
             dataset=Dataset.__new__(Dataset),  # never opened: batches are given

@@ -69,6 +69,7 @@ SHORTER = {  # by the first words of a command
     "monitor": "--false-alarms 0.4 || test $? = 1",  # watched episodes of a hasty model
     "data calibrate CONFIG --axes": "--limit 8 || test $? = 1",  # of so few pairs: not to plan by
     "data calibrate": "--limit 8",
+    "python examples/train_loop.py": "demo/examples/data 2",
     "python examples/finetune.py": "training.steps=2 training.warmup_steps=0 training.allow_weak_base=true",
 }
 

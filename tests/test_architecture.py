@@ -76,8 +76,9 @@ ORDERS: dict[str, list[str]] = {
         "network",
         "decoder_folder frame_pairs",
         "imagine training",
+        "imagined_strip",
     ],
-    "evaluation.calibration": ["variants", "data axes"],
+    "evaluation.calibration": ["variants", "data axes stride_choice"],
     "reports": ["metrics_json", "comparison paper", "figures", "write sheet", "export"],
     "cli": [
         "console",
@@ -108,6 +109,7 @@ HOMES = {
         "runs/trackers.py",
         "training/",
         "encoding/encode_dataset.py",
+        "evaluation/calibration/stride_choice.py",
         "evaluation/calibration/variants.py",
         "evaluation/evaluate_run.py",
     ],

@@ -19,7 +19,7 @@ from vjepa2_ac.process import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signal
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import batches_from
+from vjepa2_ac.training.run import batches_from
 
 WAITING = """
 import time
@@ -86,7 +86,7 @@ def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order
     os.killpg(process.pid, signal.SIGUSR1)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == EXIT_STATUS, errors
-    assert errors.startswith("SIGUSR1: stopped after step"), errors
+    assert errors.splitlines()[-1].startswith("SIGUSR1: stopped after step"), errors
     assert len(errors.splitlines()) == 1, errors
     assert not psutil.wait_procs(family, timeout=120)[1], "a worker stayed"
     train(config, reporter)

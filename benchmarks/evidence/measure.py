@@ -50,7 +50,7 @@ from vjepa2_ac.simulation.rollout import RolloutSpec, run_task
 from vjepa2_ac.simulation.tasks import Problem, TaskProblem
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import json_text
-from vjepa2_ac.training.cost.memory import count_parameters
+from vjepa2_ac.training.cost import count_parameters
 from vjepa2_ac.training.loop import train
 
 TEST_GOALS, VALIDATION_GOALS = 9_000, 4_000  # seeds of problems, to which a cell adds its own (`goals_seed`)

@@ -11,7 +11,7 @@ from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTens
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from vjepa2_ac.training.cost.step import LiveStorages
+from vjepa2_ac.training.cost import LiveStorages
 
 _BLOCK = 512  # bytes: the allocator rounds to multiples of it
 _aten = torch.ops.aten

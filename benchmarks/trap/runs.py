@@ -161,7 +161,7 @@ def config_of(run: Run, folder: Path) -> Config:
             allow_weak_base=True,
         ),
         validation=ValidationConfig(every=EVERY, clips=40, batch_size=20),
-        checkpoint=CheckpointConfig(every=EVERY, every_minutes=None, keep=STEPS),
+        checkpoint=CheckpointConfig(every=EVERY, keep=STEPS),
     )
 
 

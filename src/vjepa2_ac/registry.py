@@ -188,7 +188,7 @@ LOSSES = Registry(
     {
         "l1": "model.distances:absolute_difference",
         "l2": "model.distances:squared_difference",
-        "smooth_l1": "training.loss:SmoothL1",
+        "smooth_l1": "training.step:SmoothL1",
     },
 )
 PLANNERS = Registry(
@@ -220,6 +220,17 @@ PLANNING_FILES = Registry(
     {"prior": "policies.action_prior:read_for_planning", "monitor": "policies.monitor:read_for_planning"},
 )
 """Readers of the files that `planning` names and that packages beside the core make."""
+TRAINING_HOOKS = Registry(
+    "hook of training",
+    "",  # no entry points
+    {
+        "data.stride": "evaluation.calibration.stride_choice:StrideChoice",
+        "validation.decoder": "decoding.imagined_strip:ImaginedStrip",
+        "motion": "inspection.motion:warnings_from_index",
+        "coverage": "inspection.coverage:coverage_in",
+    },
+)
+"""Functions and classes of packages beside the core that training calls."""
 REGISTRIES = (SOURCES, LOSSES, PLANNERS, ENERGIES, METRICS, TRACKERS, TRANSFORMS)
 
 

@@ -12,7 +12,7 @@ from vjepa2_ac.config import EncoderSizes, PredictorSizes
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.model.checkpoints import base_sizes
 from vjepa2_ac.model.model_files import PUBLISHED
-from vjepa2_ac.training.cost.memory import count_parameters, estimate_memory
+from vjepa2_ac.training.cost import count_parameters, estimate_memory
 
 SMALL = EncoderSizes(width=96, depth=2, heads=4, mlp_ratio=4.0, family="v2.1")
 

@@ -22,7 +22,7 @@ from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import micro_batches_of
-from vjepa2_ac.training.setup import batches_from
+from vjepa2_ac.training.run import batches_from
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 

@@ -90,7 +90,7 @@ def test_a_run_that_cannot_write_its_record_writes_its_checkpoint_and_says_of_wh
     make_config, reporter, tmp_path, monkeypatch
 ) -> None:
     disk, quiet = FullDisk(monkeypatch), type(reporter)()
-    config = make_config(checkpoint__every=100, checkpoint__every_minutes=None, checkpoint__keep_best=False)
+    config = make_config(checkpoint__every=100, checkpoint__keep_best=False)
     with pytest.raises(InputError, match=r"metrics\.jsonl: .*No space left on device.*The checkpoint of this step is"):
         train(config, full_from(disk, reporter, 4))
     assert reporter.steps[-1] == 4, "it ended at once"

@@ -17,7 +17,7 @@ def test_a_run_that_switches_compilation_on_and_off_is_the_run_that_never_did(
     asked: list[str] = []
     monkeypatch.setattr(blocks, "compiled", lambda function, **_: asked.append(function.__name__) or function)
     monkeypatch.setattr(compilation, "missing_for_compilation", lambda _: None)
-    constant = {"training__schedule": "constant"}
+    constant = {"training__schedule": "warmup_stable_decay"}
     train(make_config(run_dir=str(tmp_path / "plain"), **constant), reporter)
     assert not asked
     for steps, compile_ in [(2, "off"), (4, "blocks"), (6, "off")]:

@@ -21,7 +21,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import read_state
 from vjepa2_ac.training import setup
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import Run, batches_from
+from vjepa2_ac.training.run import Run, batches_from
 from vjepa2_ac.training.step import gradients, training_step
 
 COPY = [*["side 1: to pinned memory", "side 1: to device"] * 3]  # frames, states, actions

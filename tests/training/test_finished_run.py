@@ -91,7 +91,7 @@ def test_a_run_that_is_made_longer_says_at_which_rate_it_continues(
 
 def test_a_rate_that_stays_is_not_mentioned() -> None:
     before = TrainingConfig(steps=12, warmup_steps=2, learning_rate=1e-3)
-    longer, constant = (before.model_copy(update=one) for one in ({"steps": 24}, {"schedule": "constant"}))
+    longer, constant = (before.model_copy(update=one) for one in ({"steps": 24}, {"schedule": "warmup_stable_decay"}))
     assert describe_changed_rate(12, before, before) == ""
     assert describe_changed_rate(12, before, before.model_copy(update={"loss": "l2", "steps": 12})) == ""
     assert describe_changed_rate(0, before, longer) == "", "nothing was trained"

@@ -10,6 +10,7 @@ from random_decoder import write_decoder
 from run_fixtures import set_up
 from same_run import assert_same_run
 from vjepa2_ac.data.loader import validation_windows
+from vjepa2_ac.decoding import imagined_strip
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED
 from vjepa2_ac.errors import InputError
@@ -17,7 +18,6 @@ from vjepa2_ac.media.images import read_image
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.training import imagined_strip
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.validation import validate
 

@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -14,9 +13,9 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.training.micro_step import Body, GraphedMicroStep, captured, plain_micro_step
-from vjepa2_ac.training.setup import Run, batches_from, encode
-from vjepa2_ac.training.step import training_step
+from vjepa2_ac.training.cuda_graph import Body, GraphedMicroStep
+from vjepa2_ac.training.run import Run, batches_from
+from vjepa2_ac.training.step import encode, micro_step, training_step
 
 STEPS = 3
 NEEDS_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -77,7 +76,7 @@ def make_run(make_config: Callable[..., Config], reporter) -> Callable[..., Run]
 def recorded(run: Run) -> Recorder:
     """Let a run capture its micro-step, on whatever device."""
     recorder = Recorder(run)
-    run.micro_step = GraphedMicroStep(run.micro_step, run.trained, recorder)
+    run.micro_step = GraphedMicroStep(recorder)
     return recorder
 
 
@@ -97,17 +96,16 @@ def test_a_capture_adds_to_the_gradients_that_are_there(make_run, none_before: b
     run = make_run()
     run.world_model.train()
     first, second = (encode(run, batch) for batch in itertools.islice(batches_from(run), 2))
-    plain = partial(plain_micro_step, run.objective, run.accelerator, run.scaler)
     recorder = recorded(run)
-    steps = [run.micro_step] * 2 if none_before else [plain, run.micro_step]
+    steps = [run.micro_step] * 2 if none_before else [micro_step, run.micro_step]
 
     def gradients(*steps: Callable[..., Tensor]) -> list[Tensor]:
         run.optimizer.zero_grad()
         for step, latents in zip(steps, (first, second), strict=True):
-            step(latents, 2.0)
+            step(run, latents, 2.0)
         return [parameter.grad.clone() for parameter in run.trained]
 
-    expected = gradients(plain, plain)
+    expected = gradients(micro_step, micro_step)
     assert all(map(torch.equal, gradients(*steps), expected))
     assert (recorder.captures, recorder.replays) == (1, len(steps) - (not none_before))
 
@@ -119,14 +117,6 @@ def test_a_cuda_graph_learns_what_plain_launches_learn(make_run) -> None:
     assert isinstance(runs[1].micro_step, GraphedMicroStep)
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
-
-
-def test_the_capture_is_that_of_cuda(make_run) -> None:
-    run = make_run()
-    training = run.config.training.model_copy(update={"cuda_graph": True})
-    run.config = run.config.model_copy(update={"training": training})
-    assert isinstance(run.micro_step, GraphedMicroStep)
-    assert run.micro_step._capture is captured
 
 
 def test_a_graph_on_a_cpu_is_refused(make_config) -> None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -23,9 +24,10 @@ from vjepa2_ac.episode import POSE_WIDTHS, Batch
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
 from vjepa2_ac.training import monitoring
-from vjepa2_ac.training.cost.flops import clip_flops
+from vjepa2_ac.training.flops import clip_flops
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.monitoring import MEASURED, Throughput, TimedBatches, Update, Watch
+from vjepa2_ac.training.monitoring import MEASURED, Throughput, TimedBatches, Watch
+from vjepa2_ac.training.step import Update
 
 CPU = torch.device("cpu")
 
@@ -49,7 +51,7 @@ def test_update_to_weight_is_of_all_tensors_together() -> None:
 def test_throughput_counts_clips_tokens_and_flops_per_second() -> None:
     config = parse_config({"run_dir": "r", "data": {"path": "d", "frames": 8}, "model": {"base": "b"}}, where="test")
     sizes, speed = ModelSizes(), matmul_speed(CPU, torch.bfloat16)
-    throughput = Throughput.of(config, sizes, CPU, processes=2)
+    throughput = Throughput.of(config, sizes, SimpleNamespace(device=CPU, num_processes=2))
     metrics = throughput.metrics(clips=12.0, seconds=4.0, waited_s=1.0)
     assert metrics["samples_per_second"] == 3.0
     assert metrics["tokens_per_second"] == 3.0 * 8 * 256
@@ -66,7 +68,8 @@ def test_throughput_counts_clips_tokens_and_flops_per_second() -> None:
 def test_every_row_of_training_says_how_the_run_and_the_machine_are(make_config, reporter) -> None:
     stepped: dict[int, dict[str, float]] = {}
     reporter.stepped = lambda step, metrics: stepped.update({step: metrics})
-    folder = train(make_config(training__steps=3, training__log_every=2, training__schedule="constant"), reporter)
+    constant = {"training__schedule": "warmup_stable_decay", "training__log_every": 2}
+    folder = train(make_config(training__steps=3, **constant), reporter)
     rows = [row for row in read_metrics_log(folder / "metrics.jsonl") if row["kind"] == "train"]
     assert [row["step"] for row in rows] == [2, 3]
     for row in rows:
@@ -261,7 +264,7 @@ def test_a_resumed_run_reports_the_same_as_an_uninterrupted_one(make_diverging, 
     whole = train(make_diverging(run_dir=str(tmp_path / "whole")), reporter)
     config = make_diverging(run_dir=str(tmp_path / "halves"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vjepa2_ac.training.loop.save_checkpoint", _stop_behind(3))
+        patch.setattr("vjepa2_ac.training.outputs.save_checkpoint", _stop_behind(3))
         with pytest.raises(KeyboardInterrupt):
             train(config, reporter)
     train(config, reporter)

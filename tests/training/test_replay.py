@@ -20,7 +20,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import batches_from
+from vjepa2_ac.training.run import batches_from
 from vjepa2_ac.training.step import training_step
 
 Names = list[tuple[str, int]]

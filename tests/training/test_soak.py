@@ -22,7 +22,6 @@ MANY = int(os.environ.get("VJEPA2_AC_SOAK", "0"))
 WAYS = ("before a file", "while writing", "whenever")
 CHANGES = {
     "training__steps": 24, "validation__every": 4, "checkpoint__every": 2, "checkpoint__keep": 2,
-    "checkpoint__every_minutes": None,
 }  # fmt: skip
 
 

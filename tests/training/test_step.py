@@ -23,7 +23,7 @@ from vjepa2_ac.media.images import read_image
 from vjepa2_ac.training import optim
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import save_checkpoint
-from vjepa2_ac.training.setup import Run, batches_from
+from vjepa2_ac.training.run import Run, batches_from
 from vjepa2_ac.training.step import ClipRecorder, Gradients, gradients, training_step
 
 

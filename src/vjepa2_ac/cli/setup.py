@@ -240,7 +240,7 @@ def _doctor(options: argparse.Namespace) -> int:
     from vjepa2_ac.data.streams import require_shared_memory
     from vjepa2_ac.distributed import slow_bf16
     from vjepa2_ac.model.checkpoints import base_sizes
-    from vjepa2_ac.training.cost.memory import USUAL_GPU, batch_bytes, estimate_memory, ways_to_fit
+    from vjepa2_ac.training.cost import USUAL_GPU, batch_bytes, estimate_memory, ways_to_fit
 
     sizes = base_sizes(config.model)
     gpu, available = None, USUAL_GPU

@@ -259,8 +259,14 @@ def _replace_keys_of_model(model: dict[str, Any]) -> None:
 
 
 def _replace_older_keys(values: dict[str, Any]) -> None:
-    """Replace the key gripper of `data.fields`, which configs of older runs have, by its two values."""
+    """Replace, in configs of older runs, the key gripper of `data.fields` and two schedules by what means the same."""
     for section, inner in values.items():
+        if section == "training" and isinstance(inner, dict) and inner.get("schedule") in ("constant", "linear"):
+            falls = inner["schedule"] == "linear"
+            inner |= {
+                "schedule": "warmup_stable_decay",
+                "decay_steps": inner.get("steps", 0) - inner.get("warmup_steps", 0) if falls else 0,
+            }
         if section == "fields" and isinstance(inner, dict) and inner.get("gripper") in _OLDER_GRIPPERS:
             inner.update(_OLDER_GRIPPERS[inner.pop("gripper")])
         elif isinstance(inner, dict):
@@ -344,7 +350,7 @@ _ALSO_CALLED = {
     "per_device_train_batch_size": "training.batch_size",
     "gradient_accumulation_steps": "training.accumulation", "accumulate_grad_batches": "training.accumulation",
     "auto_steps": "training.rollout_steps",
-    "lr": "training.learning_rate", "max_lr": "training.learning_rate", "min_lr": "training.final_learning_rate",
+    "lr": "training.learning_rate", "max_lr": "training.learning_rate",
     "wd": "training.weight_decay", "warmup": "training.warmup_steps",
     "grad_clip": "training.max_grad_norm", "clip_grad": "training.max_grad_norm",
     "amp": "training.precision", "mixed_precision": "training.precision",

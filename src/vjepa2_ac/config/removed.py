@@ -47,6 +47,13 @@ REMOVED: dict[str, RemovedKey] = {
     ),
     "data.prefetch": RemovedKey("2", (2,)),
     "data.short_episodes": RemovedKey("skip", ("skip",)),
+    "training.teacher_forcing_weight": RemovedKey("1", (1.0,)),
+    "training.rollout_weight": RemovedKey("1", (1.0,)),
+    "training.start_learning_rate": RemovedKey("0", (0.0,)),
+    "training.final_learning_rate": RemovedKey("0", (0.0,)),
+    "training.betas": RemovedKey("(0.9, 0.999)", ([0.9, 0.999],)),
+    "validation.ranking_reach_cm": RemovedKey("7.5", (7.5,)),
+    "checkpoint.every_minutes": RemovedKey("15", (15.0,)),
 }
 """RemovedKey keys and sections, by their dotted key. A row for a key of `data` also holds below `replay`."""
 

@@ -44,29 +44,19 @@ class TrainingConfig(Section):
     loss: Annotated[Component, ComponentOf(LOSSES, "l1")] = Component("l1")
     """Distance of predicted and true latents. l1: absolute (released). l2: squared. smooth_l1: squared only below its
     option beta. Or a loss of your own (docs/extending.md)."""
-    teacher_forcing_weight: NonNegative = 1.0
-    """Factor of the teacher-forced loss, in the sum and in metrics.jsonl."""
-    rollout_weight: NonNegative = 1.0
-    """Factor of the rollout loss, in the sum and in metrics.jsonl; 0 saves its computation."""
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-4
     """Peak learning rate."""
-    schedule: Literal["cosine", "warmup_stable_decay", "linear", "constant"] = "cosine"
-    """All begin with a linear warm-up. Then cosine: half a cosine to the end. linear: a straight line to the end.
-    warmup_stable_decay: constant, and a linear decay at the end. constant: the peak throughout."""
+    schedule: Literal["cosine", "warmup_stable_decay"] = "cosine"
+    """Both begin with a linear warm-up from 0. cosine: then half a cosine to 0. warmup_stable_decay: then constant, and
+    a linear decay to 0 in the last decay_steps."""
     warmup_steps: Count = Field(default_factory=_usual_warmup)
     """Optimizer steps of the linear warm-up; unless given 1,000, or a tenth of the steps where that is less."""
     decay_steps: Count = 0
-    """Optimizer steps of the final decay; warmup_stable_decay only."""
-    start_learning_rate: ZeroToOne = 0.0
-    """Learning rate at the start of the warm-up."""
-    final_learning_rate: ZeroToOne = 0.0
-    """Learning rate at the end of the schedule; not used by constant."""
+    """Optimizer steps of the final decay, warmup_stable_decay only; 0: the rate stays constant to the end."""
     optimizer: Literal["adamw", "adamw_8bit"] = "adamw"
     """adamw_8bit stores the moments of matrices of 4,096 elements and more in 8 bits: bitsandbytes, extra 8bit."""
     weight_decay: ZeroToOne = 0.04
     """AdamW's decay; biases and norms are exempt."""
-    betas: tuple[Annotated[float, Field(ge=0.0, lt=1.0)], Annotated[float, Field(ge=0.0, lt=1.0)]] = (0.9, 0.999)
-    """AdamW's decay rates of the running moments."""
     max_grad_norm: Positive | None = 1.0
     """Gradients are clipped to this norm; null: never (the released recipe)."""
     precision: Annotated[Literal["bf16", "fp16", "fp32"], Affects.LATENTS | Affects.RUN] = "bf16"
@@ -92,14 +82,10 @@ class TrainingConfig(Section):
 
     @model_validator(mode="after")
     def _parts_fit(self) -> TrainingConfig:
-        warmup, decay, schedule = self.warmup_steps, self.decay_steps, self.schedule
-        decays, constant = schedule == "warmup_stable_decay", schedule == "constant"
-        weights = self.teacher_forcing_weight + self.rollout_weight
+        warmup, decay = self.warmup_steps, self.decay_steps
         return self.refused(
             (warmup + decay > self.steps, f"warmup_steps {warmup} and decay_steps {decay} exceed steps {self.steps}"),
-            (decay and not decays, f"decay_steps belongs to schedule warmup_stable_decay, not {schedule}"),
-            (constant and self.final_learning_rate, "schedule constant has no final_learning_rate: leave it out"),
-            (not weights, "teacher_forcing_weight and rollout_weight are both 0: nothing would be learned"),
+            (decay and self.schedule == "cosine", "decay_steps belongs to schedule warmup_stable_decay, not cosine"),
         )
 
 
@@ -116,9 +102,8 @@ class ValidationConfig(Section):
     """Of these clips, how many have the true action of a move ranked among others: what planning needs (docs/
     evaluation.md). Two moves each, as large as planned ones, forwards and backwards. 0: none."""
     ranking_samples: Annotated[PositiveInt, Affects.MEASURED] = 32
-    """Other actions per move, drawn in each of two ways: in a box, and of the same length in any direction."""
-    ranking_reach_cm: Annotated[float, Field(gt=0.0, le=100.0), Affects.MEASURED] = 7.5
-    """Half the width of the box along x, y and z: as far as plans should move in a model step."""
+    """Other actions per move, drawn in each of two ways: in a box of 7.5 cm to each side, and of the same length in any
+    direction."""
     decoder: Annotated[LocalOrBuiltin | None, Affects.NOTHING] = None
     """Folder of a decoder (docs/decoding.md), or builtin:sim-tiny: with it each validation draws what base and model
     imagine of one validation clip, the one with the most motion: in RUN/imagined and in the trackers. null: none."""
@@ -128,9 +113,7 @@ class CheckpointConfig(Section):
     """Checkpoints, here and elsewhere."""
 
     every: PositiveInt = 1_000
-    """Optimizer steps between checkpoints."""
-    every_minutes: Positive | None = 15.0
-    """Minutes after which a checkpoint is written in any case; null: by steps only."""
+    """Optimizer steps between checkpoints; one is also written when the last one is 15 minutes old."""
     keep: PositiveInt = 5
     """Number of newest checkpoints that are kept."""
     keep_best: Annotated[Literal["ranking", "error", "off"], OFF, Affects.MEASURED] = "ranking"

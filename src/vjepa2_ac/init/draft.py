@@ -20,8 +20,8 @@ from vjepa2_ac.model.checkpoints import base_sizes
 from vjepa2_ac.model.model_files import OFFICIAL, PUBLISHED
 from vjepa2_ac.reporter import duration
 from vjepa2_ac.storage.places import BUILTIN
-from vjepa2_ac.training.cost.flops import clip_flops, frame_flops
-from vjepa2_ac.training.cost.memory import GIGABYTE, USUAL_GPU, estimate_memory
+from vjepa2_ac.training.cost import GIGABYTE, USUAL_GPU, estimate_memory
+from vjepa2_ac.training.flops import clip_flops, frame_flops
 
 RELEASED = "checkpoints/vjepa2-ac-vitg.pt"
 SCRATCH_ENCODER = "checkpoints/vjepa2.1-vitb-384.pt"

@@ -1,4 +1,4 @@
-"""The data sets of a run: opened, and refused where clips of both cannot be in one batch, or where a run had others."""
+"""Open the training and replay data sets; check that their clips can share a batch and match earlier starts."""
 
 from __future__ import annotations
 

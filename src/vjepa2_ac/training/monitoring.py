@@ -7,7 +7,7 @@ data_wait_share     share of the step's wall time spent waiting for the loader; 
                     since it computes queued work while the host waits
 samples_per_second  clips, of all processes
 tokens_per_second   patch tokens of the frames of these clips
-mfu                 model FLOPs per second (`training.cost.flops`) over the ceiling: the rate of this device in a large
+mfu                 model FLOPs per second (`training.flops`) over the ceiling: the rate of this device in a large
                     matrix product in the run's precision, measured for a fraction of a second at the start. NaN (null)
                     above 1: other programs used the device during that measurement, so the ceiling is not usable
 ceiling_tflops      this ceiling in 10^12 FLOPs per second, of all processes
@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from accelerate import Accelerator
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.loader import prefetch_next
@@ -37,7 +37,7 @@ from vjepa2_ac.distributed import PRECISIONS, matmul_speed
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, read_metrics_log
-from vjepa2_ac.training.cost.flops import clip_flops
+from vjepa2_ac.training.flops import clip_flops
 
 if TYPE_CHECKING:
     from vjepa2_ac.runs.trackers import Trackers
@@ -208,17 +208,10 @@ class Throughput:
     device: torch.device
 
     @classmethod
-    def of(cls, config: Config, sizes: ModelSizes, device: torch.device, processes: int) -> Throughput:
-        """Measure the ceiling, once per device, precision and program.
-
-        Args:
-            config: The run; the encoder's work counts unless latents are cached.
-            sizes: Of its model.
-            device: Of this process.
-            processes: Of the run.
-        """
-        tokens = config.data.frames * sizes.tokens_per_frame
-        ceiling = processes * matmul_speed(device, PRECISIONS[config.training.precision])
+    def of(cls, config: Config, sizes: ModelSizes, accelerator: Accelerator) -> Throughput:
+        """Measure the ceiling, once per device, precision and program; the encoder counts unless latents are cached."""
+        tokens, device = config.data.frames * sizes.tokens_per_frame, accelerator.device
+        ceiling = accelerator.num_processes * matmul_speed(device, PRECISIONS[config.training.precision])
         flops = clip_flops(config, sizes)
         return cls(flops.predictor if config.data.takes_latents else flops.total, tokens, ceiling, device)
 
@@ -243,25 +236,6 @@ class Throughput:
             "ceiling_tflops": self.ceiling / 1e12,
             "memory_gb": peak_bytes / 1e9,
         }
-
-
-class Update:
-    """Measures how far an optimizer step moves the weights. Keeps a copy of them until it is read.
-
-    Args:
-        parameters: Those of the optimizer, before the step.
-    """
-
-    def __init__(self, parameters: Iterable[Tensor]) -> None:
-        self._parameters = list(parameters)
-        self._before = [parameter.detach().clone() for parameter in self._parameters]
-
-    def to_weight(self) -> float:
-        """Return the norm of the update over that of the weights before it, of all tensors together; read it once."""
-        weight = float(torch.nn.utils.get_total_norm(self._before))
-        for before, parameter in zip(self._before, self._parameters, strict=True):
-            before -= parameter.detach()  # in the copy's own memory
-        return float(torch.nn.utils.get_total_norm(self._before)) / weight if weight else math.nan
 
 
 def _number(metrics: Mapping[str, Any], key: str) -> float:

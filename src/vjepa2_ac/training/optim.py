@@ -12,6 +12,8 @@ from torch import nn
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import require_library
 
+_BETAS = (0.9, 0.999)
+
 
 def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, object]]:
     """Split the trained parameters into matrices, which decay, and biases and norms, which do not.
@@ -36,9 +38,9 @@ def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.O
     """
     groups = parameter_groups(module, training.weight_decay)
     if training.optimizer == "adamw_8bit":
-        return _adamw_8bit()(groups, lr=training.learning_rate, betas=training.betas)  # type: ignore[no-any-return]
+        return _adamw_8bit()(groups, lr=training.learning_rate, betas=_BETAS)  # type: ignore[no-any-return]
     fused = True if _are_on_cuda(trained_parameters(module)) else None
-    return torch.optim.AdamW(groups, lr=training.learning_rate, betas=training.betas, fused=fused)
+    return torch.optim.AdamW(groups, lr=training.learning_rate, betas=_BETAS, fused=fused)
 
 
 def require_optimizer(training: TrainingConfig) -> None:
@@ -81,20 +83,16 @@ def learning_rate_at(step: int, training: TrainingConfig) -> float:
 
     Source: warmup_stable_decay is facebookresearch/vjepa2 @ c2963a4, src/utils/schedulers.py, WSDSchedule.
     """
-    start, peak, final = training.start_learning_rate, training.learning_rate, training.final_learning_rate
-    if step <= training.warmup_steps:
-        return start + (peak - start) * step / training.warmup_steps
-    if training.schedule == "constant":
-        return peak
-    done = min(1.0, (step - training.warmup_steps) / max(1, training.steps - training.warmup_steps))
+    peak, warmup = training.learning_rate, training.warmup_steps
+    if step <= warmup:
+        return peak * step / warmup
     if training.schedule == "cosine":
-        return final + (peak - final) * 0.5 * (1.0 + math.cos(math.pi * done))
-    if training.schedule == "linear":
-        return peak + (final - peak) * done
+        done = (step - warmup) / max(1, training.steps - warmup)
+        return peak * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
     first_decay = training.steps - training.decay_steps
-    if step <= first_decay:
+    if step <= first_decay or not training.decay_steps:
         return peak
-    return peak + (final - peak) * min(1.0, (step - first_decay) / training.decay_steps)
+    return peak - peak * min(1.0, (step - first_decay) / training.decay_steps)
 
 
 def describe_changed_rate(step: int, before: TrainingConfig, now: TrainingConfig) -> str:
@@ -109,9 +107,9 @@ def describe_changed_rate(step: int, before: TrainingConfig, now: TrainingConfig
         return ""
     return (
         f"The learning rate continues at {rate:.1e} (it had reached {learning_rate_at(step, before):.2g} at step"
-        f" {step:,}). Alternatives: training.learning_rate=RATE with training.schedule=constant, or with"
-        " training.schedule=warmup_stable_decay and training.decay_steps=N; or a new run, whose model.base is the"
-        " folder that `vjepa2-ac export` writes"
+        f" {step:,}). Alternatives: training.learning_rate=RATE with training.schedule=warmup_stable_decay, and"
+        " training.decay_steps=N for a decay at the end; or a new run, whose model.base is the folder that"
+        " `vjepa2-ac export` writes"
     )
 
 

@@ -1,39 +1,37 @@
-"""The optimizer step: gradients of micro-batches accumulated and clipped, weights updated, or the step refused.
-
-Clips whose loss or gradient is not finite are saved for inspection in RUN/not_finite/step-XXXXXXXX. Each process saves
-its own: an npz per clip (frames, or the latents of a cache as float32; states, actions, episode_id, start), and its
-frames side by side as a PNG.
-"""
+"""One optimizer step: losses, gradients accumulated over micro-batches and processes, clipping, update."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import smooth_l1_loss
 
+from vjepa2_ac.config import TrainingConfig
+from vjepa2_ac.config.section import Positive, Section
 from vjepa2_ac.data.loader import prefetch_next
-from vjepa2_ac.data.sources.latents.cache_files import unpack_latents
 from vjepa2_ac.distributed import all_gather_object, all_reduce_gradients, all_reduce_sum, raise_first
-from vjepa2_ac.episode import Batch, StoredLatents
+from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError, UserError
+from vjepa2_ac.model.distances import absolute_difference
+from vjepa2_ac.model.network.predictor_network import KeyValueCache, LatentDynamics
+from vjepa2_ac.registry import LOSSES
 from vjepa2_ac.runs.checkpoint import checkpoint_name
 from vjepa2_ac.runs.folder import NOT_FINITE
-from vjepa2_ac.storage import atomic_writer, is_url, write_atomically
-from vjepa2_ac.training.monitoring import Update
+from vjepa2_ac.storage import is_url
+from vjepa2_ac.training.not_finite import ClipRecorder
 from vjepa2_ac.training.optim import learning_rate_at
-from vjepa2_ac.training.setup import Run, encode
+from vjepa2_ac.training.run import Run
+
+Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, element by element
 
 SMALLEST_LOSS_SCALE = 1.0  # fp16: if gradients still overflow, they are not finite for another reason
-MOST_CLIPS = 16  # that are saved
-MOST_BYTES = 512 * 10**6  # of frames, held until the gradients are known to be finite
 
 
 @dataclass(frozen=True)
@@ -63,32 +61,32 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     learning_rate = learning_rate_at(step, run.config.training)
     for group in run.optimizer.param_groups:
         group["lr"] = learning_rate
-    taken = gradients(run, batches, ClipRecorder(), more=step < run.config.training.steps)
+    computed = gradients(run, batches, ClipRecorder(), more=step < run.config.training.steps)
     update = Update(run.trained) if measure_update else None
-    if taken.clips:  # without a clip there are no gradients, and nothing moves
+    if computed.clips:  # without a clip there are no gradients, and nothing moves
         run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
         run.scaler.update()
     run.optimizer.zero_grad(set_to_none=True)
     metrics = {
-        "loss": taken.forced_loss + taken.rollout_loss,
-        "loss_teacher_forcing": taken.forced_loss,
-        "loss_rollout": taken.rollout_loss,
-        "grad_norm": taken.norm,
+        "loss": computed.forced_loss + computed.rollout_loss,
+        "loss_teacher_forcing": computed.forced_loss,
+        "loss_rollout": computed.rollout_loss,
+        "grad_norm": computed.norm,
         "learning_rate": learning_rate,
     }
     if update is not None:
         metrics["update_to_weight"] = update.to_weight()
     if any(data.broken_episodes == "skip" for data in run.config.data_sets):
-        metrics["clips_left_out"] = float(run.clips_per_step - taken.clips)
+        metrics["clips_left_out"] = float(run.clips_per_step - computed.clips)
     if any(is_url(data.path) for data in run.config.data_sets):
-        metrics["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
+        metrics["bytes_per_clip"] = computed.bytes_fetched / max(1, computed.clips)
     if run.scaler.is_enabled():
         metrics["loss_scale"] = run.scaler.get_scale()
     return metrics
 
 
 def gradients(
-    run: Run, batches: Iterator[Batch], look_back: ClipRecorder | None = None, *, more: bool = False
+    run: Run, batches: Iterator[Batch], recorder: ClipRecorder | None = None, *, more: bool = False
 ) -> Gradients:
     """Accumulate and clip the gradients of the next micro-batches of all processes; the weights do not move.
 
@@ -98,7 +96,7 @@ def gradients(
     Args:
         run: The run.
         batches: Source of its micro-batches.
-        look_back: Saves clips into the run's folder if a loss or gradient is not finite; None: nothing is written.
+        recorder: Saves clips into the run's folder if a loss or gradient is not finite; None: nothing is written.
         more: Whether another step follows, whose first micro-batch is fetched while the device is computing.
 
     Raises:
@@ -110,28 +108,28 @@ def gradients(
     totals, names, fetched, error = torch.zeros(2), list[str](), 0, None
     try:
         with run.cast_matrices.current():
-            totals, names, fetched = _accumulate(run, batches, look_back)
+            totals, names, fetched = _accumulate(run, batches, recorder)
         if more:
             prefetch_next(batches)
-    except UserError as own:
-        error = own
-    own_part = [*totals.tolist(), len(names), fetched, error is not None]  # waits for the device
-    *losses, clips, bytes_fetched, failed = all_reduce_sum(run.accelerator, own_part)
+    except UserError as raised:
+        error = raised
+    sums = [*totals.tolist(), len(names), fetched, error is not None]  # waits for the device
+    *losses, clips, bytes_fetched, failed = all_reduce_sum(run.accelerator, sums)
     if failed:
         raise_first(run.accelerator, error)
     expected = run.clips_per_step
     if clips < expected:
-        _tell_of_broken_episodes(run)
+        _share_broken_episodes(run)
     if not clips:
         return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(bytes_fetched))
     forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
     norm = _finish_gradients(run, factor=expected / clips)
-    _refuse_not_finite(run, forced_loss + rollout_loss, norm, names, look_back)
+    _refuse_not_finite(run, forced_loss + rollout_loss, norm, names, recorder)
     return Gradients(forced_loss, rollout_loss, norm, int(clips), int(bytes_fetched))
 
 
 def _accumulate(
-    run: Run, batches: Iterator[Batch], look_back: ClipRecorder | None
+    run: Run, batches: Iterator[Batch], recorder: ClipRecorder | None
 ) -> tuple[Float[Tensor, 2], list[str], int]:
     """Return this process's part of both losses, the names of its clips, and the bytes fetched for them."""
     totals, names, fetched = torch.zeros(2, device=run.accelerator.device), list[str](), 0
@@ -142,23 +140,88 @@ def _accumulate(
             continue
         names += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
         parts = run.clips_per_step / len(batch.starts)
-        losses = run.micro_step(encode(run, batch), parts)
+        losses = run.micro_step(run, encode(run, batch), parts)
         totals += losses / parts
-        if look_back is not None:
-            look_back.add(batch, losses.sum())
+        if recorder is not None:
+            recorder.add(batch, losses.sum())
     return totals, names, fetched
 
 
-def _tell_of_broken_episodes(run: Run) -> None:
-    """Let each process count the broken episodes of all of them: the allowed share is that of the run.
+def encode(run: Run, batch: Batch) -> LatentBatch:
+    """Return the latents of a batch on the run's device, in its precision."""
+    with run.accelerator.autocast():
+        return encode_batch(run.world_model, batch, device=run.accelerator.device, chunk=run.config.model.encode_chunk)
+
+
+def micro_step(run: Run, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:
+    """Return (teacher forcing, rollout), each a mean over these clips; add the gradient of their sum over `parts`."""
+    with run.accelerator.autocast():
+        forced, rollout = run.objective(latents)
+    run.scaler.scale((forced + rollout) / parts).backward()  # type: ignore[no-untyped-call]  # torch
+    return torch.stack([forced.detach(), rollout.detach()])
+
+
+class Objective:
+    """The loss of a world model on latents: `prediction_losses` by the config."""
+
+    def __init__(self, world_model: LatentDynamics, training: TrainingConfig) -> None:
+        self.world_model, self.rollout_steps = world_model, training.rollout_steps
+        self.distance: Distance = LOSSES.make(training.loss.name, training.loss.options)
+
+    def __call__(self, batch: LatentBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+        """Return (teacher forcing, rollout); the loss is their sum."""
+        return prediction_losses(self.world_model, batch, self.rollout_steps, self.distance)
+
+
+def prediction_losses(
+    world_model: LatentDynamics, batch: LatentBatch, rollout_steps: int, distance: Distance = absolute_difference
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Return (teacher forcing, rollout) of one batch, each a mean over all elements.
+
+    Teacher forcing predicts frames 2..T from the true frames 1..T-1. The rollout starts at frame 1; its first
+    prediction is the teacher-forced one, each further one is made from the predictions before it. States and actions
+    are the true ones throughout. The rollout reuses the keys and values that teacher forcing computed for the first
+    step. Loss and gradient equal those of recomputing everything. With dropout both parts share the masks of the first
+    step, which changes the expectation of neither.
 
     Raises:
-        InputError: There are too many; in all processes.
+        ValueError: A rollout longer than the clip.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/train.py, forward_predictions and loss_fn.
     """
-    for dataset in run.datasets:
-        for reasons in all_gather_object(run.accelerator, dataset.broken.reasons):
-            for name, reason in reasons.items():
-                dataset.broken.met(name, reason)
+    latents, actions, states, extrinsics = batch.latents, batch.actions, batch.states, batch.extrinsics
+    if rollout_steps >= latents.shape[1]:
+        raise ValueError(f"a rollout of {rollout_steps} steps needs {rollout_steps + 1} frames, got {latents.shape[1]}")
+    states = states[:, :-1]
+    extrinsics = None if extrinsics is None else extrinsics[:, :-1]
+    cache = KeyValueCache() if rollout_steps > 1 else None
+    forced = world_model.predict(latents[:, :-1], actions, states, extrinsics, cache, keep=1)
+    rolled = forced[:, :1]
+    if rollout_steps > 1:
+        rest = slice(1, rollout_steps)
+        camera = None if extrinsics is None else extrinsics[:, rest]
+        further = world_model.rollout(rolled, actions[:, rest], states[:, rest], camera, cache)
+        rolled = torch.cat([rolled, further], dim=1)
+    return distance(forced, latents[:, 1:]).mean(), distance(rolled, latents[:, 1 : rollout_steps + 1]).mean()
+
+
+class SmoothL1:
+    """The loss d**2 / (2 * beta) of a difference d below beta, and d - beta / 2 above."""
+
+    class Config(Section):
+        """Options of the loss smooth_l1."""
+
+        beta: Positive = 1.0
+        """The difference below which the loss is squared."""
+
+    def __init__(self, options: Config) -> None:
+        self.beta = options.beta
+
+    def __call__(
+        self, predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"]
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return the loss of each element, computed in float32."""
+        return smooth_l1_loss(predicted.float(), true.float(), reduction="none", beta=self.beta)
 
 
 def _finish_gradients(run: Run, factor: float) -> float:
@@ -170,8 +233,33 @@ def _finish_gradients(run: Run, factor: float) -> float:
             if parameter.grad is not None:
                 parameter.grad *= factor
     limit = run.config.training.max_grad_norm
-    norm = nn.utils.clip_grad_norm_(run.trained, math.inf if limit is None else limit)
-    return float(norm)
+    return float(nn.utils.clip_grad_norm_(run.trained, math.inf if limit is None else limit))
+
+
+def _share_broken_episodes(run: Run) -> None:
+    """Let each process count the broken episodes of all of them: the allowed share is that of the run.
+
+    Raises:
+        InputError: There are too many; in all processes.
+    """
+    for dataset in run.datasets:
+        for reasons in all_gather_object(run.accelerator, dataset.broken.reasons):
+            for name, reason in reasons.items():
+                dataset.broken.met(name, reason)
+
+
+def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str], recorder: ClipRecorder | None) -> None:
+    overflow = run.scaler.is_enabled() and run.scaler.get_scale() >= SMALLEST_LOSS_SCALE
+    if math.isfinite(loss) and (math.isfinite(norm) or overflow):
+        return
+    saved = ""
+    if recorder is not None:
+        folder = run.folder / NOT_FINITE / checkpoint_name(run.state.step + 1)
+        saved = f" ({recorder.save(folder, run.accelerator.process_index)})"
+    fp16 = ", or set training.precision to bf16 or fp32" if run.scaler.is_enabled() else ""
+    found = f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}"
+    fix = f"The weights have not moved. Look at these clips{saved}, or lower training.learning_rate{fp16}"
+    raise InputError(where="training", found=found, fix=fix)
 
 
 def step_seed(seed: int, step: int, rank: int) -> int:
@@ -180,73 +268,20 @@ def step_seed(seed: int, step: int, rank: int) -> int:
     return int.from_bytes(digest, "big") >> 1
 
 
-def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str], look_back: ClipRecorder | None) -> None:
-    overflow = run.scaler.is_enabled() and run.scaler.get_scale() >= SMALLEST_LOSS_SCALE
-    if math.isfinite(loss) and (math.isfinite(norm) or overflow):
-        return
-    saved = ""
-    if look_back is not None:
-        folder = Path(run.config.run_dir) / NOT_FINITE / checkpoint_name(run.state.step + 1)
-        saved = f" ({look_back.save(folder, run.accelerator.process_index)})"
-    fp16 = ", or set training.precision to bf16 or fp32" if run.scaler.is_enabled() else ""
-    found = f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}"
-    fix = f"The weights have not moved. Look at these clips{saved}, or lower training.learning_rate{fp16}"
-    raise InputError(where="training", found=found, fix=fix)
+class Update:
+    """Measures how far an optimizer step moves the weights. Keeps a copy of them until it is read.
 
+    Args:
+        parameters: Those of the optimizer, before the step.
+    """
 
-class ClipRecorder:
-    """The micro-batches of a step, until it is known whether its gradients are finite."""
+    def __init__(self, parameters: Iterable[Tensor]) -> None:
+        self._parameters = list(parameters)
+        self._before = [parameter.detach().clone() for parameter in self._parameters]
 
-    def __init__(self) -> None:
-        self._kept: list[tuple[Batch, Tensor]] = []
-        self._bytes = 0
-
-    def add(self, batch: Batch, loss: Float[Tensor, ""]) -> None:
-        """Store a micro-batch and its loss, unless too much is stored already. Does not wait for the loss."""
-        self._bytes += batch.nbytes
-        if self._bytes <= MOST_BYTES:
-            self._kept.append((batch, loss.detach()))
-
-    def save(self, folder: Path, process: int) -> str:
-        """Write some clips, those with numbers that are not finite first; return where they are, or what failed.
-
-        Nothing is raised: the error that is being reported is more important.
-
-        Args:
-            folder: RUN/not_finite/step-XXXXXXXX.
-            process: The process of the clips.
-        """
-        clips = [(batch, row, loss) for batch, loss in self._kept for row in range(len(batch.starts))]
-        clips.sort(key=lambda clip: (_is_finite(*clip[:2]), bool(torch.isfinite(clip[2]))))
-        from vjepa2_ac.media.images import encode_png
-
-        try:
-            for number, (batch, row, _) in enumerate(clips[:MOST_CLIPS]):
-                path = folder / f"process{process}-clip{number:02d}.npz"
-                with atomic_writer(path) as file:
-                    np.savez_compressed(file, **_arrays(batch, row))
-                if batch.frames is not None:
-                    strip = np.concatenate(batch.frames[row].numpy(), axis=1)
-                    write_atomically(path.with_suffix(".png"), encode_png(strip))
-        except Exception as error:  # a full disk, no permission
-            return f"they could not all be saved in {folder}: {type(error).__name__}: {error}"
-        return f"{min(len(clips), MOST_CLIPS)} of them are saved in {folder}"
-
-
-def _is_finite(batch: Batch, row: int) -> bool:
-    return bool(batch.states[row].isfinite().all() and batch.actions[row].isfinite().all())
-
-
-def _arrays(batch: Batch, row: int) -> dict[str, Any]:
-    arrays: dict[str, Any] = {
-        "states": batch.states[row].numpy(),
-        "actions": batch.actions[row].numpy(),
-        "episode_id": np.array(batch.episode_ids[row]),
-        "start": np.array(batch.starts[row]),
-    }
-    if batch.frames is not None:
-        return {"frames": batch.frames[row].numpy(), **arrays}
-    if batch.latents is None:
-        raise ValueError("a batch with neither frames nor latents")
-    scales = None if batch.latents.scales is None else batch.latents.scales[row]
-    return {"latents": unpack_latents(StoredLatents(batch.latents.values[row], scales)).numpy(), **arrays}
+    def to_weight(self) -> float:
+        """Return the norm of the update over that of the weights before it, of all tensors together; read it once."""
+        weight = float(torch.nn.utils.get_total_norm(self._before))
+        for before, parameter in zip(self._before, self._parameters, strict=True):
+            before -= parameter.detach()  # in the copy's own memory
+        return float(torch.nn.utils.get_total_norm(self._before)) / weight if weight else math.nan

@@ -11,7 +11,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed import broadcast_object, gathered, own_part, sharing
-from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart, gathered_starts, moves_of, rank_actions
 from vjepa2_ac.evaluation.estimates import cost_of_actions, one_step_over_persistence, over_persistence
@@ -21,15 +21,17 @@ from vjepa2_ac.evaluation.result import Validation
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.training.setup import Run, encode
+from vjepa2_ac.training.run import Run
+from vjepa2_ac.training.step import encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
 RANK = "action_ranking_error"  # checkpoint.keep_best ranking
 USED = 0.02  # share of error that wrong actions cost a model that uses them, at least
+RANKING_REACH_CM = 7.5  # half the width of the box of other actions: as far as plans should move in a model step
 _AT_ONCE = 64  # samples per batch: as many tokens as the clips of a small micro-batch
-_NOT_ASKED = (
-    "Base against persistence: skipped; needs trained input heads, found fresh ones (the data have other widths than"
-    " the base)."
+_BASE_NOT_CHECKED = (
+    "Base compared with persistence: skipped; needs trained input layers, found new ones (the data have other widths"
+    " than the base)."
 )
 
 
@@ -42,7 +44,7 @@ def validate_if_due(run: Run, metrics_log: MetricsLog | None, reporter: Reporter
     is_first = step - config.validation.every < max(1, config.training.warmup_steps) <= step
     if (is_first or step == config.training.steps) and (said := unused_actions(found)):
         reporter.note(said)
-    return record(run, validation_metrics(found), metrics_log)
+    return record(run, found, metrics_log)
 
 
 def unused_actions(found: Validation) -> str:
@@ -57,8 +59,9 @@ def unused_actions(found: Validation) -> str:
     )
 
 
-def record(run: Run, metrics: dict[str, Any], metrics_log: MetricsLog | None) -> bool:
-    """Log a validation's metrics; return whether it is the best so far, by `checkpoint.keep_best`."""
+def record(run: Run, found: Validation, metrics_log: MetricsLog | None) -> bool:
+    """Log a validation; return whether it is the best so far, by `checkpoint.keep_best`."""
+    metrics = validation_metrics(found)
     if metrics_log is not None:
         metrics_log.write("validation", run.state.step, metrics)
         if run.strip is not None:
@@ -119,11 +122,10 @@ def _measured(run: Run) -> Validation:
     own = own_part(len(windows), run.config.validation.batch_size)
     read = partial(batches_of, run.dataset, batch_size=run.config.validation.batch_size, may_be_none=True)
     batches, moves = read(windows[own.start : own.stop]), list[RolloutStart]()
-    encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)
     names = [(run.dataset.table.identity(episode), start) for episode, start in windows]
     chosen = {names[place] for place in spread(len(names), run.config.validation.ranking_clips or 0)}
-    kept = _moves_kept(run, encoded, chosen, moves)
-    errors = prediction_errors(run.world_model, kept, before=actions_before(own, windows, read))
+    encoded = _encoded(run, batches, chosen, moves)
+    errors = prediction_errors(run.world_model, encoded, before=actions_before(own, windows, read))
     for name, reason in gathered(list(run.dataset.broken.reasons.items())):
         run.dataset.broken.met(name, reason)
     config, space = run.config.validation, run.dataset.spaces.action
@@ -131,23 +133,25 @@ def _measured(run: Run) -> Validation:
     missing = len(chosen) - len({(move.episode_id, move.first_step) for move in moves})
     others = [window for window, name in zip(windows, names, strict=True) if name not in chosen] if missing else []
     for batch in islice(batches_of(run.dataset, others, batch_size=1, may_be_none=True), missing):
-        moves += moves_of(encode(run, batch), 0, space, config.ranking_reach_cm / 100)
+        moves += moves_of(encode(run, batch), 0, space, RANKING_REACH_CM / 100)
     if not moves:
         return Validation(errors, None)
-    probes = ProbeOptions(samples=config.ranking_samples, reach_cm=config.ranking_reach_cm, at_once=_AT_ONCE)
+    probes = ProbeOptions(samples=config.ranking_samples, reach_cm=RANKING_REACH_CM, at_once=_AT_ONCE)
     return Validation(errors, rank_actions(run.world_model, moves, space, probes, seed=0))
 
 
-def _moves_kept(
-    run: Run, batches: Iterable[LatentBatch], chosen: Container[tuple[str, int]], moves: list[RolloutStart]
+def _encoded(
+    run: Run, batches: Iterable[Batch], chosen: Container[tuple[str, int]], moves: list[RolloutStart]
 ) -> Iterator[LatentBatch]:
-    """Yield batches, and append the moves of the clips that are chosen for the ranking."""
-    config, space = run.config.validation, run.dataset.spaces.action
+    """Yield the latents of batches, and append the moves of the clips that are chosen for the ranking."""
     for batch in batches:
-        for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
+        latents = encode(run, batch)
+        if run.strip is not None:
+            run.strip.seen(run.dataset, batch, latents)
+        for row, name in enumerate(zip(latents.episode_ids, latents.starts, strict=True)):
             if name in chosen:
-                moves += moves_of(batch, row, space, config.ranking_reach_cm / 100)
-        yield batch
+                moves += moves_of(latents, row, run.dataset.spaces.action, RANKING_REACH_CM / 100)
+        yield latents
 
 
 def validate_base(run: Run, reporter: Reporter) -> Validation | None:
@@ -166,7 +170,7 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
     if error < 1.0 or config.training.allow_weak_base or config.model.is_random:
         return found
     if run.world_model.fresh_heads is not None:
-        reporter.note(_NOT_ASKED)
+        reporter.note(_BASE_NOT_CHECKED)
         return found
     said = f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame"
     needed = "a base model that is better than persistence (below 1)"

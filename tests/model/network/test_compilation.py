@@ -14,7 +14,7 @@ from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network import compilation
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.training.loss import prediction_losses
+from vjepa2_ac.training.step import prediction_losses
 
 pytestmark = [pytest.mark.usefixtures("traced"), *tracing]
 

@@ -20,7 +20,7 @@ from vjepa2_ac.errors import counted
 
 if TYPE_CHECKING:
     from vjepa2_ac.model.model_files import Published
-    from vjepa2_ac.training.cost.memory import MemoryEstimate
+    from vjepa2_ac.training.cost import MemoryEstimate
 
 _MILLION, _GIGABYTE = 10**6, 10**9
 _LEAST_SHOWN = 500_000  # bytes: less would be shown as 0.000 GB

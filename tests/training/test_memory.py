@@ -14,7 +14,7 @@ from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelSizes, Repla
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.model.adapter.lora import trainable_report
 from vjepa2_ac.model.network.predictor_network import KeyValueCache
-from vjepa2_ac.training.cost.memory import USUAL_GPU, count_parameters, estimate_memory, ways_to_fit
+from vjepa2_ac.training.cost import USUAL_GPU, count_parameters, estimate_memory, ways_to_fit
 from vjepa2_ac.training.optim import make_optimizer
 
 

@@ -1,8 +1,7 @@
-"""The film strip of a validation: what base and model imagine of one held-out clip, beside what happened.
+"""The image strip of a validation: the frames that base and model predict for one held-out clip, and the true ones.
 
-It is always the same clip: of the validation's (with several processes, of the first one's part), the one with the
-most motion. Nothing that fails here ends a run: a
-strip is left out, and a warning says why.
+A hook of training (`validation.decoder`). The clip is always the same: the validation clip with the most motion (with
+several processes: of rank 0's clips). Nothing that fails here ends a run: the strip is left out with a warning.
 """
 
 from __future__ import annotations
@@ -15,9 +14,10 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, frames_of
 from vjepa2_ac.data.transforms import frames_as_seen
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown, strip_of
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.media.film import draw_strip
@@ -34,29 +34,38 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 
 class ImaginedStrip:
-    """Finds the clip among those of the validations of this process, and draws it at each.
+    """Chooses the clip among those of the first validation of this process, and draws it at each validation.
 
     Args:
-        decoder: Of the run's encoder.
-        dataset: Of the run.
-        size: Height and width of the encoder's input.
+        config: The run, whose decoder is loaded.
+
+    Raises:
+        InputError: `validation.decoder` is no decoder.
     """
 
-    def __init__(self, decoder: TrainedDecoder, dataset: Dataset, size: int) -> None:
-        self._decoder, self._dataset, self._size = decoder, dataset, size
+    def __init__(self, config: Config) -> None:
+        self._decoder: TrainedDecoder = load_decoder(str(config.validation.decoder), where="validation.decoder:")
         self._most = -1.0  # motion of a clip
         self._clip: tuple[Batch, int, LatentBatch] | None = None  # its row in a batch; its latents and states alone
         self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # what happened; read once
 
-    def seen(self, batch: Batch, encoded: LatentBatch) -> LatentBatch:
-        """Return the latents of a batch of validation clips, after looking for the clip with the most motion."""
+    def require_fit(self, world_model: WorldModel, config: Config) -> None:
+        """Refuse a decoder of another encoder or camera.
+
+        Raises:
+            InputError: Names both.
+        """
+        self._decoder.require_fit(world_model, config.data, subject=config.model.base)
+
+    def seen(self, dataset: Dataset, batch: Batch, encoded: LatentBatch) -> None:
+        """Look for the clip with the most motion in a batch of validation clips and its latents."""
+        self._dataset = dataset
         for row, states in enumerate(encoded.states.double().cpu().numpy()):
-            motion = self._dataset.spaces.state.path_length(states)
+            motion = dataset.spaces.state.path_length(states)
             if motion > self._most:
                 clip = encoded.clip(row)
                 own = replace(clip, latents=clip.latents.detach().float().cpu().clone())  # or all clips would stay
                 self._most, self._clip = motion, (replace(batch, latents=None, on_device=None), row, own)
-        return encoded
 
     def draw(self, world_model: WorldModel, device: torch.device, run: Path, step: int) -> Image | None:
         """Write RUN/imagined/step-XXXXXXXX.png; return the image, None if none was drawn."""
@@ -65,7 +74,7 @@ class ImaginedStrip:
             (run / IMAGINED).mkdir(exist_ok=True)
             write_atomically(run / IMAGINED / f"{checkpoint_name(step)}.png", encode_png(image))
         except Exception as error:  # an image is not worth a run
-            logger.warning("What the model imagines at step %d could not be drawn: %s", step, error)
+            logger.warning("The predictions at step %d could not be drawn: %s", step, error)
             return None
         return image
 
@@ -80,7 +89,7 @@ class ImaginedStrip:
             raise ValueError("no clip was seen")
         batch, row, clip = self._clip
         if self._frames is None:
-            self._frames = frames_as_seen(frames_of(self._dataset, batch, row), self._size)
+            self._frames = frames_as_seen(frames_of(self._dataset, batch, row), world_model.image_size)
         decoder, latents = self._decoder.to(device).decoder, clip.latents.to(device)
         actions, states = (values[0].double().cpu().numpy() for values in (clip.actions, clip.states))
         start = Start.of(replace(clip, latents=latents), self._dataset.spaces.state)

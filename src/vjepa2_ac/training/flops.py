@@ -1,12 +1,11 @@
-"""FLOPs of one clip or one plan, by formula: counting them on fake tensors takes seconds, at the start of every run.
+"""Model FLOPs of one clip, one plan or one frame, by formula.
 
-Model FLOPs are counted: only what the mathematics requires, once. A matrix product is two operations per pair of
-numbers; forward, backward with respect to inputs wherever a gradient has to pass, and with respect to weights only for
-trained ones. Recomputation (gradient checkpointing, the scores in a fused attention's backward pass) is not counted,
-nor are norms, activations and rotations, which are no matrix products. Attention is counted as block-causal: a token of
-step t attends to the tokens of steps up to t.
-
-Not counted: the norms of weights that DoRA needs.
+PyTorch's counter gives the same numbers on fake tensors, but takes seconds at the start of every run. Only what the
+mathematics requires is counted, once. A matrix product is two operations per pair of numbers; forward, backward with
+respect to inputs wherever a gradient has to pass, and with respect to weights only for trained ones. Not counted:
+recomputation (gradient checkpointing, the scores in a fused attention's backward pass), what is no matrix product
+(norms, activations, rotations), and the norms of weights that DoRA needs. Attention is block-causal: a token of step t
+attends to the tokens of steps up to t.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 from torch import nn
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.training.cost.step import meta_network, meta_predictor
+from vjepa2_ac.training.cost import meta_network, meta_predictor
 
 
 @dataclass(frozen=True)
@@ -45,26 +44,17 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
         config: What is trained, frames and rollout.
         sizes: Sizes of its model, such as `model.checkpoints.base_sizes` gives.
     """
-    passes = _Passes(sizes, config)
-    frames, training = config.data.frames, config.training
-    forced = passes.over(frames - 1, keys=range(1, frames), fed_back=False)
-    fed_back = [  # earlier keys and values are there
-        passes.over(1, keys=range(step, step + 1), fed_back=True)
-        for step in range(2, 1 + (training.rollout_steps if training.rollout_weight else 1))
-    ]
-    total = sum(fed_back, forced)
+    passes, frames = _Passes(sizes, config), config.data.frames
+    total = passes.over(frames - 1, keys=range(1, frames), fed_back=False)
+    for step in range(2, 1 + config.training.rollout_steps):  # earlier keys and values are cached
+        total += passes.over(1, keys=range(step, step + 1), fed_back=True)
     return ClipFlops(frames * frame_flops(sizes), total.forward, total.backward)
 
 
 def plan_flops(sizes: ModelSizes, steps: int) -> int:
-    """Return the operations of predicting the result of one action sequence, without an adapter beside the weights.
-
-    Args:
-        sizes: Of the model.
-        steps: Actions of the sequence.
-    """
-    passes, seen = _Passes(sizes), range(1, 1 + steps)
-    return sum(passes.over(1, keys=range(one, one + 1), fed_back=False).forward for one in seen)
+    """Return the operations of predicting the result of one sequence of actions, without an adapter."""
+    passes = _Passes(sizes)
+    return sum(passes.over(1, keys=range(step, step + 1), fed_back=False).forward for step in range(1, 1 + steps))
 
 
 def frame_flops(sizes: ModelSizes) -> int:

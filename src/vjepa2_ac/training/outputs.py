@@ -1,0 +1,202 @@
+"""The outputs of a run: its folder, metrics log, checkpoints and mirror, and the signals that stop it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from accelerate import Accelerator
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.distributed import agreed, all_reduce_max, broadcast_object, first_only
+from vjepa2_ac.errors import counted
+from vjepa2_ac.process import StoppedError, stop_on_signals
+from vjepa2_ac.registry import TRAINING_HOOKS
+from vjepa2_ac.reporter import Reporter
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, newest_checkpoint, read_state
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, asks_nothing_new, config_changes, read_run_config, write_config
+from vjepa2_ac.runs.metrics_log import MetricsLog
+from vjepa2_ac.runs.open_run import OpenRun, open_run
+from vjepa2_ac.runs.trackers import open_trackers, require_installed
+from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.training.monitoring import WatchedMetricsLog
+from vjepa2_ac.training.optim import describe_changed_rate
+from vjepa2_ac.training.resume import save_checkpoint
+from vjepa2_ac.training.run import Run
+from vjepa2_ac.training.validation import is_done
+
+if TYPE_CHECKING:
+    from vjepa2_ac.runs.mirror import Mirror
+
+SAVE_EVERY_S = 15 * 60.0  # in addition to checkpoint.every
+
+
+class RunOutputs:
+    """What the training loop calls after each step. Only the first process writes; all take part in decisions.
+
+    Args:
+        config: The run.
+        reporter: Receives messages.
+        accelerator: The processes of the run.
+        closing: Closes everything that is opened here.
+        check_only: Nothing is written.
+        allow_config_change: The run in the folder may have another config.
+
+    Raises:
+        InputError: As `open_run`.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        reporter: Reporter,
+        accelerator: Accelerator,
+        closing: contextlib.ExitStack,
+        *,
+        check_only: bool,
+        allow_config_change: bool,
+    ) -> None:
+        self._reporter, self._closing = reporter, closing
+        self.metrics_log: MetricsLog | None = None
+        self._mirror: Mirror | None = None
+        self._stopped_by = 0  # number of a signal
+        self._saved_s, self._saved_step = time.monotonic(), 0
+
+        def open_folder() -> OpenRun:
+            require_installed(config.tracking)
+            opened = open_run(config, reporter, check_only=check_only, allow_config_change=allow_config_change)
+            return closing.enter_context(opened)
+
+        self._opened = first_only(accelerator, open_folder)  # None in other processes
+        self.config = broadcast_object(accelerator, self._opened.config if self._opened else config)
+        has_ended = first_only(accelerator, lambda: not check_only and self._finish_ended())
+        self.has_ended = bool(broadcast_object(accelerator, has_ended))
+
+    def _finish_ended(self) -> bool:
+        """Return whether the run has ended already; then write its config, and send what `checkpoint.remote` lacks."""
+        newest = newest_checkpoint(Path(self.config.run_dir, CHECKPOINTS))
+        if newest is None or not asks_nothing_new(self.config) or not is_done(self.config, state := read_state(newest)):
+            return False
+        write_config(self.config)
+        self._reporter.note(_why_ended(self.config, state))
+        if self._opened is not None and (mirror := self._opened.mirror(state.run_id)) is not None:
+            with mirror:
+                mirror.finish(lambda: False)
+        return True
+
+    def report_changes(self, run: Run) -> None:
+        """Print the settings that differ from those of the last start, and a learning rate that follows from them."""
+        if self._opened is None:
+            return
+        changes = config_changes(run.config)
+        for line in changes:
+            self._reporter.note(f"The config changes: {line}")
+        before = read_run_config(run.folder) if changes else run.config
+        if rate := describe_changed_rate(run.state.step, before.training, run.config.training):
+            self._reporter.note(rate)
+
+    def begin(self, run: Run) -> None:
+        """Open the metrics log, the trackers and the mirror, and listen to signals."""
+        self._run, self._saved_step = run, run.state.step
+        agreed(run.accelerator, self._begin)
+        self._stop = self._closing.enter_context(stop_on_signals())
+
+    def _begin(self) -> None:
+        if self._opened is None:
+            return
+        run, step, run_id = self._run, self._run.state.step, self._run.state.run_id
+        self._opened.begin(run.config, run.state)
+        if run.calibration is not None:
+            write_atomically(run.folder / CALIBRATION, json.dumps(run.calibration, indent=1).encode())
+        measure_coverage = TRAINING_HOOKS.find("coverage")
+        if not (run.folder / CHANGES).exists() and (coverage := measure_coverage(run.dataset)) is not None:
+            write_atomically(run.folder / CHANGES, json.dumps(coverage.noted()).encode())
+        trackers = open_trackers(run.config, run.folder, run_id=run_id, first_step=step)
+        watched = WatchedMetricsLog(run.config, self._reporter, first_step=step, trackers=trackers)
+        self.metrics_log = self._closing.enter_context(watched)
+        if (mirror := self._opened.mirror(run_id)) is not None:
+            self._mirror = self._closing.enter_context(mirror)
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether another step follows."""
+        return not (self._stopped_by or is_done(self._run.config, self._run.state))
+
+    def logs(self, step: int) -> bool:
+        """Return whether a step is written into the metrics log."""
+        training = self._run.config.training
+        return step % training.log_every == 0 or step == training.steps
+
+    def stepped(self, metrics: dict[str, float]) -> None:
+        """Show and log the metrics of the current step."""
+        step = self._run.state.step
+        self._reporter.stepped(step, metrics)
+        if self.metrics_log is not None and self.logs(step):
+            self.metrics_log.write("train", step, metrics)
+
+    def save_if_due(self, *, is_best: bool) -> None:
+        """Save a checkpoint where one is due or a signal came, in which all processes agree, and feed the mirror.
+
+        The signal is read once: one that comes later takes effect at the next step.
+        """
+        run, step = self._run, self._run.state.step
+        is_due = step % run.config.checkpoint.every == 0 or time.monotonic() - self._saved_s >= SAVE_EVERY_S
+        is_due = is_due or is_best or is_done(run.config, run.state)
+        is_due = is_due or (self.metrics_log is not None and self.metrics_log.is_behind)
+        self._stopped_by, due = all_reduce_max(run.accelerator, [self._stop.number, is_due])
+        if due or self._stopped_by:
+            self.save()
+        if self._mirror is not None:
+            self._mirror.tick()
+
+    def save(self) -> None:
+        """Save a checkpoint, after the metrics that lead to it."""
+
+        def write() -> None:
+            with self.metrics_log.before_a_checkpoint() if self.metrics_log else contextlib.nullcontext():
+                save_checkpoint(self._run, self._run.folder)
+
+        agreed(self._run.accelerator, write)
+        self._saved_s, self._saved_step = time.monotonic(), self._run.state.step
+
+    def stops_without_data(self) -> bool:
+        """Return whether a signal has come while the data of a step do not; then save what is not saved."""
+        if not self._stop.number or self._run.accelerator.num_processes > 1:
+            return False
+        self._stopped_by = self._stop.number
+        if self._run.state.step > self._saved_step:
+            self.save()
+        return True
+
+    def finish(self) -> None:
+        """Wait for the mirror.
+
+        Raises:
+            StoppedError: A signal has stopped the run before its last step.
+        """
+        run = self._run
+        has_ended = is_done(run.config, run.state)
+        if has_ended and run.state.step < run.config.training.steps:
+            self._reporter.note(_why_ended(run.config, run.state))
+
+        def send_the_rest() -> None:
+            if self._mirror is not None:
+                self._mirror.finish(lambda: not has_ended or bool(self._stop.number))
+
+        agreed(run.accelerator, send_the_rest)  # all wait: the launcher ends all processes once one has ended
+        if not has_ended:
+            raise StoppedError(run.folder, run.state.step, signal.Signals(self._stopped_by).name)
+
+
+def _why_ended(config: Config, state: RunState) -> str:
+    """Return why training ends at a step."""
+    if state.step >= config.training.steps:
+        return f"Training is finished after {counted(config.training.steps, 'step')} (training.steps)."
+    return (
+        f"Training ends at step {state.step:,}: step {state.best_step:,} is the best, and"
+        f" no better one followed in {counted(config.training.patience or 0, 'validation')} (training.patience)."
+    )

@@ -1,0 +1,160 @@
+"""The losses equal the official ones and their definitions; the rollout reuses the first step of teacher forcing."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from pydantic import ValidationError
+from safetensors.torch import load_file
+from torch import Tensor
+from torch.nn.functional import layer_norm, smooth_l1_loss
+from vjepa2_ac.model.checkpoints.loading import load_official
+
+from paths import GOLDEN
+from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes, TrainingConfig
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.network import predictor_network
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.training.step import Objective, prediction_losses
+
+FRAMES = 7
+LORA = AdapterConfig(rank=4, alpha=8.0, dropout=0.0)
+NONE = AdapterConfig(kind="none")
+
+
+def official(name: str) -> tuple[WorldModel, LatentBatch, dict[str, Any]]:
+    expected = json.loads((GOLDEN / "model" / f"{name}.json").read_text())
+    tensors, config = load_file(GOLDEN / "model" / f"{name}.io.safetensors"), expected["config"]
+    sizes = {
+        "image_size": config["img"], "encoder": {"heads": config["enc_heads"]},
+        "predictor": {"heads": config["p_heads"], "use_extrinsics": bool(config.get("extr"))},
+    }  # fmt: skip
+    latents = tensors["features"].unflatten(1, (expected["frames"], -1))
+    cameras = tensors.get("extrinsics") if config.get("extr") else None
+    batch = LatentBatch(latents, tensors["states"], tensors["actions"], cameras, ("a", "b"), (0, 0))
+    return load_official(GOLDEN / "model" / f"{name}.pt", ModelSizes.model_validate(sizes)), batch, expected
+
+
+@pytest.mark.parametrize("name", ["tiny", "tiny_extrinsics"])
+def test_losses_equal_the_official_code(name: str) -> None:
+    model, batch, expected = official(name)
+    forced, rollout = Objective(model, TrainingConfig(rollout_steps=expected["auto_steps"]))(batch)
+    assert forced.item() == pytest.approx(expected["loss_teacher_forcing"], rel=1e-5)
+    assert rollout.item() == pytest.approx(expected["loss_rollout"], rel=1e-5)
+    assert forced.item() + rollout.item() == pytest.approx(expected["loss"], rel=1e-5)
+
+
+def test_a_rollout_longer_than_the_clip_is_refused() -> None:
+    model, batch, _ = official("tiny")
+    with pytest.raises(ValueError, match="needs 17 frames"):
+        prediction_losses(model, batch, 16)
+
+
+@pytest.mark.parametrize("keys", [{"loss": "l2"}, {"loss": {"name": "smooth_l1", "options": {"beta": 0.25}}}])
+def test_other_distances_equal_pytorch(keys: dict[str, Any]) -> None:
+    model, batch, _ = official("tiny")
+    with torch.no_grad():
+        forced = model.predict(batch.latents[:, :-1], batch.actions, batch.states[:, :-1])
+        found, _ = Objective(model, TrainingConfig.model_validate(keys))(batch)
+    true = batch.latents[:, 1:]
+    expected = smooth_l1_loss(forced, true, beta=0.25) if keys["loss"] != "l2" else (forced - true).square().mean()
+    assert found.item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("keys", "complaint"),
+    [
+        ({"loss": "huber"}, "no loss of this name"),
+        ({"loss": {"name": "l1", "options": {"beta": 0.5}}}, "no options of its own"),
+    ],
+)
+def test_a_loss_that_makes_no_sense_is_refused(keys: dict[str, object], complaint: str) -> None:
+    with pytest.raises(ValidationError, match=complaint):
+        TrainingConfig.model_validate(keys)
+
+
+def trained_model(adapter: AdapterConfig, *, extrinsics: bool = False, checkpointing: bool = False) -> WorldModel:
+    """Return a model whose adapter has an effect."""
+    sizes = ModelSizes(
+        image_size=48,
+        encoder=EncoderSizes(width=24, depth=1, heads=2, mlp_ratio=2.0),
+        predictor=PredictorSizes(width=36, depth=3, heads=3, mlp_ratio=2.0, use_extrinsics=extrinsics),
+    )
+    model = WorldModel.random(sizes, seed=0)
+    add_adapter(model, adapter, seed=0)
+    generator = torch.Generator().manual_seed(2)
+    for value in trained(model):
+        value.data += 0.05 * torch.randn(value.shape, generator=generator)
+    model.set_gradient_checkpointing(checkpointing)
+    return model.train()  # type: ignore[return-value]
+
+
+def trained(model: WorldModel) -> list[Tensor]:
+    return [value for value in model.parameters() if value.requires_grad]
+
+
+def clips(*, extrinsics: bool = False) -> LatentBatch:
+    generator = torch.Generator().manual_seed(1)
+    shapes = [(2, FRAMES, 9, 24), (2, FRAMES, 7), (2, FRAMES - 1, 7), (2, FRAMES, 6)]
+    latents, states, actions, cameras = (torch.randn(*shape, generator=generator) for shape in shapes)
+    return LatentBatch(latents, states, actions, cameras if extrinsics else None, ("a", "b"), (0, 0))
+
+
+def plain_losses(model: WorldModel, batch: LatentBatch, steps: int) -> tuple[Tensor, Tensor]:
+    """Compute the rollout from the first frame on, and everything again for each prediction."""
+
+    def predict(latents: Tensor, time: int) -> Tensor:
+        cameras = None if batch.extrinsics is None else batch.extrinsics[:, :time]
+        return model.predict(latents, batch.actions[:, :time], batch.states[:, :time], cameras)
+
+    seen = batch.latents[:, :1]
+    for time in range(1, steps + 1):
+        seen = torch.cat([seen, predict(seen, time)[:, -1:]], dim=1)
+    forced = predict(batch.latents[:, :-1], FRAMES - 1)
+    pairs = ((forced, batch.latents[:, 1:]), (seen[:, 1:], batch.latents[:, 1 : steps + 1]))
+    return tuple((predicted - true).abs().mean() for predicted, true in pairs)  # type: ignore[return-value]
+
+
+def with_gradients(model: WorldModel, losses: tuple[Tensor, Tensor]) -> list[Tensor]:
+    return [*losses, *torch.autograd.grad(losses[0] + 2.0 * losses[1], trained(model))]
+
+
+@pytest.mark.parametrize("steps", [2, 6])
+@pytest.mark.parametrize(
+    ("adapter", "checkpointing", "extrinsics"), [(LORA, False, True), (LORA, True, False), (NONE, True, True)], ids=str
+)
+def test_losses_and_gradients_equal_those_of_computing_everything_again(
+    monkeypatch: pytest.MonkeyPatch, steps: int, adapter: AdapterConfig, checkpointing: bool, extrinsics: bool
+) -> None:
+    # Float64 throughout: otherwise predictions are normalised in float32.
+    monkeypatch.setattr(predictor_network, "normalise_latents", lambda found: layer_norm(found, found.shape[-1:]))
+    model = trained_model(adapter, extrinsics=extrinsics, checkpointing=checkpointing).double()
+    batch = clips(extrinsics=extrinsics)
+    tensors = {name: value.double() for name, value in vars(batch).items() if isinstance(value, Tensor)}
+    batch = replace(batch, **tensors)
+    distance = lambda predicted, true: (predicted - true).abs()  # noqa: E731
+    found = with_gradients(model, prediction_losses(model, batch, steps, distance))
+    expected = with_gradients(model, plain_losses(model, batch, steps))
+    for one, other in zip(found, expected, strict=True):
+        assert other.any()
+        assert (one - other).norm() <= 1e-12 * other.norm()  # 2e-14 was measured
+
+
+def test_each_further_prediction_costs_one_step() -> None:
+    model, lengths = trained_model(LORA), list[int]()
+    norm = model.base_predictor.blocks[0].norm1
+    norm.register_forward_hook(lambda _module, _inputs, output: lengths.append(output.shape[1] // 11))
+    prediction_losses(model, clips(), 4)
+    assert lengths == [FRAMES - 1, 1, 1, 1]
+
+
+def test_dropout_draws_the_same_mask_for_teacher_forcing_whatever_follows() -> None:
+    model = trained_model(LORA.model_copy(update={"dropout": 0.5}))
+    torch.manual_seed(0)
+    first, _ = prediction_losses(model, clips(), 1)
+    torch.manual_seed(0)
+    forced, _ = prediction_losses(model, clips(), 3)
+    assert torch.equal(first, forced)
