@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import layer_norm, smooth_l1_loss
-from vjepa2_ac.model.checkpoints.loading import load_official
+from vjepa2_ac.model.checkpoints import load_official
 
 from paths import GOLDEN
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes, TrainingConfig
