@@ -10,12 +10,12 @@ from pydantic import ValidationError
 from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import layer_norm, smooth_l1_loss
-from vjepa2_ac.model.checkpoints import load_official
 
 from paths import GOLDEN
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes, TrainingConfig
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.checkpoints import load_official
 from vjepa2_ac.model.network import predictor_network
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.step import Objective, prediction_losses
