@@ -12,7 +12,7 @@ from run_fixtures import MakeConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, measure_decoders, wanted_frames
-from vjepa2_ac.decoding.network import Decoder, DecoderShape, as_images, as_pixels
+from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.encoding.latent_cache import needed_frames
 from vjepa2_ac.episode import no_progress
 from vjepa2_ac.errors import InputError
@@ -27,12 +27,6 @@ def test_the_image_is_the_encoder_input_up_to_rounding() -> None:
     again = input_to_pixels(inputs)
     back = pixels_to_input(again[0].permute(0, 2, 3, 1)[None], 32)
     assert (back - inputs).abs().max() <= 0.5 / (0.224 * 255) * 1.001
-
-
-def test_images_and_pixels_are_inverse() -> None:
-    pixels = torch.arange(256, dtype=torch.uint8).repeat(3, 1).reshape(1, 3, 16, 16)
-    np.testing.assert_array_equal(as_pixels(as_images(pixels)), pixels.permute(0, 2, 3, 1).numpy())
-    assert as_pixels(torch.tensor([-0.5, 1.5, 0.5]).reshape(1, 3, 1, 1)).flatten().tolist() == [0, 255, 128]
 
 
 @pytest.mark.parametrize("crop", ["released", "square"])
@@ -60,8 +54,7 @@ def test_pairs_are_what_the_encoder_saw_and_what_it_gave(
             torch.testing.assert_close(latents, model.encode(inputs)[0, 0], atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("frames", [1, 7, 30, 10_000])
-@pytest.mark.parametrize("split", ["train", "test"])
+@pytest.mark.parametrize(("frames", "split"), [(7, "train"), (30, "test"), (10_000, "train")])
 def test_frames_are_of_the_split_at_most_as_many_as_asked_and_spread(
     make_config: MakeConfig, frames: int, split: str
 ) -> None:

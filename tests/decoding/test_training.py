@@ -21,7 +21,7 @@ from vjepa2_ac.config import DecoderConfig, ModelSizes
 from vjepa2_ac.data.sources.latents.cache_files import LatentFiles
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.decoding import training
-from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, load_decoder, read_card
+from vjepa2_ac.decoding.decoder_folder import CARD, WEIGHTS, load_decoder, read_card
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs
 from vjepa2_ac.decoding.network import as_images
 from vjepa2_ac.decoding.training import DecoderSteps, learning_rate_at, train_decoder
@@ -31,14 +31,13 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.process import EXIT_STATUS, StoppedError
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 
-FINISHED = {CARD, WEIGHTS, LINEAR, "key.json", "metrics.jsonl", ".lock"}
+FINISHED = {CARD, WEIGHTS, "key.json", "metrics.jsonl", ".lock"}
 
 
 def assert_same_decoder(one: Path, other: Path) -> None:
-    for name in (WEIGHTS, LINEAR):
-        first, second = load_file(one / name), load_file(other / name)
-        assert first.keys() == second.keys()
-        assert all(torch.equal(value, second[key]) for key, value in first.items()), name
+    first, second = load_file(one / WEIGHTS), load_file(other / WEIGHTS)
+    assert first.keys() == second.keys()
+    assert all(torch.equal(value, second[key]) for key, value in first.items())
     assert read_card(one).held_out == read_card(other).held_out
     rows = [list(read_metrics_log(folder / "metrics.jsonl")) for folder in (one, other)]
     assert rows[0] == rows[1]
@@ -145,15 +144,14 @@ def test_a_stop_while_frames_are_encoded_keeps_them_and_has_its_status(
     assert_same_decoder(whole_decoder, tmp_path / "decoder")
 
 
-@pytest.mark.parametrize("died_at", [(5, 12, 17), (35,)])
 def test_a_killed_training_resumes_exactly(
-    nursery: Nursery, make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, died_at: tuple[int, ...]
+    nursery: Nursery, make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "config.yaml").write_text(as_yaml(make_decoder()))
     out = tmp_path / "decoder"
     start = ("decoder", str(tmp_path / "config.yaml"))
-    statuses = [nursery.start(*start, folder=str(out), die_at=at).wait() for at in died_at]  # type: ignore[arg-type]
-    assert statuses == [KILLED] * len(died_at)
+    for died_at in (12, 35):  # while frames are encoded, and between checkpoints
+        assert nursery.start(*start, folder=str(out), die_at=died_at).wait() == KILLED  # type: ignore[arg-type]
     assert nursery.start(*start, folder=str(out)).wait() == 0  # type: ignore[arg-type]
     assert_same_decoder(whole_decoder, out)
 
@@ -210,7 +208,7 @@ def test_what_cannot_be_decoded_is_refused_before_the_data_is_opened(
     assert not (tmp_path / "decoder").exists()
 
 
-@pytest.mark.parametrize("sizes", [{"image_size": 28, "patch_size": 14}, {"image_size": 8, "patch_size": 8}])
+@pytest.mark.parametrize("sizes", [{"image_size": 28, "patch_size": 14}])
 def test_a_model_whose_images_no_decoder_makes_is_refused(
     make_decoder: MakeConfig, tmp_path: Path, sizes: dict
 ) -> None:

@@ -22,10 +22,11 @@ from vjepa2_ac.serving.session import (
     Session,
     SessionOptions,
     has_black_bars,
+    waypoints,
     why_not_sent,
 )
 from vjepa2_ac.serving.wire import pack, unpack
-from vjepa2_ac.spaces import POSE, vector_states
+from vjepa2_ac.spaces import POSE, actions_from_states, apply_action, vector_states
 
 CUP = {"cup": (SubGoal(image(50), "cup"),), "two": (SubGoal(image(51), "a", at_most=1), SubGoal(image(52), "b"))}
 
@@ -377,17 +378,6 @@ def test_a_frozen_camera_moves_nothing_once_the_arm_has_moved_and_a_reset_forget
     assert one.counts.decisions == {"planned": 4, "frozen frame": 7}
 
 
-def test_a_black_camera_moves_nothing_and_scores_nothing() -> None:
-    one, black = session(), {"observation/image": np.zeros_like(image(0))}
-    found = ask(one, **request(goal_image=image(100)) | black)
-    assert (found["why"], found["goal"]["index"], found["actions"].any()) == ("uniform frame", 0, np.False_)
-    chunks = np.tile(STATE, (2, 8, 1))
-    assert "frame: an image without contrast" in refused(
-        one, endpoint="score", **request() | black, **{"policy/chunks": chunks}
-    )
-    assert "goal 0: an image without contrast" in refused(one, **request(goal_image=black["observation/image"]))
-
-
 class _OverAfter:
     """A clock that passes every deadline when it was read so many times."""
 
@@ -457,3 +447,24 @@ def test_an_episode_is_counted_once_and_not_for_a_robot_that_leaves() -> None:
     one.begin()
     ask(one, **request(goal_image=image(100)))
     assert one.counts.episodes == 4, "a client may name no episodes"
+
+
+# ---- waypoints ----
+
+NEAR_PI = np.array([0.4, 0.1, 0.3, np.pi - 0.02, 0.1, -1.2, 0.5])
+ACTION = np.array([0.02, -0.01, 0.03, 0.3, -0.2, 0.4, 0.25])
+
+
+@pytest.mark.parametrize("steps", [1, 4, 7])
+def test_they_are_even_and_the_last_one_is_the_target(steps: int) -> None:
+    found = waypoints(NEAR_PI, ACTION, steps)
+    np.testing.assert_array_equal(found[-1], apply_action(NEAR_PI, ACTION))
+    changes = actions_from_states(np.concatenate([NEAR_PI[None], found]))
+    np.testing.assert_allclose(changes, np.broadcast_to(changes[0], changes.shape), atol=1e-9)
+    np.testing.assert_allclose(changes[:, :3].sum(axis=0), ACTION[:3], atol=1e-12)
+
+
+def test_no_action_stays_where_it_is_and_a_gripper_is_between_open_and_closed() -> None:
+    np.testing.assert_allclose(waypoints(NEAR_PI, np.zeros(7), 3), np.tile(NEAR_PI, (3, 1)), atol=1e-12)
+    closing = np.array([0, 0, 0, 0, 0, 0, 1.0])
+    assert waypoints(NEAR_PI, closing, 4)[:, 6].tolist() == [0.75, 1.0, 1.0, 1.0]

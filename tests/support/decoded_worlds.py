@@ -25,7 +25,7 @@ def decoder(*, dim: int = DIM, tokens: int = TOKENS, strength: float = 0.25) -> 
     made.linear.weight.copy_(strength * smooth.T)
     made.linear.bias.zero_()
     card = DecoderCard("vjepa2-ac decoder 1", shape, "an encoder", "released", "fp32", "data", ("camera",), 3, 30, 100)
-    return TrainedDecoder(card, made, made, Path("decoder"))
+    return TrainedDecoder(card, made, Path("decoder"))
 
 
 def clips(batch: LatentBatch, trained: TrainedDecoder, size: int = 4, noise: float = 0.03) -> RepeatableClips:

@@ -12,13 +12,19 @@ from vjepa2_ac.model.network.world_model import WorldModel
 def write_decoder(folder: Path, model: WorldModel, *, encoder: str | None = None) -> Path:
     """Write the folder of a decoder for a model; with another fingerprint, for an encoder of the same size."""
     patch = model.sizes.patch_size
-    shapes = [DecoderShape(size, model.latent_dim, model.image_size // patch, patch) for size in ("tiny", "linear")]
-    decoders = [Decoder(shape) for shape in shapes]
-    for seed, decoder in enumerate(decoders):
-        decoder.initialise(torch.Generator().manual_seed(seed))
+    decoder = Decoder(DecoderShape("tiny", model.latent_dim, model.image_size // patch, patch))
+    decoder.initialise(torch.Generator().manual_seed(0))
     card = DecoderCard(
-        format="vjepa2-ac decoder 1", shape=shapes[0], encoder=encoder or model.encoder_fingerprint(), crop="released",
-        precision="fp32", data="none", cameras=("left",), episodes=1, frames=1, steps=1,
-    )  # fmt: skip
-    save_decoder(folder, card, *(decoder.state_dict() for decoder in decoders))
+        format="vjepa2-ac decoder 1",
+        shape=decoder.shape,
+        encoder=encoder or model.encoder_fingerprint(),
+        crop="released",
+        precision="fp32",
+        data="none",
+        cameras=("left",),
+        episodes=1,
+        frames=1,
+        steps=1,
+    )
+    save_decoder(folder, card, decoder.state_dict())
     return folder

@@ -1,4 +1,4 @@
-"""The folder of a decoder: decoder.json, decoder.safetensors and linear.safetensors. Nothing in it is executed.
+"""The folder of a decoder: decoder.json and decoder.safetensors. Nothing in it is executed.
 
 A decoder belongs to an encoder. The latents of another one would give images, too, but meaningless ones: they are
 refused.
@@ -29,7 +29,7 @@ from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 
 logger = logging.getLogger(__name__)
 
-CARD, WEIGHTS, LINEAR = "decoder.json", "decoder.safetensors", "linear.safetensors"
+CARD, WEIGHTS = "decoder.json", "decoder.safetensors"
 BUILTIN_DECODER = "decoder"  # the folder of a model of the package that holds its decoder
 SIMULATED = "frames of the simulated arm"
 
@@ -58,18 +58,16 @@ class DecoderCard:
 
 @dataclass(frozen=True, eq=False)
 class TrainedDecoder:
-    """A decoder and the linear one beside it, both in eval mode."""
+    """A decoder in eval mode, with its card."""
 
     card: DecoderCard
     decoder: Decoder
-    linear: Decoder
     name: str  # as given
     where: str = "--decoder"  # the option or knob that names it
 
     def to(self, device: torch.device) -> TrainedDecoder:
-        """Move both to a device."""
+        """Move the decoder to a device."""
         self.decoder.to(device)
-        self.linear.to(device)
         return self
 
     def as_dict(self) -> dict[str, str]:
@@ -118,15 +116,14 @@ def _is_same_data(one: str, other: str) -> bool:
     return Path(one).resolve() == Path(other).resolve() or all(are_simulated)
 
 
-def save_decoder(folder: Path, card: DecoderCard, decoder: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
+def save_decoder(folder: Path, card: DecoderCard, weights: Mapping[str, Tensor]) -> None:
     """Write a decoder into a folder, decoder.json last: a folder that has one is complete.
 
     Raises:
         InputError: The folder cannot be written.
     """
     with folder_writer(folder, CARD) as fresh:
-        for name, weights in ((WEIGHTS, decoder), (LINEAR, linear)):
-            save_tensors(weights, fresh / name)
+        save_tensors(weights, fresh / WEIGHTS)
         (fresh / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
 
 
@@ -143,9 +140,9 @@ def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecode
     is_ours = str(name).startswith(BUILTIN)
     folder = ASSETS / str(name).removeprefix(BUILTIN) / BUILTIN_DECODER if is_ours else Path(name)
     card = read_card(folder, where=where)
-    linear_shape = DecoderShape("linear", card.shape.dim, card.shape.grid, card.shape.patch_size)
-    decoder, linear = _filled(card.shape, folder / WEIGHTS), _filled(linear_shape, folder / LINEAR)
-    return TrainedDecoder(card, decoder, linear, str(name), where)
+    decoder = Decoder(card.shape).eval().requires_grad_(False)
+    decoder.load_state_dict(read_tensors(folder / WEIGHTS, decoder.state_dict(), needed=_NEEDED, fix=_FIX))
+    return TrainedDecoder(card, decoder, str(name), where)
 
 
 def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
@@ -162,9 +159,3 @@ def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
         found = f"no {CARD} there"
         raise InputError(where=f"{where} {folder}", found=found, needed=_NEEDED, fix=fix) from None
     return record_of(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)
-
-
-def _filled(shape: DecoderShape, path: Path) -> Decoder:
-    decoder = Decoder(shape).eval().requires_grad_(False)
-    decoder.load_state_dict(read_tensors(path, decoder.state_dict(), needed=_NEEDED, fix=_FIX))
-    return decoder

@@ -122,7 +122,7 @@ def _make(ready: Setup, reporter: Reporter) -> None:
         held_out=found,
         time=utc_now(),
     )
-    save_decoder(ready.folder, card, decoder.state_dict(), linear.state_dict())
+    save_decoder(ready.folder, card, decoder.state_dict())
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,14 +72,6 @@ class Moment:
     reached: bool = True  # whether the arm could do the last action
 
 
-@dataclass(frozen=True, eq=False)
-class _Imagined:
-    """The end of a path, imagined by one model."""
-
-    latents: Float[Tensor, "tokens dim"]
-    cache: KeyValueCache  # of the steps before
-
-
 class Explorer:
     """Imagines what follows from a held-out frame, one action after another, for each of some models.
 
@@ -238,20 +230,21 @@ class Explorer:
 
     def imagined(self, teller: int, place: Place) -> Float[Tensor, "tokens dim"]:
         """Return the latents at the end of a path as a model imagines them; without actions the true ones."""
-        return self._end(teller, place).latents
+        return self._end(teller, place)[0]
 
     @torch.no_grad()
-    def _imagine(self, teller: int, place: Place) -> _Imagined:
+    def _imagine(self, teller: int, place: Place) -> tuple[Float[Tensor, "tokens dim"], KeyValueCache]:
+        """Return the latents at the end of a path, and the cache of the steps before."""
         if not place.actions:
-            return _Imagined(self.moment(place.episode, place.start).latents, KeyValueCache())
-        before, states = self._end(teller, place.before), self.states(place)
+            return self.moment(place.episode, place.start).latents, KeyValueCache()
+        (before, cache), states = self._end(teller, place.before), self.states(place)
         given = states[-1] if self.spaces.action.follows == "target" else self._feasible(place, states[-2])
-        cache, camera = before.cache.copy(), self.camera(place)
+        cache, camera = cache.copy(), self.camera(place)
         action, state = (torch.as_tensor(one, dtype=torch.float32, device=self.device) for one in (given, states[-2]))
-        seen = before.latents[None, None], action[None, None], state[None, None]
+        seen = before[None, None], action[None, None], state[None, None]
         with self.autocast(), self.contenders[teller].switched():
             predicted = self.model(teller).predict(*seen, None if camera is None else camera[None, None], cache)
-        return _Imagined(predicted[0, 0].float(), cache)
+        return predicted[0, 0].float(), cache
 
     def _feasible(self, place: Place, state: np.ndarray) -> np.ndarray:
         """Return the last action, from a state, its gripper as far as it can change unless that was recorded."""

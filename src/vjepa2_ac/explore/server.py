@@ -148,19 +148,14 @@ class ExploreServer:
             request, client.replaced = client.waiting, threading.Event()
             if request is None:
                 continue
-            told = asyncio.Queue[tuple[int, int]](1)
 
-            def progress(done: int, total: int, told: Any = told) -> None:
-                loop.call_soon_threadsafe(_newest, told, (done, total))
+            def progress(done: int, total: int, seq: int = request.seq) -> None:
+                message = packed("progress", seq, {"done": done, "total": total, "what": "action sequences"})
+                asyncio.run_coroutine_threadsafe(connection.send(message), loop)
 
-            telling = asyncio.ensure_future(_tell(connection, request, told))
-            try:
-                answer = await loop.run_in_executor(
-                    self._computing, self._answer, request, progress, client.replaced.is_set
-                )
-            finally:
-                telling.cancel()
-                await asyncio.gather(telling, return_exceptions=True)
+            answer = await loop.run_in_executor(
+                self._computing, self._answer, request, progress, client.replaced.is_set
+            )
             if answer is not None:
                 await connection.send(answer)
 
@@ -196,20 +191,6 @@ def _authorization(request: Any, cookie: str) -> str | None:
     except http.cookies.CookieError:
         return None
     return f"Bearer {unquote(cookies[cookie].value)}" if cookie in cookies else single_header(request, "Authorization")
-
-
-def _newest(told: asyncio.Queue[tuple[int, int]], progress: tuple[int, int]) -> None:
-    if told.full():
-        told.get_nowait()
-    told.put_nowait(progress)
-
-
-async def _tell(connection: Any, request: PageRequest, told: asyncio.Queue[tuple[int, int]]) -> None:
-    while True:
-        done, total = await told.get()
-        await connection.send(
-            packed("progress", request.seq, {"done": done, "total": total, "what": "action sequences"})
-        )
 
 
 def serve_page(views: Views, access: Access, port: int, ready: Callable[[str], None]) -> None:

@@ -213,7 +213,6 @@ class Views:
             "path": None if position is None else states[:, position],
             "truth": None if outcome is None else "simulated" if outcome.is_simulated else "recorded",
             "truth_state": None if outcome is None else outcome.state,
-            "reached": None if outcome is None else outcome.reached,
             "note": "" if outcome is None or outcome.reached else "The arm cannot go so far: it went as far as it can.",
             "tellers": tellers,
             "copying": None if outcome is None else float(token_errors(start.latents, outcome.latents).mean()),
@@ -231,12 +230,7 @@ class Views:
                 "actions": found.plan.actions.double(),
                 "energy_now": found.energy_now,
                 "energy_plan": found.plan.energy,
-                "why": found.plan.stopped,
-                "iterations": [
-                    {"lowest": one.lowest, "mean": one.elite_energy, "action": one.elites[0, 0].double()}
-                    for one in found.plan.iterations
-                    if len(one.elites)
-                ],
+                "iterations": [{"lowest": one.lowest} for one in found.plan.iterations if len(one.elites)],
             }
             best = [self.explorer.decoded(one) for one in found.best]
             images = [

@@ -246,10 +246,3 @@ def encode_webp(
     times = [int(1000 * one) for one in seconds]
     first.save(file, "WEBP", save_all=True, append_images=others, duration=times, loop=0, quality=quality)
     return file.getvalue()
-
-
-def resized(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.ndarray, "side side 3"]:
-    """Return an image at another size, for people: smooth, not the way the encoder resizes."""
-    if pixels.shape[:2] == (side, side):
-        return pixels
-    return np.asarray(Image.fromarray(pixels).resize((side, side), Image.Resampling.LANCZOS))
