@@ -36,18 +36,11 @@ from vjepa2_ac.policies.train_prior import train_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.subject import load_subject
+from vjepa2_ac.simulation.agent import Planning
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_task
 from vjepa2_ac.simulation.domains import Domain, sample_domain
-from vjepa2_ac.simulation.policies import (
-    GoalsOf,
-    Image,
-    Oracle,
-    Planning,
-    Policy,
-    RandomActions,
-    ZeroActions,
-)
-from vjepa2_ac.simulation.rollout import RolloutSpec, run_task
-from vjepa2_ac.simulation.tasks import Problem, TaskProblem
+from vjepa2_ac.simulation.policies import Oracle, RandomActions, ZeroActions
+from vjepa2_ac.simulation.rollout import Image, Observation, Policy, Trial
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import json_text
 from vjepa2_ac.training.cost import count_parameters
@@ -99,7 +92,7 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
     if model.adaptation is not None:
         merge_adapter(model)
     seed = goals_seed(cell, choosing=choosing)
-    settings: dict[str, Any] = {"axes": file} if cell.shift in SHIFTS else {"goals_of": other_worlds.goals_of}
+    settings: dict[str, Any] = {"axes": file} if cell.shift in SHIFTS else {}
     figures["reach"] = {
         distance: closed_loop(cell, planner(model, distance, acts, **settings), folder, seed=seed, goals=goals)
         for distance in energies_of(cell)
@@ -114,7 +107,7 @@ def _cloned(cell: Cell, config: Config, folder: Path, goals: int, *, choosing: b
     minutes, seed = (time.process_time() - began) / 60, goals_seed(cell, choosing=choosing)
     acts = PLANNING.model_copy(update={"planner": Component("prior"), "prior": place})
     model = load_base(config.model, seed=cell.seed)
-    policy = planner(model, "l1", acts, goals_of=None if cell.shift in SHIFTS else other_worlds.goals_of)
+    policy = planner(model, "l1", acts)
     reached = closed_loop(cell, policy, folder, seed=seed, goals=goals)
     trained = {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": minutes, "minutes": minutes, "held_out": found}
     return {"cell": asdict(cell) | {"name": cell.name}, **trained, "reach": {"l1": reached}}
@@ -187,27 +180,28 @@ def planner(
     distance: str,
     config: PlanningConfig,
     axes: str | None = None,
-    goals_of: GoalsOf | None = None,
 ) -> Policy:
     """Return a policy that plans with a model, in calibrated axes where a file of them is given."""
     energy = config.energy.model_copy(update={"distance": Component(distance)})
     controller = Controller(model, config.model_copy(update={"energy": energy, "axes": axes}))
-    return Watched(controller) if goals_of is None else Planning(controller, goals_of=goals_of)
+    return Watched(controller)
 
 
 class Watched(Planning):
     """A planner that is asked after each decision how its energies agree with true distances (`reach` only)."""
 
-    def reset(self, problem: Problem, goal_image: Image) -> None:
+    def reset(self, trial: Trial, goal_image: Image) -> None:
         """Begin an episode."""
-        super().reset(problem, goal_image)
-        self._wanted = TaskProblem.of(problem).goal[:3]
+        super().reset(trial, goal_image)
+        self._goal_m = None if trial.problem is None else trial.problem.goal[:3]
         self.agreements: list[float] = getattr(self, "agreements", [])
 
-    def act(self, image: Image, state: np.ndarray) -> np.ndarray:
+    def act(self, observation: Observation) -> np.ndarray:
         """Return the first action of a plan."""
-        action = super().act(image, state)
-        found = visited_correlation(self.controller, self._wanted, len(self.agreements))
+        action = super().act(observation)
+        if self._goal_m is None:
+            return action
+        found = visited_correlation(self.controller, self._goal_m, len(self.agreements))
         self.agreements += [] if found is None else [found]
         return action
 
@@ -229,15 +223,15 @@ def closed_loop(cell: Cell, policy: Policy, folder: Path, *, seed: int, goals: i
     }
 
 
-def _rollouts(shift: str, seed: int, goals: int) -> Iterator[RolloutSpec]:
+def _rollouts(shift: str, seed: int, goals: int) -> Iterator[BenchmarkOptions]:
     """Yield what is to be reached: in one world, or each goal in another that no episode was recorded in."""
     world = SHIFTS[shift]
     if isinstance(world, Domain):
-        yield RolloutSpec("reach", world, goals, seed)
+        yield BenchmarkOptions("reach", world, goals, seed)
         return
     for goal in range(goals):
         drawn = sample_domain(np.random.default_rng([seed, goal]), world)
-        yield RolloutSpec("reach", drawn, 1, seed * 100 + goal)
+        yield BenchmarkOptions("reach", drawn, 1, seed * 100 + goal)
 
 
 def held_out(

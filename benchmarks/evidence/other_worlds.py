@@ -11,18 +11,9 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.episode import no_progress
-from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions
-from vjepa2_ac.simulation.policies import Policy
-from vjepa2_ac.simulation.record_world import record_world
-from vjepa2_ac.simulation.rollout import ClosedLoopResult, run_trials
-from vjepa2_ac.simulation.worlds import (
-    OtherWorld,
-    WorldProblem,
-    WorldTrials,
-    find_problems,
-)
+from vjepa2_ac.simulation.rollout import ClosedLoopResult, Policy, Trials, run_trials
+from vjepa2_ac.simulation.worlds import OtherWorld, find_trials, record_world
 
 ROOT = Path(__file__).resolve().parents[2]
 STRIDE, EVERY = 4, 2  # control steps of a model step, and from one recorded frame to the next
@@ -95,16 +86,14 @@ def record(folder: Path, task: str, when: str) -> None:
             record_world(world, path, range(first, first + count), every=EVERY)
 
 
-def problems(
-    folder: Path, task: str, seed: int, goals: int, when: str = "after"
-) -> tuple[WorldTrials, ClosedLoopResult]:
+def problems(folder: Path, task: str, seed: int, goals: int, when: str = "after") -> tuple[Trials, ClosedLoopResult]:
     """Return the problems, with a goal for each model step; kept, since the expert takes its time."""
     word = "-before" if when == "before" else ""
     path = folder / "problems" / f"{task}{word}-{seed}-{goals}.pickle"
     if not path.exists():
         options = BenchmarkOptions(episodes=goals, seed=seed, sub_goals="every-step")
         with OtherWorld(TASKS[task].command(when)) as world:
-            found = find_problems(world, options, STRIDE, no_progress)
+            found = find_trials(world, options, STRIDE)
         path.parent.mkdir(exist_ok=True)
         path.with_suffix(".part").write_bytes(pickle.dumps(found))
         path.with_suffix(".part").rename(path)
@@ -118,11 +107,6 @@ def closed_loop(
     trials, shown = problems(folder, task, seed, goals, when)
     with OtherWorld(TASKS[task].command(when)) as world:
         return figures_of(run_trials(world, policy, trials), seed, shown)
-
-
-def goals_of(problem: WorldProblem) -> tuple[SubGoal, ...]:
-    """Return a goal for each model step."""
-    return problem.goals
 
 
 def figures_of(result: ClosedLoopResult, seed: int, shown: ClosedLoopResult) -> dict[str, Any]:

@@ -29,11 +29,11 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.runs.subject import load_subject
+from vjepa2_ac.simulation.agent import Planning
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_task
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
 from vjepa2_ac.simulation.motion import MotionRecipe
-from vjepa2_ac.simulation.policies import Planning
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
-from vjepa2_ac.simulation.rollout import RolloutSpec, run_task
 from vjepa2_ac.training.loop import train
 
 Motions = Literal["narrow", "varied"]
@@ -179,7 +179,7 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     model = load_subject(home, step).world_model
     if model.adaptation is not None:
         merge_adapter(model)
-    spec = RolloutSpec("reach", WORLD, goals, GOALS + cell.run.seed)
+    spec = BenchmarkOptions("reach", WORLD, goals, GOALS + cell.run.seed)
     result = run_task(spec, Planning(Controller(model.eval(), PLANNING)))
     measured = {row.key: row.value for row in rows_of(evaluation) if row.model == evaluation.trained}
     return {

@@ -4,26 +4,54 @@
     pip install --no-deps openpi-client==0.1.2 && pip install typing_extensions  # in an environment with vjepa2-ac[sim]
     python examples/serve/simulated_arm_client.py ws://127.0.0.1:8000 served.gif
 
-Each model step of one demonstration of the same problem is a goal on the way. For tables use `vjepa2-ac simulate ws://…`.
+Each model step of one demonstration of the same problem is a sub-goal.
 """
 
 import sys
 
+import numpy as np
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
+from vjepa2_ac.config import LimitsConfig
 from vjepa2_ac.media.video import write_gif
-from vjepa2_ac.simulation.agent import ServedPlanner
-from vjepa2_ac.simulation.benchmark import DemonstratedGoals, DemonstrationSpec, every_step, film_frames
-from vjepa2_ac.simulation.domains import named_domain
-from vjepa2_ac.simulation.rollout import RolloutSpec, run_task
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, demonstrated_goals, film_frames, with_goals
+from vjepa2_ac.simulation.rollout import ArmEnvironment, Image, Observation, Trial, run_trials
+from vjepa2_ac.simulation.tasks import arm_for
+
+
+class ServedPlanner:
+    """A policy behind a server: images and measured states go through its socket."""
+
+    name, why = "openpi-client", ""
+
+    def __init__(self, client: WebsocketClientPolicy) -> None:
+        self.client = client
+
+    def reset(self, trial: Trial, goal_image: Image) -> None:  # noqa: ARG002 - of the protocol
+        """Start an episode with the sub-goals of the trial, each for at most its number of model steps."""
+        self.client.infer({"endpoint": "reset"})
+        self.goal = {
+            "goal/images": np.stack([goal.image for goal in trial.goals]),
+            "goal/at_least": [goal.at_least for goal in trial.goals],
+            "goal/durations": [goal.at_most for goal in trial.goals[:-1]],
+            "goal/grippers": [goal.gripper or "" for goal in trial.goals],
+        }
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """Return the first action of the server's plan."""
+        request = {"observation/image": observation.image, "observation/state": observation.state, **self.goal}
+        answer = self.client.infer(request)
+        self.goal, self.why = {}, answer["why"]
+        return np.asarray(answer["actions"][0])
 
 
 def main(url: str, film: str, episodes: str = "4", seed: str = "3") -> None:
     """Let the server solve some problems, and draw what the camera saw."""
-    shown = DemonstratedGoals("pick", named_domain("A"), every_step(DemonstrationSpec()))
-    policy = ServedPlanner(WebsocketClientPolicy(url), "openpi-client", shown)
     count = int(episodes)
-    result = run_task(RolloutSpec("pick", "A", count, int(seed), steps=18, films=count), policy)
+    options = BenchmarkOptions("pick", "A", count, int(seed), steps=18)
+    arm, trials, limits = arm_for("pick", options.world), options.trials(), LimitsConfig()
+    trials = with_goals(trials, [demonstrated_goals(one, arm, limits, "every-step") for one in trials.trials])
+    result = run_trials(ArmEnvironment(arm), ServedPlanner(WebsocketClientPolicy(url)), trials, films=count)
     for number, episode in enumerate(result.episodes, start=1):
         print(
             f"problem {number}: {100 * episode.distances_m[-1]:.1f} cm left, {'lifted' if episode.success else 'not'}"

@@ -22,6 +22,29 @@ def expert_of(world):
     return Expert(world).scripted()
 
 
+def has_expert(world):
+    """Return whether it is all pick and place: something movable, to a place that need not be opened first."""
+    sites = world.env.object_sites_dict
+    return all(
+        len(goal) == 3 and goal[1] in world.env.objects_dict and not (goal[2] in sites and sites[goal[2]].joints)
+        for goal in world.goals
+    )
+
+
+def left_m(world):
+    """Return the distance that is left, summed over the goals; of joints radians where they turn."""
+    return sum(_left_of(world, *goal) for goal in world.goals)
+
+
+def _left_of(world, verb, name, target=None):
+    if target:
+        return np.linalg.norm(world.at(name) - world.at(target))
+    site = world.env.object_sites_dict.get(name)
+    thing = world.env.get_object(site.parent_name if site else name)
+    low, high = thing.object_properties["articulation"][f"default_{verb}_ranges"]
+    return min(max(low - at, at - high, 0.0) for at in map(world.sim.data.get_joint_qpos, (site or thing).joints))
+
+
 class Expert:
     def __init__(self, world):
         self.world, self.turned = world, world.state()[3:6]

@@ -1,4 +1,4 @@
-"""Scripted experts of robosuite.py: they know where things are, and yield what the hand is to do next, without end.
+"""Scripted experts of robosuite.py, which yield without end the next target of the hand, and distances to goals.
 
 Each target is a place of the grip site, its orientation, both in the frame of the world, and a closedness.
 """
@@ -11,7 +11,7 @@ ABOVE, NEAR_M = np.array([0.0, 0.0, 0.10]), 0.012  # from where a thing is appro
 
 def expert_of(world):
     expert = Expert(world)
-    yield from expert.pull() if world.options.task == "Door" else expert.pick_and_put(*world.what_and_where())
+    yield from expert.pull() if world.options.task == "Door" else expert.pick_and_put(*what_and_where(world))
     yield from expert.hold(world.state()[6], steps=100_000)
 
 
@@ -52,3 +52,23 @@ class Expert:
         self.turn(np.arctan2(out[1], out[0]) - np.pi)  # the wrist on the robot's side
         for place in (behind + ABOVE * 1.5 + 0.1 * out, behind + ABOVE * 1.2, behind, behind + 0.3 * out):
             yield from self.go(lambda place=place: place, 1.0)
+
+
+def what_and_where(world):
+    """Return the body that is to be moved, and where it has to be now, in the frame of the world."""
+    env, places = world.env, world.data.body_xpos
+    if world.options.task == "Lift":
+        height = env.model.mujoco_arena.table_offset[2] + 0.04
+        return env.cube_body_id, np.maximum(places[env.cube_body_id], [-np.inf, -np.inf, height])
+    if world.options.task == "Stack":
+        return env.cubeA_body_id, places[env.cubeB_body_id] + [0.0, 0.0, 0.045]
+    place = env.target_bin_placements[env.object_to_id["can"]]
+    return env.obj_body_id["Can"], np.add(place, [-0.05, -0.05, 0.05])  # in its bin, and within reach
+
+
+def left_m(world):
+    """Return how far what the task moves is from where it has to be; of the door, how far its edge has to go."""
+    if world.options.task == "Door":
+        return 0.4 * (0.3 - world.data.qpos[world.env.hinge_qpos_addr])
+    body, place = what_and_where(world)
+    return np.linalg.norm(place - world.data.body_xpos[body])

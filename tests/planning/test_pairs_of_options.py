@@ -4,7 +4,6 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -34,8 +33,8 @@ from vjepa2_ac.policies.action_prior import ActionPrior, PriorCard, PriorSizes, 
 from vjepa2_ac.policies.monitor import Monitor
 from vjepa2_ac.registry import ENERGIES, PLANNERS
 from vjepa2_ac.runs.subject import Subject
-from vjepa2_ac.simulation.policies import Moves, Planning
-from vjepa2_ac.simulation.rollout import Observation, Span, run_in
+from vjepa2_ac.simulation.agent import Planning
+from vjepa2_ac.simulation.rollout import Observation, Trial, run
 
 
 def planner(name: str, **options: Any) -> dict[str, Any]:
@@ -195,21 +194,21 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
             yield Scene(model, {name: str(folder / file) for name, file in files.items()})
 
 
+FAR = {"distance_m": 0.1, "success": False}
+
+
 class StillWorld:
     """A world that shows noise, whatever is done."""
 
     def __init__(self, views: int) -> None:
         self.images = [image(seed, SIDE, SIDE * views) for seed in range(4)]
 
-    def begin(self, _: object) -> tuple[np.ndarray, Observation]:
+    def reset(self, **_: object) -> tuple[Observation, dict[str, Any]]:
         self.left = self.images[:3]
-        return self.images[3], self.seen()
+        return Observation(self.left.pop(), STATE), {**FAR, "goal_image": self.images[3]}
 
-    def act(self, *_: object) -> tuple[bool, Observation]:
-        return True, self.seen()
-
-    def seen(self) -> Observation:
-        return Observation(self.left.pop(), STATE, 0.1, is_done=False)
+    def step(self, _: object) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        return Observation(self.left.pop(), STATE), 0.0, False, False, FAR
 
 
 def tried(scene: Scene, *names: str) -> None:
@@ -223,11 +222,10 @@ def tried(scene: Scene, *names: str) -> None:
         chunks = np.random.default_rng(0).normal(0, 0.01, (3, planning.horizon, 7))
         acting = controller.act
         controller.act = lambda frame, state: acting(frame, state, samples=chunks)  # type: ignore[method-assign]
-    policy = Planning(controller, goals_of=lambda _: goals)
+    policy = Planning(controller)
     if mask is not None:
         policy.reset = lambda *_: controller.follow(goals, mask=mask)  # type: ignore[method-assign]
-    found = run_in(world, policy, SimpleNamespace(), Span(steps=2, stride=1))
-    assert policy.moves == Moves.FLANGE
+    found = run(world, policy, Trial(0, steps=2, stride=1, goals=goals))
     assert np.isfinite(found.actions).all()
     assert np.isfinite(controller.score(world.images[0], STATE, np.full((2, 3, 7), 0.01)).energies).all()
     planned = decide(controller, PlanRequest(world.images[0], STATE, goals, mask), nodes=0)

@@ -6,7 +6,6 @@ import pytest
 from served import STATE, image
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.serving.client import goal_keys
 from vjepa2_ac.serving.request import read_request
 
 OURS = {"observation/image": image(0), "observation/state": STATE}
@@ -66,8 +65,7 @@ def test_goals_in_order_may_have_rules_of_their_own() -> None:
     free = read_request({**OURS, "goal/images": GOALS, "goal/shares": np.array([0.25, 0.5])}).goal
     assert [rule(goal) for goal in free.goals] == [(1, None, 0.25, None), (1, None, 0.5, None)]
     assert rule(read_request({**OURS, "goal/image": image(1), "goal/shares": [0.5]}).goal.goals[0])[2] == 0.5
-    sent = read_request({**OURS, **goal_keys(found.goals)}).goal
-    assert sent.fingerprint == found.fingerprint
+    assert read_request({**OURS, **keys}).goal.fingerprint == found.fingerprint
 
 
 def test_the_same_bytes_are_the_same_goal_and_others_are_another() -> None:

@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,29 +15,18 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 pytest.importorskip("av", reason="the extra `video` is not installed")
 
 from random_decoder import write_decoder
-from served import serving
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.cli.console.tables import benchmark_notes
 from vjepa2_ac.decoding.decoder_folder import load_decoder
-from vjepa2_ac.evaluation.summary import CLOSED_LOOP_FILE
-from vjepa2_ac.media.images import read_image
+from vjepa2_ac.evaluation.imagined import imagined_next
 from vjepa2_ac.media.video import read_header
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
-from vjepa2_ac.serving.about import metadata_of
-from vjepa2_ac.serving.session import Session, SessionOptions
-from vjepa2_ac.simulation.agent import JOINT_FIELDS, Agent, agent_of_session
-from vjepa2_ac.simulation.benchmark import (
-    FILM,
-    STILLS,
-    BenchmarkOptions,
-    film_frames,
-    run_benchmark,
-)
-from vjepa2_ac.simulation.policies import Planning
+from vjepa2_ac.simulation.agent import JOINT_FIELDS, Agent, Planning
+from vjepa2_ac.simulation.benchmark import FILM, BenchmarkOptions, film_frames, run_benchmark
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
+from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
 
 SMALL = [
     "planning.samples=6",
@@ -54,10 +42,6 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("models") / "tiny"
     tiny_model().save_pretrained(folder)
     return str(folder)
-
-
-def agent_of(model: str, *overrides: str) -> Agent:
-    return agent_of_session(load_to_plan(model, overrides=[*SMALL, *overrides]))
 
 
 @pytest.fixture(scope="module")
@@ -90,23 +74,21 @@ def test_a_robot_of_joints_is_steered_by_its_joints(
     assert "other numbers than the simulated arm measures" in capsys.readouterr().err
 
 
-def test_a_decoder_adds_what_was_imagined_to_the_film_and_changes_no_metric(model: str, tmp_path: Path) -> None:
+def test_the_film_shows_images_goal_and_predictions_and_a_decoder_changes_no_metric(model: str, tmp_path: Path) -> None:
     decoder = load_decoder(write_decoder(tmp_path / "decoder", tiny_model()))
-    session = load_to_plan(model, overrides=SMALL)
-    wanted = BenchmarkOptions(episodes=2, steps=2, films=1)
-    (plain, _), (shown, _) = (
-        run_benchmark(agent_of_session(session, one), wanted, tmp_path / name)
-        for name, one in {"p": None, "d": decoder}.items()
-    )
-    filmed, other = shown.results[0].episodes
-    frames, plain_frames = list(film_frames(shown.results[0])), list(film_frames(plain.results[0]))
+    session, options = load_to_plan(model, overrides=SMALL), BenchmarkOptions(episodes=2, steps=2, films=1)
+    plain = run_benchmark(Agent(session), options).results[0]
+    shown = run_benchmark(Agent(session, partial(imagined_next, decoder=decoder)), options).results[0]
+    filmed, other = shown.episodes
+    frames, plain_frames = list(film_frames(shown)), list(film_frames(plain))
     assert [one is not None and one.shape for one in filmed.imagined] == [filmed.goal_image.shape] * 2
-    assert (other.imagined, plain.results[0].episodes[0].imagined) == ((), (None, None))
+    assert (other.imagined, plain.episodes[0].imagined) == ((), (None, None))
     np.testing.assert_array_equal(frames[0][:, :320], plain_frames[0][:, :320])
     assert frames[0].shape[1] > 640
-    assert metrics(tmp_path / "d")["about"]["decoder"] == str(tmp_path / "decoder")
-    one, two = (metrics(tmp_path / name)["policies"]["tiny"]["by_episode"] for name in "pd")
-    assert one["distance_cm"] == two["distance_cm"]
+    for frame, image in ((plain_frames[0], filmed.frames[0]), (plain_frames[-1], filmed.frames[-1])):
+        np.testing.assert_array_equal(frame[60:420:2, :640:2], image)
+        np.testing.assert_array_equal(frame[-180:, :320], filmed.goal_image)
+    np.testing.assert_array_equal(shown.distance_cm, plain.distance_cm)
 
 
 def metrics(folder: Path) -> dict:
@@ -124,8 +106,6 @@ def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     rows = {line.split("│")[1].strip(): line for line in shown.splitlines() if line.startswith("│")}
     assert list(rows) == ["tiny", "zero action", "random", "oracle"]
     assert "reach in domain B: 2 problems of seed 0, 2 steps of 0.27 s" in shown
-    assert "\n2 episodes x 2 decisions, 12 action sequences each: less than a minute on this machine\n" in "\n" + shown
-    assert "\n2 episodes x 2 decisions, 12 action sequences each; the first decision" in "\n" + shown
     following = shlex.split(re.search(r"^Next:\s+vjepa2-ac (.*)$", shown, re.M)[1])
     assert following[:4] == ["simulate", model, "--task", "reach"]
     kept = {"--domain": "B", "--episodes": "50", "--films": "1", "--out": str(tmp_path)}
@@ -174,25 +154,10 @@ def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
     assert steered["distance_cm"] == nothing["distance_cm"]
 
 
-def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path: Path) -> None:
-    asked = BenchmarkOptions(episodes=2, steps=1, films=1)
-    benchmark, files = run_benchmark(agent_of(model), asked, tmp_path)
-    assert [file.name for file in files] == [CLOSED_LOOP_FILE, FILM, STILLS]
-    steered = benchmark.results[0]
-    frames = list(film_frames(steered))
-    episode = steered.episodes[0]
-    for frame, image in ((frames[0], episode.frames[0]), (frames[-1], episode.frames[1])):
-        np.testing.assert_array_equal(frame[60:420:2, :640:2], image)
-        np.testing.assert_array_equal(frame[-180:, :320], episode.goal_image)
-    assert (frames[0] != frames[-1]).any()
-    np.testing.assert_array_equal(read_image(tmp_path / STILLS)[-180:, -320:], episode.goal_image)
-
-
-def test_what_was_unusual_is_noted(model: str, tmp_path: Path) -> None:
-    agent = replace(agent_of(model, "planning.budget_s=0.000001"), warnings=("limits leave what was taught",))
-    benchmark, _ = run_benchmark(agent, BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path)
+def test_unusual_decisions_are_noted(model: str) -> None:
+    session = load_to_plan(model, overrides=[*SMALL, "planning.budget_s=0.000001"])
+    benchmark = run_benchmark(Agent(session), BenchmarkOptions(episodes=1, steps=2, films=0))
     assert benchmark_notes(benchmark) == ("tiny: of 2 decisions out of time 2",)
-    assert metrics(tmp_path)["about"]["warnings"] == ["limits leave what was taught"]
 
 
 @pytest.mark.parametrize(
@@ -247,13 +212,8 @@ def test_goals_come_from_the_demonstration_that_looks_like_the_problem(
     assert main(["simulate", model, *given, *where, *SMALL]) == 0
     assert metrics(tmp_path / "out")["about"]["sub_goals"] == "alike"
     shown = capsys.readouterr().out
-    assert "looking for a demonstration alike 3/3" in shown
-    assert re.search(
-        r"Start and goal are [\d.]+ from those of the demonstration most alike, [\d.]+ of the median", shown
-    )
-    loaded = load_to_plan(model, config=tmp_path / "config.yaml", overrides=SMALL)
-    with serving(lambda: Session(Controller.of_subject(loaded)), told=partial(metadata_of, loaded)) as running:
-        assert main(["simulate", running.url, *given, "--out", str(tmp_path / "there")]) == 2
+    assert re.search(r"Start and goal are [\d.]+ from those of the demonstration most alike", shown)
+    assert main(["simulate", model, *given, "--out", str(tmp_path / "there")]) == 2
     assert "needed: a run; or a model with --config" in capsys.readouterr().err
 
 
@@ -267,42 +227,3 @@ def test_a_problem_that_cannot_be_demonstrated_is_told_before_any_is_worked_on(
     assert error.startswith("error: demonstration of problem 0 (pick): the oracle ends ")
     assert "planning.limits.xyz" in error
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("way", ["none", "demonstration"])
-def test_through_a_server_the_same_problems_are_solved_in_the_same_way(
-    way: str, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    given = ["--task", "reach", "--episodes", "2", "--steps", "3", "--films", "1"]
-    if way == "demonstration":
-        given += ["--sub-goals", "demonstration"]
-    assert main(["simulate", model, *given, *SMALL, "--out", str(tmp_path / "here")]) == 0
-    loaded = load_to_plan(model, overrides=SMALL)
-    with serving(lambda: Session(Controller.of_subject(loaded)), told=partial(metadata_of, loaded)) as running:
-        assert main(["simulate", running.url, *given, "--out", str(tmp_path / "there")]) == 0
-        capsys.readouterr()
-        for wrong in (["planning.samples=9"], ["--checkpoint", "newest"]):
-            assert main(["simulate", running.url, *given, *wrong]) == 2
-            assert "needed: the model itself; not its server" in capsys.readouterr().err
-    here, there = (metrics(tmp_path / name) for name in ("here", "there"))
-    same = ("task", "domain", "episodes", "steps", "stride", "planning", "planning_seed", "warnings", "sub_goals")
-    assert {key: here["about"][key] for key in same} == {key: there["about"][key] for key in same}
-    assert there["about"]["subject"] == running.url
-    for one, other in zip(here["policies"].values(), there["policies"].values(), strict=True):
-        assert one["why_counts"] == other["why_counts"]
-        assert one["by_episode"]["distance_cm"] == other["by_episode"]["distance_cm"]
-    assert (tmp_path / "there" / FILM).stat().st_size
-
-
-def test_a_server_that_sends_something_else_is_refused(model: str, capsys: pytest.CaptureFixture[str]) -> None:
-    loaded = load_to_plan(model, overrides=SMALL)
-    for options in (SessionOptions("pose"), SessionOptions(dry_run=True)):
-        with serving(
-            lambda how=options: Session(Controller.of_subject(loaded), None, how), told=partial(metadata_of, loaded)
-        ) as at:
-            assert main(["simulate", at.url, "--episodes", "1"]) == 2
-            assert "needed: changes of a pose in the frame of the base" in capsys.readouterr().err
-    assert main(["simulate", at.url, "--episodes", "1"]) == 2
-    assert "needed: a server (`vjepa2-ac serve`)" in capsys.readouterr().err
-    assert main(["simulate", model, "--key-file", "key"]) == 2
-    assert "--key-file: simulate" in capsys.readouterr().err

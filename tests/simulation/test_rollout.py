@@ -1,4 +1,4 @@
-"""Episodes end where the actions lead, and the metrics agree."""
+"""Episodes end where the actions lead, oracles solve the tasks, and the metrics agree."""
 
 from dataclasses import replace
 
@@ -6,50 +6,48 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
-from vjepa2_ac.simulation.tasks import TaskName, TaskProblem, arm_for, make_problem
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
+from vjepa2_ac.simulation.tasks import GRASP_M, RELEASED, STEPS, TaskName, arm_for, make_problem
 from vjepa2_ac.spaces import actions_from_states
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from tiny_models import tiny_model
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.simulation.agent import Planning
 from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_task
 from vjepa2_ac.simulation.motion import HIGH, forward_kinematics
-from vjepa2_ac.simulation.policies import (
-    Moves,
-    Oracle,
-    Planning,
-    RandomActions,
-    ZeroActions,
-    farthest,
-    shortened,
-)
+from vjepa2_ac.simulation.policies import Oracle, RandomActions, ZeroActions, farthest, shortened
 from vjepa2_ac.simulation.rollout import (
+    ArmEnvironment,
     ClosedLoopResult,
     EpisodeResult,
-    RolloutSpec,
-    run_episode,
-    run_task,
+    Observation,
+    Trial,
+    put,
+    run,
+    run_trials,
 )
 
 LIMITS = LimitsConfig(xyz=(0.075, 0.075, 0.075))
 SMALL = LimitsConfig(xyz=(0.03, 0.03, 0.03))
+UNSEEN = np.zeros((2, 2, 3), dtype=np.uint8)
 
 
 class Scripted:
-    """Follows a script, and records its observations."""
+    """Follows a script, and stores its observations."""
 
-    name, why, moves = "scripted", "told", Moves.FLANGE
+    name, why = "scripted", "scripted"
 
     def __init__(self, *actions: np.ndarray) -> None:
         self.actions, self.seen = list(actions), []
 
-    def reset(self, problem: TaskProblem, goal_image: np.ndarray) -> None:  # noqa: ARG002 - of the protocol
+    def reset(self, trial: Trial, goal_image: np.ndarray) -> None:  # noqa: ARG002 - of the protocol
         self.left, self.goal_image = list(self.actions), goal_image
 
-    def act(self, image: np.ndarray, state: np.ndarray) -> np.ndarray:
-        self.seen.append((image, state))
+    def act(self, observation: Observation) -> np.ndarray:
+        self.seen.append(observation)
         return self.left.pop(0)
 
 
@@ -62,27 +60,56 @@ def way(*numbers: float) -> np.ndarray:
     return np.array([*numbers, *[0.0] * (7 - len(numbers))])
 
 
-def test_the_oracle_succeeds_and_nothing_and_chance_do_not(arm: SimulatedArm) -> None:
-    results = [
-        run_task(RolloutSpec("reach", DOMAIN_B, 5), policy, arm)
-        for policy in (Oracle(LIMITS), ZeroActions(), RandomActions(SMALL))
-    ]
-    oracle, nothing, chance = results
+def trial_of(index: int, steps: int, stride: int = 4, seed: int = 0) -> Trial:
+    return Trial(index, steps, stride, make_problem("reach", DOMAIN_B, seed, index))
+
+
+CASES = [("reach", DOMAIN_B), ("push", DOMAIN_A), ("pick", DOMAIN_B), ("place", DOMAIN_A), ("place", DOMAIN_B)]
+
+
+@pytest.mark.parametrize(("task", "domain"), CASES, ids=[f"{task} {domain.name}" for task, domain in CASES])
+def test_the_oracle_solves_it_and_zero_and_random_actions_do_not(task: TaskName, domain: Domain) -> None:
+    arm = arm_for(task, domain, size=(18, 32))
+    oracle = run_task(BenchmarkOptions(task, domain, 3, seed=11), Oracle(LIMITS), arm)
     assert oracle.success_rate.value == 1.0
-    assert oracle.final_distance_cm.value < 0.5
-    assert nothing.success_rate.value == nothing.success_ever_rate.value == 0.0
-    np.testing.assert_allclose(nothing.distance_cm[:, -1], nothing.distance_cm[:, 0], atol=1e-2)
-    assert chance.success_rate.value < 0.3
-    assert [result.policy for result in results] == ["oracle", "zero action", "random"]
-    assert oracle.why_counts == {"scripted": 40}
+    assert oracle.estimates["final_distance_cm"].value < 3.0
+    assert oracle.why_counts == {"scripted": 3 * STEPS[task]}
     assert not oracle.unreachable.any()
+    for episode in oracle.episodes:
+        assert (np.abs(episode.actions) <= farthest(LIMITS)).all()
+        if task != "reach":
+            assert episode.blocks.shape == (STEPS[task] + 1, 4)
+            np.testing.assert_allclose(episode.blocks[0], episode.trial.problem.block_start, atol=1e-9)
+            ends = np.linalg.norm(episode.blocks[-1, :3] - episode.trial.problem.block_goal[:3])
+            assert episode.distances_m[-1] == pytest.approx(ends)
+        if task == "place":
+            carried = episode.blocks[:, 2] > 0.05
+            assert episode.blocks[:, 2].max() > 0.06 + 0.03, "off the table by half a block"
+            assert (episode.states[carried, 6] > RELEASED).all()
+            assert not episode.reached[carried].any()
+    for policy in (ZeroActions(), RandomActions(SMALL)):
+        result = run_task(BenchmarkOptions(task, domain, 2, seed=5), policy, arm)
+        assert result.success_rate.value == 0.0
+        assert result.estimates["final_distance_cm"].value > 7.0
+
+
+def test_a_block_that_is_held_over_the_mark_is_near_and_not_placed() -> None:
+    problem = make_problem("place", DOMAIN_A, 0, 0)
+    arm = arm_for("place", DOMAIN_A, size=(18, 32))
+    low = problem.goal.copy()
+    low[2] = problem.block_goal[2] + GRASP_M
+    put(arm, low, problem.block_goal, problem.mark)
+    holding = arm.command(arm.state + 0.9 * np.eye(7)[6], 8)
+    assert problem.distance_m(holding, arm.block) < 0.01
+    assert not problem.succeeded(holding, arm.block)
+    assert problem.succeeded(arm.command(arm.state - holding[6] * np.eye(7)[6], 8), arm.block)
 
 
 @pytest.mark.parametrize("task", ["reach", "push"])
 def test_moving_objects_start_every_episode_where_they_start_for_every_policy(task: TaskName) -> None:
-    spec = RolloutSpec(task, replace(DOMAIN_B, moving=3), episodes=2, steps=2, films=2)
-    arm = arm_for(task, spec.world, size=(45, 80))
-    zero, random, again = (run_task(spec, one, arm) for one in (ZeroActions(), RandomActions(SMALL), ZeroActions()))
+    options = BenchmarkOptions(task, replace(DOMAIN_B, moving=3), episodes=2, steps=2, films=2)
+    arm = arm_for(task, options.world, size=(45, 80))
+    zero, random, again = (run_task(options, one, arm) for one in (ZeroActions(), RandomActions(SMALL), ZeroActions()))
     for first, other, repeated in zip(zero.episodes, random.episodes, again.episodes, strict=True):
         np.testing.assert_array_equal(first.goal_image, other.goal_image)
         np.testing.assert_array_equal(first.frames[0], other.frames[0])
@@ -91,77 +118,72 @@ def test_moving_objects_start_every_episode_where_they_start_for_every_policy(ta
 
 
 def test_an_episode_starts_at_the_start_and_shows_the_goal(arm: SimulatedArm) -> None:
-    problem, policy = make_problem("reach", DOMAIN_B, 0, 1), Scripted(way(0.05), way(0.0, 0.05))
-    result = run_episode(arm, policy, problem, steps=2, keep_frames=True)
-    np.testing.assert_allclose(result.states[0], problem.start, atol=1e-3)
-    arm.set_state(problem.goal)
-    difference = np.abs(policy.goal_image.astype(int) - arm.image())
-    assert difference.mean() < 2.0  # but for the spare joint
+    trial, policy = trial_of(1, steps=2), Scripted(way(0.05), way(0.0, 0.05))
+    result = run(ArmEnvironment(arm), policy, trial, keep_frames=True)
+    np.testing.assert_allclose(result.states[0], trial.problem.start, atol=1e-3)
+    arm.set_state(trial.problem.goal)
+    assert np.abs(policy.goal_image.astype(int) - arm.image()).mean() < 2.0  # but for the spare joint
     np.testing.assert_array_equal(policy.goal_image, result.goal_image)
     assert (policy.goal_image != result.frames[0]).any()
-    for step, (image, state) in enumerate(policy.seen):
-        np.testing.assert_array_equal(image, result.frames[step])
-        np.testing.assert_array_equal(state, result.states[step])
+    for step, observation in enumerate(policy.seen):
+        np.testing.assert_array_equal(observation.image, result.frames[step])
+        np.testing.assert_array_equal(observation.state, result.states[step])
 
 
 def test_an_action_of_a_model_step_is_followed_with_the_arms_lag(arm: SimulatedArm) -> None:
-    problem = make_problem("reach", DOMAIN_B, 0, 1)
-    short, long = (
-        run_episode(arm, Scripted(way(0.05, 0.0, -0.02, 0, 0, 0.1, 0.5)), problem, steps=1, stride=stride)
-        for stride in (4, 30)
-    )
-    wanted = np.array([0.05, 0.0, -0.02, 0.0, 0.0, 0.1])
-    sign = 1.0 if problem.start[6] == 0 else 0.0  # a closed gripper cannot close further
+    action = way(0.05, 0.0, -0.02, 0, 0, 0.1, 0.5)
+    short, long = (run(ArmEnvironment(arm), Scripted(action), trial_of(1, 1, stride)) for stride in (4, 30))
+    sign = 1.0 if short.trial.problem.start[6] == 0 else 0.0  # a closed gripper cannot close further
     (moved,), (settled,) = (actions_from_states(result.states) for result in (short, long))
-    np.testing.assert_allclose(settled[:6], wanted, atol=1e-3)
-    np.testing.assert_allclose(settled[6], 0.5 * sign, atol=1e-3)
-    share = np.linalg.norm(moved[:3]) / np.linalg.norm(wanted[:3])
+    np.testing.assert_allclose(settled, [*action[:6], 0.5 * sign], atol=1e-3)
+    share = np.linalg.norm(moved[:3]) / np.linalg.norm(action[:3])
     assert share == pytest.approx(1 - np.exp(-4 / 15 / DOMAIN_B.lag_s), abs=0.01)
 
 
 def test_joints_are_observed_moved_and_kept_within_their_limits(arm: SimulatedArm) -> None:
-    problem, policy = make_problem("reach", DOMAIN_B, 0, 1), Scripted(0.1 * np.eye(8)[0], 9.0 * np.eye(8)[1])
-    policy.moves = Moves.JOINTS
-    result = run_episode(arm, policy, problem, steps=2, stride=60)
-    (_, before), (_, after) = policy.seen
+    policy = Scripted(0.1 * np.eye(8)[0], 9.0 * np.eye(8)[1])
+    result = run(ArmEnvironment(arm), policy, trial_of(1, steps=2, stride=60))
+    before, after = (observation.joints for observation in policy.seen)
     np.testing.assert_allclose(after - before, 0.1 * np.eye(8)[0], atol=1e-3)
     np.testing.assert_allclose(result.states[1][:6], forward_kinematics(after[:7]), atol=1e-6)
     assert result.unreachable == 1, "no joint turns by 9 radians"
     assert arm.joints[1] == pytest.approx(HIGH[1], abs=1e-3)
-    policy.actions = [np.zeros(7)]
-    for actor, of in ((policy, 8), (Scripted(np.full(7, np.nan)), 7)):
-        with pytest.raises(ValueError, match=f"no action of {of} finite numbers"):
-            run_episode(arm, actor, problem, steps=1)
 
 
-def test_the_same_problem_has_the_same_result_whatever_was_before(arm: SimulatedArm) -> None:
-    problem = make_problem("reach", DOMAIN_B, 0, 2)
-    first = run_episode(arm, RandomActions(SMALL), problem, steps=3)
-    run_episode(arm, RandomActions(SMALL, seed=1), make_problem("reach", DOMAIN_B, 5, 0), steps=3)
-    again = run_episode(arm, RandomActions(SMALL), problem, steps=3)
+def test_what_is_no_action_is_refused(arm: SimulatedArm) -> None:
+    for action in (np.zeros(6), np.full(7, np.nan)):
+        with pytest.raises(ValueError, match="no action of 7 or 8 finite numbers"):
+            run(ArmEnvironment(arm), Scripted(action), trial_of(1, steps=1))
+    with pytest.raises(ValueError, match="none of the simulated arm"):
+        Oracle(LIMITS).reset(Trial(0, 1, 1), UNSEEN)
+
+
+def test_the_same_trial_has_the_same_result_whatever_was_before(arm: SimulatedArm) -> None:
+    first = run(ArmEnvironment(arm), RandomActions(SMALL), trial_of(2, steps=3))
+    run(ArmEnvironment(arm), RandomActions(SMALL, seed=1), trial_of(0, steps=3, seed=5))
+    again = run(ArmEnvironment(arm), RandomActions(SMALL), trial_of(2, steps=3))
     np.testing.assert_array_equal(first.states, again.states)
     np.testing.assert_array_equal(first.goal_image, again.goal_image)
 
 
-def test_a_command_out_of_reach_takes_the_arm_part_of_the_way_and_is_counted(arm: SimulatedArm) -> None:
-    problem = make_problem("reach", DOMAIN_B, 0, 1)
-    result = run_episode(arm, Scripted(way(0.0, 0.0, 1.6), way(0.0, 0.0, 0.05)), problem, steps=2, stride=30)
+def test_a_command_out_of_reach_moves_the_arm_part_of_the_way_and_is_counted(arm: SimulatedArm) -> None:
+    script = Scripted(way(0.0, 0.0, 1.6), way(0.0, 0.0, 0.05))
+    result = run(ArmEnvironment(arm), script, trial_of(1, steps=2, stride=30))
     risen = result.states[:, 2] - result.states[0, 2]
     assert 0.15 < risen[1] < 1.0
     np.testing.assert_allclose(result.states[1, :2], result.states[0, :2], atol=2e-3)
     assert 1 <= result.unreachable <= 2
-    inside = run_episode(arm, Scripted(way(0.0, 0.0, 0.05)), problem, steps=1)
-    assert inside.unreachable == 0
+    assert run(ArmEnvironment(arm), Scripted(way(0.0, 0.0, 0.05)), trial_of(1, 1)).unreachable == 0
 
 
-def test_a_world_model_plans_within_its_limits_and_says_why(arm: SimulatedArm) -> None:
-    config = PlanningConfig(samples=8, iterations=2, limits=SMALL, planner={"name": "cem", "options": {"elites": 3}})
-    policy = Planning(Controller(tiny_model(), config), name="tiny")
-    reported = []
-    spec = RolloutSpec("reach", DOMAIN_B, episodes=2, steps=2, films=1)
-    result = run_task(spec, policy, arm, lambda *n: reported.append(n))
-    assert result.policy == "tiny"
-    assert result.why_counts == {"planned": 4}
+def test_a_planner_acts_within_its_limits_and_some_episodes_are_filmed(arm: SimulatedArm) -> None:
+    config = PlanningConfig(
+        samples=8, iterations=2, horizon=1, limits=SMALL, planner={"name": "cem", "options": {"elites": 3}}
+    )
+    policy, reported = Planning(Controller(tiny_model(), config), name="tiny"), []
+    options = BenchmarkOptions("reach", DOMAIN_B, episodes=2, steps=2, films=1)
+    result = run_task(options, policy, arm, lambda *numbers: reported.append(numbers))
+    assert (result.policy, result.why_counts) == ("tiny", {"planned": 4})
     assert reported == [(decisions, 4) for decisions in range(5)]
     assert all((np.abs(episode.actions[:, :3]) <= 0.03).all() for episode in result.episodes)
     assert np.abs(result.episodes[0].actions[:, :3]).max() > 0
@@ -170,10 +192,33 @@ def test_a_world_model_plans_within_its_limits_and_says_why(arm: SimulatedArm) -
     assert (result.seconds > 0).all()
 
 
+def test_an_environment_with_the_interface_of_gymnasium_is_enough() -> None:
+    class Line:
+        """A hand on a line, whose expert goes to the end of it."""
+
+        def reset(self, *, seed: int, options: dict) -> tuple[Observation, dict]:
+            self.at, self.stride = float(seed), options["stride"]
+            return self.observe()
+
+        def step(self, action: np.ndarray | None) -> tuple[Observation, float, bool, bool, dict]:
+            self.at -= self.stride * (1.0 if action is None else -action[0])
+            return self.observe()[0], 0.0, False, False, self.observe()[1]
+
+        def observe(self) -> tuple[Observation, dict]:
+            return Observation(UNSEEN, way(self.at)), {"distance_m": abs(self.at), "success": self.at == 0.0}
+
+    from vjepa2_ac.simulation.policies import Expert
+    from vjepa2_ac.simulation.rollout import Trials
+
+    trials = Trials("go", "a line", "done", 0.1, (Trial(4, 2, 2), Trial(2, 2, 2)), {})
+    assert run_trials(Line(), Expert(), trials).successes.tolist() == [True, False]
+    assert run_trials(Line(), Scripted(way(-1), way(-1)), trials).distance_cm[0].tolist() == [400.0, 200.0, 0.0]
+
+
 def fake(*distances_m: float, unreachable: int = 0) -> EpisodeResult:
     count = len(distances_m)
     return EpisodeResult(
-        problem=make_problem("reach", DOMAIN_A, 0, 0),
+        trial=trial_of(0, count - 1),
         states=np.zeros((count, 7)),
         actions=np.zeros((count - 1, 7)),
         blocks=None,
@@ -182,33 +227,30 @@ def fake(*distances_m: float, unreachable: int = 0) -> EpisodeResult:
         seconds=np.arange(1.0, count),
         whys=("planned",) * (count - 2) + ("out of time",),
         unreachable=unreachable,
-        goal_image=np.zeros((2, 2, 3), dtype=np.uint8),
+        goal_image=UNSEEN,
         frames=None,
     )
 
 
 def test_success_counts_at_the_end_and_passing_is_separate() -> None:
     episodes = (fake(0.04, 0.03, 0.2), fake(0.2, 0.1, 0.049), fake(0.01, 0.2, 0.051, unreachable=2))
-    result = ClosedLoopResult(RolloutSpec(), "x", episodes)
+    result = ClosedLoopResult(BenchmarkOptions().trials(), "x", episodes)
+    metrics = result.estimates
     assert result.successes.tolist() == [False, True, False]
-    assert result.success_rate.value == pytest.approx(1 / 3)
     assert [episode.success_ever for episode in episodes] == [True, True, False]
-    assert result.success_ever_rate.value == pytest.approx(2 / 3)
-    assert 0 < result.success_rate.low < 1 / 3 < result.success_rate.high < 1
-    assert result.final_distance_cm.value == pytest.approx(10.0)
-    assert result.final_distance_cm.low < 10.0 < result.final_distance_cm.high
-    assert result.seconds_per_decision.value == pytest.approx(1.5)
+    expected = {"success": 1 / 3, "success_ever": 2 / 3, "final_distance_cm": 10.0, "seconds_per_decision": 1.5}
+    assert {name: metrics[name].value for name in expected} == pytest.approx(expected)
+    assert 0 < metrics["success"].low < 1 / 3 < metrics["success"].high < 1
+    assert metrics["final_distance_cm"].low < 10.0 < metrics["final_distance_cm"].high
     assert result.why_counts == {"planned": 3, "out of time": 3}
     assert result.unreachable.tolist() == [0, 0, 2]
     late = (fake(0.2, 0.04, 0.1, 0.03, 0.02), fake(0.2, 0.1, 0.04, 0.04, 0.04), fake(0.2, 0.01, 0.2, 0.2, 0.2))
     assert [episode.steps_needed for episode in late] == [3, 2, None], "until it is done for good"
     assert fake(0.01, 0.02).steps_needed == 0
-    needed = ClosedLoopResult(RolloutSpec(), "x", late).steps_needed
-    assert needed is not None
-    assert needed.value == 2.5
+    assert replace(result, episodes=late).estimates["steps_needed"].value == 2.5
 
 
-def test_ways_are_shortened_in_their_direction_and_held_axes_left_out() -> None:
+def test_actions_are_shortened_in_their_direction_and_fixed_axes_left_out() -> None:
     limits = LimitsConfig(xyz=(0.05, 0.1, 0.0), rotation=0.2, gripper=0.5)
     cut = shortened(np.array([0.1, 0.1, 0.3, 0.1, 0.4, 0.0, -0.8]), limits)
     np.testing.assert_allclose(cut, [0.05, 0.05, 0.0, 0.05, 0.2, 0.0, -0.5], atol=1e-9)
@@ -220,17 +262,15 @@ def test_ways_are_shortened_in_their_direction_and_held_axes_left_out() -> None:
     }
     np.testing.assert_allclose(balls["l2"][:2], [0.03, 0.04], atol=1e-9)
     np.testing.assert_allclose(np.abs(balls["l1"]).sum(), 0.05, atol=1e-9)
-    held = LimitsConfig(gripper_mode="held")
-    assert shortened(np.ones(7), held)[6] == 0.0
+    assert shortened(np.ones(7), LimitsConfig(gripper_mode="held"))[6] == 0.0
 
 
-def test_random_actions_are_those_of_the_problem_within_the_limits_and_over_all_of_them() -> None:
-    policy, blank = RandomActions(LIMITS, seed=4), np.zeros((2, 2, 3), dtype=np.uint8)
-    draws = []
+def test_random_actions_are_those_of_the_trial_within_the_limits_and_over_all_of_them() -> None:
+    policy, draws = RandomActions(LIMITS, seed=4), []
     for index in (0, 1, 0):
-        problem = make_problem("reach", DOMAIN_A, 0, index)
-        policy.reset(problem, blank)
-        draws.append(np.stack([policy.act(blank, problem.start) for _ in range(50)]))
+        trial = trial_of(index, 1)
+        policy.reset(trial, UNSEEN)
+        draws.append(np.stack([policy.act(Observation(UNSEEN, trial.problem.start)) for _ in range(50)]))
     np.testing.assert_array_equal(draws[0], draws[2])
     assert (draws[0] != draws[1]).any()
     assert (np.abs(draws[0]) <= farthest(LIMITS)).all()

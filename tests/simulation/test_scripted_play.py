@@ -14,8 +14,8 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.simulation.policies import play
 from vjepa2_ac.simulation.record import RecordingSpec, default_steps, record_episode
-from vjepa2_ac.simulation.scripted_play import play
 
 
 def blocks_of(task: str, seed: int, *, script: bool, steps: int = 41) -> np.ndarray:
@@ -67,7 +67,7 @@ def test_an_episode_with_a_block_is_consistent_and_always_the_same() -> None:
 
 
 def test_every_other_episode_is_scripted(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vjepa2_ac.simulation import scripted_play as module
+    from vjepa2_ac.simulation import record as module
 
     asked, real = [], module.play
     monkeypatch.setattr(module, "play", lambda *args, **more: asked.append(more["script"]) or real(*args, **more))

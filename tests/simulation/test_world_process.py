@@ -20,8 +20,7 @@ from vjepa2_ac.simulation.worlds import WorldProcess
 
 pytest.importorskip("av", reason="the extra `video` is not installed")
 
-from vjepa2_ac.simulation.record_world import record_world
-from vjepa2_ac.simulation.worlds import OtherWorld
+from vjepa2_ac.simulation.worlds import OtherWorld, record_world
 
 PIXELS = base64.b64encode(bytes(18)).decode()
 START = f"""
@@ -59,7 +58,7 @@ def fail(command: str, timeout_s: float | None = None) -> str:
     def reset_often() -> None:
         with OtherWorld(command, timeout_s) as world:
             for seed in range(3):
-                world.reset(seed)
+                world.reset(seed=seed, options={"stride": 1})
 
     with pytest.raises(InputError) as error:
         reset_often()
@@ -130,11 +129,11 @@ def test_an_answer_that_no_request_asked_for_is_refused(program: Program, tmp_pa
     go_on, said = tmp_path / "go on", tmp_path / "said"
     wait = f"while not os.path.exists({str(go_on)!r}): time.sleep(0.01)"
     with OtherWorld(program(f"say()\n    {wait}\n    say()\n    open({str(said)!r}, 'w')")) as world:
-        world.reset(0)
+        world.reset(seed=0, options={"stride": 1})
         go_on.touch()
         wait_until(said.exists)
         with pytest.raises(InputError, match="without a request"):
-            world.reset(1)
+            world.reset(seed=1, options={"stride": 1})
 
 
 @pytest.mark.parametrize("task", ["../../../out", "/out", "a\0b\nc\x1b[2J", ".."])

@@ -23,16 +23,13 @@ class World:
         self.state = np.array([0.4, 0.0, 0.3, np.pi, 0.0, 0.0, 0.0])
         return self.seen()
 
-    def move(self, target: list[float], steps: int) -> dict[str, Any]:
+    def step(self, target: list[float] | None, steps: int) -> dict[str, Any]:
+        held = target or [*(self.state[:3] if self.is_hard else self.place), np.pi, 0.0, 0.0, 0.0]
         for _ in range(steps):
-            way = np.array(target[:3]) - self.state[:3]
+            way = np.array(held[:3]) - self.state[:3]
             self.state[:3] += way * min(1.0, REACH_M / max(float(np.linalg.norm(way)), 1e-9))
-            self.state[6] = target[6]
-        return self.seen()
-
-    def expert(self, steps: int, offset: list[float]) -> dict[str, Any]:
-        target = [*(self.state[:3] if self.is_hard else self.place + offset), np.pi, 0.0, 0.0, 0.0]
-        return {**self.move(target, steps), "target": target}
+            self.state[6] = held[6]
+        return {**self.seen(), "target": held}
 
     def seen(self) -> dict[str, Any]:
         image = np.zeros((24, 32, 3), dtype=np.uint8)

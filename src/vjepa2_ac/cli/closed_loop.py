@@ -7,8 +7,9 @@ import contextlib
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,16 +23,14 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from vjepa2_ac.evaluation.summary import Summary
+    from vjepa2_ac.evaluation.summary import Summary, Verdict
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
     from vjepa2_ac.simulation.agent import Agent
-    from vjepa2_ac.simulation.benchmark import BenchmarkOptions, ClosedLoopBenchmark
-
-    Benchmark = tuple[ClosedLoopBenchmark, tuple[Path, ...]]  # and its files
+    from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
 
 _OF_RECORD = ("cameras", "workers")
-_OF_A_MODEL = ("sub_goals", "goals", "films", "decoder", "checkpoint", "config", "out", "key_file")
+_OF_A_MODEL = ("sub_goals", "goals", "films", "decoder", "checkpoint", "config", "out")
 
 
 def add_serve(commands: cli.Commands) -> None:
@@ -62,8 +61,8 @@ def add_serve(commands: cli.Commands) -> None:
 def add_simulate(commands: cli.Commands) -> None:
     """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
     parser = cli.command(commands, "simulate", _simulate, "demo/run --task reach --domain B --episodes 10")
-    text = "a run, what model.base takes (builtin:sim-tiny), or the server of one (ws://127.0.0.1:8000); or: record"
-    cli.add(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, cli.as_planner)
+    text = "a run, or what model.base takes (builtin:sim-tiny); or: record"
+    cli.add(parser, "subject RUN_OR_MODEL|record", text, cli.as_model)
     cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
     cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
@@ -87,7 +86,6 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
     cli.add_decoder(group, "in the video what the model imagined of each frame, a step ago")
     cli.add(group, "--out FOLDER", "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)", cli.as_path)
-    cli.add(group, "--key-file FILE", "the key of a server that needs one", cli.as_path)
     group = parser.add_argument_group("to record data")
     text = "of 3 that have an image of their own, the others show the first (1)"
     cli.add(group, "--cameras N", text, cli.whole_number(1, 3))
@@ -230,8 +228,7 @@ def _record(options: argparse.Namespace) -> int:
 def _record_world(options: argparse.Namespace, target: Path) -> int:
     _refuse(options, _OF_RECORD, needed="the simulated arm: a world has one camera, and one process")
 
-    from vjepa2_ac.simulation.record_world import record_world
-    from vjepa2_ac.simulation.worlds import OtherWorld
+    from vjepa2_ac.simulation.worlds import OtherWorld, record_world
 
     with OtherWorld(options.world, options.world_timeout) as world, cli.reporter() as reporter:
         seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
@@ -252,78 +249,80 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     if options.sub_goals == "alike" and not is_run(options.subject) and options.config is None:
         needed = "a run; or a model with --config, whose data has the demonstrations"
         raise InputError(where="--sub-goals alike", found=options.subject, needed=needed)
-    if not cli.is_server(options.subject):
-        _refuse(options, ("key_file",), needed="a server: ws://HOST:PORT")
-        cli.require_to_plan(options)
-    else:
-        _refuse(options, ("checkpoint", "config", "decoder", "overrides"), needed="the model itself; not its server")
+    cli.require_to_plan(options)
 
     from vjepa2_ac.cli.console.tables import benchmark_notes, benchmark_table
-    from vjepa2_ac.simulation.benchmark import BenchmarkOptions
+    from vjepa2_ac.evaluation.summary import closed_loop
+    from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_benchmark, write_benchmark
+    from vjepa2_ac.simulation.domains import load_mujoco
+    from vjepa2_ac.simulation.worlds import OtherWorld, run_world_benchmark
+    from vjepa2_ac.storage import user_can_write
 
     chosen = cli.record_of_options(BenchmarkOptions, options)
-    chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
-    home = (Path(options.subject) if is_run(options.subject) else Path()) / "closed_loop"
-    benchmark, files = (_in_our_world if options.world is None else _in_their_world)(options, chosen, home)
-    checkpoint = benchmark.agent.checkpoint
+    chosen, name = replace(chosen, films=min(chosen.films, chosen.episodes)), f"{chosen.task}-{chosen.domain}"
+    with contextlib.ExitStack() as stack:
+        if options.world is None:
+            load_mujoco()
+        else:
+            env = stack.enter_context(OtherWorld(options.world, options.world_timeout))
+            name = f"{env.about.task} {env.about.world}"
+            name = re.sub(r"\W+", "-", name, flags=re.ASCII).strip("-")[:200]
+        agent, reporter = _agent(options), stack.enter_context(cli.reporter())
+        home = Path(options.subject) if is_run(options.subject) else Path()
+        folder = options.out or home / "closed_loop" / name
+        with user_can_write(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        if options.world is None:
+            benchmark = run_benchmark(agent, chosen, reporter)
+        else:
+            benchmark = run_world_benchmark(agent, env, chosen, reporter)
+        verdict = closed_loop(
+            benchmark.shares,
+            model=benchmark.results[0].policy,
+            oracle=benchmark.results[-1].policy,
+            problems=len(benchmark.trials.trials),
+            task=benchmark.trials.task,
+            conditions=benchmark.conditions,
+        )
+        files = write_benchmark(benchmark, folder, asdict(verdict))
     if options.all:
-        name = f"{options.subject}: checkpoint {checkpoint}" if checkpoint else options.subject
-        cli.show(name, benchmark_table(benchmark), files=files)
-    summary = _summary(benchmark, options)
-    cli.show(*benchmark_notes(benchmark), str(summary), *_next(summary, benchmark, options))
+        subject = agent.subject
+        title = f"{subject.name}: checkpoint {subject.chosen}" if subject.chosen else subject.name
+        cli.show(title, benchmark_table(benchmark), files=files)
+    summary = _summary(benchmark, verdict, options)
+    cli.show(*benchmark_notes(benchmark), str(summary), *_next(summary, verdict, benchmark, options))
     cli.show(*(f"Film: {file}" for file in files[1:2]))
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
 
 
-def _in_our_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: Path) -> Benchmark:
-    from vjepa2_ac.simulation.benchmark import run_benchmark
-    from vjepa2_ac.simulation.domains import load_mujoco
-
-    load_mujoco()
-    folder = options.out or home / f"{chosen.task}-{chosen.domain}"
-    with _agent(options) as agent, cli.reporter() as reporter:
-        return run_benchmark(agent, chosen, folder, reporter)
-
-
-def _in_their_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: Path) -> Benchmark:
-    from vjepa2_ac.simulation.worlds import OtherWorld, run_world_benchmark
-
-    with OtherWorld(options.world, options.world_timeout) as env, _agent(options) as agent, cli.reporter() as reporter:
-        name = re.sub(r"\W+", "-", f"{env.about.task} {env.about.world}", flags=re.ASCII).strip("-")[:200]
-        return run_world_benchmark(agent, env, chosen, options.out or home / name, reporter)
-
-
-def _summary(benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> Summary:
+def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse.Namespace) -> Summary:
     """Return the verdict of the closed loop, with the other verdicts that `evaluate` wrote for this checkpoint."""
     from vjepa2_ac.evaluation.summary import Summary, not_measured
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
-    agent, trials = benchmark.agent, benchmark.trials
+    subject, trials = benchmark.agent.subject, benchmark.trials
     how = _evaluate_command(options) or "`vjepa2-ac evaluate`"
     predicts, uses, ranks = (not_measured(name, how) for name in ("predicts", "uses actions", "ranks actions"))
-    steps = counted(trials.model_steps, "step")
-    measured = f"{trials.task_name}, {trials.place}, {steps} of {trials.seconds_per_step:.2f} s"
-    summary = Summary(agent.subject, measured, predicts, uses, ranks, benchmark.verdict)
-    if agent.checkpoint and (Path(agent.subject) / METRICS_FILE).is_file():
+    measured = f"{trials.task}, {trials.place}, {counted(trials.steps, 'step')} of {trials.seconds_per_step:.2f} s"
+    summary = Summary(subject.name, measured, predicts, uses, ranks, verdict)
+    if subject.chosen and (Path(subject.name) / METRICS_FILE).is_file():
         with contextlib.suppress(InputError):  # of an older format: the other verdicts are not measured
-            evaluated = read_metrics(Path(agent.subject))
-            if evaluated.about.checkpoint == agent.checkpoint:
-                summary = replace(evaluated.summary, measured=measured, plans=benchmark.verdict)
+            evaluated = read_metrics(Path(subject.name))
+            if evaluated.about.checkpoint == subject.chosen:
+                summary = replace(evaluated.summary, measured=measured, plans=verdict)
     return summary
 
 
-def _next(summary: Summary, benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> list[str]:
+def _next(summary: Summary, verdict: Verdict, benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> list[str]:
     """Return the command that follows from the verdicts of a closed loop, as lines; none if no command does."""
     from vjepa2_ac.runs.folder import is_of_moved
 
-    if benchmark.verdict.needs:
+    if verdict.needs:
         return _next_benchmark(benchmark, options)
-    if cli.is_server(options.subject):
-        return [f"Next: your robot's client at {options.subject} (docs/serving.md)"]
     command = _evaluate_command(options)
     if options.sub_goals is not None:  # a server would plan without these sub-goals
         return []
-    if benchmark.verdict.conclusion == "yes" and (summary.predicts.value is not None or not command):
+    if verdict.conclusion == "yes" and (summary.predicts.value is not None or not command):
         words = option_words(options, "checkpoint", "config", "goals", "plugin")
         command = shell_command("serve", options.subject, *words, *options.overrides)
     elif command and summary.predicts.value is not None:
@@ -342,13 +341,13 @@ def _next_benchmark(benchmark: ClosedLoopBenchmark, options: argparse.Namespace)
     from vjepa2_ac.planning.planner import samples_of_iterations
 
     planning, trials, oracle = benchmark.agent.planning, benchmark.trials, benchmark.results[-1]
-    episodes, steps = max(50, trials.episodes), trials.model_steps * (1 + (oracle.success_rate.value < CHANCE))
-    changes = {"episodes": episodes} | ({"steps": steps} if steps != trials.model_steps else {})
+    episodes, steps = max(50, len(trials.trials)), trials.steps * (1 + (oracle.success_rate.value < CHANCE))
+    changes = {"episodes": episodes} | ({"steps": steps} if steps != trials.steps else {})
     prediction_s = float(np.median(benchmark.results[0].seconds)) / (
         sum(samples_of_iterations(planning)) * planning.horizon
     )
     words = [options.subject, *option_words(options, **changes), *options.overrides]
-    on_cpu = not cli.is_server(options.subject) and is_on_cpu(cli.require_to_plan(options).training)
+    on_cpu = is_on_cpu(cli.require_to_plan(options).training)
     return next_simulation(words, planning, episodes * steps, prediction_s, on_cpu=on_cpu)
 
 
@@ -360,22 +359,19 @@ def _evaluate_command(options: argparse.Namespace) -> str:
     return shell_command("evaluate", options.subject, *words) if is_run(options.subject) else ""
 
 
-@contextlib.contextmanager
-def _agent(options: argparse.Namespace) -> Iterator[Agent]:
-    """Return who acts; a server as long as the context lasts."""
+def _agent(options: argparse.Namespace) -> Agent:
+    """Load the model, and the decoder by which videos show predicted frames."""
     from vjepa2_ac.decoding.decoder_folder import SIMULATED
-    from vjepa2_ac.serving.access import read_key
-    from vjepa2_ac.serving.client import PlanningClient
-    from vjepa2_ac.simulation.agent import agent_of_server, agent_of_session
+    from vjepa2_ac.evaluation.imagined import imagined_next
+    from vjepa2_ac.simulation.agent import Agent
 
-    if not cli.is_server(options.subject):
-        decoder = cli.given_decoder(options)
-        shown = SIMULATED if options.world is None else None  # a third-party world is what the data show
-        yield agent_of_session(cli.load_planning_session(options), decoder, shown=shown)
-        return
-    key = None if options.key_file is None else read_key(options.key_file)
-    with PlanningClient(options.subject, key) as client:
-        yield agent_of_server(client)
+    decoder, subject = cli.given_decoder(options), cli.load_planning_session(options)
+    if decoder is None:
+        return Agent(subject)
+    shown = SIMULATED if options.world is None else None  # a third-party environment is what the data show
+    decoder.require_fit(subject.world_model, subject.config.data, subject=subject.name, shown=shown)
+    decoder.to(subject.world_model.device)
+    return Agent(subject, partial(imagined_next, decoder=decoder), decoder.name)
 
 
 def _refuse(options: argparse.Namespace, names: Sequence[str], *, needed: str) -> None:

@@ -396,16 +396,6 @@ as_place = _reader(places.anywhere)  # a path of this machine, or a URL
 as_model = _reader(places.of_a_model)  # a path of this machine, or a model that comes with the package
 
 
-def as_planner(text: str) -> str:
-    """Parse what plans: a model as `as_model`, or the address of a server."""
-    return text if is_server(text) else as_model(text)
-
-
-def is_server(subject: str) -> bool:
-    """Return whether a subject is the address of a planning server."""
-    return subject.startswith(("ws://", "wss://"))
-
-
 def whole_number(least: int, most: int = _MOST) -> Callable[[str], int]:
     """Return a parser of whole numbers from `least` to `most`; by default a limit that no use reaches."""
     return _numbers(int, lambda number: least <= number <= most, f"a whole number from {least} to {most}")

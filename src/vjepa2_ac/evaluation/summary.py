@@ -22,6 +22,7 @@ from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.estimates import over_persistence
 from vjepa2_ac.evaluation.result import L1, Evaluation, Row
 from vjepa2_ac.intervals import ENOUGH_EPISODES, Estimate
+from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
 
 Conclusion = Literal["yes", "no", "inconclusive", "not measured"]
 
@@ -29,7 +30,6 @@ SAME_ERROR = 0.01  # relative; errors this close count as equal, whatever their 
 SAME_RANK = 0.005  # absolute; likewise for action-ranking errors
 SAME_SUCCESS = 0.1  # absolute; a success rate that is surely less than this above a competitor's is not better
 CHANCE = 0.5  # action-ranking error of a model that ignores its actions
-CLOSED_LOOP_FILE = "closed_loop.json"  # in RUN/closed_loop/TASK-DOMAIN
 _BASE, _PERSISTENCE, _CHANCE = "with the base model", "with persistence", "chance"  # what a verdict compares with
 _TOO_FEW = "too few for a conclusion"
 _COLUMNS, _NO_BREAK = 80, "\N{NO-BREAK SPACE}"

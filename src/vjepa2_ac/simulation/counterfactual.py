@@ -1,7 +1,7 @@
 """Counterfactuals: what really happens in a recorded simulated episode under actions that were not taken.
 
 The episode is simulated again up to a control step, and what is there is compared with what was recorded; from there
-the arm carries out other actions as in the closed loop (`closed_loop.rollout.send_action`: same targets, same lag).
+the arm carries out other actions as in the closed loop (`rollout.send_action`: same targets, same lag).
 """
 
 from __future__ import annotations

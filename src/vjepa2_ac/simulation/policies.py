@@ -1,175 +1,104 @@
-"""Policies of the simulated robot: a planner, and its references: zero actions, random actions and an oracle."""
+"""References for a planner, which look at no image: zero actions, random actions, and oracles."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from enum import Enum
-from typing import Any, Protocol
+from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.data.transforms import frame_of_seen, split_views
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-from vjepa2_ac.evaluation.imagined import imagined_next
-from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.simulation.arm import Block, SimulatedArm, State
-from vjepa2_ac.simulation.tasks import GRASP_M, RELEASED, Problem, TaskName, TaskProblem
-
-GoalsOf = Callable[[Any], Sequence[SubGoal]]  # of a problem of its world
-Image = UInt8[np.ndarray, "height width 3"]
+from vjepa2_ac.episode import ACTION_DIM
+from vjepa2_ac.simulation.arm import Block, Look, SimulatedArm, State
+from vjepa2_ac.simulation.motion import Motion, MotionRecipe, OutOfReachError
+from vjepa2_ac.simulation.rollout import Action, Image, Observation, Trial, put, states_along
+from vjepa2_ac.simulation.tasks import GRASP_M, RELEASED, TaskName, TaskProblem, make_problem
+from vjepa2_ac.spaces import apply_action
 
 _ALMOST = 1 - 1e-9  # of a limit: rounding must not exceed it
 
 
-class Moves(Enum):
-    """What a policy observes and changes: the flange's pose, or the joints; and the gripper."""
-
-    FLANGE = 7
-    JOINTS = 8
-
-
-class Policy(Protocol):
-    """Chooses the action of the next model step (legend of actions: episode.py; of joints, radians and closedness)."""
-
-    name: str
-    why: str  # reason of the last action, short enough to be counted
-    moves: Moves  # what its states and actions are: poses of the flange, or joint angles and gripper
-
-    def reset(self, problem: Problem, goal_image: Image) -> None:
-        """Begin an episode. Only an oracle uses more of the problem than the images."""
-
-    def act(self, image: Image, state: Float[np.ndarray, " dim"]) -> Float[np.ndarray, " dim"]:
-        """Return the action of the next model step from the camera image and the measured state, in base frame."""
-
-
 class ZeroActions:
-    """Does not move the arm. Base of the references, which look at no image.
+    """Does not move the arm. Base class of the references.
 
     Args:
         limits: The allowed actions.
     """
 
-    name, why, moves = "zero action", "nothing", Moves.FLANGE
+    name, why = "zero action", "nothing"
 
     def __init__(self, limits: LimitsConfig | None = None) -> None:
         self._limits = limits or LimitsConfig()
 
-    def reset(self, problem: Problem, goal_image: Image) -> None:
-        """Begin an episode."""
+    def reset(self, trial: Trial, goal_image: Image) -> None:
+        """Start an episode."""
 
-    def act(self, image: Image, state: State) -> State:  # noqa: ARG002 - of the protocol
+    def act(self, observation: Observation) -> State:
         """Return the next action, within the limits."""
-        return shortened(self._way(state), self._limits)
+        return shortened(self._way(observation), self._limits)
 
-    def _way(self, state: State) -> State:
+    def _way(self, observation: Observation) -> State:
         """Return the action before it is shortened."""
-        return np.zeros_like(state)
+        return np.zeros_like(observation.state)
 
 
 class RandomActions(ZeroActions):
-    """Draws actions uniformly from the allowed ones; the same problem gets the same actions.
+    """Draws actions uniformly from the allowed ones; the same trial gets the same actions.
 
     Args:
         limits: The allowed actions: `xyz`, `rotation` and `gripper` of each axis, and the ball.
-        seed: Of the actions, with the problem's number.
+        seed: Of the actions, with that of the trial.
     """
 
     name, why = "random", "random"
 
     def __init__(self, limits: LimitsConfig, seed: int = 0) -> None:
         super().__init__(limits)
-        self._seed, self._rng = seed, np.random.default_rng(seed)
+        self._seed = seed
 
-    def reset(self, problem: Problem, goal_image: Image) -> None:  # noqa: ARG002
-        """Seed the generator for this problem."""
-        self._rng = np.random.default_rng([self._seed, problem.index])
+    def reset(self, trial: Trial, goal_image: Image) -> None:  # noqa: ARG002
+        """Seed the generator for this trial."""
+        self._rng = np.random.default_rng([self._seed, trial.seed])
 
-    def _way(self, state: State) -> State:
-        return np.asarray(self._rng.uniform(-1.0, 1.0, size=len(state)) * farthest(self._limits))
+    def _way(self, observation: Observation) -> State:
+        return np.asarray(self._rng.uniform(-1.0, 1.0, size=len(observation.state)) * farthest(self._limits))
 
 
 class Oracle(ZeroActions):
-    """Knows the goal state and observes the block, and does the task as fast as allowed. Does not rotate.
+    """Knows the goal state and observes the block, and does a task of the simulated arm as fast as allowed.
 
-    Args:
-        limits: The allowed actions.
-        arm: The arm whose block is observed; None: the task is `reach`, which has none.
+    It does not rotate.
     """
 
     name, why = "oracle", "scripted"
 
-    def __init__(self, limits: LimitsConfig, arm: SimulatedArm | None = None) -> None:
-        super().__init__(limits)
-        self._arm = arm
-
-    def reset(self, problem: Problem, goal_image: Image) -> None:  # noqa: ARG002
+    def reset(self, trial: Trial, goal_image: Image) -> None:  # noqa: ARG002
         """Set the goal.
 
         Raises:
-            ValueError: It is a problem of another world.
+            ValueError: It is a trial of another environment.
         """
-        self._problem = TaskProblem.of(problem)
+        if trial.problem is None:
+            raise ValueError(f"trial {trial.seed} is none of the simulated arm: use Expert")
+        self._problem = trial.problem
 
-    def _way(self, state: State) -> State:
-        way = _WAYS.get(self._problem.task)
-        block = None if self._arm is None else self._arm.block
+    def _way(self, observation: Observation) -> State:
+        way, state, block = _WAYS.get(self._problem.task), observation.state, observation.block
         return _reach_way(self._problem, state) if way is None or block is None else way(self._problem, state, block)
 
 
-class Planning:
-    """A world model that plans from the images and the measured state.
+class Expert:
+    """Lets the scripted expert of an environment act."""
 
-    Args:
-        controller: Plans with the model; its last `decision` can be read after every action.
-        name: Of the model, as shown in tables.
-        decoder: Shows what it imagines, on the model's device; None: nothing does.
-        goals_of: Returns the goals on the way of a problem, with the last one; None: the problem's goal image only.
-            Their gripper modes are left out for a robot of joints, whose gripper is a number like the others.
-    """
+    name, why = "expert", "scripted"
 
-    def __init__(
-        self,
-        controller: Controller,
-        name: str = "model",
-        decoder: TrainedDecoder | None = None,
-        goals_of: GoalsOf | None = None,
-    ) -> None:
-        self.controller, self.name, self.why, self._goals_of = controller, name, "", goals_of
-        self._decoder = None if decoder is None else decoder.to(controller.device)
-        self._size = (0, 0)  # of the last image
-        self.moves = Moves.FLANGE if controller.spaces.state.position is not None else Moves.JOINTS
+    def reset(self, trial: Trial, goal_image: Image) -> None:
+        """Start an episode."""
 
-    def reset(self, problem: Problem, goal_image: Image) -> None:
-        """Give the planner the goal image, or the goals on the way."""
-        if self._goals_of is None:
-            self.controller.reset(goal_image)
-            return
-        goals, has_gripper = self._goals_of(problem), self.controller.spaces.state.is_pose
-        self.controller.follow(goals if has_gripper else [replace(goal, gripper=None) for goal in goals])
-
-    def act(self, image: Image, state: Float[np.ndarray, " dim"]) -> Float[np.ndarray, " dim"]:
-        """Return the first action of a plan; for joints as a change, whatever the model was taught."""
-        action = self.controller.act(image, state)
-        self._size = image.shape[0], image.shape[1]
-        self.why = self.controller.decision.why if self.controller.decision else ""
-        return action - state if self.controller.spaces.action.follows == "target" else action
-
-    def imagined(self) -> Image | None:
-        """Return the next camera image as it was imagined with the last action; white where the model sees nothing.
-
-        None: there is no decoder, or nothing was imagined, for example since the goal is reached.
-        """
-        decision = self.controller.decision
-        found = None if self._decoder is None or decision is None else imagined_next(decision, self._decoder)
-        if found is None:
-            return None
-        height, width, views = *self._size, self.controller.config.views
-        parts = split_views(found[None], views)
-        return np.hstack([frame_of_seen(part, height, width // views, self.controller.crop) for part in parts])
+    def act(self, observation: Observation) -> Action | None:  # noqa: ARG002
+        """Leave the action to the environment."""
+        return None
 
 
 def farthest(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
@@ -277,3 +206,85 @@ def _grasp_way(state: State, block: Block) -> State:
         if np.linalg.norm(to_place[:2]) > _OVER_M:
             way[2] = max(way[2], min(0.0, way[2] + _CLEAR_M))  # not down on the block's edge
     return way
+
+
+# ---- demonstrations with a block: the oracle with noise, or random play ----
+
+_NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's step
+_LOWEST_M, _HIGHEST_M = 0.155, 0.34  # of the flange while playing
+_TO_BLOCK = 0.5  # probability that a step of play goes to the block, or through it
+_AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # of the flange while playing, in the world
+
+
+def play(
+    arm: SimulatedArm, task: TaskName, steps: int, rng: np.random.Generator, *, script: bool, look: Look | None = None
+) -> Motion:
+    """Return a demonstration of `steps` control steps with an arm that touches the block.
+
+    Afterwards arm and block are where control step `steps` would be measured; fewer steps are the beginning of more.
+
+    Args:
+        arm: From `arm_for` of this task.
+        task: One with a block: the problem at the start, and whether the gripper is used.
+        steps: Control steps; 0: only the start is drawn.
+        rng: The only source of randomness.
+        script: Whether an oracle solves the problem, with noise; otherwise, random play.
+        look: Called with the arm.
+
+    Raises:
+        UnreachableError: MuJoCo is not installed.
+    """
+    recipe = MotionRecipe()
+    problem = make_problem(task, arm.domain, int(rng.integers(2**31)), 0)
+    limits = LimitsConfig(xyz=(recipe.reach_m,) * 3)
+    oracle, unseen = Oracle(limits), np.zeros((1, 1, 3), dtype=np.uint8)
+    put(arm, problem.start, problem.block_start, problem.mark)
+    oracle.reset(Trial(0, steps, recipe.stride, problem), unseen)
+    motion = Motion(np.empty((steps, 7)), np.empty(steps), np.empty((steps, 7)), np.empty(steps))
+    joints, grip = arm.joints, float(problem.start[6])
+    for step in range(steps):
+        if step % recipe.stride == 0:
+            if script:
+                noise = np.append(rng.normal(0.0, _NOISE_M, size=3), np.zeros(4))
+                action = shortened(oracle.act(Observation(unseen, arm.state, arm.block)) + noise, limits)
+            else:
+                action = _play_action(arm, problem, limits, rng)
+            joints, grip = _sent(arm, action)
+        motion.commanded_joints[step], motion.commanded_gripper[step] = joints, grip
+        motion.joints[step], motion.gripper[step] = arm.joints, arm.closedness
+        if look:
+            look(arm)
+        arm.command_joints(joints, grip)
+    return motion
+
+
+def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
+    """Return a step to or through the block, or anywhere; but for `push`, sometimes the gripper opens or closes."""
+    state, block = arm.state, arm.block
+    if block is None:
+        raise ValueError("there is no block to play with")
+    turn = arm.domain.base_pose()[:3, :3]
+    way = np.zeros(ACTION_DIM)
+    if rng.uniform() < _TO_BLOCK:
+        height = GRASP_M if problem.task != "push" else problem.goal[2] - block[2]
+        way[:3] = block[:3] - state[:3] + np.append(rng.normal(0.0, 0.03, size=2), height)
+        way[:2] *= rng.uniform(0.6, 1.8)
+    else:
+        way[:3] = rng.uniform(-1.0, 1.0, size=3) * limits.xyz_m
+    if problem.task != "push" and rng.uniform() < 0.25:
+        way[6] = rng.choice([-1.0, 1.0]) * limits.gripper
+    way = shortened(way, limits)
+    place = turn @ (state[:3] + way[:3])
+    low, high = np.append(_AREA[0], _LOWEST_M), np.append(_AREA[1], _HIGHEST_M)
+    way[:3] = turn.T @ np.clip(place, low, high) - state[:3]
+    return shortened(way, limits)
+
+
+def _sent(arm: SimulatedArm, action: Float[np.ndarray, " 7"]) -> tuple[np.ndarray, float]:
+    """Return the joints and closedness of a step's command, as far along it as joint angles exist."""
+    joints, target = arm.joints, apply_action(arm.state, action)
+    for way in [target, *reversed(states_along(arm.state, action)[:-1])]:
+        with suppress(OutOfReachError):
+            joints = arm.joints_for(way)
+            break
+    return joints, float(np.clip(target[6], 0.0, 1.0))

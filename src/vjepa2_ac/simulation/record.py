@@ -34,6 +34,7 @@ from vjepa2_ac.simulation.droid_writer import (
     write_droid_rlds,
 )
 from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
+from vjepa2_ac.simulation.policies import play
 from vjepa2_ac.simulation.tasks import arm_for
 from vjepa2_ac.storage.places import SIMULATION_FILE
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
@@ -108,8 +109,6 @@ def carry_out(
     """
     rng = _stream(index, spec, _MOTION)
     if spec.task is not None:  # contacts depend on all that happened before
-        from vjepa2_ac.simulation.scripted_play import play  # imports torch
-
         return play(arm, spec.task, spec.steps if until is None else until, rng, script=index % 2 == 0, look=look)
     arm.reset_clock()
     motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)

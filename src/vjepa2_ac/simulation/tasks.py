@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -57,14 +57,6 @@ _LIES_M = 0.01  # a block whose middle is at most this far from the height of a 
 _MOST_TURNED_RAD = 0.4  # of block and hand, from straight ahead
 
 
-class Problem(Protocol):
-    """One start and one goal, in any world."""
-
-    @property
-    def index(self) -> int:
-        """Its number; with the seed of a policy it determines what is random in it."""
-
-
 @dataclass(frozen=True)
 class TaskProblem:
     """One start and one goal of the simulated arm. All poses are in its base frame (legend: episode.py).
@@ -78,17 +70,6 @@ class TaskProblem:
     goal: State  # of the arm in the goal image
     block_start: Block | None = None  # None: there is no block
     block_goal: Block | None = None
-
-    @classmethod
-    def of(cls, problem: Problem) -> TaskProblem:
-        """Return a problem that has to be one of the simulated arm.
-
-        Raises:
-            ValueError: It is one of another world.
-        """
-        if not isinstance(problem, cls):
-            raise ValueError(f"{problem} is no problem of the simulated arm")  # noqa: TRY004 - a wrong argument
-        return problem
 
     @property
     def ends(self) -> Float[np.ndarray, "2 4"]:

@@ -1,7 +1,7 @@
-"""Worlds that others made: a program in an environment of its own is one more place for a model to act in.
+"""Third-party environments: each is a program in an environment of its own that models act and experts record in.
 
-The program reads requests and writes answers, one JSON object a line, on its standard input and output. It knows
-nothing of this project, so that its pins are its own. docs/worlds.md has the protocol; examples/worlds three programs.
+The program reads requests and writes answers, one JSON object a line, on its standard input and output, within limits
+of time and size. It imports nothing of this project, so that its pins are its own. Protocol: docs/worlds.md.
 """
 
 from __future__ import annotations
@@ -9,12 +9,13 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import select
 import shlex
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,54 +24,48 @@ from threading import Thread
 from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Float
 from pydantic import Field
 
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.goals.key_frames import (
-    OF_MODEL_STEPS,
-    Timing,
-    every_key_frame,
-    gripper_key_frames,
-    sub_goals_of,
-)
+from vjepa2_ac.goals.key_frames import OF_MODEL_STEPS, every_key_frame, gripper_key_frames
 from vjepa2_ac.media.video import video_library
-from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.agent import Agent
 from vjepa2_ac.simulation.benchmark import (
     BenchmarkOptions,
     ClosedLoopBenchmark,
-    DemonstrationSpec,
-    every_step,
-    of_demonstrations_alike,
+    goals_of_episode,
     try_policies,
-    write_benchmark,
+    with_own_goals,
 )
-from vjepa2_ac.simulation.policies import GoalsOf, Image, Moves, RandomActions, ZeroActions
+from vjepa2_ac.simulation.policies import Expert, RandomActions, ZeroActions
 from vjepa2_ac.simulation.rollout import (
+    Action,
     ClosedLoopResult,
     EpisodeResult,
+    Image,
     Observation,
-    Span,
-    commanded,
+    Step,
+    Trial,
+    Trials,
+    run,
+    steps_of,
+    target_of,
 )
-from vjepa2_ac.simulation.tasks import Problem
 from vjepa2_ac.spaces import POSE, actions_from_states
-from vjepa2_ac.storage import user_can_write
+from vjepa2_ac.storage import atomic_writer, user_can_write
 from vjepa2_ac.storage.structured import record_of
 
 _ANSWER_S = 120.0
 LOADING = 5  # the first answer may take this many times as long
-_ENDS_S = 10.0  # time that a world has to exit when its input has ended
+_ENDS_S = 10.0  # time that a program has to exit when its input has ended
 _MOST_BYTES = 64 << 20  # of a line: an image of 16 million pixels in base64
 _MOST_SHOWN = 200  # bytes of a wrong line
 _ERROR_BYTES, _ERROR_LINES = 64 << 10, 5  # of the error output: kept, and shown
 _KEEPER = "import os, sys; world = int(sys.stdin.readline()); sys.stdin.read(); os.killpg(world, 9)"
 PROTOCOL = "docs/worlds.md has the protocol; examples/worlds programs that follow it"
-EXPERT = "expert"
-TRIES = 2  # so many times the problems are drawn, until the expert has solved enough of them
+TRIES = 2  # times as many problems as required are drawn, until the expert has solved enough of them
 
 
 class WorldProcess(ExitStack):
@@ -190,7 +185,7 @@ def _shown(line: bytes) -> str:
 
 @dataclass(frozen=True)
 class AboutWorld:
-    """What a world says of itself, unasked, in its first line."""
+    """The first line of a program: what its environment is."""
 
     world: Annotated[str, Field(max_length=200)]  # name and version
     task: Annotated[str, Field(max_length=200)]  # part of the names of files
@@ -200,23 +195,15 @@ class AboutWorld:
     expert: bool = False  # whether it has one
 
 
-@dataclass(frozen=True)
-class WorldObservation(Observation):
-    """What a world answers."""
-
-    target: Float[np.ndarray, " 7"] | None = None  # that its expert held last
-    goal: Image | None = None  # of a reset: the image to aim at, where the world has one
-
-
 class OtherWorld(WorldProcess):
-    """A third-party environment that runs as a program; `close` ends it.
+    """A third-party environment that runs as a program; `close` ends it. Interface: `rollout.Environment`.
 
     Args:
         command: Its program and arguments, as in a shell: PYTHON examples/worlds/robosuite.py Lift.
         timeout_s: As of `WorldProcess`.
 
     Raises:
-        InputError: It cannot be started, or is no world.
+        InputError: It cannot be started, or does not say what it is.
     """
 
     def __init__(self, command: str, timeout_s: float | None = None) -> None:
@@ -228,52 +215,28 @@ class OtherWorld(WorldProcess):
             self.close()
             raise
 
-    def reset(self, seed: int) -> WorldObservation:
-        """Begin the episode of a seed: the same one, whenever it is asked for.
+    def reset(self, *, seed: int, options: Mapping[str, Any]) -> tuple[Observation, dict[str, Any]]:
+        """Start the episode of a seed: always the same one. `options` has the stride.
 
         Raises:
-            InputError: The world has ended, or answers something else.
+            InputError: The program has ended, or answers something else.
         """
+        self._stride = options["stride"]
         return self._ask(do="reset", seed=seed)
 
-    def move(self, target: Float[np.ndarray, " 7"], steps: int) -> WorldObservation:
-        """Hold a target for some control steps: a pose in the frame of the robot's base, and a closedness.
+    def step(self, action: Action | None) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Hold the pose after an action for a model step; None: let the expert act.
 
         Raises:
             InputError: As `reset`.
         """
-        return self._ask(do="move", target=target.tolist(), steps=steps)
+        target = None if action is None else target_of(self._state, action)
+        words = None if target is None else target.tolist()
+        observation, info = self._ask(do="step", target=words, steps=self._stride)
+        info.setdefault("target", observation.state if target is None else target)
+        return observation, -info["distance_m"], info["success"], False, info
 
-    def let_expert(self, steps: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> WorldObservation:
-        """Let the expert act for some control steps, its targets moved by an offset in metres.
-
-        Raises:
-            InputError: As `reset`.
-        """
-        return self._ask(do=EXPERT, steps=steps, offset=list(offset))
-
-    def begin(self, problem: Problem) -> tuple[Image, Observation]:
-        """Reset to a problem; return its goal image, and what is seen.
-
-        Raises:
-            InputError: As `reset`.
-            ValueError: It is a problem of another world.
-        """
-        if not isinstance(problem, WorldProblem):
-            raise ValueError(f"{problem} is no problem of {self.about.world}")  # noqa: TRY004 - a wrong argument
-        self._now = self.reset(problem.index)
-        return problem.goal_image, self._now
-
-    def act(self, action: Float[np.ndarray, " dim"], moves: Moves, stride: int) -> tuple[bool, Observation]:  # noqa: ARG002
-        """Hold the pose after an action for so many control steps; return True, and what is seen then.
-
-        Raises:
-            InputError: As `reset`.
-        """
-        self._now = self.move(commanded(self._now.state, action), stride)
-        return True, self._now
-
-    def _ask(self, **request: Any) -> WorldObservation:
+    def _ask(self, **request: Any) -> tuple[Observation, dict[str, Any]]:
         answer = self.exchange(request)
         try:
             image, distance_m, is_done = _image(answer["image"]), float(answer["distance_m"]), answer["success"]
@@ -282,15 +245,17 @@ class OtherWorld(WorldProcess):
                 raise ValueError(f"an image of {image.shape} after others of {self._image_shape}")  # noqa: TRY301
             if not (np.isfinite(distance_m) and isinstance(is_done, bool)):
                 raise ValueError(f"distance_m {distance_m}, success {is_done!r}")  # noqa: TRY301
-            state, target, goal = self._pose(answer["state"], "state"), answer.get("target"), answer.get("goal")
-            held = None if target is None else self._pose(target, "target")
-            aim = None if goal is None else _image(goal)
-            return WorldObservation(image, state, distance_m, is_done, target=held, goal=aim)
+            info: dict[str, Any] = {"distance_m": distance_m, "success": is_done}
+            for name, read in (("target", self._pose), ("goal", _image)):
+                if answer.get(name) is not None:
+                    info["goal_image" if name == "goal" else name] = read(answer[name])
+            self._state = self._pose(answer["state"], "state")
+            return Observation(image, self._state), info
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             found = f"no {error}" if isinstance(error, KeyError) else str(error)
             raise self.refused(found, "image, state, distance_m and success") from None
 
-    def _pose(self, numbers: Any, name: str) -> Float[np.ndarray, " 7"]:
+    def _pose(self, numbers: Any, name: str = "target") -> np.ndarray:
         pose = np.array(numbers, dtype=np.float64)
         POSE.require_state(pose, f"{self.where}: {name}")
         return pose
@@ -304,111 +269,40 @@ def _image(found: dict[str, Any]) -> Image:
     return pixels.copy().reshape(found["height"], found["width"], 3)
 
 
-@dataclass(frozen=True, eq=False)
-class WorldProblem:
-    """An episode of a world, and how its expert solves it."""
-
-    index: int  # the seed of its reset
-    goal_image: Image
-    goals: tuple[SubGoal, ...] = ()  # on the way, with the last one; none: the goal image alone
-
-
-@dataclass(frozen=True)
-class WorldTrials:
-    """The problems that a world's expert solves."""
-
-    about: AboutWorld
-    seed: int
-    stride: int
-    model_steps: int
-    problems: tuple[WorldProblem, ...]
-    asked: BenchmarkOptions
-    left_out: tuple[int, ...] = ()  # seeds that the expert does not solve
-
-    @property
-    def episodes(self) -> int:
-        """Number of problems."""
-        return len(self.problems)
-
-    @property
-    def seconds_per_step(self) -> float:
-        """Length of a model step."""
-        return self.stride / self.about.rate_hz
-
-    @property
-    def task_name(self) -> str:
-        """What is to be done."""
-        return self.about.task
-
-    @property
-    def place(self) -> str:
-        """Where it is done."""
-        return self.about.world
-
-    @property
-    def criterion(self) -> str:
-        """When it is done, in a few words."""
-        return "done"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, for JSON."""
-        return {
-            **vars(self.about),
-            "episodes": self.episodes,
-            "seeds": [problem.index for problem in self.problems],
-            "left_out": list(self.left_out),
-            "seed": self.seed,
-            "stride": self.stride,
-            "steps": self.model_steps,
-            "seconds_per_step": self.seconds_per_step,
-            "sub_goals": self.asked.sub_goals,
-            "goals": self.asked.goals,
-        }
+# ---- a model in such an environment ----
 
 
 def run_world_benchmark(
-    agent: Agent, world: OtherWorld, options: BenchmarkOptions, folder: Path, reporter: Reporter = SILENT
-) -> tuple[ClosedLoopBenchmark, tuple[Path, ...]]:
-    """Let model, zero actions and chance solve what the world's expert solves; write closed_loop.json and the video.
+    agent: Agent, world: OtherWorld, options: BenchmarkOptions, reporter: Reporter = SILENT
+) -> ClosedLoopBenchmark:
+    """Let a model, zero actions and random actions solve what the expert of an environment solves.
 
     Args:
         agent: The model and its planning settings.
         world: Where they act.
-        options: How many problems, from which seed on, and their goals on the way. Task and domain are the world's.
-        folder: The output folder; created if it is missing.
+        options: Number and first seed of the problems, and the sub-goals. Task and domain are the environment's.
         reporter: Shows the progress of each policy.
 
     Raises:
-        InputError: A folder that is not writable, a model that needs what worlds do not tell, goals that cannot be
-            used, or a world that has no goals, or whose expert solves fewer than half of the problems.
+        InputError: A model that needs what such environments do not measure, goals that cannot be used, no expert, or
+            one that solves fewer than half of the problems.
         UnreachableError: PyAV is missing.
     """
     if options.films:
         video_library()
-    with user_can_write(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    goals_of: GoalsOf | None = None
-    if options.goals is not None:
-        goals = agent.goals_of(read_goal_folder(Path(options.goals)))
-        goals_of = lambda _: goals  # noqa: E731
-    elif options.sub_goals != "none":
-        goals_of = lambda problem: problem.goals  # noqa: E731
-    model = agent.policy(None, goals_of)
-    name = world.about.task
-    trials, shown = find_problems(world, options, agent.stride, reporter.task(f"{name}: {EXPERT}"))
-    if options.sub_goals == "alike":
-        alike = of_demonstrations_alike(agent, world, trials.problems, reporter)
-        trials = replace(trials, problems=tuple(replace(one, goals=tuple(alike(one))) for one in trials.problems))
+    model = agent.policy(None)
+    progress = reporter.task(f"{world.about.task}: {Expert.name}")
+    trials, shown = find_trials(world, options, agent.stride, progress)
+    trials = with_own_goals(trials, agent, world, options, reporter)
     policies = (model, ZeroActions(), RandomActions(agent.planning.limits, options.seed))
-    results = try_policies(world, policies, agent, trials, options.films, reporter)
-    benchmark = ClosedLoopBenchmark(agent, trials, (*results, shown))
-    return benchmark, write_benchmark(benchmark, folder)
+    results = try_policies(world, policies, trials, options.films, reporter)
+    return ClosedLoopBenchmark(agent, trials, (*results, shown))
 
 
-def find_problems(
-    world: OtherWorld, options: BenchmarkOptions, stride: int, progress: Progress
-) -> tuple[WorldTrials, ClosedLoopResult]:
-    """Return as many problems as are asked for, and how the expert solves them: those that it does not are left out.
+def find_trials(
+    world: OtherWorld, options: BenchmarkOptions, stride: int, progress: Progress = no_progress
+) -> tuple[Trials, ClosedLoopResult]:
+    """Return as many trials as required that the expert solves, and its results; the others are left out.
 
     Raises:
         InputError: It solves fewer than half, or there is no expert.
@@ -418,50 +312,144 @@ def find_problems(
         found, needed = f"{about.world} {about.task} has no expert", "one: it shows the goals, and what can be reached"
         raise world.refused(found, needed)
     steps = options.steps or -(-about.steps // stride)
-    problems, shown, left_out = list[WorldProblem](), list[EpisodeResult](), list[int]()
+    trials, episodes, left_out = list[Trial](), list[EpisodeResult](), list[int]()
     for seed in range(options.seed, options.seed + TRIES * options.episodes):
-        problem, episode = _demonstrated(world, seed, Span(steps, stride), options)
-        if episode.success:
-            problems.append(problem)
-            shown.append(episode)
-        else:
+        episode = run(world, Expert(), Trial(seed, steps, stride), keep_frames=True)
+        if not episode.success:
             left_out.append(seed)
-        progress(len(problems), options.episodes)
-        if len(problems) == options.episodes:
+        else:
+            trial = replace(episode.trial, goal_image=episode.goal_image)
+            if options.sub_goals in {"demonstration", "every-step"}:
+                every = every_key_frame(steps + 1, 1)
+                keys = (
+                    every if options.sub_goals == "every-step" else gripper_key_frames(episode.states, OF_MODEL_STEPS)
+                )
+                trial = replace(trial, goals=goals_of_episode(episode, keys, options.sub_goals))
+            trials.append(trial)
+            episodes.append(replace(episode, trial=trial, frames=None))
+        progress(len(trials), options.episodes)
+        if len(trials) == options.episodes:
             break
     else:
-        tried = counted(len(problems) + len(left_out), "problem")
-        found = f"the expert solves {len(problems)} of {tried} in {counted(steps, 'model step')}"
+        tried = counted(len(trials) + len(left_out), "problem")
+        found = f"the expert solves {len(trials)} of {tried} in {counted(steps, 'model step')}"
         raise world.refused(found, "half of them", "Allow more of them with --steps")
-    trials = WorldTrials(about, options.seed, stride, steps, tuple(problems), options, tuple(left_out))
-    return trials, ClosedLoopResult(trials, EXPERT, tuple(shown))
+    values = {
+        **vars(about),
+        "episodes": len(trials),
+        "seeds": [trial.seed for trial in trials],
+        "left_out": left_out,
+        "seed": options.seed,
+        "stride": stride,
+        "steps": steps,
+        "seconds_per_step": stride / about.rate_hz,
+        "sub_goals": options.sub_goals,
+        "goals": options.goals,
+    }
+    solved = Trials(about.task, about.world, "done", stride / about.rate_hz, tuple(trials), values)
+    return solved, ClosedLoopResult(solved, Expert.name, tuple(episodes))
 
 
-def _demonstrated(
-    world: OtherWorld, seed: int, span: Span, options: BenchmarkOptions
-) -> tuple[WorldProblem, EpisodeResult]:
-    """Let the expert solve an episode; return the problem with goals of what was seen, and the record."""
-    first = world.reset(seed)
-    seen = [first, *(world.let_expert(span.stride) for _ in range(span.steps))]
-    states, images = np.stack([one.state for one in seen]), [one.image for one in seen]
-    problem = WorldProblem(seed, images[-1] if first.goal is None else first.goal)
-    if options.sub_goals in {"demonstration", "every-step"}:
-        spec = every_step(DemonstrationSpec()) if options.sub_goals == "every-step" else DemonstrationSpec()
-        keys = gripper_key_frames(states, OF_MODEL_STEPS) if spec.every is None else every_key_frame(len(seen), 1)
-        timing = Timing(1, spec.slack, spec.share)
-        goals = sub_goals_of([images[key.frame] for key in keys], keys, timing, states)
-        problem = replace(problem, goals=tuple(goals))
-    record = EpisodeResult(
-        problem=problem,
-        states=states,
-        actions=actions_from_states(states),
-        blocks=None,
-        distances_m=np.array([one.distance_m for one in seen]),
-        reached=np.array([one.is_done for one in seen]),
-        seconds=np.zeros(span.steps),
-        whys=("scripted",) * span.steps,
-        unreachable=0,
-        goal_image=problem.goal_image,
-        frames=None,
-    )
-    return problem, record
+# ---- recording of its expert, and of play ----
+
+REST_S = 0.5  # an episode ends so long after success
+OFF_M, OFF_S, EVERY_S = 0.02, 0.3, 1.5  # of a disturbance: its standard deviation on each axis, length, and period
+HELD_S, WIDER_M, GRIPS = (0.3, 1.0), 0.05, 0.3  # of play: how long a target, how much wider the box, share of grips
+LOOK = 4  # control steps between two positions of the expert that the box of play is made from
+DISTURBED, PLAY = 1, 2  # seeds that leave this, divided by three
+
+
+class _DisturbedExpert(Expert):
+    """Now and then holds a pose a few centimetres off, then lets the expert go on."""
+
+    def __init__(self, world: OtherWorld, seed: int, every: int) -> None:
+        self._rng, self._every, self._step = np.random.default_rng([seed, 0]), every, -every
+        rate_hz = world.about.rate_hz
+        self._period, self._length = max(1, round(EVERY_S * rate_hz)), round(OFF_S * rate_hz)
+
+    def act(self, observation: Observation) -> Action | None:
+        self._step += self._every
+        if self._step % self._period < self._every:
+            self._target = observation.state.copy()
+            self._target[:3] += OFF_M * self._rng.normal(size=3)
+        if self._step % self._period >= self._length:
+            return None
+        return np.asarray(actions_from_states(np.stack([observation.state, self._target]))[0])
+
+
+class _Play(Expert):
+    """Goes to random places in the box in which the expert moves, and now and then opens or closes the gripper."""
+
+    def __init__(self, world: OtherWorld, seed: int, every: int) -> None:
+        self._rng, self._rate_hz, self._every = np.random.default_rng([seed, 1]), world.about.rate_hz, every
+        expert = steps_of(world, Expert(), Trial(seed, world.about.steps // LOOK, LOOK))
+        places = [step.observation.state[:3] for step in expert]
+        self._low, self._high = np.min(places, axis=0) - [WIDER_M, WIDER_M, 0.0], np.max(places, axis=0) + WIDER_M
+        self._step, self._until = -every, 0.0
+
+    def act(self, observation: Observation) -> Action | None:
+        self._step += self._every
+        if self._step == 0:
+            self._target = observation.state.copy()
+        if self._step >= self._until:
+            self._until = self._step + self._rng.uniform(*HELD_S) * self._rate_hz
+            self._target[:3] = self._rng.uniform(self._low, self._high)
+            self._target[6] = self._rng.integers(2) if self._rng.uniform() < GRIPS else self._target[6]
+        return np.asarray(actions_from_states(np.stack([observation.state, self._target]))[0])
+
+
+def record_world(
+    world: OtherWorld, folder: Path, seeds: Sequence[int], progress: Progress = no_progress, *, every: int = 1
+) -> tuple[int, int]:
+    """Record the episodes of some seeds; one that was recorded before is not recorded again.
+
+    Of three episodes, one is the expert's. In one the hand is now and then held a few centimetres off, so that there is
+    more than one way to do the task, and ways back. One is play: without it a model learns where experts go, not what
+    actions do.
+
+    Args:
+        world: With an expert.
+        folder: One .npz file an episode (format: data/sources/npz.py).
+        seeds: Of the episodes.
+        progress: Called with (episodes done, episodes in total).
+        every: Control steps from one frame to the next.
+
+    Returns:
+        Number of episodes that the expert solved, and that it acted in; neither counts play.
+
+    Raises:
+        InputError: The folder cannot be written, or the program ends or answers something else.
+    """
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    solved, name = 0, re.sub(r"[^\w .,()+-]", "-", world.about.task, flags=re.ASCII)  # the name of a file, and no path
+    for done, seed in enumerate(seeds, start=1):
+        file = folder / f"{name}_{seed:06d}.npz"
+        if not file.exists():
+            _record(world, file, seed, every)
+        with np.load(file) as recorded:
+            solved += bool(recorded["success"]) and seed % 3 != PLAY
+        progress(done, len(seeds))
+    return solved, sum(seed % 3 != PLAY for seed in seeds)
+
+
+def _record(world: OtherWorld, file: Path, seed: int, every: int) -> None:
+    about, kind = world.about, seed % 3
+    policies = {DISTURBED: _DisturbedExpert, PLAY: _Play}
+    policy = policies[kind](world, seed, every) if kind else Expert()
+    steps, rested = list[Step](), -every
+    for step in steps_of(world, policy, Trial(seed, -(-about.steps // every), every)):
+        steps.append(step)
+        rested = rested + every if step.info["success"] else 0
+        if kind != PLAY and rested >= REST_S * about.rate_hz:
+            break
+    with user_can_write(file), atomic_writer(file) as stream:
+        np.savez(
+            stream,
+            states=np.stack([step.observation.state for step in steps[:-1]]),
+            actions=np.stack([step.info["target"] for step in steps[1:]]),
+            frames=np.stack([step.observation.image for step in steps[:-1]]),
+            fps_hz=about.rate_hz / every,
+            success=steps[-1].info["success"],
+            language=about.instruction,
+        )

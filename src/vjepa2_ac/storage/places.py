@@ -12,6 +12,7 @@ from pathlib import Path
 
 BUILTIN = "builtin:"  # models and configs that come with the package
 NO_DATA = "none"  # data.path of a model without a config
+CLOSED_LOOP_FILE = "closed_loop.json"  # in RUN/closed_loop/TASK-DOMAIN
 SIMULATION_FILE = "simulation.json"  # in a data set that `simulate record` made
 
 HUB = "hf://"

@@ -20,8 +20,8 @@ from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
-from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
-from vjepa2_ac.simulation.rollout import ClosedLoopResult, RolloutSpec
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, ClosedLoopBenchmark
+from vjepa2_ac.simulation.rollout import ClosedLoopResult
 from vjepa2_ac.spaces import POSE, vector_states
 from worlds import Copier, Halfway, about, again, clips_batch
 
@@ -73,11 +73,16 @@ def plans() -> list[Table]:
 def benchmarks() -> list[Table]:
     result = Mock(
         spec=ClosedLoopResult,
-        policy="the model of runs/of-another-day", success_rate=SHARE, success_ever_rate=SHARE,
-        final_distance_cm=Estimate(12.3, 10.1, 14.5), steps_needed=SHARE,
-        seconds_per_decision=Estimate(16.2, 15.0, 17.0),
-    )  # fmt: skip
-    trials = RolloutSpec("reach", "B", episodes=100, seed=5, steps=20)
+        policy="the model of runs/of-another-day",
+        estimates={
+            "success": SHARE,
+            "success_ever": SHARE,
+            "final_distance_cm": Estimate(12.3, 10.1, 14.5),
+            "steps_needed": SHARE,
+            "seconds_per_decision": Estimate(16.2, 15.0, 17.0),
+        },
+    )
+    trials = BenchmarkOptions("reach", "B", episodes=100, seed=5, steps=20).trials()
     return [benchmark_table(Mock(spec=ClosedLoopBenchmark, trials=trials, results=(result,)))]
 
 

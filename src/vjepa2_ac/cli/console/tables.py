@@ -114,18 +114,19 @@ def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
     """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
     trials = benchmark.trials
     table = MetricsTable(
-        f"{trials.task_name} in {trials.place}: {counted(trials.episodes, 'problem')} of seed {trials.seed},"
-        f" {counted(trials.model_steps, 'step')} of {trials.seconds_per_step:.2f} s (95 % interval over episodes)",
+        f"{trials.task} in {trials.place}: {counted(len(trials.trials), 'problem')} of seed {trials.about['seed']},"
+        f" {counted(trials.steps, 'step')} of {trials.seconds_per_step:.2f} s (95 % interval over episodes)",
         ["", f"{trials.criterion} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
     )
     for result in benchmark.results:
+        metrics, needed = result.estimates, result.estimates["steps_needed"]
         table.add_row(
             result.policy,
-            f"{result.success_rate:.0%}",
-            f"{result.success_ever_rate:.0%}",
-            f"{result.final_distance_cm:.1f}",
-            "" if result.steps_needed is None else f"{result.steps_needed.value:.1f}",
-            f"{result.seconds_per_decision.value:.2f}",
+            f"{metrics['success']:.0%}",
+            f"{metrics['success_ever']:.0%}",
+            f"{metrics['final_distance_cm']:.1f}",
+            "" if needed is None else f"{needed.value:.1f}",
+            "" if (seconds := metrics["seconds_per_decision"]) is None else f"{seconds.value:.2f}",
         )
     return table
 

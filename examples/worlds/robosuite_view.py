@@ -1,0 +1,33 @@
+"""Camera, light and mounting of robosuite.py. A lamp throws shadows: without them one camera shows no heights."""
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+TASKS = {  # in words, control steps, degrees: field of view of the camera, and how far up it is turned
+    "Lift": ("lift the cube", 60, 42, 7),
+    "Stack": ("put the red cube on the green one", 100, 42, 7),
+    "PickPlaceCan": ("put the can into its bin", 120, 36, -6),
+    "Door": ("open the door", 80, 60, 0),
+}
+
+
+def set_view(sim, options, mount):
+    """Set the view, and return the position of the robot's base, which is turned by `mount`."""
+    model, (_, _, fov, up) = sim.model, TASKS[options.task]
+    camera, base = model.camera_name2id("agentview"), model.body_name2id("robot0_base")
+    orbit = Rotation.from_euler("z", options.camera, degrees=True)
+    model.cam_pos[camera], model.cam_fovy[camera] = orbit.apply(model.cam_pos[camera]), fov
+    pose = orbit * Rotation.from_quat(model.cam_quat[camera], scalar_first=True)
+    pose = pose * Rotation.from_euler("x", up, degrees=True)
+    model.cam_quat[camera], model.body_quat[base] = pose.as_quat(scalar_first=True), mount.as_quat(scalar_first=True)
+    model.light_castshadow[:], model.light_type[:] = True, 1  # far above
+    model.light_dir[:], model.light_diffuse[:], model.vis.headlight.diffuse[:] = (0.15, 0.1, -1.0), 0.5, 0.3
+    model.vis.quality.shadowsize = 1024
+    screen = sim._render_context_offscreen
+    screen.update_offscreen_size(options.size, options.size)
+    screen.scn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0  # of the floor: a fifth of the time
+    if options.look == "dusk":
+        model.light_dir[:], model.light_diffuse[:] = (-0.6, 0.3, -1.0), (0.35, 0.25, 0.2)
+        model.mat_texid[:], model.mat_rgba[:, :3] = -1, model.mat_rgba[:, :3] * (0.4, 0.55, 0.5)
+    return np.array(model.body_pos[base])
