@@ -224,20 +224,21 @@ class Walk:
         )  # fmt: skip
 
     def serve(self) -> None:
-        """Let the simulated arm ask a server, first without the extra `serve`: the hint, pasted, installs it."""
+        """Connect to a server, first without the extra `serve`: the hint, pasted, installs it."""
         [serves] = [step for step in steps_of("docs/serving.md") if step.shown.startswith("vjepa2-ac serve")]
-        command = f"vjepa2-ac simulate ws://127.0.0.1:{PORT} --task reach --episodes 1 --steps 1 --out served"
+        connect = f"PlanningClient('ws://127.0.0.1:{PORT}').close()"
+        command = f'python -c "from vjepa2_ac.serving.client import PlanningClient; {connect}"'
         server = self._start(serves.where, f"exec {serves.run} --port {PORT}")
         try:
             for where in ("[sim]", PAGES["docs/QUICKSTART.md"]):
-                hint = re.search(r"(\S*pip install .*)\.$", self.run(where, command, expected=2).strip())
+                hint = re.search(r"(\S*pip install .*)\.$", self.run(where, command, expected=1).strip())
                 if hint is None or "[serve]" not in hint[1]:
                     self.failed.append(f"{where}: no hint that installs [serve]")
                     continue
                 self.run(where, hint[1])
                 self.run(
                     where,
-                    f"for i in $(seq 60); do vjepa2-ac {command.partition(' ')[2]} && exit; sleep 2; done; exit 1",
+                    f"for i in $(seq 60); do {command} && exit; sleep 2; done; exit 1",
                 )
         finally:
             server.terminate()

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any
 
-import numpy as np
-
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
-from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.wire import MOST_BYTES, pack, require_msgpack, unpack
 
 _READY_S = 600.0  # for a server that loads its model
@@ -73,25 +69,6 @@ class PlanningClient(ExitStack):
         if isinstance(answer, str):
             raise InputError(where=self.url, found=answer)
         return unpack(answer)
-
-
-def goal_keys(goals: Sequence[SubGoal]) -> dict[str, Any]:
-    """Return the keys of a request for goals in order, with their rules.
-
-    Raises:
-        ValueError: Of the goals before the last some have a bound on their steps, and some have none.
-    """
-    bounds = [goal.at_most for goal in goals[:-1]]
-    if None in bounds and any(bounds):
-        raise ValueError(f"bounds {bounds}: for each goal but the last, or for none")
-    keys: dict[str, Any] = {
-        "goal/images": np.stack([goal.image for goal in goals]),
-        "goal/at_least": [goal.at_least for goal in goals],
-        "goal/shares": [goal.share or 0.0 for goal in goals],
-        "goal/floors": [goal.floor for goal in goals],
-        "goal/grippers": [goal.gripper or "" for goal in goals],
-    }
-    return keys if None in bounds else {**keys, "goal/durations": bounds}
 
 
 def _reason(error: Exception) -> str:
