@@ -17,10 +17,7 @@ from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.imagined import Seen, imagine_image, imagined_next
-<<<<<<< HEAD
 from vjepa2_ac.goals.make_goals import recording_of_episode
-=======
->>>>>>> 5094b4e6 (Simulation: docs of the interface of environments, changelog, decisions)
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.subject import Subject
