@@ -1,13 +1,12 @@
 """Paths: each has one meaning everywhere, and none is mistaken for another kind."""
 
-import argparse
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from made_pages import _leaves
-from vjepa2_ac.cli.options import as_config, as_local, as_model, as_path, as_place, as_planner, as_subject
+from vjepa2_ac.cli.options import as_config, as_local, as_model, as_path, as_place, as_subject
 from vjepa2_ac.cli.program import _parser, main
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.config.loading import all_keys, config_as_flat_dict, parse_config
@@ -90,17 +89,9 @@ def test_every_path_on_the_command_line_is_read_alike() -> None:
         is_path = words & set(str(action.metavar).replace("|", " ").split())
         if is_path and action.dest != "overrides":
             found += 1
-            readers = {as_config, as_path, as_local, as_model, as_place, as_planner, as_subject}
+            readers = {as_config, as_path, as_local, as_model, as_place, as_subject}
             assert action.type in readers, f"{command}: {action.dest}"
     assert found > 20
-
-
-def test_what_plans_is_a_model_or_the_address_of_a_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/home/of/mine")
-    assert as_planner("ws://127.0.0.1:8000") == "ws://127.0.0.1:8000"
-    assert as_planner("~/run") == as_model("~/run") == "/home/of/mine/run"
-    with pytest.raises(argparse.ArgumentTypeError):
-        as_planner("http://127.0.0.1:8000")
 
 
 def test_an_option_knows_the_users_home_and_refuses_urls(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
