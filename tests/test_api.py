@@ -31,7 +31,7 @@ from vjepa2_ac import (
     train,
 )
 from vjepa2_ac.distributed import has_bf16
-from vjepa2_ac.reports.export import export_run
+from vjepa2_ac.export import export_run
 
 PAGE = (ROOT / "docs/python.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)

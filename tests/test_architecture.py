@@ -28,7 +28,7 @@ ORDERS: dict[str, list[str]] = {
         "goals policies",
         "evaluation serving simulation",
         "reports training",
-        "api init explore",
+        "api export init explore",
         "cli",
     ],
     "data": [
@@ -79,7 +79,7 @@ ORDERS: dict[str, list[str]] = {
         "imagined_strip",
     ],
     "evaluation.calibration": ["variants", "data axes stride_choice"],
-    "reports": ["metrics_json", "comparison paper", "figures", "write sheet", "export"],
+    "reports": ["metrics_json", "comparison paper", "figures", "write sheet"],
     "cli": [
         "console",
         "options next_command",
@@ -119,8 +119,8 @@ HOMES = {
     "google": [],
     "google_crc32c": ["data/sources/rlds/tfrecord.py"],
     "h5py": ["data/sources/droid_raw.py"],
-    "huggingface_hub": ["reports/export.py", "storage/transfer.py"],
-    "jinja2": ["reports/"],
+    "huggingface_hub": ["export.py", "storage/transfer.py"],
+    "jinja2": ["export.py", "reports/"],
     "markupsafe": ["reports/"],
     "matplotlib": ["media/", "reports/"],
     "msgpack": ["serving/wire.py"],

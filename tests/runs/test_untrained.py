@@ -14,13 +14,13 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+from vjepa2_ac.export import CARD, export_run
 from vjepa2_ac.model.adapter.adapter_folder import save_trained
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import fit_heads
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.reports.comparison import compare
-from vjepa2_ac.reports.export import CARD, export_run
 from vjepa2_ac.reports.metrics_json import read_metrics
 from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.checkpoint import ADAPTER, RunState, write_checkpoint
@@ -117,7 +117,7 @@ def test_the_explorer_shows_one_model_and_the_note(base_run: Path, whole_decoder
 def test_an_export_says_so_before_it_writes(
     base_run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, form: Any
 ) -> None:
-    monkeypatch.setattr("vjepa2_ac.reports.export.merge_adapter", lambda _: 1 / 0)
+    monkeypatch.setattr("vjepa2_ac.export.merge_adapter", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         export_run(base_run, tmp_path / "out", form)
     assert caplog.messages == [SELECTED]

@@ -18,10 +18,10 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.variants import calibrate_config
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+from vjepa2_ac.export import export_run
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.model_files import read_sizes
 from vjepa2_ac.model.network.world_model import widths_of_model
-from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.subject import load_subject

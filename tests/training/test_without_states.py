@@ -16,11 +16,11 @@ from vjepa2_ac.config import Config, LimitsConfig, ModelConfig, ModelSizes, Plan
 from vjepa2_ac.episode import STATE_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+from vjepa2_ac.export import export_run
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
-from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train

@@ -156,7 +156,7 @@ def _export(options: argparse.Namespace) -> None:
     config = read_run_config(options.run, options.overrides)
     cli.require_subject(str(options.run), config, options.words)
 
-    from vjepa2_ac.reports.export import export_run
+    from vjepa2_ac.export import export_run
 
     written = export_run(options.run, options.folder, options.to, options.checkpoint, options.overrides)
     what = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}

@@ -6,13 +6,11 @@ Sources: facebookresearch/vjepa2 @ 204698b, src/hub/backbones.py and app/vjepa_2
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import http.client
 import importlib.resources
 import json
 import math
-import re
 import urllib.error
 import urllib.request
 from collections.abc import Mapping, Sequence
@@ -241,7 +239,6 @@ class Published:
     encoder: EncoderShape
     image_size: int  # at which it was trained last, in pixels
     key: str  # of the encoder's weights in the file
-    hub_name: str  # its name in Meta's torch.hub
     gigabytes: float  # about: encoder, its average, predictor and the optimizer's moments, in float32
     bytes: int | None = None  # exactly, where known
     licence: str = "MIT"  # of Meta's repository; Meta's server sends none with the file
@@ -278,25 +275,16 @@ class Published:
 
 
 PUBLISHED: tuple[Published, ...] = (
-    Published(OFFICIAL, "vjepa2-ac-vitg.pt", VIT_g, 256, "encoder", "vjepa2_ac_vit_giant", 11.7),
-    Published("vjepa2-vitl", "vitl.pt", VIT_L, 256, "target_encoder", "vjepa2_vit_large", 5.1),
-    Published("vjepa2-vith", "vith.pt", VIT_H, 256, "target_encoder", "vjepa2_vit_huge", 10.4),
-    Published("vjepa2-vitg", "vitg.pt", VIT_g, 256, "target_encoder", "vjepa2_vit_giant", 16.5),
-    Published("vjepa2-vitg-384", "vitg-384.pt", VIT_g, 384, "target_encoder", "vjepa2_vit_giant_384", 16.5),
-    Published(
-        "vjepa2.1-vitb-384", "vjepa2_1_vitb_dist_vitG_384.pt", VIT_B, 384, "ema_encoder", "vjepa2_1_vit_base_384",
-        1.66, 1_664_223_428,
-    ),
-    Published(
-        "vjepa2.1-vitl-384", "vjepa2_1_vitl_dist_vitG_384.pt", VIT_L, 384, "ema_encoder", "vjepa2_1_vit_large_384", 5.1
-    ),
-    Published(
-        "vjepa2.1-vitg-1b-384", "vjepa2_1_vitg_384.pt", VIT_g, 384, "target_encoder", "vjepa2_1_vit_giant_384", 16.5
-    ),
-    Published(
-        "vjepa2.1-vitG-2b-384", "vjepa2_1_vitG_384.pt", VIT_G, 384, "target_encoder", "vjepa2_1_vit_gigantic_384", 29.8
-    ),
-)  # fmt: skip
+    Published(OFFICIAL, "vjepa2-ac-vitg.pt", VIT_g, 256, "encoder", 11.7),
+    Published("vjepa2-vitl", "vitl.pt", VIT_L, 256, "target_encoder", 5.1),
+    Published("vjepa2-vith", "vith.pt", VIT_H, 256, "target_encoder", 10.4),
+    Published("vjepa2-vitg", "vitg.pt", VIT_g, 256, "target_encoder", 16.5),
+    Published("vjepa2-vitg-384", "vitg-384.pt", VIT_g, 384, "target_encoder", 16.5),
+    Published("vjepa2.1-vitb-384", "vjepa2_1_vitb_dist_vitG_384.pt", VIT_B, 384, "ema_encoder", 1.66, 1_664_223_428),
+    Published("vjepa2.1-vitl-384", "vjepa2_1_vitl_dist_vitG_384.pt", VIT_L, 384, "ema_encoder", 5.1),
+    Published("vjepa2.1-vitg-1b-384", "vjepa2_1_vitg_384.pt", VIT_g, 384, "target_encoder", 16.5),
+    Published("vjepa2.1-vitG-2b-384", "vjepa2_1_vitG_384.pt", VIT_G, 384, "target_encoder", 29.8),
+)
 
 
 def published_as(file_name: str) -> Published | None:
@@ -305,27 +293,20 @@ def published_as(file_name: str) -> Published | None:
 
 
 def find_published(text: str) -> Published:
-    """Return the published checkpoint that a name means; dots, dashes and underscores do not matter, the case does.
+    """Return the published checkpoint that a name means, with or without `.pt`.
 
     Args:
-        text: Our name, Meta's name of the file or the name in torch.hub; with or without `.pt`.
+        text: Our name, or Meta's name of the file.
 
     Raises:
         InputError: None has this name.
     """
-    names = {_plain(name): one for one in PUBLISHED for name in (one.name, one.remote, one.hub_name)}
-    if (meant := names.get(_plain(text))) is not None:
-        return meant
-    folded = [name.casefold() for name in names]
-    near = difflib.get_close_matches(_plain(text.rpartition("/")[2]).casefold(), folded, n=3)
-    close = " or ".join(dict.fromkeys(one.name for name, one in names.items() if name.casefold() in near))
-    hint = f"Did you mean {close}? " if close else ""
-    fix = f"{hint}`vjepa2-ac download --list` shows all; where the file goes is said by --to"
-    raise InputError(where=f"download {text}", found="no published checkpoint of this name", fix=fix)
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[-_. ]", "", name.removesuffix(".pt"))
+    name = text.removesuffix(".pt")
+    meant = next((one for one in PUBLISHED if name in {one.name, one.remote.removesuffix(".pt")}), None)
+    if meant is None:
+        fix = "`vjepa2-ac download --list` shows all; where the file goes is set by --to"
+        raise InputError(where=f"download {text}", found="no published checkpoint of this name", fix=fix)
+    return meant
 
 
 CHUNK_BYTES = 2**20

@@ -3,7 +3,7 @@
 import re
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -17,50 +17,19 @@ from vjepa2_ac.model.model_files import PUBLISHED, VIT_B, Published, download, f
 from vjepa2_ac.storage.retries import RetryPolicy
 
 
-def test_files_do_not_collide_on_a_disk_that_is_blind_to_case() -> None:
-    assert len({one.file.casefold() for one in PUBLISHED}) == len(PUBLISHED)
-    assert len({one.url for one in PUBLISHED}) == len(PUBLISHED)
-
-
-def test_every_name_of_a_file_leads_to_it() -> None:
+def test_every_name_of_a_file_leads_to_it_and_no_two_files_collide() -> None:
+    assert len({one.file.casefold() for one in PUBLISHED}) == len({one.url for one in PUBLISHED}) == len(PUBLISHED)
     for one in PUBLISHED:
-        for name in (one.name, one.file, one.remote, one.remote.removesuffix(".pt"), one.hub_name):
+        for name in (one.name, one.file, one.remote, one.remote.removesuffix(".pt")):
             assert find_published(name) is one
         assert one in {published_as(one.file), published_as(one.remote)}
-
-
-@pytest.mark.parametrize(
-    ("text", "name"),
-    [
-        ("vjepa2_1_vitG_384.pt", "vjepa2.1-vitG-2b-384"),
-        ("vjepa2_1_vitg_384.pt", "vjepa2.1-vitg-1b-384"),
-        ("vjepa2.1-vitG-384", "vjepa2.1-vitG-2b-384"),
-        ("vjepa21-vitb-384", "vjepa2.1-vitb-384"),
-        ("vitl.pt", "vjepa2-vitl"),
-    ],
-)
-def test_other_spellings_are_understood(text: str, name: str) -> None:
-    assert find_published(text).name == name
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("VJEPA2_1_VITG_384", r"Did you mean .*vjepa2\.1-vitg-1b-384 or vjepa2\.1-vitG-2b-384"),
-        ("vjepa2-vitx", r"Did you mean vjepa2-vit.*download --list"),
-        ("facebook/vjepa2-vitl-fpc64-256", r"Did you mean vjepa2-vitl .*--list"),
-        ("dinov3", r"no published checkpoint of this name.*--list"),
-        ("checkpoints/vitl.pt", r"Did you mean vjepa2-vitl .*--to"),
-    ],
-)
-def test_a_name_that_is_none_is_answered_with_a_way_out(text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        find_published(text)
+    with pytest.raises(InputError, match=r"no published checkpoint of this name.*--list"):
+        find_published("VJEPA2_1_VITG_384")
 
 
 CONTENT = bytes(range(256)) * 400
 MADE_UP = Published(
-    "made-up", "elsewhere.pt", VIT_B, 384, "ema_encoder", "made_up_hub", 0.0001,
+    "made-up", "elsewhere.pt", VIT_B, 384, "ema_encoder", 0.0001,
     bytes=102_400, licence="of the test",
 )  # fmt: skip
 twice, at_once = RetryPolicy(attempts=2, first_wait_s=0.0), RetryPolicy(first_wait_s=0.0)
@@ -183,13 +152,6 @@ def test_a_refusal_is_final_and_no_network_is_said(serve, tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_that_is_here_is_not_fetched_again(serve, tmp_path: Path) -> None:
-    (tmp_path / "model.pt").write_bytes(b"mine")
-    behaviour = Behaviour()
-    assert download(serve(behaviour), tmp_path / "model.pt").read_bytes() == b"mine"
-    assert behaviour.seen == []
-
-
 def test_a_file_whose_size_is_not_said_is_refused(serve, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"needed: its size \(Content-Length\)"):
         download(serve(Behaviour(says_size=False)), tmp_path / "model.pt")
@@ -206,16 +168,6 @@ def test_less_than_the_published_file_is_not_taken_for_it(serve, tmp_path: Path)
     assert download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP).read_bytes() == CONTENT
 
 
-def test_a_size_that_is_estimated_is_a_range(serve, tmp_path: Path) -> None:
-    estimated = replace(MADE_UP, bytes=None, gigabytes=len(CONTENT) / 1.2e9)
-    assert download(serve(Behaviour()), tmp_path / "a.pt", known=estimated).read_bytes() == CONTENT
-    for wrong in (0.5e9, 2e9):
-        other = replace(estimated, gigabytes=len(CONTENT) / wrong)
-        with pytest.raises(InputError, match=r"a file of 102,400 bytes\. needed: made-up, of [\d,]+ to [\d,]+ bytes"):
-            download(serve(Behaviour()), tmp_path / "b.pt", known=other)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["a.pt"]
-
-
 def test_a_file_that_is_here_and_cannot_be_the_published_one_is_named(serve, tmp_path: Path) -> None:
     behaviour = Behaviour()
     path, url = tmp_path / "made-up.pt", serve(behaviour)
@@ -225,14 +177,6 @@ def test_a_file_that_is_here_and_cannot_be_the_published_one_is_named(serve, tmp
     with pytest.raises(InputError, match=r"a folder\. needed: the name of a file"):
         download(url, tmp_path, known=MADE_UP)
     assert behaviour.seen == []
-
-
-def test_a_part_of_another_checkpoint_is_not_gone_on_with(serve, tmp_path: Path) -> None:
-    path, other = tmp_path / "model.pt", replace(MADE_UP, name="other")
-    behaviour = Behaviour(content=CONTENT[::-1], cut_after=[1000, 0, 0])
-    with pytest.raises(UnreachableError):
-        download(serve(behaviour), path, known=other, policy=twice)
-    assert download(serve(Behaviour()), path, known=MADE_UP).read_bytes() == CONTENT
 
 
 @pytest.mark.parametrize(("free", "fits"), [(101_400, True), (101_399, False)])
@@ -255,7 +199,7 @@ def test_the_command_says_what_the_file_is_and_which_knob_takes_it(
 ) -> None:
     monkeypatch.setattr(model_files, "PUBLISHED", (MADE_UP,))
     monkeypatch.chdir(tmp_path)
-    assert main(["download", "made_up", "--url", serve(Behaviour())]) == 0
+    assert main(["download", "made-up", "--url", serve(Behaviour())]) == 0
     shown = capsys.readouterr().out
     assert "made-up: encoder" in shown
     assert "102,400 bytes, licence of the test" in shown
@@ -267,16 +211,6 @@ def test_the_command_says_what_the_file_is_and_which_knob_takes_it(
 def test_what_is_no_address_is_told_at_once(tmp_path: Path, url: str) -> None:
     with pytest.raises(UnreachableError, match=r"cannot be read.*Check the address"):
         download(url, tmp_path / "model.pt")
-
-
-@pytest.mark.parametrize("place", ["file/model.pt", "folder.part"])
-def test_a_path_that_cannot_be_written_is_told_at_once(serve, tmp_path: Path, place: str) -> None:
-    (tmp_path / "file").touch()
-    (tmp_path / "folder.part").mkdir()
-    behaviour = Behaviour()
-    with pytest.raises(InputError, match=rf"{place}: cannot be written"):
-        download(serve(behaviour), tmp_path / place.removesuffix(".part"))
-    assert len(behaviour.seen) <= 1
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")

@@ -17,16 +17,16 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from run_fixtures import TINY, SilentReporter, one_thread, tiny_config
+from vjepa2_ac import export
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.evaluation.summary import Summary, not_measured
+from vjepa2_ac.export import CARD, Exported, export_run
 from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.checkpoints import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.reports import export
-from vjepa2_ac.reports.export import CARD, Exported, export_run
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import checkpoint_name, select_checkpoint, write_manifest
