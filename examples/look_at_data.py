@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 
 from vjepa2_ac import UserError, open_dataset, read_clips
+from vjepa2_ac.inspection.sheet import plot_dataset
 from vjepa2_ac.inspection.statistics import inspect_dataset
-from vjepa2_ac.reports.sheet import plot_dataset
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 RECORDED, SHEET = Path("demo/examples/data"), Path("demo/examples/contact_sheet.png")

@@ -55,11 +55,10 @@ FEW_STEPS = (
     " data.workers=0 training.batch_size=2"
     " training.accumulation=1 training.warmup_steps=0 training.allow_weak_base=true"
 )
-FEW_CLIPS = "--clips 4 --ranking-clips 2 --samples 8 --examples 1 --landscapes 1 --nodes 3 --axes 2"
+FEW_CLIPS = "--clips 4 --ranking-clips 2 --samples 8 --examples 1 --landscapes 1 --nodes 3"
 FEW_SAMPLES = "planning.samples=16 planning.iterations=1"
 SHORTER = {  # by the first words of a command
     "train": FEW_STEPS,
-    "evaluate runs/lora --planning": f"{FEW_SAMPLES} {FEW_CLIPS} --planning-clips 2",
     "evaluate": FEW_CLIPS,
     "decoder": "decoder.steps=2 data.workers=0",
     "simulate record": "--episodes 10 --steps 33",
@@ -104,7 +103,6 @@ NOT_WALKED = {  # pattern: why
     r"^python3 -m venv|^\. ": "the environment is made here",
     r"download( vjepa2.1-vitb-384)?$": "gigabytes",
     r"configs/scratch_vitb.yaml( --check)?$(?<!doctor configs/scratch_vitb.yaml)": "needs a download",
-    r"--lpips": "needs weights that are not shipped",
     r"^torchrun|^accelerate|^sbatch|^ACCELERATE": "several GPUs; tests/distributed and tests/test_train_slurm.py",
     r"--engine ray": "600 MB; tests/encoding/test_ray_engine.py",
     r"cache_dir=gs://": "needs a bucket; tests/encoding/test_bucket.py",

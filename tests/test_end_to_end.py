@@ -56,7 +56,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-FEW = ["--ranking-clips=2", "--samples=6", "--landscapes=1", "--axes=0", "--nodes=3", "--examples=1"]
+FEW = ["--ranking-clips=2", "--samples=6", "--landscapes=1", "--nodes=3", "--examples=1"]
 NEWEST = ["--checkpoint", "newest"]  # not the base, which may be selected after so few steps
 ERRORS = "rollout.l1.over_persistence."
 
@@ -69,7 +69,7 @@ def of_model(metrics: dict, model: str, key: str) -> list[float]:
 def test_evaluate_ends_with_the_result_in_words_a_picture_and_paths(
     workshop: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["evaluate", str(workshop / "lora"), *NEWEST, "--clips", "8", "--all", *FEW, "--axes=2"]) == 0
+    assert main(["evaluate", str(workshop / "lora"), *NEWEST, "--clips", "8", "--all", *FEW]) == 0
     printed = capsys.readouterr().out
     result = json.loads((workshop / "lora" / "metrics.json").read_text())
     assert " ".join(result["summary"]["sentence"].split()) in " ".join(printed.split())

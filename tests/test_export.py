@@ -21,7 +21,7 @@ from vjepa2_ac import export
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.result import Row
+from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.evaluation.summary import Summary, not_measured
 from vjepa2_ac.export import CARD, Exported, export_run
 from vjepa2_ac.model.adapter.lora import base_only
@@ -38,7 +38,7 @@ ROWS = [
     Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "adapter", 0.7),
 ]
 EVALUATED = {
-    "format": 5,
+    "format": 6,
     "summary": asdict(Summary("somewhere/run, step 2", "8 clips", *(not_measured(name, "evaluate") for name in "abc"))),
     "trained": "adapter",
     "base": "base",
@@ -46,6 +46,7 @@ EVALUATED = {
         "subject": "somewhere/run", "checkpoint": "step 2",
         "checkpoint_path": "somewhere/run/checkpoints/step-00000002", "data": "data",
         "cameras": ["exterior"], "split": "test", "frames": 2, "stride": 4, "seconds_per_step": 0.5,
+        "source": "rlds", "seed": 0, "version": "0", "time": "",
     },
     "clips": {"count": 8, "episodes": 3, "fingerprint": "0", "named": []},
     "rows": [{name: None if value != value else value for name, value in asdict(row).items()} for row in ROWS],
@@ -54,7 +55,7 @@ EVALUATED = {
 
 
 Trained = Callable[..., Path]
-QUICK = ["--clips=4", "--ranking-clips=2", "--samples=4", "--landscapes=1", "--axes=0", "--nodes=3", "--examples=1"]
+QUICK = ["--clips=4", "--ranking-clips=2", "--samples=4", "--landscapes=1", "--nodes=3", "--examples=1"]
 
 
 @pytest.fixture(scope="module")

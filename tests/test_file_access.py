@@ -20,7 +20,6 @@ from vjepa2_ac.data.sources.latents.cache_files import EPISODES, LatentFiles, re
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError, RefusedError, in_words
-from vjepa2_ac.evaluation.decoded import load_lpips
 from vjepa2_ac.export import export_run
 from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.adapter.lora import add_adapter
@@ -118,12 +117,6 @@ def test_something_else_in_place_of_a_file_is_refused_at_once(files: Path, name:
     found = "Is a directory" if kind == "folder" else "a pipe or a device"
     with pytest.raises(InputError, match=f"{re.escape(name)}: .*{found}"):
         READERS[name](files)
-
-
-def test_weights_of_lpips_are_no_pipe(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "alex.pth")
-    with pytest.raises(InputError, match=r"alex\.pth: a pipe or a device"):
-        load_lpips(tmp_path / "alex.pth", tmp_path / "alex.pth")
 
 
 @pytest.mark.parametrize("name", sorted(one for one in READERS if one.endswith(".safetensors")))

@@ -79,7 +79,7 @@ def test_a_run_that_was_killed_ends_in_the_same_bits(workshop: Path, nursery: Nu
 
 def test_it_is_evaluated_and_plans(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = workshop / "whole"
-    few = ["--clips=4", "--ranking-clips=2", "--samples=6", "--landscapes=1", "--axes=0", "--nodes=3"]
+    few = ["--clips=4", "--ranking-clips=2", "--samples=6", "--landscapes=1", "--nodes=3"]
     assert main(["evaluate", str(run), *few]) == 0
     assert json.loads((run / "metrics.json").read_text())["summary"]["subject"] in capsys.readouterr().out
     small = ["planning.samples=16", "planning.iterations=1", "planning.horizon=1"]

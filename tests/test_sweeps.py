@@ -20,7 +20,7 @@ from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state, select_chec
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training import loop
 
-FEW = ["--clips=4", "--ranking-clips=2", "--samples=8", "--examples=1", "--landscapes=1", "--nodes=3", "--axes=2"]
+FEW = ["--clips=4", "--ranking-clips=2", "--samples=8", "--examples=1", "--landscapes=1", "--nodes=3"]
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 

@@ -24,9 +24,9 @@ from vjepa2_ac.config.data import DataConfig, Split
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.calibration.axes import calibrate_axes
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import PredictionErrors, Way
+from vjepa2_ac.inspection.axes import calibrate_axes
 from vjepa2_ac.model.adapter.lora import base_only, merge_adapter
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -246,7 +246,7 @@ def held_out(
 def _offline(model: WorldModel, config: Config, split: Split) -> dict[str, float]:
     """Return what might tell how a model fares in closed loop."""
     train, test = encoded(config, model, "train", CLIPS), encoded(config, model, split, CLIPS)
-    return offline_figures(model, open_dataset(config.data).spaces.action, train, test, PLANNING)
+    return offline_figures(model, open_dataset(config.data).spaces.action, train, test)
 
 
 def _turned(batch: LatentBatch, axes: Axes) -> LatentBatch:

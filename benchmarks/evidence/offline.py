@@ -4,26 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation import action_score
-from vjepa2_ac.evaluation.action_score import measure_plans, metrics_of, planning_start, study_of
 from vjepa2_ac.evaluation.action_use import moves_of, rank_actions
 from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of
-from vjepa2_ac.evaluation.request import SCORED, ProbeOptions
+from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.spaces import ActionSpace, apply_action
 
-MOVES, PLANS = 32, 8  # clips whose moves are ranked, and from which plans are made
-FEWER = {"samples": 60, "iterations": 5}  # of the Action Score's plans: 300 and 15 take three minutes a cell
+MOVES = 32  # clips whose moves are ranked
 VISITED = 16  # samples of each iteration of a search
 RIDGE = 10.0  # of the inverse dynamics, in units of the mean squared feature
 
@@ -33,7 +28,6 @@ def offline_figures(
     space: ActionSpace,
     train: Sequence[LatentBatch],
     held_out: Sequence[LatentBatch],
-    planning: PlanningConfig,
 ) -> dict[str, float]:
     """Return what is measured of a model without a robot, on clips of held-out episodes.
 
@@ -42,7 +36,6 @@ def offline_figures(
         space: Of its actions.
         train: Clips of the training episodes, from which the inverse dynamics is fitted.
         held_out: Clips to measure on.
-        planning: Settings of plans.
     """
     true, predicted = LatentSums(), LatentSums()
     rolled = [_rollout(model, batch) for batch in held_out]
@@ -55,16 +48,11 @@ def offline_figures(
     probes = ProbeOptions(samples=32)
     moves = [move for batch, row in chosen for move in moves_of(batch, row, space, 0.075)]
     ranking = rank_actions(model, moves, space, probes, seed=0)
-    starts = [planning_start(batch, row, 0) for batch, row in chosen[:: MOVES // PLANS][:PLANS]]
-    with patch.object(action_score, "SCORED", SCORED.model_copy(update=FEWER)):
-        plans = metrics_of(study_of(starts, planning), measure_plans(model, starts, planning))
     return {
         "action-ranking error": ranking.rank.value,
         "energy spread, negative": -ranking.spread.value,
         "spread of latents, distance from 1": abs(distribution.spread[-1].value - 1),
         "latent MMD": distribution.mmd[-1].value,
-        "Action Score, cm missed": plans["missed_cm"].value,
-        "plan of one step, cm off": plans["step_cm"].value,
         **inverse_dynamics(model, train, held_out),
     }
 

@@ -205,9 +205,7 @@ def _axes(results: Sequence[Figures]) -> str:
         for base in BASES:
             found = pick(results, shift=shift, base=base, method=AXES)
             fits = [
-                f"{one['axes']['yaw_degrees']['value']:+.0f}"
-                + (" (refused)" if one["axes"]["problem"] else "")
-                + f", condition {one['axes']['condition']['value']:.1f}"
+                f"{one['axes']['yaw_degrees']['value']:+.0f}" + (" (refused)" if one["axes"]["problem"] else "")
                 for one in found
             ]
             lines += [f"- {shift}, {base}: yaw {'; '.join(fits)}; true {true:+.0f} degrees"] if fits else []

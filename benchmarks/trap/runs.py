@@ -20,8 +20,7 @@ from vjepa2_ac.config import (
 )
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.config.training import CheckpointConfig
-from vjepa2_ac.distributed import joined
-from vjepa2_ac.evaluation.evaluate_run import measure_subject
+from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.model.adapter.lora import merge_adapter
@@ -172,10 +171,9 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     home, step = Path(config.run_dir), str(cell.step)
     rows = [row for row in read_metrics_log(home / "metrics.jsonl") if row["kind"] == "validation"]
     (validated,) = (row for row in rows if row["step"] == cell.step)
-    probes = ProbeOptions(ranking_clips=24, samples=32, landscape_clips=4, axis_clips=0, nodes=5, examples=0)
+    probes = ProbeOptions(ranking_clips=24, samples=32, landscape_clips=4, nodes=5, examples=0)
     asked = EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes)
-    with joined(config) as accelerator:
-        evaluation = measure_subject(str(home), asked, accelerator)
+    evaluation = evaluate_subject(str(home), asked)
     model = load_subject(home, step).world_model
     if model.adaptation is not None:
         merge_adapter(model)

@@ -272,7 +272,7 @@ def evaluate(
 ) -> Evaluated:
     """Measure a run or a model on held-out episodes, as `vjepa2-ac evaluate` does, and write the report.
 
-    For more options, such as other models to compare with, see `vjepa2_ac.reports.write.evaluate_subject`.
+    For more options, such as other models to compare with, see `vjepa2_ac.evaluation.evaluate_run.evaluate_subject`.
 
     Args:
         subject: The folder of a run, which is measured beside its base; or a model, as of `load_model`.
@@ -295,8 +295,9 @@ def evaluate(
         >>> result.error_over_persistence[result.evaluation.trained][-1]  # at the last horizon, with its 95 % interval
         Estimate(value=0.728, low=0.699, high=0.759)
     """
+    from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
     from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-    from vjepa2_ac.reports.write import evaluate_subject
+    from vjepa2_ac.reports.write import write_evaluation
 
     if data is not None and out is None:
         needed = "a folder for the results: those in a run's own folder are of its own data"
@@ -308,7 +309,7 @@ def evaluate(
         out=None if out is None else Path(out),
         probes=ProbeOptions() if probes else ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0),
     )
-    return evaluate_subject(str(subject), asked)
+    return write_evaluation(evaluate_subject(str(subject), asked), asked.out or Path(subject))
 
 
 class _Told(Reporter):
@@ -325,7 +326,7 @@ class _Told(Reporter):
             self._on_step(step, metrics)
 
     def validated(self, step: int, found: Validation) -> None:
-        from vjepa2_ac.evaluation.estimates import over_persistence
+        from vjepa2_ac.evaluation.result import over_persistence
 
         by_horizon = ", ".join(f"{ratio.value:.3f}" for ratio in over_persistence(found.errors, "rollout"))
         ranking = f"; action-ranking error {100 * found.ranking.rank.value:.1f} %" if found.ranking else ""

@@ -17,7 +17,7 @@ from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError, counted, escaped
-from vjepa2_ac.evaluation.result import Row
+from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.evaluation.summary import with_closed_loop
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import merge_adapter, trainable_report

@@ -9,6 +9,7 @@ import pytest
 
 from benches import imported
 from paths import ROOT
+from vjepa2_ac.config.loading import config_as_yaml
 
 OTHERS = "\n".join(path.read_text() for path in Path(__file__).parent.glob("test_*.py"))
 
@@ -42,6 +43,14 @@ def test_it_runs_to_its_end(
             monkeypatch.setattr(module.measure_workers, "__defaults__", (2, 2))
         module.main(options.split())
     assert printed in capfd.readouterr().out
+
+
+def test_the_action_score_is_printed(make_config, tmp_path: Path, monkeypatch, capsys) -> None:
+    config = make_config(data__frames=4, data__test_share=0.4)
+    (tmp_path / "data.yaml").write_text(config_as_yaml(config))
+    for module in imported("action_score", monkeypatch):
+        module.main([str(config.model.base), str(tmp_path / "data.yaml"), "--clips", "2", "--samples", "12"])
+    assert capsys.readouterr().out.startswith("plans: Action Score ")
 
 
 def test_no_benchmark_is_left_out() -> None:

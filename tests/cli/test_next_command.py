@@ -137,17 +137,17 @@ def next_of_evaluate(
 
 
 def test_real_data_are_never_sent_to_the_simulated_arm(monkeypatch: pytest.MonkeyPatch) -> None:
-    given = "builtin:sim-tiny --checkpoint 8 --planning planning.horizon=2"
+    given = "builtin:sim-tiny --checkpoint 8"
     (command,) = next_of_evaluate(given)
-    assert command == "Next: vjepa2-ac serve builtin:sim-tiny --checkpoint 8 planning.horizon=2"
+    assert command == "Next: vjepa2-ac serve builtin:sim-tiny --checkpoint 8"
     recorded = RecordedSimulation.of(RecordingSpec("B", task="pick"), 3)
     monkeypatch.setattr(record, "read_simulation", lambda _: recorded)
     command, time = next_of_evaluate(given)
-    quick = "planning.horizon=2 planning.samples=64 planning.iterations=4"
+    quick = "planning.samples=64 planning.iterations=4"
     expected = f"simulate builtin:sim-tiny --task pick --domain B --checkpoint 8 {quick}"
     assert command == f"Next: vjepa2-ac {expected}"
     parse(shlex.split(expected))
-    minutes = round(50 * 12 * 256 * 2 * 2.0 / (10 * 101) / 60)  # decisions, sequences, steps, measured seconds
+    minutes = round(50 * 12 * 256 * 2.0 / (10 * 101) / 60)  # decisions, sequences, steps, measured seconds
     where = "on this CPU with the quick planner"
     assert time == f"  (about {minutes} minutes {where}: 600 decisions of 256 action sequences each)"
 

@@ -124,7 +124,7 @@ def test_evaluate_needs_something_to_evaluate(capsys: pytest.CaptureFixture[str]
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["evaluate", "run", "--clips", "3", "planning.samples=64"], "no plans are asked for.*Add --planning"),
+        (["evaluate", "run", "--clips", "3", "planning.samples=64"], "planning.samples=64.*evaluate does not change"),
         (["evaluate", "run", "--clips", "3", "other"], "'other' is no key=value"),
         (["config", "schema", "training.steps=3"], "config schema training.steps=3"),
         (["plan", "run", "--start", "a", "--goal", "b", "--state", "1", "2", "-3"], r"'2 -3'.*in one word"),

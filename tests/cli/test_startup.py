@@ -21,9 +21,6 @@ encode {demo}
 evaluate nope
 evaluate builtin:sim-tiny
 evaluate nope --data {demo} --out out
-evaluate nope --lpips alex.pth --lpips-heads heads.pth
-evaluate nope --lpips a.pth
-evaluate nope --decoder builtin:sim-tiny --lpips alex.pth
 compare a b
 data check nope.yaml
 data check {demo}

@@ -21,8 +21,8 @@ from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.check import batch_findings
+from vjepa2_ac.inspection.sheet import plot_dataset
 from vjepa2_ac.inspection.statistics import CHANGED, inspect_dataset
-from vjepa2_ac.reports.sheet import plot_dataset
 from vjepa2_ac.spaces import Spaces
 
 JOINTS = ("steps/observation/joint_position", "steps/observation/gripper_position")

@@ -25,7 +25,7 @@ from vjepa2_ac.planning.model_setup import load_to_plan
 DOORS = {
     "train": ["train", "CONFIG"],
     "encode": ["encode", "CONFIG"],
-    "evaluate": ["evaluate", "no such model", "--data", "CONFIG", "--out", "out", "--planning"],
+    "evaluate": ["evaluate", "no such model", "--data", "CONFIG", "--out", "out"],
     "calibrate": ["data", "calibrate", "CONFIG"],
     "decoder": ["decoder", "CONFIG"],
     "plan": [

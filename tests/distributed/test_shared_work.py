@@ -17,9 +17,8 @@ from vjepa2_ac.training.loop import train
 pytestmark = pytest.mark.usefixtures("default_signals")
 BROKEN = str(ROOT / "tests/support/broken_clips.py")
 PROBES = [
-    "--clips", "7", "--ranking-clips", "5", "--samples", "6", "--landscapes", "2", "--nodes", "3", "--axes", "3",
-    "--examples", "2", "--planning-clips", "3", "--planning", "planning.samples=12", "planning.iterations=2",
-    "planning.planner.options.elites=3",
+    "--clips", "7", "--ranking-clips", "5", "--samples", "6", "--landscapes", "2", "--nodes", "3",
+    "--examples", "2",
 ]  # fmt: skip
 
 
@@ -53,7 +52,6 @@ def test_processes_that_share_an_evaluation_find_what_one_finds(make_config, tmp
     assert "uses actions" in said[0][0]
     assert [out for out, _ in said[1:]] == ["", ""], "only the first process speaks"
     alone, together = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("alone", "together"))
-    assert {"plans.score", "axes.residual_cm"} <= {row["key"] for row in alone["rows"]}
     assert_same(alone["rows"], together["rows"])
     assert alone["clips"]["count"] == together["clips"]["count"] == 5
 

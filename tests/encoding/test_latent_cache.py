@@ -44,8 +44,8 @@ from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.sheet import plot_dataset
 from vjepa2_ac.inspection.statistics import inspect_dataset
-from vjepa2_ac.reports.sheet import plot_dataset
 from vjepa2_ac.simulation.droid_writer import write_droid_rlds
 
 STEPS, FRAMES, TOKENS, DIM = 12, (0, 2, 5, 11), 4, 24

@@ -11,11 +11,11 @@ from same_run import assert_same_run, metrics
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
-from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.training.loop import train
 
 
@@ -117,12 +117,12 @@ def test_a_run_is_evaluated_from_its_cache_as_from_its_data(make_config, reporte
     changes = {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches"), "training__steps": 2}
     config = make_config(run_dir=str(tmp_path / "run"), data__cache="auto", **changes)
     train(config, reporter)
-    probes = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, axis_clips=0, nodes=3, examples=1)
+    probes = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, nodes=3, examples=1)
     asked = EvaluationOptions(clips=6, probes=probes)
     folder = next((tmp_path / "caches").iterdir())
-    from_cache = evaluate_subject(str(tmp_path / "run"), asked).evaluation
+    from_cache = evaluate_subject(str(tmp_path / "run"), asked)
     folder.rename(tmp_path / "elsewhere")
-    from_data = evaluate_subject(str(tmp_path / "run"), asked).evaluation
+    from_data = evaluate_subject(str(tmp_path / "run"), asked)
     found = [metrics_as_dict(one) for one in (from_cache, from_data)]
     assert [examples.frames is not None for examples in from_cache.examples] == [True] * len(from_data.examples)
     for cached, original in zip(from_cache.examples, from_data.examples, strict=True):

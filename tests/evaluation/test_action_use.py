@@ -18,10 +18,9 @@ from vjepa2_ac.evaluation.action_use import (
     rank_actions,
     start_of,
 )
-from vjepa2_ac.evaluation.estimates import rank_difference
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.result import ActionRanking, Landscapes
+from vjepa2_ac.evaluation.result import ActionRanking, Landscapes, rank_difference
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, vector_actions
 from worlds import DIM, Copier, Halfway, Oracle, clips_batch, moved
@@ -245,7 +244,7 @@ def test_the_minimum_of_an_analytic_energy_is_at_the_true_action() -> None:
         np.testing.assert_allclose(one.minimum, one.true, rtol=1e-6)
         assert one.energy.min() == pytest.approx(0.0, abs=1e-4)
         assert one.distance == 0.0
-    assert found.distance.value == 0.0
+    assert found.mean("distance").value == 0.0
     assert found.chance_distance > 5.0
 
 
@@ -262,13 +261,13 @@ def test_the_minimum_of_a_mirrored_model_is_far_from_the_true_action() -> None:
             return super().predict(latents, -actions, states, extrinsics)
 
     found = landscapes(Mirrored(), nodes=21)
-    assert found.distance.value > 3.0
+    assert found.mean("distance").value > 3.0
 
 
 def test_the_landscape_of_a_model_that_ignores_actions_is_flat() -> None:
     found = landscapes(Copier())
-    assert found.distance.value > 1.0
-    assert found.sharpness.value == pytest.approx(0.0, abs=1e-6)
+    assert found.mean("distance").value > 1.0
+    assert found.mean("sharpness").value == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("true", [[0.0, 0.07, -0.07], [0.031, -0.002, 0.05]])

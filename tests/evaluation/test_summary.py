@@ -26,7 +26,7 @@ from vjepa2_ac.evaluation.result import (
 )
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.summary import Summary, closed_loop, not_measured, percent, summarize, with_closed_loop
-from vjepa2_ac.intervals import Estimate, mean_of, share_of
+from vjepa2_ac.intervals import Estimate, share_of
 from vjepa2_ac.spaces import POSE_CHANGE
 from worlds import about
 
@@ -69,7 +69,6 @@ def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
         about=about(frames=HORIZON + 1, seconds_per_step=0.5),
         clips=clips_of(actions, ids, tuple(range(CLIPS)), space=POSE_CHANGE, seconds_per_step=0.5),
         models={each.name: each for each in models},
-        strata=(),
     )
 
 
@@ -202,7 +201,7 @@ def test_a_measurement_of_fewer_episodes_than_the_evaluation_has_no_conclusion_a
 
 def with_spread(result: ModelResult, spread: float) -> ModelResult:
     estimates = (Estimate(spread, spread, spread),) * HORIZON
-    distribution = LatentDistribution(estimates, estimates, (0.5,) * HORIZON, (spread,) * HORIZON, (1.0,) * HORIZON)
+    distribution = LatentDistribution(estimates, estimates, 0.5, (spread,) * HORIZON, (1.0,) * HORIZON)
     return replace(result, distribution=distribution)
 
 
@@ -227,12 +226,13 @@ def mapped(result: ModelResult, distance: float, sharpness: float, episodes: int
     """Return a model with landscapes of a mean distance and sharpness, which differ a little by clip."""
     rng, ids = np.random.default_rng(0), [f"episode {number}" for number in range(episodes)]
     distances = distance + rng.uniform(-0.5, 0.5, episodes)
+    energy = np.full((2, 2, 2), 1.0)
+    energy[0, 0, 0], energy[1, 1, 1] = 1 - sharpness / 2, 1 + sharpness / 2
     maps = tuple(
-        Landscape(name, 0, np.zeros((3, 2)), np.ones((2, 2, 2)), np.zeros(3), np.zeros(3), float(one))
+        Landscape(name, 0, np.zeros((3, 2)), energy, np.zeros(3), np.array([one, 0.0, 0.0]))
         for name, one in zip(ids, distances, strict=True)
     )
-    level = mean_of(np.full(episodes, sharpness), ids)
-    found = Landscapes(("dx", "dy", "dz"), "cm", maps, mean_of(distances, ids), level, 25.0)
+    found = Landscapes(("dx", "dy", "dz"), "cm", maps, 25.0)
     return replace(result, landscapes=found)
 
 

@@ -11,10 +11,10 @@ from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.inspection import sheet as figure
 from vjepa2_ac.inspection.coverage import sample_of
+from vjepa2_ac.inspection.sheet import plot_dataset
 from vjepa2_ac.inspection.statistics import MOVED, TURNED, idle_runs, inspect_dataset
-from vjepa2_ac.reports import sheet as figure
-from vjepa2_ac.reports.sheet import plot_dataset
 
 
 def knobs(droid: Path, **changes: object) -> DataConfig:

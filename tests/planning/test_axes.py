@@ -16,7 +16,7 @@ from tiny_models import actions, goal, scene, tiny_model
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.calibration.axes import TRIED_DEGREES, fit_axes
+from vjepa2_ac.inspection.axes import TRIED_DEGREES, fit_axes
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import apply_actions
 from vjepa2_ac.planning.axes import Axes
@@ -38,8 +38,7 @@ def write(path: Path, model: WorldModel, degrees: float = 43.0, **changes: Any) 
     values = {
         "format": 1,
         **{name: {"value": one, "low": one - 1, "high": one + 1} for name, one in
-           {"yaw_degrees": degrees, "gain": 1.0, "condition": 1.5, "residual_cm": 1.0}.items()},
-        "matrix": np.eye(3).tolist(),
+           {"yaw_degrees": degrees, "error": 0.9}.items()},
         "pairs": 200,
         "episodes": 20,
         "problem": None,
@@ -104,7 +103,7 @@ def test_limits_hold_for_what_the_robot_executes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"problem": "ill-conditioned: condition 30"}, "ill-conditioned: condition 30"),
+        ({"problem": "uncertain: yaw 30 degrees"}, "uncertain: yaw 30 degrees"),
         ({"format": 7}, "format 7"),
         ({"yaw_degrees": {"value": "north", "low": None, "high": None}}, r"yaw_degrees\.value"),
     ],
@@ -154,10 +153,8 @@ def test_a_wrong_file_is_told_before_a_model_is_loaded(tmp_path: Path) -> None:
 
 
 def test_what_a_fit_writes_can_be_read(tmp_path: Path) -> None:
-    moves = np.random.default_rng(0).normal(size=(40, 3)) * 0.03
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     errors = 1.1 - np.cos(np.deg2rad(np.array(TRIED_DEGREES) - 90.0))
-    fit = fit_axes(moves @ turn.T, moves, np.tile(errors, (40, 1)), [f"{place // 4}" for place in range(40)])
+    fit = fit_axes(np.tile(errors, (40, 1)), [f"{place // 4}" for place in range(40)])
     assert fit.problem is None
     model = tiny_model()
     path = write(tmp_path / "axes.json", model, **json.loads(json.dumps(fit.as_dict())))

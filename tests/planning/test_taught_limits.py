@@ -13,7 +13,7 @@ from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, settle
+from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
@@ -64,7 +64,7 @@ def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config
     taught = PlanningConfig.model_validate({**PLANNING, "limits": {"xyz": "data"}})
     of_run = Controller.of_run(load_subject(folder), taught)
     np.testing.assert_allclose(of_run.space.upper[0, :3], limits, rtol=1e-6)
-    asked = EvaluationOptions(planning=("planning.limits.xyz=data",), probes=ProbeOptions(planning_clips=2))
+    asked = EvaluationOptions(planning=("planning.limits.xyz=data",))
     assert settle(str(folder), asked).planning.limits.xyz == limits
 
 
@@ -86,9 +86,6 @@ def test_a_run_without_it_plans_as_before_and_its_limits_cannot_be_those_of_the_
     taught = PlanningConfig.model_validate({"limits": {"xyz": "data"}})
     with pytest.raises(InputError, match=error):
         Controller(load_subject(folder).world_model, taught)
-    asked = EvaluationOptions(planning=("planning.limits.xyz=data",), probes=ProbeOptions(planning_clips=2))
-    with pytest.raises(InputError, match=error):
-        settle(str(folder), asked)
 
 
 def test_whoever_loads_a_run_is_warned_of_limits_that_leave_what_it_was_taught(

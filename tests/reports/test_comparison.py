@@ -16,11 +16,10 @@ from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.summary import Conclusion
 from vjepa2_ac.reports.comparison import Comparison, compare
 from vjepa2_ac.reports.figures.evaluation import plot_comparison
-from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
-from vjepa2_ac.reports.paper import write_tables
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_csv, write_metrics
 from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 
-PROBES = ProbeOptions(ranking_clips=4, samples=10, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
+PROBES = ProbeOptions(ranking_clips=4, samples=10, landscape_clips=2, nodes=3, examples=0)
 
 
 def written(
@@ -220,7 +219,7 @@ def test_a_run_that_was_not_evaluated_is_named_with_the_way_out(tmp_path: Path) 
     [
         ({"by_clip": {"persistence": 0.5, "models": {}}}, "by_clip.persistence"),
         ({"rows": [{"key": 1}]}, "metrics that cannot be used"),
-        ({"format": 99}, "format: Input should be 5"),
+        ({"format": 99}, "format: Input should be 6"),
     ],
 )
 def test_damaged_metrics_are_named(tmp_path: Path, changes: dict[str, object], words: str) -> None:
@@ -254,32 +253,8 @@ def test_the_cost_of_wrong_actions_follows_from_the_errors_in_the_file(tmp_path:
     assert metrics.summary.uses_actions.value == metrics.of("cost_of_actions.shuffled").value
 
 
-def test_a_run_of_an_older_version_is_compared(tmp_path: Path) -> None:
-    """Keys of strata contained numbers of the data, and one-step errors by clip were absent."""
-    one, other = written(tmp_path / "one", Halfway()), written(tmp_path / "other", Halfway())
-    text = (other / METRICS_FILE).read_text()
-    assert "one_step.action_size.small" in text
-    metrics = json.loads(text.replace(".action_size.small", ".action size.0.0 to 1.2 cm"))
-    del metrics["by_clip"]["one_step"]
-    (other / METRICS_FILE).write_text(json.dumps(metrics))
-    found = compare([one, other])
-    models = {row.model for row in found.rows if row.key == "one_step.action_size.medium"}
-    assert models == {"one", "other"}
-    assert {row.model for row in found.rows if row.key == "one_step.action_size.small"} == {"one"}
-    table, paper = write_tables(found.rows, tmp_path / "comparison.png")
-    assert "one_step.action size.0.0 to 1.2 cm" in table.read_text()
-    assert "small: " in paper.read_text()
-
-
-def test_tables_for_a_paper_have_every_row_and_escape_names(tmp_path: Path) -> None:
+def test_the_table_has_every_row(tmp_path: Path) -> None:
     found = compare([written(tmp_path / "half_1", Halfway()), written(tmp_path / "100%", Copier())])
-    table, paper = write_tables(found.rows, tmp_path / "comparison.png")
-    with table.open(newline="") as file:
-        again = [(row["key"], row["model"], float(row["value"])) for row in csv.DictReader(file)]
-    assert again == [(row.key, row.model, pytest.approx(row.value, nan_ok=True)) for row in found.rows]
-    text = paper.read_text()
-    assert r"half\_1" in text
-    assert r"100\%" in text
-    for one in text.split(r"\begin{tabular}")[1:]:
-        columns = one.partition("}")[0].count("r")
-        assert {len(re.findall(r"(?<!\\)&", line)) for line in one.splitlines() if "&" in line} == {columns}
+    with write_csv(found.rows, tmp_path / "comparison.csv").open(newline="") as file:
+        rows = [(row["key"], row["model"], float(row["value"])) for row in csv.DictReader(file)]
+    assert rows == [(row.key, row.model, pytest.approx(row.value, nan_ok=True)) for row in found.rows]

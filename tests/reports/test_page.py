@@ -16,8 +16,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 from evaluation_results import decoded_strips, evaluation, page_of
-from planned import with_plans
-from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
+from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.summary import Verdict, summarize
 from vjepa2_ac.reports import write
@@ -53,7 +52,7 @@ Usual = tuple[Evaluation, str, Page]
 @pytest.fixture(scope="module")
 def usual(_undrawn: Callable[[pytest.MonkeyPatch], None]) -> Usual:
     """An evaluation of which everything was measured, its page with figures that have content, and that in pieces."""
-    one = decoded_strips(with_plans(evaluation(others=("runs/other",))))
+    one = decoded_strips(evaluation(others=("runs/other",)))
     with pytest.MonkeyPatch.context() as patch:
         _undrawn(patch)
         html = page_of(one)
@@ -113,7 +112,7 @@ def test_all_but_the_first_screen_is_folded_and_no_table_stands_beside_the_figur
 ) -> None:
     _, html, _ = usual
     first, *parts = re.split("\n<details id=", html)
-    assert len(parts) == html.count("<summary><h2>") > 10
+    assert len(parts) == html.count("<summary><h2>") == 9
     assert "<details open" not in html
     assert "<table" not in first
     for part in parts:
@@ -140,27 +139,14 @@ def test_the_video_shows_the_clip_with_the_median_error_and_is_short_and_small()
             assert np.abs(shown[:256, place * 264 : place * 264 + 256] - true).mean() < 4
 
 
-@pytest.mark.usefixtures("without_figures")
-def test_of_many_episodes_the_best_and_the_worst_are_shown_by_short_names() -> None:
-    one = evaluation(episodes=40, clips=80)
-    html = page_of(one)
-    for place, scores in (("best", one.episodes[:8]), ("worst", one.episodes[-8:])):
-        table = html.partition(f"<caption>The 8 {place} of 40")[2].partition("</table>")[0]
-        rows = re.findall(r'title="(.*?)">(.*?)</th><td>\d+</td><td>(.*?)</td>', table)
-        ids = [score.episode_id for score in scores]
-        assert [row[:2] for row in rows] == [(name, name.rpartition("/")[2]) for name in ids]
-        assert [row[2] for row in rows] == [f"{score.over_persistence:.3f}" for score in scores]
-
-
 def named(name: str) -> Evaluation:
     """Return an evaluation in which everything that has a name of somebody's choice has this one."""
     form = name.replace("{", "{{").replace("}", "}}") + "{0}"
-    one = decoded_strips(with_plans(evaluation(id_form=form, others=(name,))))
+    one = decoded_strips(evaluation(id_form=form, others=(name,)))
     return replace(
         one,
         about=replace(one.about, subject=name, data=name, checkpoint_path=name, cameras=(name,)),
         examples=tuple(replace(example, why=name) for example in one.examples),
-        training=(TrainingCurve(name, (1, 2), (0.5, 0.4)),),
         notes=(name,),
     )
 
@@ -196,8 +182,7 @@ def test_the_page_stays_small_whatever_was_measured() -> None:
     rng = np.random.default_rng(0)
     one = evaluation(frames=16, size=256)
     noise = rng.integers(0, 256, size=one.examples[0].frames.shape, dtype=np.uint8)
-    curve = TrainingCurve("loss", tuple(range(5_000)), tuple(map(float, range(5_000))))
-    html = page_of(replace(one, examples=(replace(one.examples[0], frames=noise),) * 6, training=(curve,) * 4))
+    html = page_of(replace(one, examples=(replace(one.examples[0], frames=noise),) * 6))
     assert len(html.encode()) < 5_000_000
     assert html.count("data:image/webp") == MOST_CLIPS
 
@@ -205,18 +190,18 @@ def test_the_page_stays_small_whatever_was_measured() -> None:
 def test_what_was_not_measured_is_named_with_the_reason() -> None:
     one = evaluation(with_base=False)
     adapter = replace(one.models["adapter"], ranking=None, landscapes=None, distribution=None)
-    bare = replace(one, models={"adapter": adapter}, examples=(), training=(), strata=(), episodes=(), copies=None)
+    bare = replace(one, models={"adapter": adapter}, examples=(), copies=None)
     noted = replace(bare, notes=("--ranking-clips is 0: no energy landscapes.",))
     shown = Page(page_of(noted)).shown
     for what in (
-        "Compared with the base", "Energy landscapes", "Example clips", "Training curves", "Other strides",
-        "Spread of the predictions", "Decoded images", "Plans beside demonstrations",
+        "Compared with the base", "Energy landscapes", "Example clips", "Distribution of the predictions",
+        "Decoded images",
     ):  # fmt: skip
         assert f"{what}: not measured." in shown
     assert "Energy landscapes: not measured. --ranking-clips is 0: no" in shown
     assert "`" not in shown, "a command is shown as code"
     written = metrics_as_dict(noted)["not_measured"]
-    assert len(written) == 8
+    assert len(written) == 5
     assert all(reason.replace("`", "") in shown for reason in written.values()), "page and metrics.json agree"
     assert "No video: vjepa2-ac evaluate runs/kitchen --decoder FOLDER" in shown
 

@@ -10,7 +10,6 @@ import pytest
 
 from browser import open_page
 from evaluation_results import decoded_strips, evaluation, page_of
-from planned import with_plans
 
 pytestmark = pytest.mark.usefixtures("drawn")
 
@@ -31,7 +30,7 @@ addEventListener("message", told => Object.assign(document.documentElement.datas
 @cache
 def page() -> str:
     """Return a page of everything that can be measured."""
-    return page_of(decoded_strips(with_plans(evaluation(others=("a run with a rather long name/and/slashes",)))))
+    return page_of(decoded_strips(evaluation(others=("a run with a rather long name/and/slashes",))))
 
 
 def probed(folder: Path, *, dark: bool, width: int, opened: bool) -> dict[str, str]:

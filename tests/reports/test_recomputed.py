@@ -18,7 +18,7 @@ from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_met
 from worlds import Oracle, about, again, clips_batch
 
 T = {5: 2.7764451, 6: 2.5705818}  # by number of episodes n: the quantile 0.975 of Student's t with n - 1 degrees
-PROBES = ProbeOptions(ranking_clips=10, samples=12, landscape_clips=10, axis_clips=0, nodes=3, examples=0)
+PROBES = ProbeOptions(ranking_clips=10, samples=12, landscape_clips=10, nodes=3, examples=0)
 
 
 class Short(Oracle):
@@ -140,10 +140,13 @@ def test_the_conclusions_follow_from_paired_differences_in_metrics_json(tmp_path
     ranks, base_ranks = (written[name]["ranking"]["ranks"] for name in ("adapter", "base"))
     ids = written["adapter"]["ranking"]["episode_ids"]
     maps, base_maps = (written[name]["landscapes"]["maps"] for name in ("adapter", "base"))
-    distances = [one["distance"] - other["distance"] for one, other in zip(maps, base_maps, strict=True)]
+    distances = [
+        math.dist(one["minimum"], one["true"]) - math.dist(other["minimum"], other["true"])
+        for one, other in zip(maps, base_maps, strict=True)
+    ]
     for key, values, episode_ids in (
         ("ranking.difference_to_base", np.subtract(ranks, base_ranks), ids),
-        ("landscapes.difference_to_base", distances, [one["episode_id"] for one in maps]),
+        ("landscapes.distance.difference_to_base", distances, [one["episode_id"] for one in maps]),
     ):
         row = metrics.of(key)
         assert row is not None

@@ -19,8 +19,8 @@ from PIL import Image
 from vjepa2_ac.cli import main
 from vjepa2_ac.config.loading import config_as_dict, config_as_yaml, parse_config
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.checkpoint import newest_checkpoint
 from vjepa2_ac.runs.folder import (
     RunLock,
@@ -194,9 +194,9 @@ def test_a_run_is_measured_and_goes_on_from_anywhere_as_from_its_own_folder(
 ) -> None:
     train(at_home, reporter)
     as_written = (home / "run/config.yaml").read_text()
-    here = evaluate_subject("run", ASKED).evaluation
+    here = evaluate_subject("run", ASKED)
     monkeypatch.chdir(home.parent / "elsewhere")
-    there = evaluate_subject(str(home / "run"), ASKED).evaluation
+    there = evaluate_subject(str(home / "run"), ASKED)
     elsewhere, nearby = (found.models["adapter"].errors.of("rollout") for found in (there, here))
     assert (elsewhere == nearby).all()
     assert there.about.data == str(home / "data")
@@ -260,7 +260,7 @@ def test_every_address_of_a_config_is_named_with_its_knob() -> None:
     ("command", "contacts"),
     [
         (["train", "RUN", "--resume"], "vjepa2_ac.training.loop.train"),
-        (["evaluate", "RUN"], "vjepa2_ac.reports.write.evaluate_subject"),
+        (["evaluate", "RUN"], "vjepa2_ac.evaluation.evaluate_run.evaluate_subject"),
         (
             ["plan", "RUN", "--start", "a.png", "--goal", "a.png", "--state", "0.4,0,0.3,3.1,0,0.1,0.2", "--out", "p"],
             "vjepa2_ac.planning.model_setup.load_to_plan",

@@ -13,6 +13,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.episode import Widths
+from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.export import CARD, export_run
 from vjepa2_ac.model.adapter.adapter_folder import save_trained
@@ -22,7 +23,7 @@ from vjepa2_ac.model.network.world_model import fit_heads
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import read_metrics
-from vjepa2_ac.reports.write import evaluate_subject
+from vjepa2_ac.reports.write import write_evaluation
 from vjepa2_ac.runs.checkpoint import ADAPTER, RunState, write_checkpoint
 from vjepa2_ac.runs.folder import CONFIG
 from vjepa2_ac.runs.subject import load_subject
@@ -90,7 +91,7 @@ def test_a_checkpoint_before_the_first_step_is_called_what_it_is(
 
 
 def test_the_base_is_measured_once_and_its_metrics_say_so(base_run: Path, caplog: pytest.LogCaptureFixture) -> None:
-    measured = evaluate_subject(str(base_run), FEW)
+    measured = write_evaluation(evaluate_subject(str(base_run), FEW), base_run)
     assert caplog.messages == [SELECTED]
     assert [(one.name, one.role) for one in measured.evaluation.models.values()] == [("base", "trained")]
     assert SELECTED in measured.evaluation.notes
@@ -102,7 +103,7 @@ def test_the_base_is_measured_once_and_its_metrics_say_so(base_run: Path, caplog
     assert f"**{SELECTED}**" in (base_run / "hub" / CARD).read_text()
     assert "| base |" in (base_run / "hub" / CARD).read_text()
     asked = EvaluationOptions(clips=3, probes=FEW.probes, checkpoint="newest", out=base_run / "newest")
-    later = evaluate_subject(str(base_run), asked).evaluation
+    later = write_evaluation(evaluate_subject(str(base_run), asked), base_run / "newest").evaluation
     assert (list(later.models), later.about.is_base) == (["base", "adapter"], False)
     assert list(compare([base_run, base_run / "newest"]).measured) == ["run", "newest"]
 

@@ -7,8 +7,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from vjepa2_ac.evaluation.calibration.axes import TRIED_DEGREES, AxisFit, fit_axes
-from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
     L1,
@@ -27,15 +25,12 @@ from vjepa2_ac.evaluation.result import (
     Mode,
     ModelResult,
     PredictionErrors,
-    Stratum,
-    TrainingCurve,
     Way,
 )
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import mean_of
 from vjepa2_ac.reports.write import report_page
-from vjepa2_ac.spaces import POSE_CHANGE
 
 ABOUT = About(
     subject="runs/kitchen",
@@ -48,7 +43,6 @@ ABOUT = About(
     frames=4,
     stride=4,
     seconds_per_step=4 / 15,
-    space=POSE_CHANGE,
     seed=0,
     version="0.1.0",
     time="2026-11-21 16:00 UTC",
@@ -86,30 +80,19 @@ def _landscape(rng: np.random.Generator, episode_id: str, off: float) -> Landsca
     energy = 0.4 + 0.002 * ((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + 0.5 * (z - centre[2]) ** 2)
     place = np.unravel_index(energy.argmin(), energy.shape)
     minimum = np.array([axes[axis][place[axis]] for axis in range(3)])
-    return Landscape(episode_id, 12, axes, energy, true, minimum, float(np.linalg.norm(minimum - true)))
+    return Landscape(episode_id, 12, axes, energy, true, minimum)
 
 
 def _landscapes(rng: np.random.Generator, ids: tuple[str, ...], off: float) -> Landscapes:
     maps = tuple(_landscape(rng, name, off) for name in ids[:5])
-    distance = mean_of(np.array([one.distance for one in maps]), ids[:5])
-    sharpness = mean_of(np.array([np.ptp(one.energy) / one.energy.mean() for one in maps]), ids[:5])
-    return Landscapes(("dx", "dy", "dz"), "cm", maps, distance, sharpness, 8.1)
-
-
-def _axes(ids: tuple[str, ...], degrees: float) -> AxisFit:
-    moves = np.random.default_rng(1).normal(size=(len(ids), 3)) * 0.03
-    angle = np.deg2rad(degrees)
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-    errors = np.tile(1.1 - np.cos(np.deg2rad(np.array(TRIED_DEGREES) - degrees)), (len(ids), 1))
-    errors *= 1 + 0.1 * np.random.default_rng(2).random(errors.shape)
-    return fit_axes(0.9 * moves @ turn.T + 0.005 * np.roll(moves, 1, axis=0), moves, errors, ids)
+    return Landscapes(("dx", "dy", "dz"), "cm", maps, 8.1)
 
 
 def _distribution(rng: np.random.Generator, ids: tuple[str, ...], spread: float, horizon: int) -> LatentDistribution:
     levels = [spread ** (h / horizon) + 0.1 * rng.standard_normal(len(ids)) for h in range(1, horizon + 1)]
     spreads = tuple(mean_of(level, ids) for level in levels)
     mmd, variance = tuple(mean_of(1 - level, ids) for level in levels), tuple(2 * one.value for one in spreads)
-    return LatentDistribution(spreads, mmd, (0.04,) * horizon, variance, (2.0,) * horizon)
+    return LatentDistribution(spreads, mmd, 1.5 - spread, variance, (2.0,) * horizon)
 
 
 def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, models: list[str], size: int) -> Example:
@@ -119,15 +102,12 @@ def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, mo
         np.stack([255 * x, 255 * y, 255 * (np.hypot(x - 0.2 - 0.5 * t / times, y - 0.5) < 0.15)], axis=-1)
         for t in range(times)
     ]).astype(np.uint8)  # fmt: skip
-    colours = frames[:, :: size // grid, :: size // grid][:, :grid, :grid]
     return Example(
         why,
         episode_id,
         12,
         frames,
         {name: rng.gamma(2.0, 0.15, size=(times - 1, grid, grid)) for name in ("persistence", *models)},
-        colours,
-        dict.fromkeys(models, colours[1:] // 2 + 40),
     )
 
 
@@ -147,7 +127,9 @@ def decoded_strips(one: Evaluation, size: int = 64) -> Evaluation:
     strips = tuple(DecodedStrip("median", one.clips.episode_ids[0], 0, shown) for shown in both)
     psnr = (mean_of(np.linspace(20, 24, len(one.clips)), one.clips.episode_ids),) * one.horizon
     curves = {(name, "psnr_db.whole.truth"): psnr for name in names}
-    return replace(one, decoded=DecodedRollouts({"folder": "decoder"}, names, curves, strips))
+    return replace(
+        one, decoded=DecodedRollouts({"folder": "decoder"}, names, curves, strips, fvd=dict.fromkeys(names, 0.4))
+    )
 
 
 @lru_cache(maxsize=8)
@@ -175,7 +157,6 @@ def evaluation(
             PredictionErrors(ids, arrays),
             _landscapes(rng, ids, 4 - 3 * skill),
             ranking=ranking_of(0.3 * (1 - skill) + 0.1 * rng.random(len(ids)), ids),
-            beside={"axes": _axes(ids, degrees=60 - 60 * skill)},
             distribution=_distribution(np.random.default_rng(place), ids, 0.5 + 0.4 * skill, horizon),
         )
     size_of_action = rng.gamma(2.0, 2.0, size=(clips, horizon))
@@ -184,20 +165,7 @@ def evaluation(
         about=replace(ABOUT, frames=frames),
         clips=Clips(ids, tuple(range(clips)), size_of_action, moving, "the flange moves 1.5 cm or more in a step"),
         models=models,
-        strata=(
-            Stratum("motion.moving", "moving", moving),
-            Stratum("motion.idle", "idle", ~moving),
-            Stratum("action_size.small", "small: 0 to 3 cm", size_of_action < 3),
-            Stratum("action_size.large", "large: 3 to 9.9 cm", size_of_action >= 3),
-        ),
-        episodes=episode_scores(models["adapter"].errors, models["base"].errors if with_base else None),
         examples=tuple(_example(rng, why, ids[0], frames, names, size) for why in ("best", "worst")),
-        training=(
-            TrainingCurve("train/loss", tuple(range(10, 810, 10)), tuple(0.4 + 0.3 * np.exp(-np.arange(80) / 20))),
-            TrainingCurve("validation/rollout_over_persistence_last", (0, 400, 800), (0.95, 0.8, 0.78)),
-            TrainingCurve("train/data_wait_share", (10, 400, 800), (0.1, 0.02, 0.03)),
-            TrainingCurve("train/learning_rate", tuple(range(10, 810, 10)), tuple(np.linspace(3e-3, 0, 80))),
-        ),
         copies=_distribution(np.random.default_rng(9), ids, 1.0, horizon),
-        noise_floor=(0.031,) * horizon,
+        fvd_of_halves=0.12,
     )

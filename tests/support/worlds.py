@@ -9,7 +9,7 @@ from torch import Tensor
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.evaluate import RepeatableClips
 from vjepa2_ac.evaluation.result import About
-from vjepa2_ac.spaces import POSE_CHANGE
+from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace
 
 TIME, TOKENS, DIM = 5, 4, 6
 
@@ -95,7 +95,7 @@ def in_batches(batch: LatentBatch, size: int) -> list[LatentBatch]:
     return [rows(batch, list(range(first, min(first + size, count)))) for first in range(0, count, size)]
 
 
-def again(batch: LatentBatch, size: int = 4) -> RepeatableClips:
+def again(batch: LatentBatch, size: int = 4, space: ActionSpace = POSE_CHANGE) -> RepeatableClips:
     """Return clips that can be read again; their pictures are grey."""
     places = {name: place for place, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True))}
 
@@ -104,7 +104,7 @@ def again(batch: LatentBatch, size: int = 4) -> RepeatableClips:
         for part in in_batches(rows(batch, chosen), size):
             yield part, lambda _: np.full((TIME, 8, 8, 3), 128, np.uint8)
 
-    return RepeatableClips(tuple(places), read)
+    return RepeatableClips(tuple(places), read, space)
 
 
 def about(**changes: object) -> About:
@@ -112,6 +112,6 @@ def about(**changes: object) -> About:
     values: dict[str, object] = {
         "subject": "run", "checkpoint": "step-00000002 (the newest)", "checkpoint_path": "step-00000002",
         "source": "rlds", "data": "data", "cameras": ("exterior_1_left",), "split": "test", "frames": TIME, "stride": 4,
-        "seconds_per_step": 0.25, "space": POSE_CHANGE, "seed": 0, "version": "0", "time": "2026-01-01T00:00:00Z",
+        "seconds_per_step": 0.25, "seed": 0, "version": "0", "time": "2026-01-01T00:00:00Z",
     }  # fmt: skip
     return About(**(values | changes))  # type: ignore[arg-type]

@@ -16,6 +16,7 @@ from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.variants import calibrate_config
+from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.export import export_run
@@ -23,13 +24,12 @@ from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.model_files import read_sizes
 from vjepa2_ac.model.network.world_model import widths_of_model
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
-from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train
 
 MakeConfig = Callable[..., Config]
 HEADS = ["action_encoder", "state_encoder"]
-PROBES = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, axis_clips=0, nodes=3, examples=1)
+PROBES = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, nodes=3, examples=1)
 QUICK = EvaluationOptions(split="validation", clips=4, probes=PROBES)
 ROBOTS = {"14/14": Widths(14, 14), "8/7": Widths(8, 7), "7/8": Widths(7, 8)}
 
@@ -68,7 +68,7 @@ def test_from_recordings_to_a_model_of_its_own(
     run = load_subject(folder)
     assert widths_of_model(run.world_model.sizes) == widths
 
-    evaluation = evaluate_subject(str(folder), QUICK).evaluation
+    evaluation = evaluate_subject(str(folder), QUICK)
     assert list(evaluation.models) == ["adapter" if kind == "lora" else "model"]
     metrics = metrics_as_dict(evaluation)
     assert any("no base to compare with" in note for note in metrics["notes"])
@@ -111,7 +111,7 @@ def test_what_it_learnt_is_a_base_that_the_same_robot_trains_on(
     folder = train(make_robot(training__steps=1, training__allow_weak_base=True, **second), again)
     assert not any("initialised anew" in note for note in again.notes)
     assert any("state encoder: the base's own" in note for note in again.notes)
-    evaluation = evaluate_subject(str(folder), replace(QUICK, checkpoint="newest")).evaluation
+    evaluation = evaluate_subject(str(folder), replace(QUICK, checkpoint="newest"))
     assert list(evaluation.models) == ["base", "adapter"]
     results = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), ClipSample(clips=4)).results
     assert [one.moved_cm for one in results.values()] == [None, None]
@@ -143,7 +143,7 @@ def test_vectors_as_wide_as_poses_keep_the_heads_and_must_prove_themselves(
         train(make_robot(widths, adapter__modules_to_save=[]), reporter)
     assert [note for note in reporter.notes if "encoder: the base's own" in note]
     folder = train(make_robot(widths, training__allow_weak_base=True, training__steps=1), reporter)
-    evaluation = evaluate_subject(str(folder), replace(QUICK, checkpoint="newest")).evaluation
+    evaluation = evaluate_subject(str(folder), replace(QUICK, checkpoint="newest"))
     assert list(evaluation.models) == ["base", "adapter"]
     assert export_run(folder, tmp_path / "official.pt", "official").path.is_file()
 

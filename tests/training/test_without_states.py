@@ -15,19 +15,19 @@ from vector_sets import write_vectors
 from vjepa2_ac.config import Config, LimitsConfig, ModelConfig, ModelSizes, PlanningConfig
 from vjepa2_ac.episode import STATE_DIM
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.export import export_run
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
-from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train
 
 MakeConfig = Callable[..., Config]
 SIZES = {**TINY, "predictor": {**TINY["predictor"], "use_states": False}}  # type: ignore[dict-item]
-PROBES = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, axis_clips=0, nodes=3, examples=1)
+PROBES = ProbeOptions(ranking_clips=2, samples=4, landscape_clips=1, nodes=3, examples=1)
 QUICK = EvaluationOptions(split="validation", clips=4, probes=PROBES, checkpoint="newest")
 SEARCH = PlanningConfig(samples=6, iterations=2, planner={"name": "cem", "options": {"elites": 3}})
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
@@ -82,7 +82,7 @@ def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_pat
     run = load_subject(folder)
     assert not run.world_model.sizes.predictor.use_states
 
-    evaluation = evaluate_subject(str(folder), QUICK).evaluation
+    evaluation = evaluate_subject(str(folder), QUICK)
     assert list(evaluation.models) == (["base", "adapter"] if kind == "lora" else ["model"])
 
     assert drive(Controller.of_run(run, SEARCH), STATE).shape == (2, 7)
@@ -111,7 +111,7 @@ def test_states_of_any_width_need_no_new_head(
     for width in (11, 7):
         with_states(base, width).save_pretrained(tmp_path / f"of {width}")
     asked = replace(QUICK, against=("base", str(tmp_path / "of 11")))
-    assert list(evaluate_subject(str(folder), asked).evaluation.models) == ["base", "of 11", "adapter"]
+    assert list(evaluate_subject(str(folder), asked).models) == ["base", "of 11", "adapter"]
     with pytest.raises(InputError, match=r"states of 11 and actions of 7 numbers\. needed: states of 7"):
         evaluate_subject(str(folder), replace(QUICK, against=(str(tmp_path / "of 7"),)))
     planning = SEARCH.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})

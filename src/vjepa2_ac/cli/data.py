@@ -15,7 +15,7 @@ from vjepa2_ac.errors import InputError, counted, shell_command
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
     from vjepa2_ac.episode import Progress
-    from vjepa2_ac.evaluation.calibration.data import VariantProbe
+    from vjepa2_ac.inspection.probe import VariantProbe
 
 _CLIPS, _PAIRS = 64, 200  # to calibrate by: strides, axes (as the paper)
 
@@ -49,7 +49,7 @@ def _add_commands(commands: cli.Commands) -> None:
 
     parser = cli.command(commands, "calibrate", _calibrate, "my_robot.yaml --limit 64")
     cli.add_config(parser, such_as=such_as)
-    cli.add(parser, "--axes RUN_OR_MODEL", "fit the moves that it infers to the executed ones: axes.json", cli.as_model)
+    cli.add(parser, "--axes RUN_OR_MODEL", "find the angle between its axes and the robot's: axes.json", cli.as_model)
     cli.add(parser, "--model MODEL", "ask another than model.base: a .pt, a folder, or a run", cli.as_model)
     cli.add(parser, "--split", "of which (validation)", choices=["train", "validation", "test"], default="validation")
     cli.add(parser, "--limit N", "clips at each stride (64), or pairs of frames (200)", cli.count)
@@ -152,7 +152,7 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
 
 def _probe(config: Config, model: str, *, clips: int, progress: Progress) -> VariantProbe:
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.evaluation.calibration.data import probe_config
+    from vjepa2_ac.inspection.probe import probe_config
     from vjepa2_ac.inspection.statistics import at_some_stride
 
     return probe_config(config, at_some_stride(open_dataset(config.data)), model=model, clips=clips, progress=progress)
@@ -180,9 +180,9 @@ def _inspect(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.cli.console.tables import motion_table
     from vjepa2_ac.data.dataset import open_dataset
+    from vjepa2_ac.inspection.sheet import plot_dataset
     from vjepa2_ac.inspection.statistics import RELEASED, at_some_stride, inspect_dataset
     from vjepa2_ac.reporter import INDEXING
-    from vjepa2_ac.reports.sheet import plot_dataset
     from vjepa2_ac.storage import write_atomically
 
     with cli.reporter() as reporter:
@@ -243,9 +243,7 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
     require_axes_in(config.data)
     cli.make_folder(options.out)
 
-    from vjepa2_ac.cli.console.tables import row_tables
-    from vjepa2_ac.evaluation.calibration.axes import calibrate_axes
-    from vjepa2_ac.reports.figures.planning import plot_axes
+    from vjepa2_ac.inspection.axes import calibrate_axes, plot_axes
     from vjepa2_ac.storage import write_atomically
     from vjepa2_ac.storage.structured import json_text
 
@@ -254,5 +252,5 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
         fit, content = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
     write_atomically(options.out / AXES_FILE, json_text(content))
     files = [options.out / AXES_FILE, plot_axes(fit, options.out / "axes.png")]
-    cli.show(*row_tables(fit.rows(options.axes), "Yaw of least error, and fit of moves"), fit.words(), files=files)
+    cli.show(fit.words(), files=files)
     return int(fit.problem is not None)

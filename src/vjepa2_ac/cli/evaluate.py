@@ -31,18 +31,12 @@ def add_evaluate(commands: cli.Commands) -> None:
     cli.add(parser, "--against base|RUN|MODEL", "what to compare with (the base of a run)", cli.as_model, nargs="+")
     cli.add(parser, "--clips N", "at most this many clips, spread over the episodes (256)", cli.count)
     cli.add_decoder(parser, "the rollouts as images, and measure these, too")
-    text = "plan, too, and compare with the demonstrations (long); with these settings of planning, here or anywhere"
-    cli.add(parser, "--planning planning.key=value", text, nargs="*", dest="plan_settings")
     cli.add(parser, "--out FOLDER", "where figures go (the run's folder)", cli.as_path)
     cli.add_all(parser)
     group = parser.add_argument_group("data, and what is measured")
     cli.add(group, "--data CONFIG", "measure on its data (with its model.dtype, device, seed)", cli.as_local)
     cli.add(group, "--split", "which held-out episodes (test)", choices=["test", "validation"])
     cli.add_checkpoint(group)
-    cli.add(group, "--planning-clips N", "clips to plan from, one frame of each (32)", cli.count, default=32)
-    cli.add(group, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
-    cli.add(group, "--lpips FILE", "weights for LPIPS of the decoded images (docs/decoding.md)", cli.as_path)
-    cli.add(group, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", cli.as_path)
     group = parser.add_argument_group("use of the actions")
     cli.add(group, "--ranking-clips N", "clips for the action-ranking error (32)", cli.whole_number(0))
     cli.add(group, "--samples N", "alternative actions for each of them (64)", cli.count)
@@ -53,7 +47,6 @@ def add_evaluate(commands: cli.Commands) -> None:
         cli.whole_number(0),
         dest="landscape_clips",
     )
-    cli.add(group, "--axes N", "clips of those to calibrate the axes by (32)", cli.whole_number(0), dest="axis_clips")
     cli.add(group, "--nodes N", "points of a landscape along each axis (9)", cli.whole_number(3, 51))
     cli.add(group, "--reach CM", "half its width (7.5)", cli.number_between(0.0, 1000.0, "cm"), dest="reach_cm")
     cli.add(group, "--examples N", "clips to show (4)", cli.whole_number(0))
@@ -106,26 +99,29 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.cli.console.tables import row_tables
     from vjepa2_ac.distributed import leave_processes
+    from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
     from vjepa2_ac.evaluation.rows import rows_of
     from vjepa2_ac.evaluation.summary import spread_of_errors
     from vjepa2_ac.reporter import SILENT
-    from vjepa2_ac.reports.write import evaluate_subject
+    from vjepa2_ac.reports.write import write_evaluation
 
     evaluations = []
     for subject, how in asked:
         cli.say_places_elsewhere(subject)
         with cli.reporter() as reporter:
-            measured = evaluate_subject(subject, how, reporter if is_first() else SILENT)
-        if not is_first():  # it shared the work of the first process, which reports
-            continue
-        evaluations.append(measured.evaluation)
+            evaluation = evaluate_subject(subject, how, reporter=reporter if is_first() else SILENT)
+            if not is_first():  # it shared the work of the first process, which reports
+                continue
+            reporter.task("writing report and figures")
+            measured = write_evaluation(evaluation, how.out or Path(subject))
+        evaluations.append(evaluation)
         if options.all:
-            checkpoint, notes = measured.evaluation.about.checkpoint, measured.evaluation.notes
+            checkpoint, notes = evaluation.about.checkpoint, evaluation.notes
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
-            tables = row_tables(rows_of(measured.evaluation), "Held-out episodes")
+            tables = row_tables(rows_of(evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
         cli.show(str(measured.summary), *_next(measured, options, reporter))
-        film = "" if measured.evaluation.decoded is None else "film and "
+        film = "" if evaluation.decoded is None else "film and "
         cli.show(f"Report with {film}all tables: {measured.report}")
     if len(evaluations) > 1:
         cli.show(spread_of_errors(evaluations))
@@ -137,7 +133,7 @@ def _next(measured: Evaluated, options: argparse.Namespace, reporter: ConsoleRep
     from vjepa2_ac.runs.folder import is_of_moved
 
     about, summary = measured.evaluation.about, measured.summary
-    settings = [*(options.plan_settings or ()), *options.overrides]
+    settings = options.overrides
     config = options.data or f"{about.subject}/config.yaml"
     words = ["data", "check", config]
     if not about.checkpoint:
@@ -191,24 +187,21 @@ def _next_closed_loop(
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
-    """Return what is asked of each subject; refuse planning settings that would have no effect: without plans."""
+    """Return the options for each subject; refuse settings without effect."""
     from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
     from vjepa2_ac.runs.folder import is_of_moved
 
-    of_plans = [word for word in options.overrides if not is_of_moved(word)]
-    if of_plans and options.plan_settings is None:
-        found = f"{' '.join(of_plans)}, and no plans are asked for"
-        needed = "--planning beside settings of planning; what else a config says is not changed by evaluate"
-        raise InputError(where="command line", found=found, needed=needed, fix="Add --planning")
-    several, plan_settings = len(options.subjects) > 1, options.plan_settings
-    clips = 0 if plan_settings is None else options.planning_clips
+    if unused := [word for word in options.overrides if not is_of_moved(word)]:
+        needed = "model.base=PATH, for a run whose base was moved: evaluate does not change other config keys"
+        raise InputError(where="command line", found=" ".join(unused), needed=needed)
+    several = len(options.subjects) > 1
     every = cli.record_of_options(
         EvaluationOptions,
         options,
         data=cli.read_config(options.data) if options.data else None,
         against=tuple(options.against) if options.against else None,
-        probes=cli.record_of_options(ProbeOptions, options, planning_clips=clips),
-        planning=(*(plan_settings or ()), *options.overrides),
+        probes=cli.record_of_options(ProbeOptions, options),
+        planning=tuple(options.overrides),
     )
     return [
         (subject, replace(every, out=options.out / Path(subject).name if options.out and several else options.out))
@@ -227,10 +220,11 @@ def _compare(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.cli.console.tables import row_tables
     from vjepa2_ac.reports.figures.evaluation import plot_comparison
-    from vjepa2_ac.reports.paper import write_tables
+    from vjepa2_ac.reports.metrics_json import write_csv
 
     tables = row_tables(comparison.rows, comparison.title) if options.all else []
-    files = [plot_comparison(comparison, options.out), *write_tables(comparison.rows, options.out)]
+    table = write_csv(comparison.rows, options.out.with_suffix(".csv"))
+    files = [plot_comparison(comparison, options.out), table]
     cli.show(*tables, str(comparison), *comparison.notes, comparison.next_command, files=files)
 
 

@@ -126,10 +126,10 @@ class PlanningConfig(Section):
     know all of them: `data.camera` of several."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks; needs a C compiler, and a minute within the first decision. The
-    same energies to rounding. Not of `evaluate --planning`, which computes plainly."""
+    same energies to rounding."""
     axes: Local | None = None
     """Calibrated axes of the model (`data calibrate --axes`, its axes.json): it is given what the robot does turned by
-    their angle, as its training camera would have seen it. Of poses in the base frame. Not of `evaluate --planning`."""
+    their angle, as its training camera would have seen it. Of poses in the base frame."""
     limits: LimitsConfig = LimitsConfig()
     """Limits of every action."""
     energy: EnergyConfig = EnergyConfig()

@@ -16,12 +16,11 @@ from vjepa2_ac.distributed import gathered, shared
 from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.result import ActionRanking, Landscape, Landscapes
+from vjepa2_ac.evaluation.result import SAME_ENERGY, ActionRanking, Landscape, Landscapes
 from vjepa2_ac.intervals import mean_of, ratio
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.spaces import POSE, ActionSpace, vector_states
 
-_SAME = 1e-6  # relative difference below which energies are equal: rounding decides no rank
 _ROOM = 1.25  # extent of a landscape's grid relative to the largest true action
 _AXES = slice(0, 3)  # of the grid: of poses, the position
 
@@ -215,7 +214,7 @@ def rank_actions(
         drawn = [move.true[None], pool.in_box(move, generator), pool.on_shell(move, generator)]
         (true, *energies), (_, *changes) = evaluate_actions(model, move, np.concatenate(drawn), at_once=probes.at_once)
         alternatives = np.reshape(energies, (2, -1))
-        is_same = np.abs(alternatives - true) <= _SAME * max(abs(true), 1e-12)
+        is_same = np.abs(alternatives - true) <= SAME_ENERGY * max(abs(true), 1e-12)
         # A prediction that is not finite is the farthest: of the true action, no alternative is farther.
         is_closer = alternatives < true if np.isfinite(true) else np.ones_like(alternatives)
         box, shell = np.where(is_same, 0.5, is_closer).mean(axis=1)
@@ -262,14 +261,11 @@ def measure_landscapes(
         return _landscape(model, start, grid_axes(true, half, nodes), true, space.shown_factor, probes.at_once)
 
     maps = shared(starts, landscape, progress)
-    ids = [one.episode_id for one in maps]
     chance = np.mean([np.linalg.norm(_places_of(one.axes) - one.true, axis=1).mean() for one in maps])
     return Landscapes(
         axis_names=space.names[_AXES],
         unit=space.shown_unit,
         maps=tuple(maps),
-        distance=mean_of(np.array([one.distance for one in maps]), ids),
-        sharpness=mean_of(np.array([np.ptp(one.energy) / one.energy.mean() for one in maps]), ids),
         chance_distance=float(chance),
     )
 
@@ -284,7 +280,7 @@ def grid_axes(true: Float[np.ndarray, " 3"], half: float, nodes: int) -> Float[n
 def lowest(energy: Float[np.ndarray, ...]) -> Bool[np.ndarray, ...]:
     """Return where the energy is lowest; everywhere, if it is flat."""
     least = energy.min()
-    return np.asarray(energy <= least + _SAME * abs(least))
+    return np.asarray(energy <= least + SAME_ENERGY * abs(least))
 
 
 def _landscape(
@@ -302,7 +298,6 @@ def _landscape(
         energy=energy,
         true=true * unit,
         minimum=minimum * unit,
-        distance=float(np.linalg.norm(minimum - true)) * unit,
     )
 
 

@@ -1,17 +1,21 @@
-"""Are predicted latents as varied as true ones (spread), and distributed alike (MMD)? Streaming sums over clips.
+"""Distribution of predicted latents over clips, compared with the true ones: spread, MMD and Fréchet distance.
 
 A prediction that averages possible futures is nearer to each of them and less varied than they are: its error falls,
 and a decoded frame is blurred. `spread` is the trace of the covariance over clips of the predicted latents (per token
 and number: the mean squared deviation from the mean over clips), over that of the true latents at the same horizon.
 1: as varied as the truth; below 1: smoothed. It says nothing about the error: persistence, too, is about 1.
 
-`discrepancy` is the squared maximum mean discrepancy of features, unbiased over episodes. Its kernel is JEDi's,
+`mmd` is the squared maximum mean discrepancy of features, unbiased over episodes. Its kernel is JEDi's,
 k(x, y) = (<x, y> / dim)^2, so it is the squared Frobenius distance of the second moments, over dim^2: it sees means and
 covariances, and not a sign that all features share. **The estimate is not JEDi's**: that one counts pairs of a clip
 with itself, which favours predictions of less spread when clips are few. Here no pair of clips of one episode counts,
 which excludes a prediction and its own truth, too. So the estimate is 0 in expectation if the distributions are equal,
-and may be below 0. Everything is times 100, and depends on the encoder, the clips, frames and stride: compare only
-where these are equal.
+and may be below 0. It is times 100.
+
+`fvd` is the Fréchet distance of FVD, with the frozen encoder's features in place of I3D's: a clip's latents averaged
+over tokens and frames. It is biased upwards, the more the fewer clips there are, so it is reported with their number
+and with the distance between two halves of the true clips. All three depend on the encoder, the clips, frames and
+stride: compare only where these are equal.
 """
 
 from __future__ import annotations
@@ -28,11 +32,7 @@ from torch import Tensor
 from vjepa2_ac.evaluation.result import LatentDistribution
 from vjepa2_ac.intervals import Estimate, bootstrapped_by_weights
 
-FLIPS = 2000  # of signs, for a p-value
-HALVINGS = 500  # of the true episodes, for the noise floor
-_SCALE = 100.0
-_SHARE = 0.95  # of the halvings below the noise floor
-_ROUNDING = 1e-9  # flipping all signs gives the same statistic: it counts as equal
+_SCALE = 100.0  # of the MMD
 MOST_SKETCHED = 8192  # numbers of a latent (tokens x dim); of more, a sketch of this length stands in for intervals
 
 
@@ -117,12 +117,48 @@ class LatentSums:
             scale = exact / products.sum(axis=(1, 2))
         return np.asarray(products * np.where(np.isfinite(scale), scale, 1)[:, None, None])
 
+    @property
+    def features(self) -> Float[np.ndarray, "clips dim"]:
+        """The latents of each clip, averaged over tokens and frames: the features of `frechet_distance`."""
+        return np.asarray(self.pooled.mean(axis=1))
+
 
 def distribution_of(predicted: LatentSums, true: LatentSums) -> LatentDistribution:
-    """Return spread and, averaged over tokens, discrepancy of predicted latents against the true ones of the clips."""
+    """Return how predicted latents are distributed, compared with the true ones of the same clips."""
     pairs = zip(predicted.pooled.swapaxes(0, 1), true.pooled.swapaxes(0, 1), strict=True)
-    mmd, p_values = zip(*(discrepancy(one, other, true.episode_ids) for one, other in pairs), strict=True)
-    return LatentDistribution(spread_of(predicted, true), mmd, p_values, predicted.variances(), true.variances())
+    return LatentDistribution(
+        spread=spread_of(predicted, true),
+        mmd=tuple(mmd(one, other, true.episode_ids) for one, other in pairs),
+        fvd=frechet_distance(predicted.features, true.features),
+        variance=predicted.variances(),
+        true_variance=true.variances(),
+    )
+
+
+def frechet_distance(one: Float[np.ndarray, "clips dim"], other: Float[np.ndarray, "others dim"]) -> float:
+    """Return |mean - mean'|^2 + tr C + tr C' - 2 tr (C C')^(1/2) of two sets of features; NaN of a single clip.
+
+    With fewer clips than numbers the covariances are singular. The last trace is exact all the same: C = A'A and
+    C' = B'B, and it is the sum of the singular values of A B'.
+
+    Source: Dowson and Landau (1982), The Fréchet distance between multivariate normal distributions; as a metric of
+    videos, Unterthiner et al. (2018), FVD.
+    """
+    if min(len(one), len(other)) < 2:
+        return math.nan
+    means = one.mean(axis=0), other.mean(axis=0)
+    left, right = (
+        (values - mean) / math.sqrt(len(values) - 1) for values, mean in zip((one, other), means, strict=True)
+    )
+    common = np.linalg.svd(left @ right.T, compute_uv=False).sum()
+    return float(np.square(means[0] - means[1]).sum() + np.square(left).sum() + np.square(right).sum() - 2 * common)
+
+
+def distance_of_halves(true: LatentSums) -> float:
+    """Return the Fréchet distance between the true clips of every second episode and those of the others."""
+    _, episode_of = np.unique(np.array(true.episode_ids), return_inverse=True)
+    is_even = episode_of % 2 == 0
+    return frechet_distance(true.features[is_even], true.features[~is_even])
 
 
 def spread_of(predicted: LatentSums, true: LatentSums) -> tuple[Estimate, ...]:
@@ -166,42 +202,25 @@ def _hashes(numbers: int, device: torch.device) -> tuple[Int[Tensor, " numbers"]
         return place.to(device), sign.to(device)
 
 
-def discrepancy(
+def mmd(
     predicted: Float[np.ndarray, "clips dim"], true: Float[np.ndarray, "clips dim"], episode_ids: Sequence[str]
-) -> tuple[Estimate, float]:
-    """Return the discrepancy of predicted and true features of the same clips, with its interval over episodes.
+) -> Estimate:
+    """Return the squared maximum mean discrepancy of predicted and true features of the same clips, times 100.
 
-    The interval is for its size. Whether it differs from 0 is decided by the second number alone, the probability of no
-    difference: near 0 the estimate is degenerate, and its interval too wide. Both are NaN of one episode.
-
-    Args:
-        predicted: Row i is of clip i.
-        true: Likewise.
-        episode_ids: Of each clip.
+    Near 0 the estimate is degenerate and its interval over episodes too wide. There is none from one episode.
 
     Source: Gretton et al. (2012), A Kernel Two-Sample Test, lemma 6, with pairs of one episode left out as pairs of one
     sample are there; the kernel: Luo et al. (2410.05203), JEDi.
     """
-    pairs, counts = episode_pairs(predicted, true, episode_ids), _counts(episode_ids)
+    one, other = predicted.astype(np.float64), true.astype(np.float64)
+    across = _kernel(one, other)
+    pairs = _summed(_kernel(one, one) + _kernel(other, other) - across - across.T, episode_ids)
+    counts = _summed(np.ones((len(episode_ids), len(episode_ids))), episode_ids)
 
     def of_weights(weights: np.ndarray) -> np.ndarray:
         return np.asarray(_SCALE * _quadratic(weights, pairs) / _quadratic(weights, counts))[:, None]
 
-    (squared,) = bootstrapped_by_weights(of_weights, len(pairs))
-    return squared, p_of_no_difference(pairs)
-
-
-def episode_pairs(
-    predicted: Float[np.ndarray, "clips dim"], true: Float[np.ndarray, "clips dim"], episode_ids: Sequence[str]
-) -> Float[np.ndarray, "episodes episodes"]:
-    """Return k(x, x') + k(y, y') - k(x, y') - k(y, x'), summed over the clips of each pair of episodes."""
-    one, other = predicted.astype(np.float64), true.astype(np.float64)
-    across = _kernel(one, other)
-    return _summed(_kernel(one, one) + _kernel(other, other) - across - across.T, episode_ids)
-
-
-def _counts(episode_ids: Sequence[str]) -> Float[np.ndarray, "episodes episodes"]:
-    return _summed(np.ones((len(episode_ids), len(episode_ids))), episode_ids)
+    return bootstrapped_by_weights(of_weights, len(pairs))[0]
 
 
 def _summed(
@@ -214,37 +233,6 @@ def _summed(
     return np.asarray(sums - np.diag(np.diag(sums)))
 
 
-def p_of_no_difference(kernel: Float[np.ndarray, "episodes episodes"], *, flips: int = FLIPS, seed: int = 0) -> float:
-    """Return the probability of a discrepancy as large as this one if predictions and truth were exchangeable.
-
-    The kernel is that of `episode_pairs`. Each flip exchanges prediction and truth of a random half of the
-    episodes. Of few episodes it cannot be small: at least 2 / 2^episodes.
-    """
-    if (count := len(kernel)) < 2:
-        return math.nan
-    signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(flips, count))
-    least = kernel.sum() - _ROUNDING * np.abs(kernel).sum()
-    return float((1 + (_quadratic(signs, kernel) >= least).sum()) / (1 + flips))
-
-
-def noise_floor(true: Float[np.ndarray, "clips dim"], episode_ids: Sequence[str]) -> float:
-    """Return the discrepancy that two halves of the true episodes stay below in 95 % of random halvings.
-
-    What is smaller cannot be told from the choice of the episodes. It is cautious: halves are smaller than the whole,
-    and unlike predictions they are not of the same clips. NaN of fewer than four episodes.
-    """
-    values = true.astype(np.float64)
-    kernel, counts = _summed(_kernel(values, values), episode_ids), _counts(episode_ids)
-    if (count := len(kernel)) < 4:
-        return math.nan
-    rng = np.random.default_rng(0)
-    half = np.stack([rng.permutation(count) < count // 2 for _ in range(HALVINGS)]).astype(np.float64)
-    rest = 1 - half
-    within = sum(_quadratic(part, kernel) / _quadratic(part, counts) for part in (half, rest))
-    across = _quadratic(half, kernel, rest) / _quadratic(half, counts, rest)
-    return float(np.quantile(_SCALE * (within - 2 * across), _SHARE))
-
-
 def _kernel(
     one: Float[np.ndarray, "clips dim"], other: Float[np.ndarray, "others dim"]
 ) -> Float[np.ndarray, "clips others"]:
@@ -252,9 +240,7 @@ def _kernel(
 
 
 def _quadratic(
-    left: Float[np.ndarray, "draws side"],
-    matrix: Float[np.ndarray, "side side"],
-    right: Float[np.ndarray, "draws side"] | None = None,
+    weights: Float[np.ndarray, "draws episodes"], matrix: Float[np.ndarray, "episodes episodes"]
 ) -> Float[np.ndarray, " draws"]:
-    """Return left' M right of each draw; `right` is `left` if it is None."""
-    return np.asarray(((left @ matrix) * (left if right is None else right)).sum(axis=1))
+    """Return w' M w of each draw."""
+    return np.asarray(((weights @ matrix) * weights).sum(axis=1))

@@ -6,7 +6,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -18,7 +18,6 @@ from torch import Tensor
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed import gathered
 from vjepa2_ac.episode import LatentBatch, Progress
-from vjepa2_ac.evaluation.action_score import PlanningStart, measure_plans, planning_start, study_of
 from vjepa2_ac.evaluation.action_use import (
     RolloutStart,
     gathered_starts,
@@ -27,10 +26,16 @@ from vjepa2_ac.evaluation.action_use import (
     rank_actions,
     start_of,
 )
-from vjepa2_ac.evaluation.calibration.axes import infer_axes
-from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of, noise_floor
-from vjepa2_ac.evaluation.estimates import episode_scores
-from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, no_clips, prediction, with_other_actions
+from vjepa2_ac.evaluation.distribution import LatentSums, distance_of_halves, distribution_of
+from vjepa2_ac.evaluation.measure import (
+    VALIDATED,
+    Predictor,
+    joined,
+    measured,
+    no_clips,
+    prediction,
+    with_other_actions,
+)
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
     L1,
@@ -43,13 +48,12 @@ from vjepa2_ac.evaluation.result import (
     ModelResult,
     PredictionErrors,
     Role,
-    Stratum,
     Way,
     registered_metrics,
 )
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.spaces import ActionSpace, matrices_from_euler
+from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, matrices_from_euler
 
 _CPU = torch.device("cpu")
 ClipName = tuple[str, int]  # id of the episode, first control step
@@ -64,7 +68,6 @@ class Contender:
     role: Role
     model: Predictor
     switched: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext  # while it predicts
-    to_plan: Callable[[], Predictor] | None = None  # returns the model that plans in its place, held only for that time
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ class RepeatableClips:
 
     names: Sequence[ClipName]  # of all
     read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]
+    space: ActionSpace = POSE_CHANGE  # of the actions
     has_frames: bool = True  # False: of cached latents there are only small ones
     before: Float[Tensor, "1 time action_dim"] | None = None  # of the part of this process, as of `with_other_actions`
     device: torch.device = _CPU  # of the latents
@@ -96,45 +100,37 @@ def evaluate(
         metrics: Of the errors, L1 first; None: all that are registered.
         probes: Options of the measurements beyond the errors.
         reporter: Shows the progress of each part of the work.
-
-    Raises:
-        ValueError: Too few frames for planning.
     """
-    probes, metrics = probes or ProbeOptions(), metrics or registered_metrics()
-    seen = _collect(contenders, clips, probes, about, metrics, reporter.task("measuring"))
-    ids = tuple(seen.ids)
-    known = clips_of(seen.actions, ids, tuple(seen.firsts), space=about.space, seconds_per_step=about.seconds_per_step)
+    probes, metrics, space = probes or ProbeOptions(), metrics or registered_metrics(), clips.space
+    sums = _collect(contenders, clips, probes, metrics, reporter.task("measuring"))
+    known = clips_of(
+        sums.actions, tuple(sums.ids), tuple(sums.firsts), space=space, seconds_per_step=about.seconds_per_step
+    )
     models: dict[str, ModelResult] = {}
     for contender in contenders:
         with contender.switched():
-            models[contender.name] = _measure(contender, seen, known, probes, about, reporter)
-    evaluation = Evaluation(
+            models[contender.name] = _measure(contender, sums, known, probes, about.seed, reporter)
+    errors = next(model.errors for model in models.values() if model.role == "trained")
+    width = sums.actions.shape[-1]
+    has_no_landscape = probes.ranking_clips and probes.landscape_clips and width < 3
+    note = f"No energy landscapes: an action has {width} numbers, and a landscape is over three."
+    return Evaluation(
         about=about,
         clips=known,
         models=models,
-        strata=strata_of(known, about.space),
-        planning=study_of(seen.planned, probes.planning) if seen.planned else None,
+        examples=_examples(contenders, clips, known, errors, probes.examples),
+        notes=(note,) if has_no_landscape else (),
         metrics=metrics,
-        copies=distribution_of(seen.copies, seen.true),
-        noise_floor=tuple(noise_floor(column, ids) for column in seen.true.pooled.swapaxes(0, 1)),
-    )
-    notes, width = [], seen.actions.shape[-1]
-    if probes.ranking_clips and probes.landscape_clips and width < 3:
-        notes.append(f"No energy landscapes: an action has {width} numbers, and a landscape is over three.")
-    if probes.planning_clips and about.space.position is None:
-        notes.append("No plans: they are poses' displacements, and the states here are plain numbers.")
-    return replace(
-        evaluation,
-        episodes=episode_scores(evaluation.errors, evaluation.base_errors),
-        examples=_examples(contenders, clips, evaluation, probes.examples),
-        notes=tuple(notes),
+        copies=distribution_of(sums.copies, sums.true),
+        fvd_of_halves=distance_of_halves(sums.true),
     )
 
 
 @dataclass
-class _Seen:
+class _Collected:
     """What all clips gave: errors, actions, sums of latents, and one frame and the next of some."""
 
+    space: ActionSpace
     errors: dict[str, list[PredictionErrors]]  # by model
     predicted: dict[str, LatentSums]  # rollouts with the true actions, by model
     true: LatentSums
@@ -144,28 +140,24 @@ class _Seen:
     firsts: list[int] = field(default_factory=list)
     starts: list[RolloutStart] = field(default_factory=list)
     moves: list[RolloutStart] = field(default_factory=list)
-    planned: list[PlanningStart] = field(default_factory=list)
 
 
 def _collect(
     contenders: Sequence[Contender],
     clips: RepeatableClips,
     probes: ProbeOptions,
-    about: About,
     metrics: Sequence[Metric],
     progress: Progress,
-) -> _Seen:
-    names, space = [contender.name for contender in contenders], about.space
+) -> _Collected:
+    names, space = [contender.name for contender in contenders], clips.space
     batches = with_other_actions((batch for batch, _ in clips.read(None)), clips.before)
     first = list(itertools.islice(batches, 1))
     if not (origins := gathered([batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first])):
         raise no_clips()
-    sums = {name: LatentSums(origins[0]) for name in names}
-    seen, actions = _Seen({name: [] for name in names}, sums, LatentSums(origins[0]), LatentSums(origins[0])), []
-    probed, planned = (
-        {clips.names[place] for place in spread(len(clips.names), count)}
-        for count in (probes.ranking_clips, probes.planning_clips if space.position is not None else 0)
-    )
+    sums, errors = {name: LatentSums(origins[0]) for name in names}, {name: list[PredictionErrors]() for name in names}
+    seen = _Collected(space, errors, sums, LatentSums(origins[0]), LatentSums(origins[0]))
+    actions: list[np.ndarray] = []
+    probed = {clips.names[place] for place in spread(len(clips.names), probes.ranking_clips)}
 
     def add(ids: Sequence[str], name: str, way: Way, mode: Mode, predicted: torch.Tensor) -> None:
         if (way, mode) == ("true", "rollout"):
@@ -177,14 +169,12 @@ def _collect(
         for contender in contenders:
             watch = partial(add, batch.episode_ids, contender.name)
             with contender.switched():
-                seen.errors[contender.name].append(measured(contender.model, batch, ALL, metrics, others, watch))
+                seen.errors[contender.name].append(measured(contender.model, batch, VALIDATED, metrics, others, watch))
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             if name in probed:
                 largest = int(batch.actions[row][:, space.sized].norm(dim=-1).argmax())
                 seen.starts.append(start_of(batch, row, largest))
                 seen.moves += moves_of(batch, row, space, probes.reach_cm / 100)
-            if name in planned:
-                seen.planned.append(planning_start(batch, row, about.seed))
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
         seen.ids += batch.episode_ids
         seen.firsts += batch.starts
@@ -192,11 +182,12 @@ def _collect(
     return _of_all(seen, gathered(actions), clips.device)
 
 
-def _of_all(seen: _Seen, actions: Sequence[np.ndarray], device: torch.device) -> _Seen:
+def _of_all(seen: _Collected, actions: Sequence[np.ndarray], device: torch.device) -> _Collected:
     """Return what the clips of all processes that share the work gave."""
     ids, firsts = gathered(seen.ids), gathered(seen.firsts)
     of_starts = partial(gathered_starts, device=device, names=list(zip(ids, firsts, strict=True)))
-    return _Seen(
+    return _Collected(
+        space=seen.space,
         errors={name: gathered(found) for name, found in seen.errors.items()},
         predicted={name: LatentSums.joined(gathered([sums])) for name, sums in seen.predicted.items()},
         true=LatentSums.joined(gathered([seen.true])),
@@ -206,47 +197,37 @@ def _of_all(seen: _Seen, actions: Sequence[np.ndarray], device: torch.device) ->
         firsts=firsts,
         starts=of_starts(seen.starts),
         moves=of_starts(seen.moves),
-        planned=of_starts(seen.planned),
     )
 
 
 def _measure(
-    contender: Contender, seen: _Seen, clips: Clips, probes: ProbeOptions, about: About, reporter: Reporter
+    contender: Contender,
+    seen: _Collected,
+    clips: Clips,
+    probes: ProbeOptions,
+    seed: int,
+    reporter: Reporter,
 ) -> ModelResult:
-    """Measure one model beyond its predictions: what is asked for, and applies."""
-    name, model, starts, space = contender.name, contender.model, seen.starts, about.space
-    found = ModelResult(
-        name, contender.role, joined(seen.errors[name]), distribution=distribution_of(seen.predicted[name], seen.true)
-    )
-
-    def progress(what: str) -> Progress:
-        return reporter.task(f"{what}, {name}")
-
+    """Measure how one model uses the actions: what is asked for, and applies."""
+    name, model, starts, space = contender.name, contender.model, seen.starts, seen.space
+    ranking, landscapes = None, None
     if starts:
-        ranking = rank_actions(model, seen.moves, space, probes, seed=about.seed, progress=progress("action ranking"))
-        found = replace(found, ranking=ranking)
-    moving = [start for start in starts if clips.moving[start.clip].any()] or starts
-    if moving and probes.landscape_clips and seen.actions.shape[-1] >= 3:
+        progress = reporter.task(f"action ranking, {name}")
+        ranking = rank_actions(model, seen.moves, space, probes, seed=seed, progress=progress)
+    if starts and probes.landscape_clips and seen.actions.shape[-1] >= 3:
+        moving = [start for start in starts if clips.moving[start.clip].any()] or starts
         chosen = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
-        maps = measure_landscapes(model, chosen, space, probes, progress("energy landscapes"))
-        found = replace(found, landscapes=maps)
-    if seen.planned:
-        planner = model if contender.to_plan is None else contender.to_plan()
-        plans = measure_plans(planner, seen.planned, probes.planning, progress("planning"), prior=probes.prior)
-        found = replace(found, plans=plans)
-    if starts and probes.axis_clips and space.is_pose:
-        chosen = [starts[place] for place in spread(len(starts), probes.axis_clips)]
-        found = replace(found, beside={"axes": infer_axes(model, chosen, probes.at_once, progress("axes"))})
-    return found
+        landscapes = measure_landscapes(model, chosen, space, probes, reporter.task(f"energy landscapes, {name}"))
+    distribution = distribution_of(seen.predicted[name], seen.true)
+    return ModelResult(name, contender.role, joined(seen.errors[name]), landscapes, ranking, distribution)
 
 
 @torch.no_grad()
 def _examples(
-    contenders: Sequence[Contender], clips: RepeatableClips, evaluation: Evaluation, count: int
+    contenders: Sequence[Contender], clips: RepeatableClips, known: Clips, errors: PredictionErrors, count: int
 ) -> tuple[Example, ...]:
     """Read the clips of the examples again: which ones these are is known only now."""
-    known = evaluation.clips
-    chosen = chosen_clips(evaluation.errors, known.action_size.sum(axis=1), count)
+    chosen = chosen_clips(errors, known.action_size.sum(axis=1), count)
     if not chosen:
         return ()
     reasons = {(known.episode_ids[clip], known.starts[clip]): why for clip, why in chosen.items()}
@@ -267,7 +248,6 @@ SPEED_CM_S = 2.0  # of the flange; slower, and
 TURN_DEGREES_S = 10.0  # turning slower, and
 GRIP = 0.05  # closing or opening by less than this share in a model step: idle
 _IDLE_SHARE = 0.1  # of the 95th percentile of the norm, where actions are no poses
-_SIZES = ("small", "medium", "large")  # thirds of the steps, by the size of the action
 
 
 def clips_of(
@@ -302,19 +282,6 @@ def clips_of(
         f" gripper opens or closes by {GRIP:.0%} or more in the step"
     )
     return Clips(episode_ids, starts, size, moves | turns | grips, words)
-
-
-def strata_of(clips: Clips, space: ActionSpace) -> tuple[Stratum, ...]:
-    """Return moving and idle steps, then thirds by the size of the action; empty strata are left out."""
-    found = [Stratum("motion.moving", "moving", clips.moving), Stratum("motion.idle", "idle", ~clips.moving)]
-    edges = np.quantile(clips.action_size, np.arange(1, len(_SIZES)) / len(_SIZES))
-    part = np.searchsorted(edges, clips.action_size, side="right")
-    for number, size in enumerate(_SIZES):
-        if (steps := part == number).any():
-            sizes = clips.action_size[steps]
-            label = f"{size}: {sizes.min():.3g} to {sizes.max():.3g} {space.shown_unit}".rstrip()
-            found.append(Stratum(f"action_size.{size}", label, steps))
-    return tuple(stratum for stratum in found if stratum.steps.any())
 
 
 def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], count: int) -> dict[int, str]:
@@ -364,38 +331,10 @@ def make_example(
         of_patch = absolute_difference(values, true[1:]).mean(dim=-1)
         return rearrange(of_patch, "horizon (h w) -> horizon h w", h=grid).numpy()
 
-    colours = Colours(true)
     return Example(
         why=why,
         episode_id=batch.episode_ids[row],
         start=batch.starts[row],
         frames=frames,
         errors={"persistence": errors(true[:1])} | {name: errors(values) for name, values in predicted.items()},
-        true_colours=colours.of(true),
-        predicted_colours={name: colours.of(values) for name, values in predicted.items()},
     )
-
-
-class Colours:
-    """Turns latents into colours by the three principal components of some true latents: similar latents look similar.
-
-    The 1st to 99th percentile of a component in the true latents is mapped to the range of its colour.
-    """
-
-    def __init__(self, true: Float[Tensor, "time tokens dim"]) -> None:
-        flat = true.flatten(0, 1).double()
-        self._mean = flat.mean(dim=0)
-        centred = flat - self._mean
-        _, vectors = torch.linalg.eigh(centred.T @ centred)
-        basis = vectors[:, -3:].flip(1)  # the largest first
-        largest = basis.gather(0, basis.abs().argmax(dim=0, keepdim=True))
-        self._basis = basis * largest.sign()  # otherwise the sign would depend on the library
-        seen = centred @ self._basis
-        self._low, self._high = (torch.quantile(seen, share, dim=0) for share in (0.01, 0.99))
-
-    def of(self, latents: Float[Tensor, "time tokens dim"]) -> UInt8[np.ndarray, "time grid grid 3"]:
-        """Return the colours of latents."""
-        seen = (latents.double() - self._mean) @ self._basis
-        shown = ((seen - self._low) / (self._high - self._low).clamp(min=1e-9)).clamp(0, 1) * 255
-        grid = math.isqrt(latents.shape[1])
-        return np.asarray(rearrange(shown, "time (h w) c -> time h w c", h=grid).round().to(torch.uint8).numpy())

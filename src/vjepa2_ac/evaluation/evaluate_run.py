@@ -2,41 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from accelerate import Accelerator
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, frames_of, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
-from vjepa2_ac.data.transforms import frames_as_seen
+from vjepa2_ac.data.transforms import frames_as_seen, pixels_to_input
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
-from vjepa2_ac.distributed import first_of_machine, first_only, own_part, sharing
+from vjepa2_ac.decoding.network import as_pixels
+from vjepa2_ac.distributed import first_of_machine, first_only, joined, own_part, sharing
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.calibration.variants import calibrate_model
-from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, load_lpips, measure_decoded
+from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, measure_decoded
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
-from vjepa2_ac.evaluation.measure import ClipSample, actions_before
+from vjepa2_ac.evaluation.measure import actions_before
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
-from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurement, Role, TrainingCurve
-from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
+from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation
+from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.policies.action_prior import load_prior
 from vjepa2_ac.reporter import LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
-from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
+from vjepa2_ac.runs.metrics_log import warnings_of
 from vjepa2_ac.runs.subject import Subject, load_subject
 from vjepa2_ac.storage import try_writing_at, user_can_write
 from vjepa2_ac.storage.places import BUILTIN
@@ -96,28 +94,19 @@ def load_models(
             absent, needed = "a model without a base (model.base: random)", "a base to compare with"
             raise InputError(where="--against base", found=absent, needed=needed, fix="Leave out --against base")
     elif BASE in against and not is_of_run:
-        found.append(_contender(BASE, "base", _like(name, world_model, config.model.base, config, dataset.widths)))
+        found.append(Contender(BASE, "base", _like(name, world_model, config.model.base, config, dataset.widths)))
     elif BASE in against and world_model.fresh_heads is not None:
         notes.append(_NO_BASE)
     elif BASE in against:
-        found.append(_contender(BASE, "base", world_model, partial(base_only, world_model)))
+        found.append(Contender(BASE, "base", world_model, partial(base_only, world_model)))
     is_adapter = world_model.adaptation is not None and world_model.adaptation.kind == "lora"
     own = BASE if is_base else "adapter" if is_adapter else "model"
     for other in against:
         if other != BASE:
             taken = {each.name for each in found} | {own, BASE, PERSISTENCE, TRUE_FRAMES, *NEIGHBOURS}
             called = Path(other).name if Path(other).name not in taken else other
-            found.append(_contender(called, "other", _like(name, world_model, other, config, dataset.widths)))
-    return Models(subject, (*found, _contender(own, "trained", world_model)), tuple(notes))
-
-
-def _contender(
-    name: str, role: Role, model: WorldModel, switched: Callable[[], AbstractContextManager[object]] = nullcontext
-) -> Contender:
-    """Return a model to measure unmerged; a merged copy plans in its place (see `planning.model_setup`)."""
-    adaptation = model.adaptation
-    plans_as_it_is = adaptation is None or (role == "base" and adaptation.kind == "lora")  # whose adapter is off then
-    return Contender(name, role, model, switched, None if plans_as_it_is else partial(unadapted_copy, model))
+            found.append(Contender(called, "other", _like(name, world_model, other, config, dataset.widths)))
+    return Models(subject, (*found, Contender(own, "trained", world_model)), tuple(notes))
 
 
 def _like(subject: str, world_model: WorldModel, other: str, config: Config, widths: Widths) -> WorldModel:
@@ -140,71 +129,54 @@ def _like(subject: str, world_model: WorldModel, other: str, config: Config, wid
     return loaded
 
 
-def measure_subject(
-    subject: str, asked: EvaluationOptions, accelerator: Accelerator, *, reporter: Reporter = SILENT
-) -> Evaluation:
-    """Measure a run or a model on held-out episodes. Cheap failures first.
+def evaluate_subject(subject: str, asked: EvaluationOptions, *, reporter: Reporter = SILENT) -> Evaluation:
+    """Measure a run or a model on held-out episodes, in this process or shared by several. Cheap failures first.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
         asked: The options.
-        accelerator: Of the processes that share the work: `joined` by the settled config.
         reporter: Shows the progress of each part of the work.
 
     Raises:
-        InputError: The subject, the data, the decoder, a file of a metric, or a model to compare with cannot be used;
-            the split is empty; the folder of the output cannot be written.
+        InputError: The subject, the data, the decoder, or a model to compare with cannot be used; the split is empty;
+            the folder of the output cannot be written.
     """
     config = settle(subject, asked)
-    first_only(accelerator, partial(_require_places, subject, asked))
-    decoder = None if asked.decoder is None else load_decoder(asked.decoder)
-    lpips = load_lpips(asked.lpips, asked.lpips_heads) if asked.lpips and asked.lpips_heads else None
-    plans_from_prior = asked.probes.planning_clips and config.planning.prior is not None
-    trained = load_prior(str(config.planning.prior), where="planning.prior") if plans_from_prior else None
-    progress = reporter.task("looking through the data")
-    dataset = first_of_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
-    chosen = validation_windows(dataset, asked.split, clips=asked.clips)
-    reporter.task(LOADING)
-    loaded = load_models(subject, config, asked, dataset, decoder)
-    world_model, contenders, is_of_run = loaded.world_model, loaded.contenders, loaded.subject.checkpoint is not None
-    prior = (
-        None
-        if trained is None
-        else trained.of(world_model.encoder_fingerprint(), config.data.crop).to(accelerator.device)
-    )
-    through_cache = with_latents_if_there(config, dataset, world_model)
-    if through_cache.config.is_cache and not asked.calibrate:
-        world_model.set_encoder_aside()
-    loaded.put_on(accelerator.device)
-    beside: dict[str, Measurement] = {}
-    if asked.calibrate:
-        sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
-        beside["strides"] = calibrate_model(world_model, dataset, config, accelerator, sample, progress)
-    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
-    axis_clips = asked.probes.axis_clips if dataset.spaces.state.is_base_pose else 0
-    with accelerator.autocast(), sharing(accelerator):
-        size, device = config.validation.batch_size, accelerator.device
-        clips = _clips(through_cache, chosen, size, encode, device, world_model.image_size)
-        evaluation = evaluate(
-            contenders,
-            clips,
-            _about(loaded.subject, config, dataset, asked),
-            probes=replace(asked.probes, planning=config.planning, prior=prior, axis_clips=axis_clips),
-            reporter=reporter,
-        )
-        decoded = None
-        if decoder is not None:
-            decoder.to(accelerator.device)
-            lpips = None if lpips is None else lpips.to(accelerator.device)
-            decoded = measure_decoded(contenders, clips, decoder, evaluation.examples, lpips=lpips, reporter=reporter)
+    with joined(config) as accelerator:
+        first_only(accelerator, partial(_require_places, subject, asked))
+        decoder = None if asked.decoder is None else load_decoder(asked.decoder)
+        progress = reporter.task("looking through the data")
+        dataset = first_of_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
+        chosen = validation_windows(dataset, asked.split, clips=asked.clips)
+        reporter.task(LOADING)
+        loaded = load_models(subject, config, asked, dataset, decoder)
+        world_model, device = loaded.world_model, accelerator.device
+        through_cache = with_latents_if_there(config, dataset, world_model)
+        if through_cache.config.is_cache and decoder is None:
+            world_model.set_encoder_aside()
+        loaded.put_on(device)
+        with accelerator.autocast(), sharing(accelerator):
+            clips = _clips(through_cache, chosen, config, world_model, device)
+            about = _about(loaded.subject, config, dataset, asked)
+            evaluation = evaluate(loaded.contenders, clips, about, probes=asked.probes, reporter=reporter)
+            decoded = None
+            if decoder is not None:
+                encode = partial(_encoded, world_model, chunk=config.model.encode_chunk)
+                decoder.to(device)
+                decoded = measure_decoded(
+                    loaded.contenders, clips, decoder, evaluation.examples, encode=encode, reporter=reporter
+                )
+    is_of_run = loaded.subject.checkpoint is not None
     warned = [f"In training, {text}." for text in warnings_of(Path(subject) / METRICS)] if is_of_run else []
-    return replace(
-        evaluation,
-        decoded=decoded,
-        training=_training_curves(Path(subject)) if is_of_run else (),
-        beside=beside,
-        notes=(*loaded.notes, *warned, *evaluation.notes),
-    )
+    return replace(evaluation, decoded=decoded, notes=(*loaded.notes, *warned, *evaluation.notes))
+
+
+def _encoded(
+    world_model: WorldModel, images: Float[Tensor, "batch time 3 size size"], *, chunk: int
+) -> Float[Tensor, "batch time tokens dim"]:
+    """Return the latents of decoded images, rounded to 8 bits as camera images are."""
+    pixels = torch.from_numpy(as_pixels(images)).to(images.device)
+    return world_model.encode(pixels_to_input(pixels, world_model.image_size), chunk=chunk)
 
 
 def _require_places(subject: str, asked: EvaluationOptions) -> None:
@@ -217,34 +189,22 @@ def _require_places(subject: str, asked: EvaluationOptions) -> None:
         try_writing_at(folder)
 
 
-def _training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
-    """Return all scalar metrics of a run's metrics.jsonl, over optimizer steps."""
-    points: dict[str, list[tuple[int, float]]] = {}
-    for row in read_metrics_log(folder / METRICS):
-        for name, value in row.items():
-            if name != "step" and isinstance(value, int | float):
-                points.setdefault(f"{row['kind']}/{name}", []).append((row["step"], float(value)))
-    return tuple(
-        TrainingCurve(name, tuple(step for step, _ in found), tuple(value for _, value in found))
-        for name, found in points.items()
-    )
-
-
 def _clips(
     dataset: Dataset,
     windows: Sequence[tuple[int, int]],
-    batch_size: int,
-    encode: Callable[[Batch], LatentBatch],
+    config: Config,
+    world_model: WorldModel,
     device: torch.device,
-    image_size: int,
 ) -> RepeatableClips:
     """Return the clips at these windows, with the frames as the encoder sees them; of cached latents, small ones."""
+    batch_size = config.validation.batch_size
+    encode = partial(encode_batch, world_model, device=device, chunk=config.model.encode_chunk)
     own = own_part(len(windows), batch_size)
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
     some = partial(batches_of, dataset, may_be_none=True)
 
     def frames(batch: Batch, row: int) -> UInt8[np.ndarray, "time size size 3"]:
-        return frames_as_seen(frames_of(dataset, batch, row), image_size)
+        return frames_as_seen(frames_of(dataset, batch, row), world_model.image_size)
 
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
         wanted = windows[own.start : own.stop] if names is None else [by_name[name] for name in names]
@@ -252,7 +212,7 @@ def _clips(
             yield encode(batch), partial(frames, batch)
 
     before = actions_before(own, windows, partial(some, batch_size=1))
-    return RepeatableClips(tuple(by_name), read, not dataset.config.is_cache, before, device)
+    return RepeatableClips(tuple(by_name), read, dataset.spaces.action, not dataset.config.is_cache, before, device)
 
 
 def _about(subject: Subject, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:
@@ -268,9 +228,9 @@ def _about(subject: Subject, config: Config, dataset: Dataset, asked: Evaluation
         frames=data.frames,
         stride=data.model_stride,
         seconds_per_step=data.model_stride / dataset.control_rate_hz,
-        space=dataset.spaces.action,
         seed=config.seed,
         version=__version__,
         time=utc_now(),
+        is_pose=dataset.spaces.action.position is not None,
         is_base=subject.is_base,
     )

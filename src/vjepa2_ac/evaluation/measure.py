@@ -1,4 +1,4 @@
-"""Measurement of predictions: errors between predicted and true latents, beside the error of persistence.
+"""Measurement of predictions: errors between predicted and true latents, and those of persistence.
 
 All errors compare layer-normalised latents, per clip and model step. *Persistence* is the error of copying a frame that
 was seen. A ratio of 1 means: as good as persistence; 0: perfect.
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, islice, product
-from typing import Protocol, TypeVar, get_args, runtime_checkable
+from itertools import chain, islice
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,7 +24,6 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import L1, MODES, Metric, Mode, PredictionErrors, Way
 
 _Window = TypeVar("_Window")
-ALL: tuple[tuple[Way, Mode], ...] = tuple(product(get_args(Way), MODES))
 VALIDATED: tuple[tuple[Way, Mode], ...] = (  # rollouts, which take longest, with the true actions only
     *(("true", mode) for mode in MODES),
     *(("persistence", mode) for mode in MODES),

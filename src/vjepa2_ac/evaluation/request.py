@@ -1,12 +1,4 @@
-"""What is asked of an evaluation: its options, and the config that follows from them. PyTorch is not imported.
-
-The protocol of the Action Score stands here, too. No option changes it, so that scores of different runs compare.
-
-Source: facebookresearch/jepa-wms @ 6eafb14, configs/evals/simu_env_planning/droid/vj2ac,
-evals/simu_env_planning/planning (planner.py: CEMPlanner; objectives.py: ReprTargetDistMPCObjective; plan_evaluator.py:
-sample_traj_segment_from_dset), app/vjepa_wm/modelcustom/simu_env_planning/vit_enc_preds.py: EncPredWM.unroll.
-Where it differs: docs/evaluation_reference.md.
-"""
+"""Options of an evaluation, and the config that follows from them. PyTorch is not imported."""
 
 from __future__ import annotations
 
@@ -14,38 +6,15 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, parse_config
-from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.planning.settings import require_limits, with_taught_limits
+from vjepa2_ac.planning.settings import with_taught_limits
 from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.folder import is_of_moved, is_run, read_run_config
-
-if TYPE_CHECKING:
-    from vjepa2_ac.policies.action_prior import ActionPrior
-
-STEPS = 3  # of a scored plan
-FRAMES = STEPS + 1  # required of a clip
-FRAMES_SEEN = 2  # by the model at most, predicted ones included
-BEST_SCORE = 80.0
-_SCORED_CEM = {
-    **dict.fromkeys(("momentum_mean", "momentum_std", "momentum_mean_gripper", "momentum_std_gripper"), 0.0),
-    "try_mean": True,
-}
-SCORED = PlanningConfig(
-    planner=Component("cem", _SCORED_CEM),
-    horizon=STEPS,
-    samples=300,
-    iterations=15,
-    limits=LimitsConfig(xyz=(0.1, 0.1, 0.1), rotation=0.1, gripper=0.75, gripper_mode="free"),
-    energy=EnergyConfig(distance=Component("l2"), steps="last"),
-)
 
 
 @dataclass(frozen=True)
@@ -55,14 +24,10 @@ class ProbeOptions:
     ranking_clips: int = 32
     samples: int = 64  # alternative actions per move, drawn in each of two ways
     landscape_clips: int = 8
-    axis_clips: int = 32  # of those of the ranking, from which axes are fitted; of poses in the base frame only
     nodes: int = 9  # along each axis of a landscape
     reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
     examples: int = 4
     at_once: int = 64  # samples per batch
-    planning_clips: int = 0  # number of clips whose plans are compared with the demonstration; of poses only
-    planning: PlanningConfig = field(default_factory=PlanningConfig)  # settings of one-step plans
-    prior: ActionPrior | None = None  # network of `planning.prior`, on the device of the latents
 
 
 @dataclass(frozen=True)
@@ -76,11 +41,9 @@ class EvaluationOptions:
     against: tuple[str, ...] | None = None  # base, runs, models; None: the base of a run, nothing for a model
     out: Path | None = None  # output folder; None: the run's
     probes: ProbeOptions = field(default_factory=ProbeOptions)
-    calibrate: bool = False  # also measure the error at other strides
     decoder: str | None = None  # folder of a decoder, or builtin:sim-tiny: rollouts are decoded and measured as images
-    lpips: Path | None = None  # with a decoder: torchvision's AlexNet or VGG16, for LPIPS
-    lpips_heads: Path | None = None  # its heads
-    # Settings in place of the config's: planning.samples=200; for a run whose base was moved model.base=PATH, too.
+    # Settings in place of the config's: model.base=PATH for a run whose base was moved; planning.… for commands that
+    # plan or roll out.
     planning: tuple[str, ...] = ()
 
 
@@ -92,28 +55,15 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
         asked: The options.
 
     Raises:
-        InputError: Several processes; the subject is no run and no data are named, a setting is wrong, a folder is
-            missing, limits are those of data that nobody knows, or files of LPIPS are named without a decoder or
-            incompletely.
+        InputError: The subject is no run and no data are named, a setting is wrong, or a folder is missing.
     """
-    if (asked.lpips or asked.lpips_heads) and not (asked.decoder and asked.lpips and asked.lpips_heads):
-        needed = "a --decoder, whose images LPIPS compares, and both files (docs/decoding.md says where to get them)"
-        raise InputError(where="--lpips, --lpips-heads", found="one without the others", needed=needed)
     config = _config_of(subject, asked)
     for setting in asked.planning:
         if not (setting.startswith("planning.") or (is_run(subject) and is_of_moved(setting))):
             needed = "settings of planning, such as planning.samples=200; or, for a run, model.base=PATH"
-            raise InputError(where="--planning", found=setting, needed=needed)
-    config = parse_config(config_as_dict(config), asked.planning, where="--planning")
-    if is_run(subject):
-        config = with_taught_limits(config, Path(subject))
-    if asked.probes.planning_clips:
-        require_limits(config)
-        if config.data.states == "pose" and config.data.frames < FRAMES:
-            found = f"clips of {config.data.frames} frames (data.frames)"
-            needed = f"{FRAMES} or more: plans are held against {STEPS} steps that were demonstrated"
-            raise InputError(where="--planning", found=found, needed=needed, fix="Give --data other clips, and --out")
-    return config
+            raise InputError(where="override", found=setting, needed=needed)
+    config = parse_config(config_as_dict(config), asked.planning, where="overrides")
+    return with_taught_limits(config, Path(subject)) if is_run(subject) else config
 
 
 def require_one_process(environment: Mapping[str, str] = os.environ) -> None:

@@ -1,104 +1,29 @@
-"""Evaluation results: records of plain arrays, and the rows that people and programs read. PyTorch is not imported.
+"""Evaluation results: records of arrays by clip, and estimates from them with intervals. PyTorch is not imported.
 
 Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). All errors compare
-layer-normalised latents, by all metrics that are registered. What has intervals is computed from these by
-`evaluation.estimates`; the rows by `evaluation.rows`, the summary by `evaluation.summary`.
+layer-normalised latents, by all metrics that are registered. Estimates that compare two models are paired by clip. The
+rows are made by `evaluation.rows`, the summary by `evaluation.summary`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from pydantic import BeforeValidator
 
-from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio, ratios
 from vjepa2_ac.model.distances import absolute_difference, squared_difference
 from vjepa2_ac.registry import METRICS
-from vjepa2_ac.spaces import ActionSpace
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-
-_Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]  # null in JSON: NaN
-PERSISTENCE = "persistence"  # the model of rows that stand where chance does
-
-
-@dataclass(frozen=True)
-class Row:
-    """One number of an evaluation: console, report page, metrics.json and comparison show the same ones."""
-
-    group: str  # the table that it stands in
-    name: str  # its line
-    key: str  # both, for programs, such as rollout.l1.over_persistence.3
-    model: str  # its column: a model, persistence, or plans without a model
-    value: _Number  # NaN: there is none
-    low: _Number = math.nan  # 95 % interval over episodes; NaN: there is none
-    high: _Number = math.nan
-    form: str = ".3f"
-    better: Literal["lower", "higher", ""] = "lower"
-    chance: float | None = None  # what persistence has, or a model that ignores its actions
-    note: str = ""
-    unit: str = ""  # of the value, if it has one and `name` does not give it: cm
-    detail: bool = False  # not for a screen
-
-    @property
-    def estimate(self) -> Estimate:
-        """The number with its interval."""
-        return Estimate(self.value, self.low, self.high)
-
-    def __str__(self) -> str:
-        text = "not measured" if math.isnan(self.value) else f"{self.estimate:{self.form}}"
-        return f"{text} ({self.note})" if self.note else text
-
-
-@dataclass(frozen=True)
-class RowTable:
-    """The rows of one group as a table."""
-
-    title: str
-    columns: tuple[str, ...]
-    lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, by chance or persistence, a cell for each column
-
-
-def sections(rows: Sequence[Row]) -> list[RowTable]:
-    """Return rows as tables: those of one key are a line, each in the column of its model."""
-    by_key: dict[str, dict[str, Row]] = {}
-    for row in rows:
-        by_key.setdefault(row.key, {})[row.model] = row
-    groups: dict[str, list[dict[str, Row]]] = {}
-    for line in by_key.values():
-        groups.setdefault(next(iter(line.values())).group, []).append(line)
-    return [_section(title, lines) for title, lines in groups.items()]
-
-
-def _section(title: str, lines: Sequence[Mapping[str, Row]]) -> RowTable:
-    columns = tuple(dict.fromkeys(model for line in lines for model in line if model != PERSISTENCE))
-    found = []
-    for line in lines:
-        first = next(iter(line.values()))
-        chance = "" if first.chance is None else f"{first.chance:{first.form}}"
-        chance = str(line.get(PERSISTENCE, chance))
-        found.append((first.name, chance, tuple(str(line.get(model, "")) for model in columns)))
-    return RowTable(title, columns, tuple(found))
-
-
-class Measurement(Protocol):
-    """What a measurement beside the core found of a model."""
-
-    def rows(self, model: str) -> list[Row]:
-        """Return its numbers."""
-        ...
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return all of it as plain values, for metrics.json."""
-        ...
+SAME_ENERGY = 1e-6  # relative difference below which energies are equal: rounding decides no rank
+PERSISTENCE = "persistence"  # in the column of models: a copy of frame 0
 
 
 @dataclass(frozen=True)
@@ -139,30 +64,24 @@ ACTIONS: tuple[Actions, ...] = ("true", "zero", "shuffled")
 
 
 @dataclass(frozen=True)
-class WrittenAbout:
-    """What readers of metrics.json need of the description of an evaluation."""
+class About:
+    """The description of an evaluation: model, data and settings."""
 
+    subject: str  # the run or model, as given
     checkpoint: str  # which one, as text; "" for a model
     checkpoint_path: str  # likewise
+    source: str  # data.source
     data: str  # data.path
     cameras: tuple[str, ...]
     split: str
     frames: int  # of a clip
     stride: int  # control steps per model step
     seconds_per_step: float
-    is_base: bool = field(default=False, kw_only=True)  # the checkpoint has the weights of the base model
-
-
-@dataclass(frozen=True)
-class About(WrittenAbout):
-    """The description of an evaluation: model, data and settings."""
-
-    subject: str  # the run or model, as given
-    source: str  # data.source
-    space: ActionSpace  # of the actions
     seed: int
     version: str  # of this package
     time: str  # UTC
+    is_pose: bool = True  # actions are changes of a pose
+    is_base: bool = False  # the checkpoint has the weights of the base model
 
 
 @dataclass(frozen=True)
@@ -241,53 +160,66 @@ class Landscape:
     energy: Float[np.ndarray, "grid grid grid"]  # indices: first, second, third axis
     true: Float[np.ndarray, " 3"]
     minimum: Float[np.ndarray, " 3"]  # where the energy is lowest (the mean if there are several)
-    distance: float  # between the two, in the units of the axes
+
+    @property
+    def distance(self) -> float:
+        """The distance of the minimum to the true action, in the units of the axes."""
+        return float(np.linalg.norm(self.minimum - self.true))
+
+    @property
+    def rank(self) -> float:
+        """The fraction of the other nodes whose energy is below that of the true action; equal energies count half."""
+        node = tuple(np.abs(self.axes - self.true[:, None]).argmin(axis=1))
+        difference = self.energy - self.energy[node]
+        is_equal = np.abs(difference) <= SAME_ENERGY * abs(self.energy[node])
+        below = (difference < 0) & ~is_equal
+        return float((below.sum() + (is_equal.sum() - 1) / 2) / (self.energy.size - 1))
+
+    @property
+    def sharpness(self) -> float:
+        """The range of the energy over its mean; 0: flat."""
+        return float(np.ptp(self.energy) / self.energy.mean())
+
+
+LandscapeMeasure = Literal["distance", "rank", "sharpness"]
 
 
 @dataclass(frozen=True)
 class Landscapes:
-    """Landscapes of some clips of one model, and statistics over them."""
+    """Landscapes of some clips of one model."""
 
     axis_names: tuple[str, ...]  # three
     unit: str  # cm, or "" where the states are no poses
     maps: tuple[Landscape, ...]
-    distance: Estimate  # mean over clips
-    sharpness: Estimate  # mean over clips of (highest - lowest) / mean energy of a landscape; 0: flat
-    chance_distance: float  # the same of a node drawn at random
+    chance_distance: float  # mean distance of a node drawn at random to the true action
 
+    @property
+    def episode_ids(self) -> tuple[str, ...]:
+        """The episode of each clip."""
+        return tuple(one.episode_id for one in self.maps)
 
-@dataclass(frozen=True)
-class Plans:
-    """The plans of one method from each start; several draws of it, if it is random."""
+    def mean(self, measure: LandscapeMeasure) -> Estimate:
+        """Return the mean of a measure over the clips."""
+        return mean_of(self._values(measure), self.episode_ids)
 
-    one_step: Float[np.ndarray, "draws starts 7"]  # towards the next frame; an action as in `vjepa2_ac.episode`
-    three_steps: Float[np.ndarray, "draws starts 3 7"]  # towards the frame three steps later
-    empty: int = 0  # plans without a finite energy, which do nothing
+    def difference(self, other: Landscapes, measure: LandscapeMeasure) -> Estimate:
+        """Return the mean of a measure minus that of another model on the same clips, paired."""
+        return mean_of(self._values(measure) - other._values(measure), self.episode_ids)
 
-
-@dataclass(frozen=True)
-class PlanningStudy:
-    """The starts of the plans, the demonstrated actions, and model-free plans. Of poses only."""
-
-    clips: tuple[int, ...]  # indices into Clips
-    places: tuple[int, ...]  # frame of each clip at which planning begins
-    episode_ids: tuple[str, ...]
-    demonstrated: Float[np.ndarray, "starts 3 7"]
-    zero: Plans
-    random: Plans  # every number uniform within its limits
-    within_limits: Plans  # the demonstration clipped to the limits: no plan can be closer
-    one_step_beyond: float  # share of the demonstrated steps that exceed the limits along x, y or z
-    three_steps_beyond: float
-    settings: PlanningConfig  # of the one-step plans
+    def _values(self, measure: LandscapeMeasure) -> Float[np.ndarray, " clips"]:
+        return np.array([getattr(one, measure) for one in self.maps])
 
 
 @dataclass(frozen=True)
 class LatentDistribution:
-    """How the latents of one kind of prediction are distributed, by horizon (index h - 1), against the truth."""
+    """How the latents of one kind of prediction are distributed, compared with the true ones of the same clips.
+
+    By horizon (index h - 1), but for `fvd`, which has one feature vector for each clip: see `evaluation.distribution`.
+    """
 
     spread: tuple[Estimate, ...]  # 1: as varied as the truth
-    mmd: tuple[Estimate, ...]  # squared, times 100, of latents averaged over tokens; NaN of one episode
-    p_values: tuple[float, ...]  # of no difference, by sign flips; NaN of one episode
+    mmd: tuple[Estimate, ...]  # squared, times 100; unbiased; no interval from one episode
+    fvd: float  # Fréchet distance; biased upwards, the more the fewer clips
     variance: tuple[float, ...]  # trace of the covariance over clips, of these latents
     true_variance: tuple[float, ...]  # the same of the true latents: `spread` is the ratio
 
@@ -316,6 +248,8 @@ class DecodedRollouts:
     curves: Mapping[tuple[str, str], tuple[Estimate, ...]]  # by source and metric, such as psnr_db.moving.truth
     strips: tuple[DecodedStrip, ...] = ()
     notes: tuple[str, ...] = ()  # what is absent, and why; how many clips were left out
+    # By source: Fréchet distance of the re-encoded images to the true latents; empty: the encoder was not loaded.
+    fvd: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -326,19 +260,8 @@ class ModelResult:
     role: Role
     errors: PredictionErrors  # those of persistence are the same for all models, which share the encoder
     landscapes: Landscapes | None = None
-    plans: Plans | None = None
     ranking: ActionRanking | None = None
     distribution: LatentDistribution | None = None  # of the rollout with the true actions
-    beside: Mapping[str, Measurement] = field(default_factory=dict)  # by measurements that the core does not know
-
-
-@dataclass(frozen=True)
-class Stratum:
-    """A group of steps; `steps` selects [clip, horizon] of the *teacher-forced* errors."""
-
-    key: str  # motion.moving, motion.idle, action_size.small, .medium or .large: the same for all data
-    label: str  # such as "moving", "small: 0 to 1.2 cm"
-    steps: Bool[np.ndarray, "clips horizon"]
 
 
 @dataclass(frozen=True)
@@ -350,27 +273,6 @@ class Example:
     start: int
     frames: UInt8[np.ndarray, "time height width 3"] | None  # as the encoder sees them; None: no frames (a cache)
     errors: Mapping[str, Float[np.ndarray, "horizon grid grid"]]  # model or persistence -> L1 error of each patch
-    true_colours: UInt8[np.ndarray, "time grid grid 3"]  # three principal components of the true latents, as RGB
-    predicted_colours: Mapping[str, UInt8[np.ndarray, "horizon grid grid 3"]]  # model -> in the same basis and scale
-
-
-@dataclass(frozen=True)
-class EpisodeScore:
-    """The score of the trained model on one episode, at the last horizon of the rollout (L1)."""
-
-    episode_id: str
-    clips: int
-    over_persistence: float
-    gain_over_base: float | None  # relative reduction of the base's error; None: no base
-
-
-@dataclass(frozen=True)
-class TrainingCurve:
-    """One metric of a run's metrics.jsonl over optimizer steps."""
-
-    name: str  # loss, learning_rate, validation/rollout_over_persistence ...
-    steps: tuple[int, ...]
-    values: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -380,16 +282,11 @@ class Evaluation:
     about: About
     clips: Clips
     models: Mapping[str, ModelResult]
-    strata: tuple[Stratum, ...]
-    episodes: tuple[EpisodeScore, ...] = ()  # best first
     examples: tuple[Example, ...] = ()
-    training: tuple[TrainingCurve, ...] = ()
-    beside: Mapping[str, Measurement] = field(default_factory=dict)  # as of a model: of the one that is evaluated
     notes: tuple[str, ...] = ()  # for the reader: why there is no base, no landscape ...
-    planning: PlanningStudy | None = None
     metrics: tuple[Metric, ...] = (L1, L2)  # of the errors
     copies: LatentDistribution | None = None  # of frame 0
-    noise_floor: tuple[float, ...] = ()  # of the MMD: what chance makes of the truth, by horizon
+    fvd_of_halves: float = math.nan  # between two halves of the true clips: what chance makes of equal distributions
     decoded: DecodedRollouts | None = None  # None: no decoder was given
 
     @property
@@ -437,3 +334,51 @@ class Evaluation:
     def seconds_ahead(self) -> float:
         """The same in seconds."""
         return self.horizon * self.about.seconds_per_step
+
+
+# ---- estimates ----
+
+Curve = tuple[Estimate, ...]  # at horizon 1, 2, ...; index h - 1
+Steps = Bool[np.ndarray, "clips horizon"]  # which steps count
+
+
+def over_persistence(errors: PredictionErrors, mode: Mode, metric: Metric = L1, way: Way = "true") -> Curve:
+    """Return mean error over mean persistence error by horizon: 1 as good as persistence; of L1, 0 is perfect."""
+    return ratios(errors.of(mode, metric, way), errors.of(mode, metric, "persistence"), errors.episode_ids)
+
+
+def one_step_over_persistence(
+    errors: PredictionErrors, actions: Actions = "true", steps: Steps | None = None
+) -> Estimate:
+    """Return teacher-forced error over persistence, over all steps of the clips or the chosen ones; NaN of none."""
+    return ratio(_one_step(errors, actions, steps), _one_step(errors, "persistence", steps), errors.episode_ids)
+
+
+def gain_over(errors: PredictionErrors, others: PredictionErrors, mode: Mode = "rollout", metric: Metric = L1) -> Curve:
+    """Return the share by which a model is better than another, by horizon, paired by clip: 0.18 is 18 % better."""
+    pair = [each.of(mode, metric) for each in (errors, others)]
+    better = 1 if metric.smaller_is_better else -1
+    return bootstrapped(lambda sums: better * (1 - sums[0] / sums[1]), np.stack(pair), errors.episode_ids)
+
+
+def cost_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
+    """Return the share by which the teacher-forced error grows with zero or shuffled actions, paired; 0: unused."""
+    grown = ratio(_one_step(errors, actions), _one_step(errors, "true"), errors.episode_ids)
+    return Estimate(grown.value - 1, grown.low - 1, grown.high - 1)
+
+
+def gap_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
+    """Return how much higher the teacher-forced error over persistence is with zero or shuffled actions, paired."""
+    given, true = (errors.of("teacher_forced", L1, each) for each in (actions, "true"))
+    return ratio((given - true).mean(axis=1), _one_step(errors, "persistence"), errors.episode_ids)
+
+
+def rank_difference(one: ActionRanking, other: ActionRanking) -> Estimate:
+    """Return the mean rank of one model minus that of another on the same moves, paired: below 0 is better."""
+    return mean_of(one.ranks - other.ranks, one.episode_ids)
+
+
+def _one_step(errors: PredictionErrors, way: Way, steps: Steps | None = None) -> np.ndarray:
+    """Return the mean teacher-forced L1 error of each clip, or the sum over the chosen steps."""
+    found = errors.of("teacher_forced", L1, way)
+    return np.asarray(found.mean(axis=1) if steps is None else (found * steps).sum(axis=1))

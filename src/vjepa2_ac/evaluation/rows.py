@@ -1,80 +1,115 @@
-"""The rows of an evaluation: every number with its interval, once, for console, page, metrics.json and comparison."""
+"""The rows of an evaluation: every number with its interval, once, for console, page, metrics.json and comparison.
+
+PyTorch is not imported.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BeforeValidator
 
 from vjepa2_ac.errors import counted
-from vjepa2_ac.evaluation.action_score import AXES, differences_of, metrics_of, signed_along, ways_of
-from vjepa2_ac.evaluation.estimates import (
-    Curve,
-    cost_of_actions,
-    difference_to,
-    distance_difference,
-    gain_over,
-    gap_of_actions,
-    mean_error,
-    one_step_over_persistence,
-    over_persistence,
-    rank_difference,
-    stratum_gain,
-)
-from vjepa2_ac.evaluation.request import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
     L1,
-    MODES,
     PERSISTENCE,
     ActionRanking,
+    Curve,
     Evaluation,
+    LandscapeMeasure,
     Landscapes,
-    Metric,
-    Mode,
-    Row,
+    cost_of_actions,
+    gain_over,
+    gap_of_actions,
+    one_step_over_persistence,
+    over_persistence,
+    rank_difference,
 )
 from vjepa2_ac.intervals import Estimate
 
-MOST_HORIZONS = 8  # on a screen
-_MODES: dict[Mode, str] = {"rollout": "open loop", "teacher_forced": "teacher-forced"}
-_SIMILARITIES = {"psnr_db": ("PSNR (dB)", ".1f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".3f")}
+_Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]  # null in JSON: NaN
+_MOST_HORIZONS = 8  # on a screen
+_SIMILARITIES = {"psnr_db": ("PSNR (dB)", ".1f"), "ssim": ("SSIM", ".3f")}
 _REGIONS = {"whole": "whole image", "moving": "where something moves"}
-_PLANS = {  # label, format, and whether it is a detail
-    "score": (f"Action Score (best {BEST_SCORE:.0f})", ".1f", False),
-    "missed_cm": (f"end of {STEPS} steps off by, cm", ".1f", False),
-    "missed_over_zero": ("its end off, over the zero action", ".2f", True),
-    "step_cm": ("one step off by, cm", ".1f", False),
-    "step_over_zero": ("one step off, over the zero action", ".2f", True),
-    **{f"axes_cm.{name}": (f"along {name}, cm", ".1f", False) for name in AXES},
-    "angle_degrees": ("angle, degrees", ".0f", False),
-    **{f"signs.{name}": (f"right sign of {name}", ".2f", False) for name in AXES},
-    "gripper": ("gripper off by", ".2f", False),
-}
-_PLAN_DIFFERENCES = {"score": "Action Score", "missed_cm": "end off by, cm", "step_cm": "one step off by, cm"}
 _GAIN: dict[str, Any] = {"form": ".1%", "better": "higher", "chance": 0.0}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number of an evaluation: console, report page, metrics.json and comparison show the same ones."""
+
+    group: str  # the title of its table
+    name: str  # its line
+    key: str  # both, for programs, such as rollout.l1.over_persistence.3
+    model: str  # its column: a model, or persistence
+    value: _Number  # NaN: there is none
+    low: _Number = math.nan  # 95 % interval over episodes; NaN: there is none
+    high: _Number = math.nan
+    form: str = ".3f"
+    better: Literal["lower", "higher", ""] = "lower"
+    chance: float | None = None  # value of persistence, or of a model that ignores its actions
+    unit: str = ""  # of the value, if it has one and `name` does not give it: cm
+    detail: bool = False  # not for a screen
+
+    @property
+    def estimate(self) -> Estimate:
+        """The number with its interval."""
+        return Estimate(self.value, self.low, self.high)
+
+    def __str__(self) -> str:
+        return "not measured" if math.isnan(self.value) else f"{self.estimate:{self.form}}"
+
+
+@dataclass(frozen=True)
+class RowTable:
+    """The rows of one group as a table."""
+
+    title: str
+    columns: tuple[str, ...]
+    lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, by chance or persistence, a cell for each column
+
+
+def sections(rows: Sequence[Row]) -> list[RowTable]:
+    """Return rows as tables: those of one key are a line, each in the column of its model."""
+    by_key: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        by_key.setdefault(row.key, {})[row.model] = row
+    groups: dict[str, list[dict[str, Row]]] = {}
+    for line in by_key.values():
+        groups.setdefault(next(iter(line.values())).group, []).append(line)
+    return [_section(title, lines) for title, lines in groups.items()]
+
+
+def _section(title: str, lines: Sequence[Mapping[str, Row]]) -> RowTable:
+    columns = tuple(dict.fromkeys(model for line in lines for model in line if model != PERSISTENCE))
+    cells = []
+    for line in lines:
+        first = next(iter(line.values()))
+        chance = "" if first.chance is None else f"{first.chance:{first.form}}"
+        chance = str(line.get(PERSISTENCE, chance))
+        cells.append((first.name, chance, tuple(str(line.get(model, "")) for model in columns)))
+    return RowTable(title, columns, tuple(cells))
 
 
 def rows_of(evaluation: Evaluation) -> list[Row]:
     """Return every number of an evaluation."""
-    rows, models = _Rows(evaluation), evaluation.models.values()
-    for mode, metric in product(reversed(MODES), evaluation.metrics):
-        rows.add_errors(mode, metric)
-    for mode, metric in product(reversed(MODES), evaluation.metrics):
-        rows.add_comparison(mode, metric)
+    rows = _Rows(evaluation)
+    rows.add_errors()
     rows.add_distributions()
     rows.add_one_steps()
-    for model in models:
+    for model in evaluation.models.values():
         if model.ranking is not None:
             rows.add_ranking(model.name, model.ranking)
-    rows += [row for model in models for found in model.beside.values() for row in found.rows(model.name)]
-    for model in models:
+    for model in evaluation.models.values():
         if model.landscapes is not None:
             rows.add_landscapes(model.name, model.landscapes)
-    rows.add_plans()
     rows.add_decoded()
-    return [*rows, *(row for found in evaluation.beside.values() for row in found.rows(evaluation.trained))]
+    return list(rows)
 
 
 class _Rows(list[Row]):
@@ -85,165 +120,133 @@ class _Rows(list[Row]):
         self.evaluation = evaluation
         self.errors = {name: model.errors for name, model in evaluation.models.items()}
         self.base = None if evaluation.base is None else evaluation.models[evaluation.base]
-        self.others = {name: one for name, one in self.errors.items() if name != evaluation.base}
 
-    def line(self, group: str, name: str, key: str, found: Mapping[str, Estimate], **style: Any) -> None:
+    def line(self, group: str, name: str, key: str, values: Mapping[str, Estimate], **style: Any) -> None:
         """Add a row for each model."""
-        self.extend(Row(group, name, key, model, one.value, one.low, one.high, **style) for model, one in found.items())
+        self.extend(
+            Row(group, name, key, model, one.value, one.low, one.high, **style) for model, one in values.items()
+        )
 
     def curves(
         self, group: str, key: str, curves: Mapping[str, Curve], shown: Collection[int] = (), **style: Any
     ) -> None:
         """Add the rows of curves by horizon, of which some are shown on a screen."""
         for h in range(1, self.evaluation.horizon + 1):
-            found = {model: curve[h - 1] for model, curve in curves.items()}
-            self.line(group, self.ahead(h), f"{key}.{h}", found, detail=h not in shown, **style)
+            values = {model: curve[h - 1] for model, curve in curves.items()}
+            name = f"{h * self.evaluation.about.seconds_per_step:.2f} s ahead"
+            self.line(group, name, f"{key}.{h}", values, detail=h not in shown, **style)
 
-    def ahead(self, horizon: int) -> str:
-        """Return a horizon as text."""
-        return f"{horizon * self.evaluation.about.seconds_per_step:.2f} s ahead"
-
-    def add_errors(self, mode: Mode, metric: Metric) -> None:
-        """Add the errors over persistence, and the errors."""
-        last, better = self.evaluation.horizon, "lower" if metric.smaller_is_better else "higher"
-        every = -(-last // MOST_HORIZONS)
-        shown = {1, *range(every, last + 1, every), last} if metric is L1 else {last}
-        for actions in ACTIONS:
-            given, key = ("", "") if actions == "true" else (f", {actions} actions", f"_{actions}_actions")
-            curves = {name: over_persistence(one, mode, metric, actions) for name, one in self.errors.items()}
-            on_screen = shown if actions == "true" and mode == "rollout" else ()
-            group = f"{metric.label} error / persistence, {_MODES[mode]}{given}"
-            key = f"{mode}.{metric.name}.over_persistence{key}"
-            self.curves(group, key, curves, on_screen, better=better, chance=1.0)
-        curves = {PERSISTENCE: mean_error(self.evaluation.errors, mode, metric, "persistence")}
-        curves |= {name: mean_error(one, mode, metric) for name, one in self.errors.items()}
-        group, key = f"{metric.label} error, {_MODES[mode]}", f"{mode}.{metric.name}.error"
-        self.curves(group, key, curves, form=".4f", better=better)
-
-    def add_comparison(self, mode: Mode, metric: Metric) -> None:
-        """Add gains over the base and differences to it, paired by clip."""
+    def add_errors(self) -> None:
+        """Add the errors of rollouts over persistence, and the gains over the base, paired by clip."""
+        last = self.evaluation.horizon
+        every = -(-last // _MOST_HORIZONS)
+        for metric in self.evaluation.metrics:
+            shown = {1, *range(every, last + 1, every), last} if metric is L1 else {last}
+            curves = {name: over_persistence(one, "rollout", metric) for name, one in self.errors.items()}
+            group, key = f"{metric.label} error / persistence, open loop", f"rollout.{metric.name}.over_persistence"
+            better = "lower" if metric.smaller_is_better else "higher"
+            self.curves(group, key, curves, shown, better=better, chance=1.0)
         if self.base is None:
             return
-        base, key = self.base.errors, f"{mode}.{metric.name}"
-        gains = {name: gain_over(one, base, mode, metric) for name, one in self.others.items()}
-        self.curves(f"Gain over the base by {metric.label}, {_MODES[mode]}", f"{key}.gain_over_base", gains, **_GAIN)
-        found = {name: difference_to(one, base, mode, metric) for name, one in self.others.items()}
-        group = f"{metric.label} error minus the base's, {_MODES[mode]}"
-        better = "lower" if metric.smaller_is_better else "higher"
-        self.curves(group, f"{key}.difference_to_base", found, form="+.4f", better=better, chance=0.0)
+        base, others = self.base.errors, {name: one for name, one in self.errors.items() if name != self.base.name}
+        for metric in self.evaluation.metrics:
+            gains = {name: gain_over(one, base, "rollout", metric) for name, one in others.items()}
+            group, key = f"Gain over the base by {metric.label}, open loop", f"rollout.{metric.name}.gain_over_base"
+            self.curves(group, key, gains, **_GAIN)
 
     def add_distributions(self) -> None:
-        """Add spread and MMD of the latents."""
-        copies, models = self.evaluation.copies, self.evaluation.models
-        found = {name: model.distribution for name, model in models.items() if model.distribution is not None}
-        if copies is None or not found:
+        """Add spread, MMD and Fréchet distance of the latents."""
+        one = self.evaluation
+        models = {name: model.distribution for name, model in one.models.items() if model.distribution is not None}
+        if one.copies is None or not models:
             return
-        found = {PERSISTENCE: copies, **found}
-        curves = {name: one.spread for name, one in found.items()}
-        group = "Spread / that of the truth, open loop (1: as varied)"
-        self.curves(group, "spread", curves, {self.evaluation.horizon}, better="")
-        group = "Squared MMD of latents to the truth, x 100, open loop"
-        for h, floor in enumerate(self.evaluation.noise_floor, start=1):
-            beside = "" if math.isnan(floor) else f" (two halves of the truth stay below {floor:.3f})"
-            for model, one in found.items():
-                p = one.p_values[h - 1]
-                note = "" if math.isnan(p) else f"p {p:.3f}"
-                mmd = {model: one.mmd[h - 1]}
-                self.line(group, self.ahead(h) + beside, f"latent_mmd.{h}", mmd, note=note, detail=True)
+        known = {PERSISTENCE: one.copies, **models}
+        spreads = {name: distribution.spread for name, distribution in known.items()}
+        self.curves("Spread / that of the truth, open loop (1: as varied)", "spread", spreads, {one.horizon}, better="")
+        sample = f"{counted(len(one.clips), 'clip')} of {counted(one.clips.episodes, 'episode')}"
+        group = f"Squared MMD of latents to the truth, x 100, open loop ({sample}; unbiased)"
+        self.curves(group, "latent_mmd", {name: distribution.mmd for name, distribution in known.items()})
+        halves = f"; two halves of the true clips: {one.fvd_of_halves:.3g}" if math.isfinite(one.fvd_of_halves) else ""
+        group = f"Fréchet distance of latents to the truth (FVD; {sample}; biased upwards{halves})"
+        style: dict[str, Any] = {"form": ".3g", "detail": True}
+        distances = {name: distribution.fvd for name, distribution in known.items()}
+        self.line(group, "predicted frames", "fvd.predicted", _without_intervals(distances), **style)
+        if one.decoded is not None and one.decoded.fvd:
+            self.line(group, "decoded frames", "fvd.decoded", _without_intervals(one.decoded.fvd), **style)
 
     def add_one_steps(self) -> None:
-        """Add teacher-forced errors of one step: with other actions, and by stratum."""
-        group = "One step, teacher-forced: L1 error / persistence"
+        """Add teacher-forced errors of one step: with other actions, and of moving and idle steps."""
+        group, moving = "One step, teacher-forced: L1 error / persistence", self.evaluation.clips.moving
         for actions in ACTIONS:
-            found = {name: one_step_over_persistence(one, actions) for name, one in self.errors.items()}
-            self.line(group, f"{actions} actions", f"one_step.{actions}", found, chance=1.0)
-        for part in self.evaluation.strata:
-            found = {name: one_step_over_persistence(one, "true", part) for name, one in self.errors.items()}
-            label = f"{part.label} ({counted(int(part.steps.sum()), 'step')})"
-            self.line(group, label, f"one_step.{part.key}", found, chance=1.0)
+            ratios = {name: one_step_over_persistence(one, actions) for name, one in self.errors.items()}
+            self.line(group, f"{actions} actions", f"one_step.{actions}", ratios, chance=1.0)
+        for name, steps in (("moving", moving), ("idle", ~moving)):
+            if steps.any():
+                ratios = {model: one_step_over_persistence(one, "true", steps) for model, one in self.errors.items()}
+                label = f"{name} ({counted(int(steps.sum()), 'step')})"
+                self.line(group, label, f"one_step.{name}", ratios, chance=1.0)
         grown, gap = "Growth of the one-step error without the true actions", "The same, over the error of persistence"
         for actions in ACTIONS[1:]:
             name = f"{actions} actions"
-            found = {model: cost_of_actions(one, actions) for model, one in self.errors.items()}
-            self.line(grown, name, f"cost_of_actions.{actions}", found, detail=True, **_GAIN)
-            found = {model: gap_of_actions(one, actions) for model, one in self.errors.items()}
-            style = {**_GAIN, "form": ".3f"}
-            self.line(gap, name, f"gap_of_actions.{actions}", found, detail=True, **style)
-        if (base := self.evaluation.base_errors) is None:
-            return
-        for part in self.evaluation.strata:
-            found = {name: stratum_gain(one, base, part) for name, one in self.others.items()}
-            key = f"one_step_gain.{part.key}"
-            self.line("One-step gain over the base", part.label, key, found, detail=True, **_GAIN)
+            costs = {model: cost_of_actions(one, actions) for model, one in self.errors.items()}
+            self.line(grown, name, f"cost_of_actions.{actions}", costs, detail=True, **_GAIN)
+            gaps = {model: gap_of_actions(one, actions) for model, one in self.errors.items()}
+            self.line(gap, name, f"gap_of_actions.{actions}", gaps, detail=True, **(_GAIN | {"form": ".3f"}))
 
-    def add_ranking(self, model: str, found: ActionRanking) -> None:
+    def add_ranking(self, model: str, ranking: ActionRanking) -> None:
         """Add the action-ranking error, and how much prediction and energy change with the action."""
         group = "Action-ranking error: alternative actions with a lower energy than the true one"
         share: dict[str, Any] = {"form": ".1%", "chance": 0.5}
-        self.line(group, "of all alternatives", "ranking.rank", {model: found.rank}, **share)
-        self.line(group, "of those in the box", "ranking.box", {model: found.box}, **share)
-        self.line(group, "of those of the same length", "ranking.shell", {model: found.shell}, **share)
+        self.line(group, "of all alternatives", "ranking.rank", {model: ranking.rank}, **share)
+        self.line(group, "of those in the box", "ranking.box", {model: ranking.box}, **share)
+        self.line(group, "of those of the same length", "ranking.shell", {model: ranking.shell}, **share)
         for key, label, one in (
-            ("change", "change of the prediction with the action / persistence", found.change),
-            ("spread", "spread of the energy / persistence", found.spread),
+            ("change", "change of the prediction with the action / persistence", ranking.change),
+            ("spread", "spread of the energy / persistence", ranking.spread),
         ):
             self.line(group, label, f"ranking.{key}", {model: one}, better="higher", chance=0.0)
         base = None if self.base is None else self.base.ranking
-        if base is not None and base is not found:
-            label, difference = "of all alternatives, minus the base model's", {model: rank_difference(found, base)}
+        if base is not None and base is not ranking:
+            label, difference = "of all alternatives, minus the base model's", {model: rank_difference(ranking, base)}
             self.line(group, label, "ranking.difference_to_base", difference, form="+.1%", chance=0.0, detail=True)
 
-    def add_landscapes(self, model: str, found: Landscapes) -> None:
-        """Add where the energy is lowest."""
-        group, label = f"Energy landscapes of {counted(len(found.maps), 'clip')}", "lowest energy to the true action"
-        label += f", {found.unit}" if found.unit else ""
-        style: dict[str, Any] = {"chance": found.chance_distance, "unit": found.unit}
-        self.line(group, label, "landscapes.distance", {model: found.distance}, **style)
-        label, sharpness = "sharpness: (highest - lowest) / mean energy", {model: found.sharpness}
-        self.line(group, label, "landscapes.sharpness", sharpness, better="higher", chance=0.0)
+    def add_landscapes(self, model: str, landscapes: Landscapes) -> None:
+        """Add the offset of the energy minimum, the rank of the true action, the sharpness, and their differences."""
+        group, unit = f"Energy landscapes of {counted(len(landscapes.maps), 'clip')}", landscapes.unit
+        labels: dict[LandscapeMeasure, tuple[str, dict[str, Any]]] = {
+            "distance": (
+                f"lowest energy to the true action{f', {unit}' if unit else ''}",
+                {"chance": landscapes.chance_distance, "unit": unit},
+            ),
+            "rank": ("grid points with a lower energy than the true action", {"form": ".1%", "chance": 0.5}),
+            "sharpness": ("sharpness: (highest - lowest) / mean energy", {"better": "higher", "chance": 0.0}),
+        }
         base = None if self.base is None else self.base.landscapes
-        if base is not None and base is not found:
-            label, difference = "distance minus the base's", {model: distance_difference(found, base)}
-            self.line(group, label, "landscapes.difference_to_base", difference, form="+.3f", chance=0.0, detail=True)
-
-    def add_plans(self) -> None:
-        """Add the metrics of plans, and their differences to the zero action and to the base's, paired by start."""
-        study = self.evaluation.planning
-        if study is None:
-            return
-        models = ways_of(self.evaluation)
-        free = {"zero action": study.zero, "random": study.random, "within limits": study.within_limits}
-        found = {name: metrics_of(study, plans) for name, plans in (free | models).items()}
-        group = f"Plans beside demonstrations, from {counted(len(study.clips), 'clip')}"
-        for key, (label, form, detail) in _PLANS.items():
-            kind, _, axis = key.partition(".")
-            count = int(signed_along(study, AXES.index(axis)).sum()) if kind == "signs" else None
-            if count != 0:
-                label += "" if count is None else f" ({counted(count, 'clip')})"
-                style: dict[str, Any] = {"form": form, "detail": detail}
-                style["better"] = "higher" if kind in {"score", "signs"} else "lower"
-                self.line(group, label, f"plans.{key}", {name: one[key] for name, one in found.items()}, **style)
-        base = None if self.base is None else self.base.plans
-        for kind, whose, other in (("zero", "zero action", study.zero), ("base", "the base", base)):
-            for name, plans in models.items():
-                if other is not None and plans is not other:
-                    for key, one in differences_of(study, plans, other).items():
-                        group, key_of = f"Plans minus those of {whose}", f"plans_minus_{kind}.{key}"
-                        style = {"form": "+.1f", "better": "higher" if key == "score" else "lower", "detail": True}
-                        self.line(group, _PLAN_DIFFERENCES[key], key_of, {name: one}, **style)
+        for measure in get_args(LandscapeMeasure):
+            label, style = labels[measure]
+            key, detail = f"landscapes.{measure}", measure == "rank"
+            self.line(group, label, key, {model: landscapes.mean(measure)}, detail=detail, **style)
+            if base is not None and base is not landscapes:
+                difference = {model: landscapes.difference(base, measure)}
+                style = {"form": "+.1%" if measure == "rank" else "+.3f", "better": style.get("better", "lower")}
+                name = f"{measure}, minus the base model's"
+                self.line(group, name, f"{key}.difference_to_base", difference, chance=0.0, detail=True, **style)
 
     def add_decoded(self) -> None:
         """Add the metrics of decoded rollouts."""
-        if (found := self.evaluation.decoded) is None:
+        if (decoded := self.evaluation.decoded) is None:
             return
-        references, known = ("truth", "decoded_truth"), {metric for _, metric in found.curves}
+        references, known = ("truth", "decoded_truth"), {metric for _, metric in decoded.curves}
         main = next(one for one in references if f"psnr_db.whole.{one}" in known)
         every = product(references, _SIMILARITIES.items(), _REGIONS.items())
         for reference, (name, (label, form)), (region, where) in every:
             metric = f"{name}.{region}.{reference}"
             if metric in known:
                 group = f"Decoded images against the {reference.replace('_', ' ')}: {label}, {where}"
-                curves = {source.replace("_", " "): found.curves[source, metric] for source in found.sources}
+                curves = {source.replace("_", " "): decoded.curves[source, metric] for source in decoded.sources}
                 shown = {self.evaluation.horizon} if reference == main else ()
-                better = "lower" if name == "lpips" else "higher"
-                self.curves(group, f"decoded.{metric}", curves, shown, form=form, better=better)
+                self.curves(group, f"decoded.{metric}", curves, shown, form=form, better="higher")
+
+
+def _without_intervals(values: Mapping[str, float]) -> dict[str, Estimate]:
+    return {name.replace("_", " "): Estimate(value, math.nan, math.nan) for name, value in values.items()}

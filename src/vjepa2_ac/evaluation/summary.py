@@ -19,8 +19,8 @@ from typing import Literal
 import numpy as np
 
 from vjepa2_ac.errors import counted
-from vjepa2_ac.evaluation.estimates import over_persistence
-from vjepa2_ac.evaluation.result import L1, Evaluation, Row
+from vjepa2_ac.evaluation.result import L1, Evaluation, over_persistence
+from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.intervals import ENOUGH_EPISODES, Estimate
 from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
 
@@ -337,7 +337,7 @@ def _landscape(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict
     distance, chance, unit = rows[key].estimate, rows[key].chance or 0.0, rows[key].unit
     conclusion, compared_with = conclusion_of(distance.below(chance), 0.0), _CHANCE
     references = [f"random point {_with_unit(chance, unit)}", f"sharpness {rows[sharpness].value:#.2g}"]
-    if (difference := rows.get("landscapes.difference_to_base")) is not None:
+    if (difference := rows.get("landscapes.distance.difference_to_base")) is not None:
         if conclusion == "yes":
             conclusion, compared_with = conclusion_of(difference.estimate.below(0.0), 0.0), _BASE
         references.insert(0, f"base model {_with_unit(base_rows[key].value, unit)}")

@@ -45,7 +45,7 @@ _MOVING = 1e-2  # of deviations: episodes with smaller ones may agree because th
 _MOST_COPIES = 8  # of one recording; of more, not all may be found
 
 ENOUGH_NEAR = 0.5  # a direction is covered by this share of the steps that go near it if all are equally frequent
-_SHORT_CM = 0.5  # a shorter step has no direction, and along an axis no sign (as evaluation.action_score.metrics)
+_SHORT_CM = 0.5  # a shorter step has no direction, and along an axis no sign
 _NEAR_DEG = 30.0
 # Measured: random reaching of the simulated arm 0.99 or more, of 100 random steps 0.90; half of all directions 0.61,
 # a plane 0.50 (0.58 if a fifth as thick as wide), an axis 0.14 (0.43), one way 0.07; starts of BridgeData 0.41.

@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, RED, in_our_style, new_figure, pixels_of
 
 Pixels = UInt8[np.ndarray, "_ _ 3"]
-Kind = Literal["recorded", "simulated", "decoded", "imagined", "error", "latents"]
+Kind = Literal["recorded", "simulated", "decoded", "imagined", "error"]
 
 MEANING: dict[Kind, tuple[str, str]] = {
     "recorded": (GREY, "recorded"),
@@ -26,7 +26,6 @@ MEANING: dict[Kind, tuple[str, str]] = {
     "decoded": (BLUE, "decoded from the true frame's latents"),
     "imagined": (ORANGE, "imagined from the first frame alone"),
     "error": (RED, "error of each patch: brighter is worse"),
-    "latents": ("#7a4fa3", "latents as colours: alike if the latents are"),
 }
 """Colour and meaning of each kind."""
 

@@ -2,7 +2,8 @@
 
 Images are RGB in 0 .. 1 (data range 1), channels first; every function returns one value per image, in float32 and
 without autocast, and can be differentiated. All reward blur: an object smeared over every place where it may be scores
-better than a sharp one 12 pixels off. State them beside LPIPS, and inside the moving region.
+better than a sharp one 12 pixels off. State them together with the spread of the predictions, and inside the moving
+region.
 """
 
 from __future__ import annotations

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.errors import InputError, counted, shell_command
-from vjepa2_ac.evaluation.result import L1, Row
+from vjepa2_ac.evaluation.result import L1
+from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.evaluation.summary import Verdict, percent
 from vjepa2_ac.intervals import Estimate, bootstrapped
 from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
@@ -224,7 +225,4 @@ def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
         notes.append(f"Action-ranking errors do not compare, the actions were ranked differently ({settings}).")
     if not _have_same_base(measured.values()) and all(one.base or one.about.is_base for one in measured.values()):
         notes.append("The runs have different base models: errors are compared with persistence.")
-    plans = [one.planning for one in measured.values() if one.planning is not None]
-    if len({f"{study.get('clips')} {study.get('places')}" for study in plans}) > 1:
-        notes.append("Plans began at other frames (another --planning-clips or seed): Action Scores do not compare.")
     return tuple(notes)

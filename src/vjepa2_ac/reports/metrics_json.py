@@ -1,13 +1,16 @@
-"""metrics.json: the rows of an evaluation, and what they come from, as plain values. Images are in the report only.
+"""metrics.json: the rows of an evaluation, the arrays that they come from, and the rows as metrics.csv.
 
-Its schema is in docs/evaluation_reference.md.
+Images are in the report only. The schema is in docs/evaluation_reference.md.
 """
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -15,26 +18,23 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from vjepa2_ac.errors import InputError, MissingFileError, shell_command
-from vjepa2_ac.evaluation.request import SCORED
-from vjepa2_ac.evaluation.result import L1, Evaluation, Row, Way, WrittenAbout
+from vjepa2_ac.evaluation.result import L1, About, Evaluation, Way
+from vjepa2_ac.evaluation.rows import Row, rows_of
 from vjepa2_ac.evaluation.summary import Summary, summarize
 from vjepa2_ac.storage import user_can_read, write_atomically
 from vjepa2_ac.storage.structured import json_text
 
 METRICS_FILE = "metrics.json"
-FORMAT = 5  # incremented when a reader of the file would have to change
+FORMAT = 6  # incremented when a reader of the file would have to change
 _NEEDS = {  # parts of an evaluation: a word of the note that says why a part is missing, and what the part needs
     "base": ("no base", "The comparison needs a base model; a model without one was evaluated."),
-    "spread": ("spread", "The spread is a variance over clips and needs two clips or more."),
+    "distribution": ("spread", "The spread is a variance over clips and needs two clips or more."),
     "landscapes": ("energy landscapes", "They are measured by `vjepa2-ac evaluate --ranking-clips 32 --landscapes 8`."),
-    "planning": ("No plans", "Plans are measured by `vjepa2-ac evaluate --planning`; this takes a while."),
     "examples": ("example clips", "They are drawn by `vjepa2-ac evaluate --examples 4`."),
     "decoded": (
         "decoded images",
         "They need a decoder: train one with `vjepa2-ac decoder CONFIG`, then add `--decoder FOLDER`.",
     ),
-    "training": ("metrics.jsonl", "They need `metrics.jsonl` of a run: this is a model, or the file is missing."),
-    "strides": ("strides", "Other strides are measured by `vjepa2-ac evaluate --calibrate`."),
 }
 
 
@@ -60,16 +60,15 @@ class WrittenErrors:
 class Metrics:
     """The content of metrics.json that programs read, but for what the rows come from."""
 
-    format: Literal[5]
+    format: Literal[6]
     summary: Summary
     trained: str
     base: str | None
-    about: WrittenAbout
+    about: About
     clips: WrittenClips
     rows: tuple[Row, ...]
     by_clip: WrittenErrors
     ranked: str | None = None  # how actions were ranked; None: they were not
-    planning: dict[str, Any] | None = None
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -85,7 +84,7 @@ class Metrics:
 def not_measured(one: Evaluation) -> dict[str, str]:
     """Return the parts of an evaluation that were not measured, with the reason of each."""
     model = one.models[one.trained]
-    parts = {**vars(one), **vars(model), **one.beside, "base": one.base, "spread": model.distribution}
+    parts = {**vars(one), **vars(model), "base": one.base}
     return {
         part: next((note for note in one.notes if word in note), needs)
         for part, (word, needs) in _NEEDS.items()
@@ -122,21 +121,15 @@ def read_metrics(folder: Path) -> Metrics:
 
 def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> dict[str, Any]:
     """Return all metrics as plain values; see docs/evaluation_reference.md for the meaning of each."""
-    from vjepa2_ac.evaluation.rows import rows_of  # reading needs no PyTorch
-
-    one, clips, study, rows = evaluation, evaluation.clips, evaluation.planning, rows_of(evaluation)
+    one, clips, decoded, rows = evaluation, evaluation.clips, evaluation.decoded, rows_of(evaluation)
     summary = summary or summarize(one, rows)
     named = list(zip(clips.episode_ids, clips.starts, strict=True))
-    about = {name: value for name, value in vars(one.about).items() if name != "space"}
-    decoded, planning = one.decoded, {"three_steps_settings": SCORED}
-    of_study = ("clips", "places", "demonstrated", "one_step_beyond", "three_steps_beyond", "settings")
-    of_model = ("role", "ranking", "landscapes", "distribution", "plans")  # what rows come from, but for errors
     metrics = {
         "format": FORMAT,
         "summary": {**vars(summary), "sentence": summary.sentence},
         "trained": one.trained,
         "base": one.base,
-        "about": about | {"is_pose": one.about.space.position is not None},
+        "about": one.about,
         "clips": {
             "count": len(clips),
             "episodes": clips.episodes,
@@ -146,7 +139,6 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
         },
         "ranked": one.ranked,
         "rows": rows,
-        "episodes": one.episodes,
         "by_clip": {
             "persistence": one.errors.of("rollout", L1, "persistence"),
             "models": {name: model.errors.of("rollout") for name, model in one.models.items()},
@@ -159,14 +151,11 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
                 for name, model in one.models.items()
             },
         },
-        "models": {
-            name: {key: getattr(model, key) for key in of_model}
-            | {key: found.as_dict() for key, found in model.beside.items()}
+        "models": {  # what rows come from, but for errors
+            name: {key: getattr(model, key) for key in ("role", "ranking", "landscapes", "distribution")}
             for name, model in one.models.items()
         },
-        "planning": None if study is None else planning | {name: getattr(study, name) for name in of_study},
         "decoded": None if decoded is None else {"decoder": decoded.decoder, "notes": decoded.notes},
-        **{name: found.as_dict() for name, found in one.beside.items()},
         "notes": one.notes,
         "not_measured": not_measured(one),
     }
@@ -179,3 +168,13 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
 def _rounded(value: Any) -> Any:
     """Return the numbers of an array with 7 significant digits: more than a prediction in bfloat16 has."""
     return [_rounded(one) for one in value] if isinstance(value, list) else float(f"{value:.7g}")
+
+
+def write_csv(rows: Sequence[Row], path: Path) -> Path:
+    """Write every row with its fields as columns, atomically; a missing number is nan."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, [one.name for one in fields(Row)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(vars(row) for row in rows)
+    write_atomically(path, text.getvalue())
+    return path

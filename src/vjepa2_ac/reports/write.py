@@ -1,4 +1,4 @@
-"""The report of an evaluation: measured, and written as metrics.json, evaluation.png, and one HTML page.
+"""The files of an evaluation: metrics.json, metrics.csv, evaluation.png, and one HTML page.
 
 The page shows the summary and a video first, then every number and plot, folded; it needs no network and no script.
 """
@@ -11,7 +11,6 @@ import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -21,27 +20,20 @@ from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from vjepa2_ac.distributed import first_only, joined
 from vjepa2_ac.episode import short_names
 from vjepa2_ac.errors import counted
-from vjepa2_ac.evaluation.estimates import Curve, over_persistence
-from vjepa2_ac.evaluation.evaluate_run import measure_subject
-from vjepa2_ac.evaluation.request import EvaluationOptions, settle
-from vjepa2_ac.evaluation.result import L1, DecodedStrip, EpisodeScore, Evaluation, Example, Row, RowTable, sections
-from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.result import L1, Curve, DecodedStrip, Evaluation, Example, over_persistence
+from vjepa2_ac.evaluation.rows import Row, RowTable, rows_of, sections
 from vjepa2_ac.evaluation.summary import Summary, Verdict, interval_of, percent, summarize, with_closed_loop
 from vjepa2_ac.media.figure import svg_of, visible
 from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_webp
-from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation
-from vjepa2_ac.reports.metrics_json import METRICS_FILE, not_measured, write_metrics
-from vjepa2_ac.reports.paper import write_tables
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, not_measured, write_csv, write_metrics
 from vjepa2_ac.storage import write_atomically
 
 PLOT, REPORT = "evaluation.png", "report.html"
 MOST_CLIPS = 4  # example clips, and as many decoded ones
-_AT_EACH_END = 8  # episodes in a table
 _BYTES = 3_000_000  # of all clips together
 _AT_AN_END = 10.0  # percent of the width of a bar, free on both sides
 LONGEST_S = 6.0  # of the film
@@ -50,20 +42,14 @@ _STEP_S, _FIRST_S, _LAST_S = 0.5, 1.2, 1.8  # how long frames are shown
 _QUALITIES = (85, 70, 50, 30, 10)
 _THIN = 32  # a gap, or the bar of time, is so many times thinner than an image is wide
 _GREY, _PASSED = 170, (31, 111, 180)  # of gaps and bar, on white as well as on black
-_PARTS = {  # title, and how the keys of the rows begin; what it means stands in the template
-    "errors": ("Error by horizon", r"(rollout|teacher_forced)\.\w+\.(over_pers|error)"),
-    "base": ("Compared with the base", r"(rollout|teacher_forced)\.|one_step_gain"),
-    "actions": ("Use of the actions", "cost_of|gap_of|ranking|axes"),
-    "steps": ("Where it helps", "one_step"),
+_PARTS = {  # title, and how the keys of the rows begin; the template explains each
+    "errors": ("Error by horizon", r"rollout\.\w+\.over_persistence"),
+    "base": ("Compared with the base", r"rollout\."),
+    "actions": ("Use of the actions", "one_step|cost_of|gap_of|ranking"),
     "examples": ("Example clips", "$^"),
     "decoded": ("Decoded images", "decoded"),
-    "episodes": ("Episodes", "$^"),
-    "spread": ("Spread of the predictions", "spread|latent_mmd"),
+    "distribution": ("Distribution of the predictions", "spread|latent_mmd|fvd"),
     "landscapes": ("Energy landscapes", "landscapes"),
-    "planning": ("Plans beside demonstrations", "plans"),
-    "strides": ("Other strides", "strides"),
-    "training": ("Training curves", "$^"),
-    "others": ("Further measurements", ""),
 }
 
 Frame = UInt8[np.ndarray, "height width 3"]
@@ -148,13 +134,10 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
     images: dict[str, list[PageImage]] = {name: [] for name in _PARTS} | _clips(evaluation)
     for one in drawings(evaluation):
         images[one.part].append(PageImage(svg_of(one.draw, one.width, one.height, evaluation), one.described))
-    notes = {
-        "decoded": () if evaluation.decoded is None else evaluation.decoded.notes,
-        "strides": tuple(str(one.as_dict().get("verdict", "")) for one in evaluation.beside.values()),
-    }
-    tables = {name: sections(found) for name, found in of_part.items()} | {"episodes": _episodes(evaluation.episodes)}
+    notes = {"decoded": () if evaluation.decoded is None else evaluation.decoded.notes}
     return [
-        PagePart(name, title, tables[name], images[name], notes.get(name, ())) for name, (title, _) in _PARTS.items()
+        PagePart(name, title, sections(of_part[name]), images[name], notes.get(name, ()))
+        for name, (title, _) in _PARTS.items()
     ]
 
 
@@ -164,7 +147,7 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
     labels = {
         f"rollout.{L1.name}.over_persistence.{last}": f"L1 error / persistence, {ahead}",
         "ranking.rank": "action-ranking error",
-        "one_step.motion.moving": "one-step L1 error / persistence, moving steps",
+        "one_step.moving": "one-step L1 error / persistence, moving steps",
         f"spread.{last}": f"spread of the predictions, {ahead}",
     }
     if evaluation.base is None:  # the first verdict is on this error
@@ -177,23 +160,6 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
         for key, label in labels.items()
         if (key, evaluation.trained) in known
     ]
-
-
-def _episodes(scores: Sequence[EpisodeScore]) -> list[RowTable]:
-    """Return the best and the worst episodes."""
-    parts = {f"All {counted(len(scores), 'episode')}, best first": scores} if scores else {}
-    if len(scores) > 2 * _AT_EACH_END:
-        parts = {
-            f"The {_AT_EACH_END} best of {counted(len(scores), 'episode')}, best first": scores[:_AT_EACH_END],
-            f"The {_AT_EACH_END} worst of {counted(len(scores), 'episode')}, worst last": scores[-_AT_EACH_END:],
-        }
-    columns = ("clips", "L1 error / persistence", "gain over the base")
-    return [RowTable(title, columns, tuple(map(_episode, part))) for title, part in parts.items()]
-
-
-def _episode(score: EpisodeScore) -> tuple[str, str, tuple[str, ...]]:
-    gain = "" if score.gain_over_base is None else f"{score.gain_over_base:+.1%}"
-    return score.episode_id, "", (str(score.clips), f"{score.over_persistence:.3f}", gain)
 
 
 def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
@@ -284,29 +250,20 @@ class Evaluated:
         return {name: over_persistence(one.errors, "rollout") for name, one in self.evaluation.models.items()}
 
 
-def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, reporter: Reporter = SILENT) -> Evaluated:
-    """Measure as `measure_subject` does, and write metrics.json, report and figure; of several processes the first.
+def write_evaluation(evaluation: Evaluation, folder: Path) -> Evaluated:
+    """Write metrics.json, metrics.csv, figure and report of an evaluation, each atomically; return it with its summary.
 
-    Raises:
-        InputError: As `measure_subject`.
+    The summary has the planning verdict of a closed loop of the same checkpoint, if the run has one.
     """
-    asked = asked or EvaluationOptions()
-    with joined(settle(subject, asked)) as accelerator:
-        evaluation = measure_subject(subject, asked, accelerator, reporter=reporter)
-        reporter.task("writing report and figures")
-        rows = rows_of(evaluation)
-        summary, about = summarize(evaluation, rows), evaluation.about
-        if about.checkpoint:
-            summary = with_closed_loop(summary, Path(about.subject), about.checkpoint)
-        files = first_only(accelerator, partial(_written, evaluation, summary, rows, asked.out or Path(subject)))
-    return Evaluated(evaluation, summary, files or ())
-
-
-def _written(evaluation: Evaluation, summary: Summary, rows: Sequence[Row], folder: Path) -> tuple[Path, ...]:
+    rows, about = rows_of(evaluation), evaluation.about
+    summary = summarize(evaluation, rows)
+    if about.checkpoint:
+        summary = with_closed_loop(summary, Path(about.subject), about.checkpoint)
     write_atomically(folder / REPORT, report_page(evaluation, summary))
-    return (
+    files = (
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE, summary),
-        *write_tables(rows, folder / METRICS_FILE),
+        write_csv(rows, (folder / METRICS_FILE).with_suffix(".csv")),
         folder / REPORT,
     )
+    return Evaluated(evaluation, summary, files)

@@ -14,10 +14,9 @@ from vjepa2_ac.distributed import broadcast_object, gathered, own_part, sharing
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart, gathered_starts, moves_of, rank_actions
-from vjepa2_ac.evaluation.estimates import cost_of_actions, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.measure import actions_before, prediction_errors
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.result import Validation
+from vjepa2_ac.evaluation.result import Validation, cost_of_actions, one_step_over_persistence, over_persistence
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.metrics_log import MetricsLog

@@ -15,8 +15,7 @@ from vjepa2_ac.cli.console.tables import benchmark_table, motion_table, plan_tab
 from vjepa2_ac.evaluation.calibration.variants import VariantResult
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.result import Row
-from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.rows import Row, rows_of
 from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
@@ -46,7 +45,7 @@ def evaluations() -> list[Table]:
     names = ["base", "adapter", "runs/of-another-day/with-a-long-name", "vjepa2-ac-vitg.pt"]
     contenders = [Contender(name, "trained" if name == "adapter" else "base", Halfway()) for name in names[:2]]
     contenders += [Contender(name, "other", Copier()) for name in names[2:]]
-    probes = ProbeOptions(ranking_clips=4, samples=4, landscape_clips=2, axis_clips=0, nodes=3, examples=0)
+    probes = ProbeOptions(ranking_clips=4, samples=4, landscape_clips=2, nodes=3, examples=0)
     found = evaluate(cast("Any", contenders), again(clips_batch(12, 0)), about(), probes=probes)
     return row_tables(rows_of(found), "Held-out episodes")
 

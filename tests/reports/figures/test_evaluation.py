@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from evaluation_results import decoded_strips, evaluation
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import Comparison
-from vjepa2_ac.reports.figures.evaluation import draw_decoded, draw_training, plot_comparison, plot_evaluation
+from vjepa2_ac.reports.figures.evaluation import draw_decoded, plot_comparison, plot_evaluation
 
 NAMES = ("runs/lora", "_hidden", r"$\frac$", *(f"run {number}" for number in range(10)))
 
@@ -43,12 +43,6 @@ def test_decoded_rollouts_without_a_finite_psnr_are_drawn_and_say_so(value: floa
     assert one.decoded is not None
     curves = {key: (Estimate(value, value, value),) * one.horizon for key in one.decoded.curves}
     figure = Figure()
-    draw_decoded(figure, one, replace(one.decoded, curves=curves))
+    draw_decoded(figure, replace(one, decoded=replace(one.decoded, curves=curves)))
     figure.canvas.draw()
     assert figure.axes[0].get_title().endswith("no finite value")
-
-
-def test_no_empty_chart_stands_beside_those_of_training() -> None:
-    figure = Figure()
-    draw_training(figure, evaluation())
-    assert [bool(axes.lines) for axes in figure.axes] == [axes.axison for axes in figure.axes]

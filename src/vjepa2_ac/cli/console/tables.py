@@ -12,7 +12,7 @@ from rich.table import Table
 
 from vjepa2_ac.cli.console.progress import MetricsTable, console, wrapped
 from vjepa2_ac.errors import counted
-from vjepa2_ac.evaluation.result import Row, sections
+from vjepa2_ac.evaluation.rows import Row, sections
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from vjepa2_ac.cli.console.progress import ConsoleReporter, show
-from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.result import ACTIONS, Validation
+from vjepa2_ac.evaluation.result import ACTIONS, Validation, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.summary import interval_of, percent
 
 _MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help

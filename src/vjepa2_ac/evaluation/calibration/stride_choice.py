@@ -55,7 +55,7 @@ class StrideChoice:
         candidates = replace(dataset, config=dataset.config.model_copy(update={"stride_candidates": tuple(fitting)}))
         sample = ClipSample(clips=config.validation.clips)
         calibration = calibrate_model(world_model, candidates, config, accelerator, sample)
-        for row in calibration.rows(""):
-            reporter.note(f"  {row.name}: error/persistence {row}")
+        for one in calibration.results.values():
+            reporter.note(f"  {one.name}: error/persistence {one.ratio:.3f}")
         reporter.note(calibration.verdict())
         return broadcast_object(accelerator, calibration)

@@ -3,12 +3,11 @@
 A model's one-step error over persistence is lowest where frames, states and actions are those that it knows. So strides
 are calibrated: the step length of the released weights is unknown (see IMPLEMENTATION_NOTES), and robots differ in
 their control rate. At each candidate stride, the same clips begin at the same control steps of the same held-out
-episodes. Other readings of the data are in `evaluation.calibration.data`.
+episodes. Other readings of the data are in `inspection.probe`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -28,7 +27,7 @@ from vjepa2_ac.encoding.batch import encode_batch, require_same_encoder, require
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, EpisodeSource, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.evaluation.measure import ONE_STEP, ClipSample, Predictor, measured
-from vjepa2_ac.evaluation.result import L1, Row
+from vjepa2_ac.evaluation.result import L1
 from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -263,18 +262,6 @@ class Calibration:
         if best.ratio.value >= 1:
             return f"{words}. At no stride is the model better than persistence: does it fit this data at all?"
         return f"{words}."
-
-    def rows(self, model: str) -> list[Row]:
-        """Return the error at each stride as rows of an evaluation."""
-        group = "One-step L1 error / persistence by stride"
-        rows = [
-            Row(group, f"stride {stride}", f"strides.{stride}", model, math.nan, note=why, detail=True)
-            for stride, why in self.impossible.items()
-        ]
-        for stride, one in self.results.items():
-            numbers = one.ratio.value, one.ratio.low, one.ratio.high
-            rows.append(Row(group, one.name, f"strides.{stride}", model, *numbers, chance=1.0, detail=True))
-        return rows
 
     def as_dict(self) -> dict[str, Any]:
         """Return all metrics as plain values, for `calibration.json`."""

@@ -1,13 +1,11 @@
-"""Figures of an evaluation: errors by horizon, use of the actions, episodes, plans, landscapes, training, one clip."""
+"""Figures of an evaluation: curves by horizon, use of the actions, landscapes, example clips; and of a comparison."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,32 +13,27 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib import colormaps
 
-from vjepa2_ac.evaluation.action_score import AXES, ways_of
-from vjepa2_ac.evaluation.estimates import Curve, gain_over, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
-    DecodedRollouts,
+    PERSISTENCE,
+    Curve,
     DecodedStrip,
     Evaluation,
     Example,
     Landscapes,
-    Mode,
-    PlanningStudy,
-    PredictionErrors,
-    TrainingCurve,
+    gain_over,
+    one_step_over_persistence,
+    over_persistence,
 )
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, RED, headline, visible, written_figure
 from vjepa2_ac.media.film import FilmStrip, Kind, StripRow, draw_rows
 from vjepa2_ac.reports.comparison import Comparison
 
-_NOTHING = "persistence"
 _COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE, "decoded truth": GREEN, "raw persistence": RED}
 _RUNS = (BLUE, ORANGE, GREEN, "#8f5bb0", RED, "#0b7f8a", "#8a6d0b", "#333333")
 _DASHES = ("-", "--", ":")  # after all colours
 _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
-_MOST_POINTS = 300  # of a curve
-_MOST_CHARTS = 12  # of training
-_DRAWN_FIRST = ("loss", "over_persistence", "learning_rate", "grad_norm")
+_GREY_PX = 224  # side of a frame that stands for those that a cache does not have
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
@@ -54,9 +47,7 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
         if evaluation.decoded is not None and evaluation.decoded.strips:
             draw_rows(right, decoded_strip(evaluation, evaluation.decoded.strips[0]))
         elif evaluation.examples:
-            strip = example_strip(evaluation, evaluation.examples[0])
-            rows = tuple(row for row in strip.rows if row.kind != "latents") or strip.rows
-            draw_rows(right, replace(strip, rows=rows))
+            draw_rows(right, example_strip(evaluation, evaluation.examples[0]))
     return path
 
 
@@ -68,7 +59,7 @@ def plot_comparison(comparison: Comparison, path: Path) -> Path:
         drawn = _curves(axes, comparison.seconds, zip(comparison.curves.values(), styles, strict=False))
         axes.set(title=f"{comparison.title} (band: 95 % over episodes)", ylabel="latent error / persistence")
         axes.set_ylim(0, None)
-        names = [_NOTHING, *(textwrap.fill(visible(name), 34) for name in comparison.curves)]
+        names = [PERSISTENCE, *(textwrap.fill(visible(name), 34) for name in comparison.curves)]
         figure.legend(drawn, names, loc="outside right upper")
     return path
 
@@ -85,63 +76,53 @@ class Drawing(NamedTuple):
 
 def drawings(evaluation: Evaluation) -> Iterator[Drawing]:
     """Yield the figures of an evaluation that can be drawn, by the part of the page."""
-    models = evaluation.models.values()
-    forced = partial(draw_errors, mode="teacher_forced")
     yield Drawing("errors", "Open-loop L1 error over persistence by horizon", 6.4, 3.6, draw_errors)
-    yield Drawing("errors", "Teacher-forced L1 error over persistence by horizon", 6.4, 3.6, forced)
-    if (base := evaluation.base_errors) is not None:
-        yield Drawing("base", "Gain over the base by horizon", 6.4, 3.4, partial(draw_gains, base=base))
+    if evaluation.base is not None:
+        yield Drawing("base", "Gain over the base by horizon", 6.4, 3.4, _draw_gains)
+    models = evaluation.models.values()
     if any(model.distribution and math.isfinite(model.distribution.spread[-1].value) for model in models):
-        yield Drawing("spread", "Spread by horizon", 6.4, 3.4, draw_spread)
+        yield Drawing("distribution", "Spread by horizon", 6.4, 3.4, _draw_spread)
     yield Drawing("actions", "One-step error with other actions", 6.4, 3.0, draw_use_of_actions)
-    if any(model.ranking for model in models):
-        yield Drawing("actions", "Action-ranking error of every move", 6.4, 3.4, draw_ranks)
-    if clips := landscape_clips(evaluation):
+    if clips := _landscape_clips(evaluation):
         rows = len(clips) * (2 if evaluation.base and evaluation.models[evaluation.base].landscapes else 1)
         described = "Energy around the true action: cross; lowest energy: ring"
-        yield Drawing("landscapes", described, 9.0, 2.6 * rows, draw_landscapes)
-    if (study := evaluation.planning) is not None:
-        yield Drawing("planning", "Ends of plans", 11.0, 3.6, partial(draw_plans, study=study))
-    if evaluation.episodes:
-        yield Drawing("episodes", "Error of every episode", 6.4, 3.0, draw_episodes)
-    if (decoded := evaluation.decoded) is not None:
-        yield Drawing("decoded", "PSNR by horizon", 6.4, 3.6, partial(draw_decoded, found=decoded))
-    if charts := len(training_charts(evaluation.training)):
-        yield Drawing("training", "Metrics over optimizer steps", 11.0, 2.8 * -(-charts // 3), draw_training)
+        yield Drawing("landscapes", described, 9.0, 2.6 * rows, _draw_landscapes)
+    if evaluation.decoded is not None:
+        yield Drawing("decoded", "PSNR by horizon", 6.4, 3.6, draw_decoded)
 
 
-def draw_errors(figure: Any, evaluation: Evaluation, mode: Mode = "rollout") -> None:
+def draw_errors(figure: Any, evaluation: Evaluation) -> None:
     """Draw the error over persistence of every model by horizon."""
-    curves = {name: over_persistence(model.errors, mode) for name, model in evaluation.models.items()}
-    axes = _by_horizon(figure, evaluation, curves, level=(1.0, _NOTHING))
-    how = {"rollout": "open loop", "teacher_forced": "teacher-forced"}[mode]
-    axes.set(title=f"L1 error by horizon, {how} (band: 95 % over episodes)", ylabel="latent error / persistence")
+    curves = {name: over_persistence(model.errors, "rollout") for name, model in evaluation.models.items()}
+    axes = _by_horizon(figure, evaluation, curves, level=(1.0, PERSISTENCE))
+    axes.set(title="L1 error by horizon, open loop (band: 95 % over episodes)", ylabel="latent error / persistence")
     axes.set_ylim(0, None)
 
 
-def draw_gains(figure: Any, evaluation: Evaluation, base: PredictionErrors) -> None:
-    """Draw the gain of the models over the base by horizon."""
-    errors = {name: model.errors for name, model in evaluation.models.items()}
-    gains = {name: gain_over(one, base) for name, one in errors.items() if one is not base}
+def _draw_gains(figure: Any, evaluation: Evaluation) -> None:
+    base = evaluation.models[str(evaluation.base)]
+    others = [model for model in evaluation.models.values() if model is not base]
+    gains = {model.name: gain_over(model.errors, base.errors) for model in others}
     axes = _by_horizon(figure, evaluation, gains, level=(0.0, "the base"))
     axes.set(title="Gain over the base, open loop, L1 (above 0: better)", ylabel="gain over the base")
     axes.yaxis.set_major_formatter("{x:.0%}")
 
 
-def draw_spread(figure: Any, evaluation: Evaluation) -> None:
-    """Draw the spread of predictions over that of the truth by horizon."""
+def _draw_spread(figure: Any, evaluation: Evaluation) -> None:
     curves = {name: one.distribution.spread for name, one in evaluation.models.items() if one.distribution is not None}
     axes = _by_horizon(figure, evaluation, curves, level=(1.0, "the truth"))
     axes.set(title="Spread of predicted latents, open loop (1: as varied as the truth)", ylabel="spread / the truth's")
     axes.set_ylim(0, None)
 
 
-def draw_decoded(figure: Any, evaluation: Evaluation, found: DecodedRollouts) -> None:
-    """Draw the PSNR of decoded rollouts by horizon, where something moves if the true frames say so."""
-    finite = {name for (_, name), curve in found.curves.items() if any(math.isfinite(one.value) for one in curve)}
+def draw_decoded(figure: Any, evaluation: Evaluation) -> None:
+    """Draw the PSNR of decoded rollouts by horizon: where something moves, if there are true frames."""
+    decoded = evaluation.decoded
+    assert decoded is not None  # noqa: S101  # else there is no such drawing
+    finite = {name for (_, name), curve in decoded.curves.items() if any(math.isfinite(one.value) for one in curve)}
     names = ("psnr_db.moving.truth", "psnr_db.whole.truth", "psnr_db.whole.decoded_truth")
-    metric = max(names, key=lambda name: (name in finite, (found.sources[0], name) in found.curves))
-    curves = {source.replace("_", " "): found.curves[source, metric] for source in found.sources}
+    metric = max(names, key=lambda name: (name in finite, (decoded.sources[0], name) in decoded.curves))
+    curves = {source.replace("_", " "): decoded.curves[source, metric] for source in decoded.sources}
     axes = _by_horizon(figure, evaluation, curves, level=None)
     _, region, reference = metric.split(".")
     where = "where something moves" if region == "moving" else "of the whole image"
@@ -164,49 +145,11 @@ def draw_use_of_actions(figure: Any, evaluation: Evaluation) -> None:
     axes.set(title="Does it use the actions?", xlabel="actions given", ylabel="one-step error / persistence")
 
 
-def draw_ranks(figure: Any, evaluation: Evaluation) -> None:
-    """Draw the share of moves up to each action-ranking error, by model."""
-    axes = figure.subplots()
-    errors = np.linspace(0, 100, 51)
-    axes.plot([0, 100], [0, 100], color=GREY, linestyle=":", label="chance")
-    for name, colour in _colours(evaluation.models).items():
-        if (ranking := evaluation.models[name].ranking) is not None:
-            shares = 100 * np.searchsorted(np.sort(ranking.ranks), errors / 100, side="right") / len(ranking.ranks)
-            axes.plot(errors, shares, color=colour, label=_short(name))
-    axes.set(title="Action-ranking error of every move (0 %: best)")
-    axes.set(xlabel="action-ranking error (%)", ylabel="share of moves up to it (%)")
-    axes.legend()
-
-
-def draw_episodes(figure: Any, evaluation: Evaluation) -> None:
-    """Draw the error over persistence of every episode, best first."""
-    axes = figure.subplots()
-    values = [score.over_persistence for score in evaluation.episodes]
-    axes.plot(range(1, len(values) + 1), values, "o-", color=BLUE, markersize=3)
-    axes.axhline(1.0, color=GREY, linestyle="--")
-    axes.set(title="Error of every episode at the last horizon", xlabel="episodes, best first", ylim=(0, None))
-    axes.set_ylabel("L1 error / persistence")
-
-
-def draw_plans(figure: Any, evaluation: Evaluation, study: PlanningStudy) -> None:
-    """Draw where plans of three steps end, along each axis, against where the demonstrations do."""
-    colours = _colours(evaluation.models)
-    for axis, axes in enumerate(figure.subplots(1, len(AXES))):
-        demonstrated = 100 * study.demonstrated[..., axis].sum(axis=-1)
-        for name, plans in ways_of(evaluation).items():
-            planned = 100 * plans.three_steps[0, ..., axis].sum(axis=-1)
-            axes.scatter(demonstrated, planned, s=12, color=colours[name], label=_short(name))
-        axes.axline((0, 0), slope=1, color=GREY, linestyle="--")
-        axes.axhline(0, color=GREY, linewidth=0.8)
-        axes.set(xlabel=f"demonstrated along {AXES[axis]} (cm)", ylabel=f"planned along {AXES[axis]} (cm)")
-        axes.legend()
-
-
-def draw_landscapes(figure: Any, evaluation: Evaluation) -> None:
+def _draw_landscapes(figure: Any, evaluation: Evaluation) -> None:
     """Draw slices of the energy through the true action: of the base and the evaluated model, of three clips."""
     models = {name: model.landscapes for name, model in evaluation.models.items()}
     drawn = {name: one for name, one in models.items() if one and name in {evaluation.base, evaluation.trained}}
-    places = landscape_clips(evaluation)
+    places = _landscape_clips(evaluation)
     grid = figure.subplots(len(places) * len(drawn), 3, squeeze=False)
     for row, (place, (name, found)) in zip(grid, itertools.product(places, drawn.items()), strict=True):
         for axes, (first, second) in zip(row, itertools.combinations(range(3), 2), strict=True):
@@ -214,7 +157,7 @@ def draw_landscapes(figure: Any, evaluation: Evaluation) -> None:
         row[0].set_title(f"{_short(name)}, clip {place + 1}", loc="left")
 
 
-def landscape_clips(evaluation: Evaluation) -> list[int]:
+def _landscape_clips(evaluation: Evaluation) -> list[int]:
     """Return the clips whose landscapes are shown: of the nearest, the median and the farthest minimum."""
     found = evaluation.models[evaluation.trained].landscapes
     if found is None:
@@ -237,56 +180,16 @@ def _plane(axes: Any, landscapes: Landscapes, place: int, first: int, second: in
     axes.set(xlabel=landscapes.axis_names[first] + unit, ylabel=landscapes.axis_names[second] + unit)
 
 
-def draw_training(figure: Any, evaluation: Evaluation) -> None:
-    """Draw the metrics of training over optimizer steps, those of one kind in one chart."""
-    charts = training_charts(evaluation.training)
-    columns = min(3, len(charts))
-    grid = figure.subplots(-(-len(charts) // columns), columns, squeeze=False).flat
-    for (kind, curves), axes in zip(charts.items(), grid, strict=False):
-        for curve in curves:
-            every = -(-len(curve.steps) // _MOST_POINTS)
-            kept = sorted({*range(0, len(curve.steps), every), len(curve.steps) - 1})
-            label = _short(curve.name.rpartition("/")[2].replace("_", " "))
-            axes.plot([curve.steps[k] for k in kept], [curve.values[k] for k in kept], label=label)
-        axes.set(title=_short(kind))
-        axes.legend(fontsize=7)
-    for axes in grid:
-        axes.set_axis_off()
-
-
-def training_charts(curves: Sequence[TrainingCurve]) -> dict[str, list[TrainingCurve]]:
-    """Return the curves by chart: losses, errors of validation, and each other in its own; important ones first."""
-    charts: dict[str, list[TrainingCurve]] = {}
-    for curve in curves:
-        if any(map(math.isfinite, curve.values)):
-            where, _, what = curve.name.rpartition("/")
-            kind = f"{where}: {what.replace('_', ' ')}" if where == "validation" else what.replace("_", " ")
-            if where == "validation" and "over_persistence" in what:
-                kind = "validation: error / persistence"
-            elif what.startswith("loss") and what != "loss_scale":
-                kind = "training loss"
-            charts.setdefault(kind, []).append(curve)
-
-    def rank(kind: str) -> int:
-        names = charts[kind][0].name
-        return next((place for place, name in enumerate(_DRAWN_FIRST) if name in names), len(_DRAWN_FIRST))
-
-    return {kind: charts[kind] for kind in sorted(charts, key=rank)[:_MOST_CHARTS]}
-
-
 def example_strip(evaluation: Evaluation, example: Example) -> FilmStrip:
-    """Return an example clip: its frames, the error of each patch over them, and true and predicted latents."""
-    frames = example.true_colours if example.frames is None else example.frames
+    """Return an example clip: its frames, and the error of each patch over them; grey without frames."""
+    steps = 1 + len(example.errors[PERSISTENCE])
+    frames = np.full((steps, _GREY_PX, _GREY_PX, 3), 128, np.uint8) if example.frames is None else example.frames
     worst = max(float(errors.max()) for errors in example.errors.values())
     rows = [] if example.frames is None else [StripRow("true frames", "recorded", frames)]
     for name, errors in example.errors.items():
         shown = [_overlay(frame, of_frame, worst) for frame, of_frame in zip(frames, (None, *errors), strict=True)]
         captions = ("", *(f"mean {of_frame.mean():.3f}" for of_frame in errors))
         rows.append(StripRow(f"error of {_short(name)}", "error", np.stack(shown), captions))
-    rows.append(StripRow("true latents", "latents", example.true_colours))
-    for name, colours in example.predicted_colours.items():
-        whole = np.concatenate([example.true_colours[:1], colours])
-        rows.append(StripRow(f"latents predicted\nby {_short(name)}", "latents", whole))
     seconds = tuple(time * evaluation.about.seconds_per_step for time in range(len(frames)))
     return FilmStrip(f"{visible(example.why)[:80]}: from control step {example.start}", tuple(rows), seconds)
 

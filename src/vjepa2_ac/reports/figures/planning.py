@@ -1,4 +1,4 @@
-"""Figures of planning: a plan, the goals of a demonstration, and the axes of a model."""
+"""Figures of planning: a plan, the goals of a demonstration, and a watched episode."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from vjepa2_ac.planning.decision import PlanResult, summarize
 from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
-    from vjepa2_ac.evaluation.calibration.axes import AxisFit
     from vjepa2_ac.evaluation.imagined import ImaginedPlan
     from vjepa2_ac.goals.make_goals import EnergyCourse, MadeGoals
     from vjepa2_ac.planning.planner import Plan
@@ -233,29 +232,6 @@ def _energy(axes: Any, made: MadeGoals, course: EnergyCourse) -> None:
         axes.axhline(made.noise.energy, color=RED, linewidth=1.0, linestyle="--", label="noise of a resting arm")
     axes.set(title="Energy along the demonstration", xlabel="frame", ylim=(0, None))
     axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=3)
-
-
-def plot_axes(fit: AxisFit, path: Path) -> Path:
-    """Write moves in the horizontal plane, and the robot's x and y as the model takes them, as PNG, atomically."""
-    with written_figure(path, 9.0, 4.6, dpi=110, size=9) as figure:
-        words = (
-            f"yaw {fit.yaw_degrees}, fitted yaw {fit.fitted_yaw_degrees}, gain {fit.gain}, condition {fit.condition}"
-        )
-        headline(figure, words)
-        left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-        reach = 105 * max(float(np.abs(moves[:, :2]).max()) for moves in (fit.executed, fit.inferred)) or 1.0
-        left.scatter(*(100 * fit.executed[:, :2].T), s=9, color=GREY, label="executed")
-        left.scatter(*(100 * fit.inferred[:, :2].T), s=9, color=BLUE, label="inferred by the model")
-        for axis, name in enumerate("xy"):
-            for moved, colour in ((np.eye(3)[:2, axis], GREY), (fit.matrix[:2, axis], ORANGE)):
-                along = 0.8 * reach * moved
-                right.annotate("", along, (0, 0), arrowprops={"arrowstyle": "->", "color": colour, "lw": 2})
-                right.annotate(name, along, color=colour)
-        right.set_title("the robot's axes (grey), and what the model takes them for", fontsize=9)
-        left.legend(frameon=False, fontsize=8, loc="upper left")
-        for axes in (left, right):
-            axes.set(xlabel="dx (cm)", ylabel="dy (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-    return path
 
 
 MONITOR_IMAGE = "monitor.png"

@@ -13,7 +13,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.evaluation.calibration.data import VariantProbe, probe_config
+from vjepa2_ac.inspection.probe import VariantProbe, probe_config
 from vjepa2_ac.model.checkpoints import load_base
 
 MakeConfig = Callable[..., Config]

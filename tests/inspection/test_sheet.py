@@ -10,8 +10,8 @@ from matplotlib.image import imread
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.transforms import crop_box
+from vjepa2_ac.inspection.sheet import Strip, pictures_per_row, plot_contact_sheet
 from vjepa2_ac.inspection.statistics import inspect_dataset
-from vjepa2_ac.reports.sheet import Strip, pictures_per_row, plot_contact_sheet
 
 pytestmark = pytest.mark.usefixtures("drawn")
 

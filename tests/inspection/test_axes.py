@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.evaluation.action_use import RolloutStart, start_of
-from vjepa2_ac.evaluation.calibration.axes import AxisFit, infer_axes
+from vjepa2_ac.inspection.axes import AxisFit, infer_axes
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.axes import Axes
 from worlds import TIME, Copier, Oracle, clips_batch
@@ -26,12 +26,6 @@ class Turned(Oracle):
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
         back = self.back.actions(actions) / torch.tensor([self.gain, self.side * self.gain, 1, 1, 1, 1, 1])
         return super().predict(latents, back, states, extrinsics)
-
-
-def turn(degrees: float, gain: float = 1.0) -> np.ndarray:
-    angle = np.deg2rad(degrees)
-    flat = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    return flat * [gain, gain, 1.0]
 
 
 def starts(**changes: object) -> list[RolloutStart]:
@@ -51,26 +45,16 @@ def fitted_to_turned(degrees: float) -> AxisFit:
 @pytest.mark.parametrize("degrees", [0.0, -60.0, 179.9])
 def test_the_angle_of_a_turned_oracle_is_recovered_within_half_a_degree(degrees: float) -> None:
     found = fitted_to_turned(degrees)
-    for yaw in (found.yaw_degrees, found.fitted_yaw_degrees):
-        assert yaw.value == pytest.approx(degrees, abs=0.5)
-        assert yaw.low <= yaw.value <= yaw.high < yaw.low + 3
+    yaw = found.yaw_degrees
+    assert yaw.value == pytest.approx(degrees, abs=0.5)
+    assert yaw.low <= yaw.value <= yaw.high < yaw.low + 3
     assert found.error.value == (1.0 if degrees == 0.0 else pytest.approx(0.0, abs=0.02))
-    assert found.gain.value == pytest.approx(1.0, abs=0.02)
-    assert found.condition.value == pytest.approx(1.0, abs=0.03)
     assert found.problem is None
     assert (found.pairs, found.episodes) == (CLIPS, CLIPS // 2)
 
 
-def test_gain_and_condition_are_those_of_the_matrix() -> None:
-    found = fitted(Turned(30.0, gain=0.6))
-    np.testing.assert_allclose(found.matrix, turn(30.0, gain=0.6), atol=0.04)
-    assert found.gain.value == pytest.approx(0.6, abs=0.02)
-    assert found.condition.value == pytest.approx(1 / 0.6, abs=0.1)
-    assert found.residual_cm.value < 0.5
-
-
-def test_a_model_that_ignores_actions_is_refused_as_ill_conditioned() -> None:
-    assert "ill-conditioned" in (fitted(Copier()).problem or "")
+def test_a_model_that_ignores_actions_is_refused() -> None:
+    assert (fitted(Copier()).problem or "").startswith("no better than none")
 
 
 def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are_refused() -> None:
@@ -82,7 +66,7 @@ def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are
 
 
 def test_mirrored_axes_and_one_episode_are_refused_by_name() -> None:
-    assert "mirrored" in (fitted(Turned(0.0, mirrored=True)).problem or "")
+    assert fitted(Turned(0.0, mirrored=True)).problem is not None
     batch = clips_batch(2)
     alone = infer_axes(Oracle(), [start_of(batch, clip, step) for clip in (0, 1) for step in range(TIME - 1)],
                        at_once=64)  # fmt: skip

@@ -1,0 +1,241 @@
+"""Calibration of axes: the angle about the vertical between the axes of a model and those of the robot.
+
+States and actions are turned by angles all around, about the robot's base and about the middle of the motion; taken is
+the angle at which the model predicts the next frame best.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from vjepa2_ac import __version__
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import validation_batches
+from vjepa2_ac.distributed import make_accelerator
+from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.errors import counted
+from vjepa2_ac.evaluation.action_use import RolloutStart, start_of
+from vjepa2_ac.evaluation.calibration.variants import load_named
+from vjepa2_ac.evaluation.measure import Predictor
+from vjepa2_ac.intervals import Estimate, bootstrapped, ratio
+from vjepa2_ac.media.figure import BLUE, GREY, headline, written_figure
+from vjepa2_ac.model.adapter.lora import merge_adapter
+from vjepa2_ac.model.distances import squared_difference
+from vjepa2_ac.planning.axes import AXES_FORMAT, Axes, require_axes_in
+from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
+from vjepa2_ac.storage.structured import utc_now
+
+MOST_YAW_DEGREES = 15.0  # half the width of the interval of an angle that is known
+EPISODES_NEEDED = 2  # for an interval
+TRIED_DEGREES = tuple(range(-180, 180, 15))
+_UNTURNED = TRIED_DEGREES.index(0)
+
+
+@dataclass(frozen=True)
+class AxisFit:
+    """The angle about z, counterclockwise from above, at which a model predicts best what the robot does."""
+
+    yaw_degrees: Estimate
+    error: Estimate  # squared error of the next frame at the tried angle next to the yaw, over that of no turn
+    by_angle: tuple[float, ...]  # the same at each of `TRIED_DEGREES`
+    pairs: int  # of frames
+    episodes: int
+    centre_m: tuple[float, float]  # x, y about which states are turned by the yaw
+
+    @property
+    def problem(self) -> str | None:
+        """Why nothing can be planned by it, as text; None: it can."""
+        yaw, half = self.yaw_degrees, (self.yaw_degrees.high - self.yaw_degrees.low) / 2
+        if self.episodes < EPISODES_NEEDED:
+            return f"pairs of {self.episodes} episode, and an interval needs {EPISODES_NEEDED}"
+        if _nearest_tried(yaw.value) != _UNTURNED and not self.error.high < 1.0:
+            return f"no better than none: squared error {self.error} of that without a turn"
+        if not half <= MOST_YAW_DEGREES:
+            return f"uncertain: yaw {yaw.value:.0f} degrees, 95 % interval {yaw.low:.0f} to {yaw.high:.0f}"
+        return None
+
+    def words(self) -> str:
+        """Return the result as a sentence, and whether it can be planned by."""
+        yaw, (x, y) = self.yaw_degrees, self.centre_m
+        centre = f"the middle of its motion, x {x:.2f} y {y:.2f} m" if any(self.centre_m) else "its base"
+        between = f" (95 % interval {yaw.low:.0f} to {yaw.high:.0f})" if yaw.has_interval else ""
+        text = (
+            f"The model predicts best if the robot's motion is turned by {yaw.value:+.1f} degrees about {centre}"
+            f"{between}: squared error {self.error} of that without a turn"
+            f" ({self.pairs} pairs of {counted(self.episodes, 'episode')})."
+        )
+        return text if self.problem is None else f"{text} Not to plan by: {self.problem}."
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all numbers as plain values, for JSON."""
+        return {
+            "yaw_degrees": self.yaw_degrees.as_dict(),
+            "error": self.error.as_dict(),
+            "error_by_degrees": dict(zip(map(str, TRIED_DEGREES), self.by_angle, strict=True)),
+            "centre_m": list(self.centre_m),
+            **{name: getattr(self, name) for name in ("pairs", "episodes", "problem")},
+        }
+
+
+def fit_axes(
+    errors: Float[np.ndarray, "pairs angles"], episode_ids: Sequence[str], centre_m: tuple[float, float] = (0.0, 0.0)
+) -> AxisFit:
+    """Return the angle of least error, from a parabola through the least of the tried ones and its two neighbours.
+
+    Args:
+        errors: Squared errors of the next frame at each of `TRIED_DEGREES`.
+        episode_ids: Of each pair; whole episodes are resampled for the intervals.
+        centre_m: x, y about which states were turned.
+    """
+    nearby = _least(errors.sum(axis=0))
+
+    def of_sums(sums: Float[np.ndarray, "1 *batch angles"]) -> Float[np.ndarray, "*batch 1"]:
+        return np.asarray((nearby + _wrapped(_least(sums[0]) - nearby))[..., None])
+
+    (yaw,) = bootstrapped(of_sums, errors[None], episode_ids)
+    return AxisFit(
+        yaw_degrees=yaw,
+        error=ratio(errors[:, _nearest_tried(yaw.value)], errors[:, _UNTURNED], episode_ids),
+        by_angle=tuple((errors.sum(axis=0) / errors[:, _UNTURNED].sum()).tolist()),
+        pairs=len(errors),
+        episodes=len(set(episode_ids)),
+        centre_m=centre_m,
+    )
+
+
+def _nearest_tried(degrees: float) -> int:
+    return int(np.abs(_wrapped(np.array(TRIED_DEGREES) - degrees)).argmin())
+
+
+def _least(errors: Float[np.ndarray, "*batch angles"]) -> Float[np.ndarray, "*batch"]:
+    place = errors.argmin(axis=-1)[..., None]
+    before, least, after = (
+        np.take_along_axis(errors, (place + step) % errors.shape[-1], axis=-1)[..., 0] for step in (-1, 0, 1)
+    )
+    bend = before - 2 * least + after
+    shift = np.divide(before - after, 2 * bend, out=np.zeros_like(bend), where=bend > 0)
+    step = TRIED_DEGREES[1] - TRIED_DEGREES[0]
+    return np.asarray(_wrapped(TRIED_DEGREES[0] + step * (place[..., 0] + shift)))
+
+
+def _wrapped(degrees: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """Return angles within -180 .. 180: an interval may go across it."""
+    return np.asarray(np.remainder(degrees + 180.0, 360.0) - 180.0)
+
+
+@torch.no_grad()
+def infer_axes(
+    model: Predictor, starts: Sequence[RolloutStart], at_once: int, progress: Progress = no_progress
+) -> AxisFit:
+    """Find the angle by which a model's axes are turned.
+
+    Args:
+        model: The predictor.
+        starts: Of poses in the robot's base frame; one or more.
+        at_once: Samples per batch.
+        progress: Called with the number of finished starts.
+    """
+    # A turned mounting turns states about the robot's base. A turned camera turns them about the point that it looks
+    # at, which is near the middle of the motion.
+    x, y = np.mean([start.state[:2].cpu().double().numpy() for start in starts], axis=0)
+    centres = ((0.0, 0.0), (float(x), float(y)))
+    errors = np.zeros((len(centres), len(starts), len(TRIED_DEGREES)))
+    for number, start in enumerate(starts):
+        for of_centre, centre in zip(errors, centres, strict=True):
+            of_centre[number] = _errors_by_angle(model, start, centre, at_once)
+        progress(number + 1, len(starts))
+    best = int(errors.sum(axis=1).min(axis=1).argmin())
+    return fit_axes(errors[best], [start.episode_id for start in starts], centres[best])
+
+
+def _errors_by_angle(
+    model: Predictor, start: RolloutStart, centre_m: tuple[float, float], at_once: int
+) -> Float[np.ndarray, " angles"]:
+    """Return the mean squared error of the next frame at each angle of `TRIED_DEGREES`, with the executed action."""
+    turns = [Axes(math.radians(angle), centre_m) for angle in TRIED_DEGREES]
+    states = torch.stack([turn.poses(start.state) for turn in turns])[:, None]
+    actions = torch.stack([turn.actions(start.action) for turn in turns])[:, None]
+    cameras = None
+    if start.extrinsics is not None:
+        cameras = torch.stack([turn.poses(start.extrinsics) for turn in turns])[:, None]
+    errors = []
+    for first in range(0, len(turns), at_once):
+        part = slice(first, first + at_once)
+        frames = start.frame.expand(len(states[part]), 1, *start.frame.shape)
+        camera = None if cameras is None else cameras[part]
+        predicted = model.predict(frames, actions[part], states[part], camera)
+        errors.append(squared_difference(predicted[:, 0], start.following).mean(dim=(1, 2)))
+    return torch.cat(errors).double().cpu().numpy()
+
+
+def calibrate_axes(
+    config: Config, model: str, *, pairs: int, split: Split = "validation", reporter: Reporter = SILENT
+) -> tuple[AxisFit, dict[str, Any]]:
+    """Fit the axes of a model to recorded pairs of frames, one model step apart.
+
+    The model predicts as it plans: with trained weights merged, in the base's type, without autocast.
+
+    Args:
+        config: The data, the device and the precision.
+        model: What `model.base` takes, or the folder of a run.
+        pairs: At most, spread over the episodes.
+        split: Of the data.
+        reporter: Shows the progress of indexing, encoding and predicting.
+
+    Returns:
+        The fit, and the content of axes.json, by the schema in docs/planning_reference.md.
+
+    Raises:
+        InputError: The data or the model cannot be used; or the states have no axes.
+    """
+    require_axes_in(config.data)
+    accelerator = make_accelerator(config)
+    settings = config.data.model_copy(update={"frames": 2})
+    dataset = open_dataset(settings, progress=reporter.task(INDEXING))
+    reporter.task(LOADING)
+    world_model = load_named(config, dataset, model)
+    known = world_model.fingerprints()
+    if world_model.adaptation is not None:
+        merge_adapter(world_model)
+    world_model.to(accelerator.device).eval()
+    starts: list[RolloutStart] = []
+    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
+    with torch.no_grad():
+        for batch in validation_batches(dataset, split, clips=pairs, batch_size=config.validation.batch_size):
+            latents = encode(batch)
+            starts += [start_of(latents, row, 0) for row in range(len(batch.starts))]
+    fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("turning the axes"))
+    data = config.data
+    return fit, {
+        "format": AXES_FORMAT,
+        "verdict": fit.words(),
+        **fit.as_dict(),
+        "model": {"subject": model, **known._asdict()},
+        "data": {"path": data.path, "cameras": list(data.cameras), "stride": data.model_stride, "split": split},
+        "version": __version__,
+        "time": utc_now(),
+    }
+
+
+def plot_axes(fit: AxisFit, path: Path) -> Path:
+    """Write the error at each tried angle as PNG; it is written atomically."""
+    with written_figure(path, 6.4, 3.6, dpi=110, size=9) as figure:
+        headline(figure, f"yaw {fit.yaw_degrees:.1f} degrees")
+        axes = figure.subplots()
+        axes.plot(TRIED_DEGREES, fit.by_angle, "o-", color=BLUE, markersize=3)
+        axes.axhline(1.0, color=GREY, linestyle="--")
+        axes.axvline(fit.yaw_degrees.value, color=GREY, linestyle=":")
+        axes.set(xlabel="turn about the vertical (degrees)", ylabel="squared error / that without a turn")
+    return path
