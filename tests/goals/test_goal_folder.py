@@ -1,7 +1,6 @@
 """A folder of goals: what is written is read again, and what is broken is refused by name."""
 
 import json
-import logging
 import os
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,8 @@ import pytest
 from decisions import image
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.media.images import encode_png
-from vjepa2_ac.planning.goals import GOALS_FILE, NoiseFloor, SubGoal, read_goal_folder, write_goals
+from vjepa2_ac.planning.goals import GOALS_FILE, SubGoal, read_goal_folder, write_goals
 
-NOISE = NoiseFloor(0.08, 12, "a" * 64, "l1")
 GOALS = (
     SubGoal(image(1), "before closing", 2, 8, 0.5, "held"),
     SubGoal(image(2), "closed", 1, 4, None, "close"),
@@ -24,25 +22,30 @@ GOALS = (
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    write_goals(tmp_path / "goals", GOALS, frames=(8, 12, 30), began=(0.3, 0.1, 0.4), noise=NOISE, origin={"by": "me"})
+    write_goals(tmp_path / "goals", GOALS, frames=(8, 12, 30), origin={"by": "me"})
     return tmp_path / "goals"
 
 
 def settings(goal: SubGoal) -> tuple:
-    return goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper, goal.floor
+    return goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper
 
 
 def test_what_is_written_is_read_again(folder: Path) -> None:
     found = read_goal_folder(folder)
-    assert [settings(goal) for goal in found.goals] == [settings(goal) for goal in GOALS]
-    for goal, written in zip(found.goals, GOALS, strict=True):
+    assert [settings(goal) for goal in found] == [settings(goal) for goal in GOALS]
+    for goal, written in zip(found, GOALS, strict=True):
         np.testing.assert_array_equal(goal.image, written.image)
-    assert (found.began, found.noise) == ((0.3, 0.1, 0.4), NOISE)
     written = json.loads((folder / GOALS_FILE).read_text())
     assert written["origin"] == {"by": "me"}
     assert [goal["frame"] for goal in written["goals"]] == [8, 12, 30]
-    assert len(read_goal_folder(folder).goals) == 3
     assert sorted(path.name for path in folder.iterdir()) == ["goal_1.png", "goal_2.png", "goal_3.png", GOALS_FILE]
+
+
+def test_noise_and_energies_of_older_versions_are_ignored(folder: Path) -> None:
+    noise = {"energy": 0.08, "pairs": 12, "encoder": "a" * 64, "distance": "l1"}
+    edit(folder, lambda content: content.update(noise=noise), None)
+    edit(folder, first(began=0.3))
+    assert len(read_goal_folder(folder)) == 3
 
 
 def test_a_folder_written_by_hand_needs_no_more_than_files(tmp_path: Path) -> None:
@@ -50,27 +53,9 @@ def test_a_folder_written_by_hand_needs_no_more_than_files(tmp_path: Path) -> No
         (tmp_path / name).write_bytes(encode_png(image(1)))
     written = {"format": 1, "goals": [{"file": "grasped.png", "at_most": 4, "at_least": 4}, {"file": "placed.png"}]}
     (tmp_path / GOALS_FILE).write_text(json.dumps(written))
-    first, last = read_goal_folder(tmp_path).goals
-    assert settings(first) == ("", 4, 4, None, None, 0.0)
-    assert settings(last) == ("", 1, None, None, None, 0.0)
-    assert len(read_goal_folder(tmp_path).for_model("b", "l1")) == 2
-
-
-def test_thresholds_are_kept_above_the_noise_of_the_same_encoder_only(
-    folder: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    found = read_goal_folder(folder)
-    with caplog.at_level(logging.WARNING):
-        assert [goal.floor for goal in found.for_model("a" * 64, "l1")] == [0.08] * 3
-        assert not caplog.records, "half of 0.3 is above 0.08"
-        for encoder, distance in (("b" * 64, "l1"), ("a" * 64, "l2")):
-            assert [goal.floor for goal in found.for_model(encoder, distance)] == [0.0] * 3
-            assert "does not guard their thresholds" in caplog.messages.pop()
-            caplog.clear()
-        edit(folder, lambda goals: goals[0].update(share=0.2))
-        assert read_goal_folder(folder).for_model("a" * 64, "l1")[0].floor == 0.08
-        expected = "goal 1: 20% of energy 0.3 is below the noise of a resting arm, 0.08: that is its threshold"
-        assert caplog.messages == [expected]
+    first, last = read_goal_folder(tmp_path)
+    assert settings(first) == ("", 4, 4, None, None)
+    assert settings(last) == ("", 1, None, None, None)
 
 
 def edit(folder: Path, change: Any, key: str | None = "goals") -> None:
@@ -150,7 +135,7 @@ def test_a_file_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> No
         with pytest.raises(UserError, match=complaint):
             read_goal_folder(folder)
     edit(folder, lambda goals: goals[1].update(file="inside.png"))
-    assert len(read_goal_folder(folder).goals) == 3
+    assert len(read_goal_folder(folder)) == 3
 
 
 def test_an_image_without_contrast_is_no_goal(folder: Path) -> None:

@@ -1,7 +1,6 @@
 """`vjepa2-ac goals` makes a folder of goals of an episode or a film, and `plan` and `simulate` take it."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ STATE = "0.4,0.0,0.3,3.1,0.0,0.1,0.2"
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set of two picks, a config, a model, a film of the first episode, and one of a resting arm with noise."""
+    """A data set of two picks, a config, a model, and a film."""
     here = tmp_path_factory.mktemp("workshop")
     record_dataset(here / "set", RecordingSpec("A", 41, seed=3, task="pick"), episodes=2)
     config = {"run_dir": str(here / "run"), "data": {"path": str(here / "set"), "frames": 4}, "model": {"base": "none"}}
@@ -36,8 +35,6 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames = [rng.integers(0, 256, (48, 64, 3), dtype=np.uint8) for _ in range(3)]
     ways = [np.linspace(0, 1, 12)[:, None, None, None] * (b.astype(float) - a) + a for a, b in [frames[:2], frames[1:]]]
     write_video(here / "film.mp4", np.concatenate(ways).astype(np.uint8), rate_hz=15.0)
-    still = [(frames[0] / 2 + rng.integers(0, 30, frames[0].shape)).astype(np.uint8) for _ in range(9)]
-    write_video(here / "still.mp4", still, rate_hz=15.0)
     return here
 
 
@@ -56,7 +53,6 @@ def test_an_episode_becomes_goals_by_its_gripper(
     assert [goal["frame"] for goal in file["goals"]] == [16, 18, 40]
     assert [(goal["at_least"], goal["at_most"]) for goal in file["goals"]] == [(3, 5), (1, 2), (5, None)]
     assert [goal["share"] for goal in file["goals"]] == [0.5, 0.5, None]
-    assert file["noise"] is None
     origin = file["origin"]
     assert (origin["data"], origin["by"], origin["stride"], origin["frames"]) == (
         str(workshop / "set"), "gripper", 4, 41,
@@ -64,32 +60,14 @@ def test_an_episode_becomes_goals_by_its_gripper(
     with Image.open(tmp_path / "goals/goals.png") as sheet:
         assert sheet.width == 1196
     printed = capsys.readouterr().out
-    assert "No energies and no noise floor: --model measures them." in printed
     assert "before closing" in printed
     assert str(tmp_path / "goals/goals.json") in printed
 
 
-def test_a_model_adds_energies_and_the_noise_of_a_resting_arm(
-    workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model = ["--model", str(workshop / "model"), "--share", "0.001"]
-    status, file = goals(workshop, tmp_path / "goals", *model, "--still", str(workshop / "still.mp4"))
-    assert status == 0
-    assert all(goal["began"] > 0 for goal in file["goals"])
-    noise = file["noise"]
-    assert (noise["pairs"], noise["distance"]) == (5, "l1"), "nine frames, pairs four apart"
-    assert noise["energy"] > 0.001 * file["goals"][0]["began"]
-    printed = capsys.readouterr().out
-    assert "Noise floor: energy" in printed
-    assert "Goal 1: its threshold" in printed
-    found = read_goal_folder(tmp_path / "goals").for_model(noise["encoder"], "l1")
-    assert [goal.floor for goal in found] == [noise["energy"]] * 3
-
-
 def test_an_episode_is_named_or_numbered_and_every_so_many_frames_are_taken(workshop: Path, tmp_path: Path) -> None:
-    _, numbered = goals(workshop, tmp_path / "a", "--episode", "1", "--by", "every", "10", "data.stride=5")
+    _, numbered = goals(workshop, tmp_path / "a", "--episode", "1", "--every", "10", "data.stride=5")
     name = numbered["origin"]["episode"]
-    _, named = goals(workshop, tmp_path / "b", "--episode", name, "--by", "every", "10", "data.stride=5")
+    _, named = goals(workshop, tmp_path / "b", "--episode", name, "--every", "10", "data.stride=5")
     assert named["goals"] == numbered["goals"]
     assert [goal["frame"] for goal in named["goals"]] == [10, 20, 30, 40]
     assert [goal["at_most"] for goal in named["goals"]] == [5, 5, 5, None]
@@ -111,7 +89,7 @@ def test_two_photographs_find_the_episode_that_they_are_alike(
         assert file["origin"]["episode"] == dataset.table.identity(index)
         first, second, *_, last = (goal["name"] for goal in file["goals"])
         assert (first, second, last) == ("before closing", "closed", "the photograph")
-        photograph = read_goal_folder(tmp_path / f"{index}").goals[-1].image
+        photograph = read_goal_folder(tmp_path / f"{index}")[-1].image
         np.testing.assert_array_equal(photograph, seen[1])
     Image.fromarray(seen[0, ::2]).save(tmp_path / "now.png")
     capsys.readouterr()
@@ -122,43 +100,19 @@ def test_two_photographs_find_the_episode_that_they_are_alike(
     assert "the image of the start: 320 x 90 pixels (width x height). needed: 320 x 180" in capsys.readouterr().err
 
 
-def test_a_demonstration_that_cannot_be_read_is_left_out_of_those_alike(
-    workshop: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    copy = shutil.copytree(workshop / "set", tmp_path / "set")
-    (records,) = copy.glob("*.tfrecord*")
-    content = bytearray(records.read_bytes())
-    content[len(content) // 4] ^= 255  # within the first episode
-    records.write_bytes(content)
-    model = ["--model", str(workshop / "model"), f"data.path={copy}"]
-    dataset = open_dataset(workshop / "set", frames=4)
-    seen = np.array(dataset.source.read(0).read_frames([0, 40]))
-    for name, image in zip(("now", "goal"), seen, strict=True):
-        Image.fromarray(image).save(tmp_path / f"{name}.png")
-    photographs = ["--alike", str(tmp_path / "now.png"), str(tmp_path / "goal.png")]
-    status, file = goals(workshop, tmp_path / "goals", *model, *photographs)
+def test_a_film_becomes_goals_of_every_nth_frame(workshop: Path, tmp_path: Path) -> None:
+    words = ["--every", "8", "--stride", "4", "--stop-share", "0.3"]
+    status, file = goals(workshop, tmp_path / "goals", *words, source="film.mp4")
     assert status == 0
-    assert file["origin"]["episode"] == dataset.table.identity(1)
-    assert "1 of 2 episodes were left out" in caplog.text
-
-
-def test_a_film_without_states_becomes_goals_by_latents(workshop: Path, tmp_path: Path) -> None:
-    model = ["--model", str(workshop / "model")]
-    status, file = goals(
-        workshop, tmp_path / "goals", *model, "--stride", "2", "--stop-share", "0.3", source="film.mp4"
-    )
-    assert status == 0
-    assert [goal["frame"] for goal in file["goals"]][-1] == 23
+    assert [goal["frame"] for goal in file["goals"]] == [8, 16, 23]
     assert {goal["gripper"] for goal in file["goals"]} == {None}
     assert file["goals"][-1]["share"] == 0.3
     assert file["origin"]["film"] == str(workshop / "film.mp4")
-    status, plain = goals(workshop, tmp_path / "plain", "--by", "every", "8", "--stride", "4", source="film.mp4")
-    assert [goal["frame"] for goal in plain["goals"]] == [8, 16, 23]
 
 
 def test_plan_and_simulate_take_the_folder(workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, model = tmp_path / "goals", str(workshop / "model")
-    goals(workshop, folder, "--share", "0.5", "--model", model)
+    goals(workshop, folder, "--share", "0.5")
     given = ["--goals", str(folder), "--state", STATE, "--nodes", "0", "--out", str(tmp_path / "plan"), *QUICK]
     assert main(["plan", model, "--start", str(folder / "goal_3.png"), *given]) < 2
     plan = json.loads((tmp_path / "plan/plan.json").read_text())
@@ -200,23 +154,13 @@ def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
 @pytest.mark.parametrize(
     ("words", "wrong"),
     [
-        (["config.yaml", "--by", "every"], "--by: every. needed: gripper, latent, or every N"),
-        (["config.yaml", "--by", "sound"], "--by: sound"),
-        (["config.yaml", "--by", "latent"], "--by latent: no model"),
         (["config.yaml", "--alike", "a.png", "b.png"], "--alike: no model"),
         (["config.yaml", "--alike", "a.png", "b.png", "--model", "m", "--episode", "0"], "--alike: --episode, too"),
-        (["film.mp4", "--alike", "a.png", "b.png", "--model", "m", "--stride", "4"], "--alike: a film, too"),
-        (["config.yaml", "--still", "still.mp4"], "--still: no model"),
         (["config.yaml", "--episode", "9"], "--episode 9: no such episode"),
-        (["config.yaml", "--by", "every", "9", "--apart", "3"], "--apart"),
         (["config.yaml", "data.stride=auto"], "data.stride: auto"),
-        (["none.yaml"], "none.yaml"),
-        (["film.mp4", "--stride", "4"], "--by latent: no model"),
-        (["film.mp4", "--by", "gripper", "--stride", "4"], "--by gripper: film.mp4: no measured poses"),
-        (["film.mp4", "--by", "every", "9"], "--stride: a film"),
-        (["film.mp4", "--by", "every", "9", "--episode", "0"], "--episode"),
-        (["none.mp4", "--by", "every", "9", "--stride", "4"], "none.mp4: cannot be read"),
-        (["text.mp4", "--by", "every", "9", "--stride", "4"], "text.mp4: cannot be read as a video"),
+        (["film.mp4", "--stride", "4"], "film.mp4: no measured poses"),
+        (["film.mp4", "--every", "9"], "--stride: a film"),
+        (["text.mp4", "--every", "9", "--stride", "4"], "text.mp4: cannot be read as a video"),
     ],
 )
 def test_what_cannot_be_is_one_line_and_leaves_nothing(
@@ -233,19 +177,6 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_of_a_long_film_every_so_many_frames_are_looked_at(
-    workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("vjepa2_ac.goals.make_goals._MOST_ENCODED", 10)
-    given = ["--model", str(workshop / "model"), "--stride", "2", "--apart", "6"]
-    status, file = goals(workshop, tmp_path / "goals", *given, source="film.mp4")
-    assert status == 0
-    assert "encoding frames 9/9" in capsys.readouterr().out, "24 frames, every third, and the last"
-    frames = [goal["frame"] for goal in file["goals"]]
-    assert frames[-1] == 23
-    assert all(frame % 3 == 0 for frame in frames[:-1])
-
-
 def test_language_labels_become_goals_that_a_client_may_prompt(workshop: Path, tmp_path: Path) -> None:
     status = main(["goals", str(workshop / "config.yaml"), "--task", "BLOCK", "--out", str(tmp_path / "goals")])
     assert status == 0
@@ -253,7 +184,7 @@ def test_language_labels_become_goals_that_a_client_may_prompt(workshop: Path, t
     assert list(kept) == ["pick up the block"]
     source = open_dataset(workshop / "set", frames=4).source
     ends = [source.read(number).read_frames([40])[0] for number in range(2)]
-    shown = kept["pick up the block"].goals[0].image
+    shown = kept["pick up the block"][0].image
     assert any(np.array_equal(shown, end) for end in ends)
     assert main(["goals", str(workshop / "config.yaml"), "--task", "pour", "--out", str(tmp_path / "none")]) == 2
     assert not list((tmp_path / "none").glob("*"))

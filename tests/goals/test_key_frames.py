@@ -1,6 +1,4 @@
-"""Key frames of made-up demonstrations: by the gripper, by latents, and every so many."""
-
-from itertools import pairwise
+"""Key frames of made-up demonstrations: by the gripper, and every n-th frame."""
 
 import numpy as np
 import pytest
@@ -13,9 +11,6 @@ from vjepa2_ac.goals.key_frames import (
     Timing,
     every_key_frame,
     gripper_key_frames,
-    latent_key_frames,
-    resting,
-    resting_pairs,
     sub_goals_of,
     with_frames_between,
 )
@@ -109,34 +104,6 @@ def test_frames_between_keep_the_key_frames_and_are_so_far_apart(gaps: list[int]
     assert (ways < 1.5 * step).all() if step > 1 else (ways == 1).all()
 
 
-def embedded(*corners: float, frames: int = 20) -> np.ndarray:
-    """Return an embedding that goes evenly from corner to corner, with a little noise."""
-    line = np.concatenate([np.linspace(a, b, frames, endpoint=False) for a, b in pairwise(corners)])
-    return np.append(line, corners[-1]) + 0.002 * np.random.default_rng(0).standard_normal(len(line) + 1)
-
-
-def test_latents_that_turn_back_show_where_something_else_began() -> None:
-    """Reach out, come back a little, reach out again: farthest from each goal is where its approach began."""
-    values = embedded(0.0, 1.0, -0.5, 1.5)
-    found = latent_key_frames(len(values), lambda goal: np.abs(values - values[goal]), 8)
-    assert found[-1] == KeyFrame(len(values) - 1, "end")
-    assert [abs(key.frame - corner) <= 2 for key, corner in zip(found, (20, 40, 60), strict=True)] == [True] * 3
-
-
-def test_a_straight_way_has_one_goal() -> None:
-    values = embedded(0.0, 2.0, frames=50)
-    assert [key.frame for key in latent_key_frames(51, lambda goal: np.abs(values - values[goal]), 8)] == [50]
-
-
-@given(st.integers(0, 100), st.integers(1, 12), st.integers(2, 60))
-def test_goals_by_latents_are_so_far_apart(seed: int, least: int, frames: int) -> None:
-    values = np.random.default_rng(seed).standard_normal(frames).cumsum()
-    found = [key.frame for key in latent_key_frames(frames, lambda goal: np.abs(values - values[goal]), least)]
-    assert found[-1] == frames - 1
-    assert (np.diff(found) >= least).all()
-    assert len(found) == 1 or found[0] >= least
-
-
 def test_goals_have_the_durations_and_the_gripper_of_the_demonstration() -> None:
     states = way((10, 0.2, 0), (5, 0, 0.5), (21, 0.2, 0))
     keys = gripper_key_frames(states)
@@ -147,11 +114,3 @@ def test_goals_have_the_durations_and_the_gripper_of_the_demonstration() -> None
     assert [goal.share for goal in goals] == [0.5, 0.5, None]
     assert [goal.name for goal in goals] == ["before closing", "closed", "end"]
     assert [goal.gripper for goal in sub_goals_of(images, keys, Timing())] == [None] * 3
-
-
-def test_frames_between_which_the_arm_rests_are_found_in_pairs() -> None:
-    states = way((5, 0.2, 0), (4, 0, 0), (5, 0.2, 0), (3, 0, 0.4))
-    assert np.flatnonzero(resting(states)).tolist() == [5, 6, 7, 8]
-    assert resting_pairs(resting(states), 3).tolist() == [[5, 8], [6, 9]]
-    assert resting_pairs(resting(states), 9).tolist() == [[5, 9]], "as far apart as there are"
-    assert resting_pairs(resting(way((9, 0.3, 0))), 4).shape == (0, 2)

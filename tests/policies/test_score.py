@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from tiny_models import tiny_model
 from vjepa2_ac.api import open_dataset
@@ -189,55 +188,13 @@ def test_a_run_that_logged_the_older_key_is_still_checked(tmp_path: Path, whole_
     assert ranking_of_run(str(run), checkpoint) == ranking_of_run(str(whole_run), checkpoint)
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> list[str]:
-    for seed, name in enumerate(("start", "goal")):
-        pixels = np.random.default_rng(seed).integers(0, 256, (36, 64, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(tmp_path / f"{name}.png")
-    np.save(tmp_path / "chunks.npy", np.random.default_rng(0).normal(0, 0.01, (3, 4, 7)))
-    state = "0.4,0.0,0.3,3.1,0.0,0.1,0.2"
-    images = ["--start", str(tmp_path / "start.png"), "--goal", str(tmp_path / "goal.png"), "--state", state]
-    return [
-        *images,
-        "--chunks",
-        str(tmp_path / "chunks.npy"),
-        "--form",
-        "deltas",
-        "--out",
-        str(tmp_path / "score.json"),
-    ]
-
-
-def test_the_command_scores_the_chunks_of_a_scene(
-    whole_run: Path, base_folder: Path, scene: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    status = main(["score", str(whole_run), *scene])
-    found = json.loads((tmp_path / "score.json").read_text())
-    assert status == int(found["is_blind"])
-    assert (found["best"] is None) == found["is_blind"]
-    assert len(found["energies"]) == 3
-    capsys.readouterr()
-    assert main(["score", str(base_folder), *scene, "--control-steps", "2"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "Action ranking of this model: not measured" in said
-    assert "zero action" in said
-
-
-def test_the_command_scores_policies_and_joints_through_the_users_kinematics(
-    whole_run: Path, data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_scores_policies(whole_run: Path, data_folder: Path, tmp_path: Path) -> None:
     dataset = open_dataset(data_folder, frames=4, stride=2, workers=0)
-    name = dataset.table.identity(0)
-    poses = dataset.source.read(0).states[1:5]
-    np.savez(
-        tmp_path / "joints.npz", episodes=np.array([name]), frames=np.array([0]), chunks=poses[None, None, :, ::-1]
-    )
-    (tmp_path / "my_arm.py").write_text("def forward(joints):\n    return joints[..., ::-1]\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
-    words = ["score", str(whole_run), "--policy", "joints.npz", "--kinematics", "my_arm:forward"]
-    assert main(words) in {0, 1}
+    chunks = dataset.source.read(0).states[1:5][None, None]
+    place = {"episodes": np.array([dataset.table.identity(0)]), "frames": np.array([0])}
+    np.savez(tmp_path / "one.npz", chunks=chunks, **place)
+    words = ["--policy", str(tmp_path / "one.npz"), "--out", str(tmp_path / "score.json")]
+    assert main(["score", str(whole_run), *words]) in {0, 1}
     found = json.loads((tmp_path / "score.json").read_text())
     assert found["places"] == 1
     assert found["policies"][0]["mean"]["value"] == pytest.approx(found["demonstrated"]["value"], rel=1e-4)
-    assert main([*words[:-1], "my_arm:backward"]) == 2

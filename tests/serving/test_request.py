@@ -57,11 +57,10 @@ def rule(goal: SubGoal) -> tuple:
 def test_goals_in_order_may_have_rules_of_their_own() -> None:
     keys = {
         "goal/images": GOALS, "goal/durations": [9], "goal/at_least": [2, 3], "goal/shares": [0.25, 0.0],
-        "goal/grippers": ["held", ""], "goal/floors": [0.1, 0.0],
+        "goal/grippers": ["held", ""],
     }  # fmt: skip
     found = read_request({**OURS, **keys}).goal
     assert [rule(goal) for goal in found.goals] == [(2, 9, 0.25, "held"), (3, None, None, None)]
-    assert [goal.floor for goal in found.goals] == [0.1, 0.0]
     free = read_request({**OURS, "goal/images": GOALS, "goal/shares": np.array([0.25, 0.5])}).goal
     assert [rule(goal) for goal in free.goals] == [(1, None, 0.25, None), (1, None, 0.5, None)]
     assert rule(read_request({**OURS, "goal/image": image(1), "goal/shares": [0.5]}).goal.goals[0])[2] == 0.5
@@ -142,7 +141,6 @@ WRONG = {
         **OURS, "goal/images": GOALS, "goal/durations": [1], "goal/at_least": [1],
     },
     "goal/shares: \\[1, 0\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1], "goal/shares": [1, 0]},
-    "goal/floors: \\[-1, 0\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1], "goal/floors": [-1, 0]},
     "goal/durations: None": {**OURS, "goal/images": GOALS, "goal/shares": [0.0, 0.5]},
     "goal/grippers: \\['up', ''\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1], "goal/grippers": ["up", ""]},
     "goal/grippers: 'held'": {**OURS, "goal/image": image(1), "goal/grippers": "held"},

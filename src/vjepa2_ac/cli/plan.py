@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.config import Config
     from vjepa2_ac.config.planning import PlanningConfig
-    from vjepa2_ac.planning.goals import GoalFolder
+    from vjepa2_ac.planning.goals import SubGoal
 
 _QUICK = " ".join(QUICK_WORDS)
 _COLUMNS = 100
@@ -56,18 +56,17 @@ def add_goals(commands: cli.Commands) -> None:
     cli.add(parser, "--alike", text, nargs=2, metavar=("NOW", "GOAL"))
     text = "instead: the last frame of a successful episode of each language label with this text, for prompts"
     cli.add(parser, "--task TEXT", text, nargs="?", const="")
-    text = "gripper: where it changes or the arm stops; latent: by images; every N frames (gripper; of a film latent)"
-    cli.add(parser, "--by gripper|latent|every", text, nargs="+")
-    cli.add(parser, "--model RUN_OR_MODEL", "what will plan: for latents, energies and the noise floor", cli.as_model)
+    text = "instead of where the gripper changes or the arm stops: every N frames; needed for a film"
+    cli.add(parser, "--every N", text, cli.count)
+    cli.add(parser, "--model RUN_OR_MODEL", "the model that will plan, for --alike", cli.as_model)
     cli.add(parser, "--stride N", "frames of a model step (data.stride); needed of a film", cli.count)
     group = parser.add_argument_group("where goals lie, and when the next one follows")
     cli.add_checkpoint(group, default=None)
-    cli.add(group, "--apart N", "least frames from one goal to another (gripper: 4; latent: 4 model steps)", cli.count)
+    cli.add(group, "--apart N", "least frames from a stop of the arm to another goal (4)", cli.count, default=4)
     cli.add(group, "--slack N", "model steps that a goal may take fewer or more (3)", cli.whole_number(0), default=3)
     share, energy = cli.number_between(0.0, 1.0, "the energy"), "below this share of the energy at a goal's beginning"
     cli.add(group, "--share X", f"{energy} the next one follows (none: by steps only)", share)
     cli.add(group, "--stop-share X", f"{energy} the last one is reached (none: an equal image)", share)
-    cli.add(group, "--still VIDEO", "of the resting arm, for the noise floor (where the episode rests)", cli.as_path)
 
 
 def _plan(options: argparse.Namespace) -> int:
@@ -77,6 +76,7 @@ def _plan(options: argparse.Namespace) -> int:
     that the plan is worse than the zero action or than the current frame; the first line of the result then says so.
     """
     from vjepa2_ac.data.sources.indexed_source import measured_space
+    from vjepa2_ac.planning.goals import with_shares
 
     state, extrinsics = cli.as_numbers(options.state, "--state"), cli.camera_pose(options.extrinsics)
     cli.require_goals(options.goals)
@@ -84,13 +84,13 @@ def _plan(options: argparse.Namespace) -> int:
     measured_space(config.data, len(state)).require_state(state, "--state")  # how wide, only the model knows
     cli.make_folder(options.out)
     goals = _goals_of(options, config)
-    start, mask = _images(options, goals.goals[0].image)
+    with_shares(goals, config.planning.goals, first=1)
+    start, mask = _images(options, goals[0].image)
 
     from vjepa2_ac.cli.console.tables import plan_table
     from vjepa2_ac.evaluation.imagined import imagine_plan
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
-    from vjepa2_ac.planning.model_setup import goals_of
     from vjepa2_ac.reports.figures.planning import PLAN_IMAGE, plot_plan
     from vjepa2_ac.storage import user_can_write
 
@@ -98,7 +98,7 @@ def _plan(options: argparse.Namespace) -> int:
     session = cli.load_planning_session(options)
     if decoder is not None:
         decoder.require_fit(session.world_model, session.config.data, subject=options.subject)
-    request = PlanRequest(start, state, goals_of(goals, session), mask)
+    request = PlanRequest(start, state, goals, mask)
     with cli.reporter() as reporter:
         reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
         controller = Controller.of_subject(session, seed=options.seed, extrinsics=extrinsics)
@@ -142,10 +142,10 @@ def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, 
     return start, mask
 
 
-def _goals_of(options: argparse.Namespace, config: Config) -> GoalFolder:
+def _goals_of(options: argparse.Namespace, config: Config) -> tuple[SubGoal, ...]:
     """Return the goals of a folder; or images with the durations that were given, else with equal ones."""
     from vjepa2_ac.media.images import read_image, require_image
-    from vjepa2_ac.planning.goals import GoalFolder, equal_durations, read_goal_folder, timed
+    from vjepa2_ac.planning.goals import equal_durations, read_goal_folder, timed
 
     if options.goals is not None:
         if options.durations:
@@ -155,7 +155,7 @@ def _goals_of(options: argparse.Namespace, config: Config) -> GoalFolder:
     if options.goal_from is not None:
         from vjepa2_ac.goals.make_goals import frame_of_episode
 
-        return GoalFolder(timed([frame_of_episode(config.data, options.goal_from)], []))
+        return timed([frame_of_episode(config.data, options.goal_from)], [])
     images, count = [read_image(path) for path in options.goal], len(options.goal)
     for path, image in zip(options.goal, images, strict=True):
         require_image(image, where=f"--goal {path}", like=images[0])
@@ -164,16 +164,16 @@ def _goals_of(options: argparse.Namespace, config: Config) -> GoalFolder:
         found = f"{options.durations!r} for {count} goal{'s' * (count > 1)}"
         needed = f"{count - 1} whole numbers from 1, with commas between them: of each goal but the last"
         raise InputError(where="--durations", found=found, needed=needed)
-    return GoalFolder(timed(images, [int(word) for word in words] or equal_durations(config.planning.horizon, count)))
+    return timed(images, [int(word) for word in words] or equal_durations(config.planning.horizon, count))
 
 
 def _goals(options: argparse.Namespace) -> None:
-    """Make goals that follow one another, of a demonstration.
+    """Make goals that follow one another, from a demonstration.
 
-    They are key frames of an episode or a film, with durations and gripper, in a folder that `plan --goals` and
-    `simulate --goals` take, with a contact sheet.
+    The goals are key frames of an episode or a film, with durations and gripper modes, in a folder that `plan --goals`
+    and `simulate --goals` take, with a contact sheet.
     """
-    (by, every), photographs = _way(options), _photographs(options)
+    photographs = _photographs(options)
     cli.require_new_place(options.out)
     if options.task is not None:
         _goals_by_label(options)
@@ -181,39 +181,32 @@ def _goals(options: argparse.Namespace) -> None:
     config = None if _is_film(options) else cli.read_config(options.source, options.overrides)
     stride = _stride(options, config)
 
-    from vjepa2_ac.cli.console.tables import goals_notes, goals_table
-    from vjepa2_ac.goals.make_goals import (
-        KeyFrameOptions,
-        make_goals,
-        recording_of_episode,
-        recording_of_film,
-    )
+    from vjepa2_ac.cli.console.tables import goals_table
+    from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals, recording_of_episode, recording_of_film
     from vjepa2_ac.goals.nearest import demonstrations_alike, ending_with
     from vjepa2_ac.planning.model_setup import load_to_plan
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
     from vjepa2_ac.storage import user_can_write
 
-    still = None if options.still is None else recording_of_film(options.still)
-    session = None
-    if options.model is not None:
-        cli.say_places_elsewhere(options.model)
-        session = load_to_plan(options.model, checkpoint=options.checkpoint or "selected")
-    chosen = cli.record_of_options(KeyFrameOptions, options, by=by, every=every, stride=stride)
+    by = "gripper" if options.every is None else "every"
+    chosen = cli.record_of_options(KeyFrameOptions, options, by=by, stride=stride)
     with cli.reporter() as reporter:
         if config is None:
             recording = recording_of_film(Path(options.source))
-        elif photographs is not None and session is not None:
+        elif photographs is not None:
+            cli.say_places_elsewhere(options.model)
+            session = load_to_plan(options.model, checkpoint=options.checkpoint or "selected")
             (recording,) = demonstrations_alike(config.data, session, [photographs], reporter)
         else:
             progress, views = reporter.task(INDEXING), config.planning.views
             recording = recording_of_episode(config.data, options.episode or "0", progress, views=views)
-        made = make_goals(recording, chosen, session, still=still, reporter=reporter)
+    made = make_goals(recording, chosen)
     if photographs is not None:
         made = ending_with(made, photographs[1])
     with user_can_write(options.out):
         written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
-    cli.show(goals_table(made), *goals_notes(made), files=written)
+    cli.show(goals_table(made), files=written)
 
 
 def _goals_by_label(options: argparse.Namespace) -> None:
@@ -228,29 +221,6 @@ def _goals_by_label(options: argparse.Namespace) -> None:
 
 def _is_film(options: argparse.Namespace) -> bool:
     return Path(options.source).suffix.lower() in _FILMS
-
-
-def _way(options: argparse.Namespace) -> tuple[str, int | None]:
-    """Return how key frames are found, and of `every` how many frames apart; give back words that are no part of it."""
-    words = [word for word in options.by or () if "=" not in word]
-    options.overrides = [*options.overrides, *(word for word in options.by or () if "=" in word)]
-    way, *rest = words or ["latent" if _is_film(options) else "gripper"]
-    is_every = way == "every" and len(rest) == 1 and rest[0].isdecimal() and int(rest[0]) > 0
-    if not is_every and (way not in {"gripper", "latent"} or rest):
-        needed = "gripper, latent, or every N, with a number of frames"
-        raise InputError(where="--by", found=" ".join(words), needed=needed)
-    needs_model = {
-        "--by latent": way == "latent",
-        "--still": options.still,
-        "--alike": options.alike,
-        "--checkpoint": options.checkpoint,
-    }
-    for name, given in needs_model.items():
-        if given and options.model is None:
-            raise InputError(where=name, found="no model", needed="--model RUN_OR_MODEL")
-    if is_every and options.apart is not None:
-        raise InputError(where="--apart", found="--by every N", needed="one of them: N frames are between its goals")
-    return way, int(rest[0]) if is_every else None
 
 
 def _stride(options: argparse.Namespace, config: Config | None) -> int:
@@ -275,6 +245,8 @@ def _photographs(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray] |
     """Return start and goal to which a demonstration is to be alike; None: other ways to choose one are given."""
     if options.alike is None:
         return None
+    if options.model is None:
+        raise InputError(where="--alike", found="no model", needed="--model RUN_OR_MODEL")
     others = {"a film": _is_film(options), "--episode": options.episode, "--task": options.task is not None}
     for name, given in others.items():
         if given:

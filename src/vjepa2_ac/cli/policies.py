@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError, counted
-
-if TYPE_CHECKING:
-    import numpy as np
 
 _FORMS = ("targets", "deltas", "offsets")
 
@@ -22,21 +17,12 @@ def add_score(commands: cli.Commands) -> None:
     example = "demo/run --policy mine.npz --policy other.npz"
     parser = cli.command(commands, "score", _score, example)
     cli.add_planner(parser, such_as="such as planning.energy.distance=l2")
-    given = parser.add_mutually_exclusive_group(required=True)
-    cli.add(given, "--chunks FILE", "what a policy would do now: .npy, chunks x control steps x numbers", cli.as_path)
-    text = "or what one would do at frames of the data's episodes: .npz; again for others"
-    cli.add(given, "--policy FILE", text, cli.as_path, action="append", dest="policies")
+    text = "what a policy would do at frames of the data's episodes: .npz; again for others"
+    cli.add(parser, "--policy FILE", text, cli.as_path, action="append", dest="policies", required=True)
     text = "numbers are poses to reach, changes from pose to pose, or of all poses from the present one (targets)"
     cli.add(parser, "--form FORM", text, choices=_FORMS, default="targets")
     cli.add(parser, "--control-steps N", "of a chunk, in a model step (data.stride)", cli.count)
-    text = "of joints: a function of yours from chunks x steps x joints to x,y,z,roll,pitch,yaw,gripper"
-    cli.add(parser, "--kinematics MODULE:FUNCTION", text)
-    cli.add(parser, "--out FILE", "where the figures go, as JSON (score.json)", cli.as_path, default=Path("score.json"))
-    group = parser.add_argument_group("with --chunks: the present, and the goal")
-    cli.add(group, "--start IMAGE", "what the camera sees now: PNG or JPEG", cli.as_local)
-    cli.add(group, "--state NUMBERS", "measured x,y,z,roll,pitch,yaw,gripper; or a vector")
-    cli.add(group, "--goal IMAGE", "what it is to see", cli.as_local)
-    cli.add(group, "--goals FOLDER", "goals that `vjepa2-ac goals` made; the first one counts", cli.as_path)
+    cli.add(parser, "--out FILE", "where the scores go, as JSON (score.json)", cli.as_path, default=Path("score.json"))
 
 
 def add_prior(commands: cli.Commands) -> None:
@@ -64,89 +50,12 @@ def add_monitor(commands: cli.Commands) -> None:
 
 
 def _score(options: argparse.Namespace) -> int:
-    """Score what a policy would do, by the energy of its actions.
+    """Rank policies by the energy of what they would do at frames of held-out episodes.
 
-    One chunk of actions is better than another if the model predicts that it leads nearer to the goal; both are shown
-    compared with the zero action. Or policies are put in order by what they would do at frames of held-out episodes.
-    Status 1 where the model cannot tell: it ranks true actions no better than chance.
+    A chunk of actions is better than another if the model predicts that it leads nearer to the goal. Exits with status
+    1 if the model ranks true actions no better than chance.
     """
-    one_scene = options.chunks is not None
-    for name in ("start", "state", "goal", "goals"):
-        if getattr(options, name) is not None and not one_scene:
-            raise InputError(where=f"--{name}", found="--policy, whose frames are those of the data", needed="none")
-    if one_scene and (
-        options.start is None or options.state is None or (options.goal is None) == (options.goals is None)
-    ):
-        raise InputError(where="--chunks", found="no scene", needed="--start, --state, and one of --goal and --goals")
-    cli.require_goals(options.goals)
     cli.require_to_plan(options)
-    to_poses = _kinematics(options.kinematics)
-    return (_score_chunks if one_scene else _score_policies)(options, to_poses)
-
-
-def _kinematics(words: str | None) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the user's function from joints to poses; one that changes nothing, where none is named."""
-    if words is None:
-        return lambda numbers: numbers
-    from vjepa2_ac.registry import import_user_module
-
-    module, _, name = words.partition(":")
-    found = getattr(import_user_module(module, where=f"--kinematics {words}"), name, None)
-    if not callable(found):
-        raise InputError(where=f"--kinematics {words}", found="no such function", needed="MODULE:FUNCTION")
-    return found  # type: ignore[no-any-return]  # the user's
-
-
-def _score_chunks(options: argparse.Namespace, to_poses: Callable[[np.ndarray], np.ndarray]) -> int:
-    from vjepa2_ac.cli.console.progress import MetricsTable
-    from vjepa2_ac.data.windows import require_stride
-    from vjepa2_ac.media.images import read_image
-    from vjepa2_ac.planning.controller import Controller
-    from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
-    from vjepa2_ac.planning.model_setup import goals_of
-    from vjepa2_ac.policies.score import CHANCE, changes_of_chunks, is_blind, ranking_of_run, read_chunks
-    from vjepa2_ac.storage import write_atomically
-    from vjepa2_ac.storage.structured import json_text
-
-    chunks, state = read_chunks(options.chunks), cli.as_numbers(options.state, "--state")
-    session = cli.load_planning_session(options)
-    controller = Controller.of_subject(session, extrinsics=cli.camera_pose(options.extrinsics))
-    if options.goals is None:
-        controller.follow((SubGoal(read_image(options.goal)),))
-    else:
-        controller.follow(goals_of(read_goal_folder(options.goals), session))
-    fix, space = "Say how many control steps of a chunk are one: --control-steps 4", controller.spaces.state
-    steps = options.control_steps or require_stride(session.config.data, to="know a model step", fix=fix)
-    changes = changes_of_chunks(to_poses(chunks), state, form=options.form, control_steps=steps, space=space)
-    found = controller.score(read_image(options.start), state, changes)
-    ranking = ranking_of_run(options.subject, session.chosen)
-    blind = is_blind(ranking)
-    title = f"Energy after {counted(changes.shape[1], 'model step')} (now: {found.now:.4f})"
-    table = MetricsTable(title, ["chunk", "energy", "relative to the zero action"])
-    for chunk in found.order.tolist():
-        beside = found.energies[chunk] / found.doing_nothing - 1
-        table.add_row(str(chunk), f"{found.energies[chunk]:.4f}", f"{beside:+.1%}")
-    table.add_row("zero action", f"{found.doing_nothing:.4f}", "+0.0%")
-    notes = [f"Spread of the chunks: {found.spread:.1%} of the energy now."]
-    if found.tied > 1:
-        notes.append(f"{found.tied} chunks share the lowest energy: the model does not distinguish them.")
-    if ranking is None:
-        notes.append("Action ranking of this model: not measured. `vjepa2-ac evaluate` measures it.")
-    elif blind:
-        notes.append(
-            f"These energies mean nothing: the action-ranking error in validation is {ranking.value:.0%}"
-            f" (0 % is best, chance {CHANCE:.0%})."
-        )
-    about = session.as_dict() | {"start": options.start, "chunks": str(options.chunks), "form": options.form}
-    scores = found.as_dict(is_blind=blind) | {"energies": found.energies.tolist()}
-    scores["action_ranking_error"] = None if ranking is None else ranking.as_dict()
-    write_atomically(options.out, json_text(about | scores))
-    cli.show(table, *notes, files=[options.out])
-    return int(blind)
-
-
-def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray], np.ndarray]) -> int:
-    from dataclasses import replace
 
     from vjepa2_ac.cli.console.progress import MetricsTable
     from vjepa2_ac.data.dataset import open_dataset
@@ -158,7 +67,6 @@ def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray]
     from vjepa2_ac.storage.structured import json_text
 
     policies = [read_policy_chunks(file) for file in options.policies]
-    policies = [replace(one, chunks=to_poses(one.chunks)) for one in policies]
     session = cli.load_planning_session(options)
     require_frames(session.config.data, to="score policies at")
     with cli.reporter() as reporter:

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from vjepa2_ac.planning.goals import GripperMode, SubGoal
 from vjepa2_ac.planning.search_space import GRIPPER
@@ -23,7 +23,6 @@ GRIPS = 0.15  # of closedness: less is no change of the gripper
 _MOVES = 0.02  # of closedness, from one frame to the next: less is no motion of the fingers
 _PAUSE = 2  # frames that the fingers may rest within one change
 _STILL_M, _STILL_RAD = 0.002, 0.02  # from one frame to the next: less is a resting arm
-_REST = (0.0005, 0.005, 0.005)  # metres, radians, closedness, likewise: less is noise of the sensors
 _LEFT_M = 0.01  # farther from where it gripped, an arm has left
 _SAME_M, _SAME_RAD = 0.005, 0.05  # less apart in all are two images of the same state
 
@@ -112,25 +111,6 @@ def _stops(states: States, lasts: int) -> list[int]:
     return [begin for begin in begins if still[begin : begin + lasts].all() and begin + lasts <= len(still)]
 
 
-def resting(states: States) -> Bool[np.ndarray, " neighbours"]:
-    """Return of each frame but the last whether arm and fingers rest until the next one, up to what sensors measure."""
-    return _are_below(actions_from_states(states), *_REST)
-
-
-def resting_pairs(rests: Bool[np.ndarray, " neighbours"], gap: int) -> Int[np.ndarray, "pairs 2"]:
-    """Return pairs of frames between which the arm rests all the time, `gap` frames apart, or as many as there are.
-
-    Args:
-        rests: Of each frame but the last whether the arm rests until the next one.
-        gap: Frames apart: neighbours in a film share their noise.
-    """
-    for apart in range(gap, 0, -1):
-        whole = [frame for frame in range(len(rests) - apart + 1) if rests[frame : frame + apart].all()]
-        if whole:
-            return np.array([[frame, frame + apart] for frame in whole])
-    return np.zeros((0, 2), dtype=np.int64)
-
-
 def _is_same(one: Float[np.ndarray, " 7"], other: Float[np.ndarray, " 7"]) -> bool:
     return bool(_are_below(actions_from_states(np.stack([one, other])), _SAME_M, _SAME_RAD, GRIPS)[0])
 
@@ -168,45 +148,6 @@ def every_key_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:
         step: From one key frame to the next, one or more.
     """
     return with_frames_between([KeyFrame(frames - 1, "end")], step, "frame {}")
-
-
-def latent_key_frames(
-    frames: int, distances: Callable[[int], Float[np.ndarray, " frames"]], least: int
-) -> tuple[KeyFrame, ...]:
-    """Return the frames at which images stop looking like the goal before: from the last one backwards.
-
-    Going back from a goal, the distance of images to it grows while the demonstration was approaching it; where it
-    stops growing (the nearest local maximum of the smoothed distance, at least `least` frames earlier), something else
-    was being done: this is the goal before.
-
-    Args:
-        frames: Of the demonstration, two or more.
-        distances: Of all frames to the one of an index, in latents.
-        least: Frames from one goal to the next, and from the start to the first; one or more.
-
-    Source of the rule: zcczhang/UVD @ e7d657a, uvd/decomp/decomp.py, embedding_decomp.
-    """
-    found = [frames - 1]
-    while (before := _maximum_before(_smoothed(distances(found[-1])[: found[-1] + 1], least), least)) is not None:
-        found.append(before)
-    return tuple(KeyFrame(frame, "end" if frame == frames - 1 else f"frame {frame}") for frame in reversed(found))
-
-
-def _smoothed(values: Float[np.ndarray, " frames"], least: int) -> Float[np.ndarray, " frames"]:
-    """Return a moving average by a normal distribution that is a sixth of `least` wide."""
-    wide = max(least / 6, 0.5)
-    reach = np.arange(-math.ceil(3 * wide), math.ceil(3 * wide) + 1)
-    weights = np.exp(-0.5 * (reach / wide) ** 2)
-    padded = np.pad(values, len(reach) // 2, mode="edge")
-    return np.convolve(padded, weights / weights.sum(), mode="valid")
-
-
-def _maximum_before(values: Float[np.ndarray, " frames"], least: int) -> int | None:
-    """Return the last local maximum that has `least` frames before and after it; None: there is none."""
-    for frame in range(len(values) - 1 - least, least - 1, -1):
-        if values[frame] > values[frame - 1] and values[frame] >= values[frame + 1]:
-            return frame
-    return None
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,12 @@ from vjepa2_ac.goals.make_goals import (
     KeyFrameOptions,
     MadeGoals,
     Recording,
-    energies_of,
     make_goals,
     recording_of,
 )
 from vjepa2_ac.media.images import require_image
 from vjepa2_ac.planning.cameras import require_views
+from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.subject import Subject
@@ -73,7 +73,7 @@ def demonstrations_alike(
         if not apart:  # before thousands are read
             require_image(wanted[0][0], where="the image of the start", like=ends[0])
         seen = encoded(ends)
-        apart[index] = [float(energies_of(session, seen, pair).sum()) for pair in both]
+        apart[index] = [float(distance(seen, pair, session.config.planning.energy).sum()) for pair in both]
     if not apart:
         found = unusable[0] if unusable else "no successful episode"
         raise InputError(where=config.path, found=found, needed="one that can be read: its key frames become goals")

@@ -168,7 +168,7 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
     """Return the content of the file; numbers that are not finite are null."""
     decision, question, controller = answer.decision, answer.question, answer.controller
     plan, progress, names = decision.plan, decision.progress, answer.state_space.change_names
-    rules = ("name", "at_least", "at_most", "share", "gripper", "floor")
+    rules = ("name", "at_least", "at_most", "share", "gripper")
     recorded = ("samples", "finite", "lowest", "mean", "std", "seconds")
     energy = {"now": decision.energy_now, "began": progress.began, "doing_nothing": answer.doing_nothing}
     found = {

@@ -5,7 +5,6 @@ Such a folder is written by `vjepa2-ac goals`, or by a person. PyTorch is not im
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -23,12 +22,9 @@ from vjepa2_ac.media.images import encode_png, read_image, require_image
 from vjepa2_ac.storage.files import folder_writer
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
 
-logger = logging.getLogger(__name__)
-
 GOALS_FILE = "goals.json"
 REACHED = 1e-6  # the energy of an image equal to the goal image, up to rounding
 
-Energy = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 GripperMode = Literal["rounded", "free", "held", "open", "close"]
 
 
@@ -46,7 +42,6 @@ class SubGoal:
     at_most: int | None = None  # likewise; None: no bound, and always of the last goal
     share: float | None = None  # the next goal follows below this share of the energy at the beginning; None: by count
     gripper: GripperMode | None = None  # None: planning.limits.gripper_mode
-    floor: float = 0.0  # noise of camera and encoder: no threshold is below this energy
 
     def __post_init__(self) -> None:
         where = f"goal {self.name!r}" if self.name else "goal"
@@ -55,8 +50,6 @@ class SubGoal:
             raise InputError(where=where, found=found, needed="1 <= at_least <= at_most")
         if self.share is not None and not 0.0 < self.share < 1.0:
             raise InputError(where=where, found=f"share {self.share}", needed="a number between 0 and 1, or none")
-        if not 0.0 <= self.floor < np.inf:
-            raise InputError(where=where, found=f"a noise floor of {self.floor}", needed="an energy of 0 or more")
 
     def why_reached(self, energy: float, began: float) -> str:
         """Return why an energy is low enough, by what it was when the goal began; empty: it is not, as for NaN."""
@@ -64,8 +57,6 @@ class SubGoal:
             return ""
         if energy < self.share * began:
             return f"energy {energy:.4g} is below {self.share:.0%} of {began:.4g}"
-        if energy < self.floor:
-            return f"energy {energy:.4g} is within the noise of {self.floor:.4g}"
         return "the image equals the goal's" if energy <= REACHED else ""
 
 
@@ -162,63 +153,19 @@ class GoalEntry:
     share: float | None = None
     gripper: GripperMode | None = None
     frame: int | None = None  # of the demonstration
-    began: Energy | None = None  # energy of the key frame before, or of the first frame, to this one
-
-
-@dataclass(frozen=True)
-class NoiseFloor:
-    """The energy between frames of a resting arm: what camera and encoder cannot tell apart."""
-
-    energy: Energy
-    pairs: int  # of frames
-    encoder: str  # SHA-256 of its weights: energies of another one mean something else
-    distance: str  # as planning.energy.distance
+    began: float | None = None  # of older versions
 
 
 @dataclass(frozen=True)
 class _GoalsFile:
     format: Literal[1]  # goes up when a reader of the file would have to change
     goals: Annotated[list[GoalEntry], Field(min_length=1, max_length=256)]
-    noise: NoiseFloor | None = None
+    noise: dict[str, Any] | None = None  # of older versions
     origin: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class GoalFolder:
-    """Goals as they were written, with what is known of their demonstration."""
-
-    goals: tuple[SubGoal, ...]
-    noise: NoiseFloor | None = None
-    began: tuple[float | None, ...] = ()  # energy of each goal at its beginning, in the demonstration
-
-    def for_model(self, encoder: str, distance: str) -> tuple[SubGoal, ...]:
-        """Return the goals with the noise floor, below which no threshold lies, if it was measured with this encoder.
-
-        What is changed or cannot be known is logged as a warning.
-
-        Args:
-            encoder: SHA-256 of its weights.
-            distance: As planning.energy.distance.
-        """
-        noise = self.noise
-        if noise is None:
-            return self.goals
-        if (noise.encoder, noise.distance) != (encoder, distance):
-            if any(goal.share is not None for goal in self.goals):
-                found = f"{noise.distance} and encoder {noise.encoder[:8]}, not {distance} and encoder {encoder[:8]}"
-                logger.warning("the noise floor of these goals is of %s: it does not guard their thresholds", found)
-            return self.goals
-        for place, (goal, began) in enumerate(zip(self.goals, self.began, strict=True), start=1):
-            if goal.share is not None and began is not None and goal.share * began < noise.energy:
-                logger.warning(
-                    "goal %d: %.0f%% of energy %.4g is below the noise of a resting arm, %.4g: that is its threshold",
-                    place, 100 * goal.share, began, noise.energy,
-                )  # fmt: skip
-        return tuple(replace(goal, floor=noise.energy) for goal in self.goals)
-
-
-def read_goal_folder(folder: Path) -> GoalFolder:
-    """Return the goals of a folder, and what it says about them.
+def read_goal_folder(folder: Path) -> tuple[SubGoal, ...]:
+    """Return the goals of a folder.
 
     Raises:
         InputError: There is no goals.json, it says something else, or a file is not in the folder, has no contrast, or
@@ -236,7 +183,7 @@ def read_goal_folder(folder: Path) -> GoalFolder:
             goals.append(SubGoal(image, entry.name, entry.at_least, entry.at_most, entry.share, entry.gripper))
         except InputError as error:
             raise InputError(where=f"{path}: goal {place}", found=error.found, needed=error.needed) from None
-    return GoalFolder(tuple(goals), found.noise, tuple(entry.began for entry in found.goals))
+    return tuple(goals)
 
 
 def _path_of(entry: GoalEntry, folder: Path, *, where: str) -> Path:
@@ -259,18 +206,14 @@ def write_goals(
     goals: Sequence[SubGoal],
     *,
     frames: Sequence[int | None] = (),
-    began: Sequence[float | None] = (),
-    noise: NoiseFloor | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write goals into a folder, whole or not at all, and return the path of its goals.json.
 
     Args:
         folder: A new or empty one; other files in it stay.
-        goals: In order. Their noise floor is not written: it is that of `noise`.
+        goals: In order.
         frames: Of the demonstration, of each goal; empty: not known.
-        began: Energy of each goal at its beginning; empty: not known.
-        noise: Energy between frames of a resting arm.
         origin: Where they come from, as plain values.
 
     Raises:
@@ -282,11 +225,11 @@ def write_goals(
     none = [None] * len(goals)
     with folder_writer(folder, GOALS_FILE) as filling:
         entries = []
-        for place, (goal, frame, energy) in enumerate(zip(goals, frames or none, began or none, strict=True), start=1):
+        for place, (goal, frame) in enumerate(zip(goals, frames or none, strict=True), start=1):
             name = f"goal_{place}.png"
             (filling / name).write_bytes(encode_png(goal.image))
             bounds = (goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper)
-            entries.append(GoalEntry(name, *bounds, frame, energy))
-        content = _GoalsFile(1, entries, noise, dict(origin or {}))
+            entries.append(GoalEntry(name, *bounds, frame))
+        content = _GoalsFile(1, entries, origin=dict(origin or {}))
         (filling / GOALS_FILE).write_text(json_text(asdict(content)))
     return folder / GOALS_FILE

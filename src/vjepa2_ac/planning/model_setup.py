@@ -13,7 +13,6 @@ from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_type_of_weights
 from vjepa2_ac.model.adapter.lora import merge_adapter, unadapted_copy
 from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.goals import GoalFolder, SubGoal, with_shares
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.subject import Subject, load_subject
@@ -52,19 +51,6 @@ def load_to_plan(
         merge_adapter(loaded.world_model)
     loaded.world_model.to(device)
     return replace(loaded, warnings=warnings)
-
-
-def goals_of(folder: GoalFolder, subject: Subject) -> tuple[SubGoal, ...]:
-    """Return the goals of a folder for a model, with their noise floor; what is changed is logged as a warning.
-
-    Raises:
-        InputError: A goal would never end, or the last one has a bound.
-    """
-    planning, has_noise = subject.config.planning, folder.noise is not None  # else no weights need to be hashed
-    encoder = subject.world_model.fingerprints().encoder if has_noise else ""
-    goals = folder.for_model(encoder, planning.energy.distance.name) if has_noise else folder.goals
-    with_shares(goals, planning.goals, first=1)
-    return goals
 
 
 def prepare_for_planning(world_model: WorldModel, config: PlanningConfig) -> WorldModel:

@@ -98,22 +98,6 @@ def read_policy_chunks(path: Path) -> PolicyChunks:
     return PolicyChunks(path.stem, places, chunks.astype(np.float64))
 
 
-def read_chunks(path: Path) -> Float[np.ndarray, "chunks steps dim"]:
-    """Read the chunks of one scene from an .npy file.
-
-    Raises:
-        InputError: It cannot be read, or holds another kind of array.
-    """
-    needed = "numbers, chunks x control steps x numbers of a state, as numpy.save writes them"
-    try:
-        found = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=needed) from None
-    if not isinstance(found, np.ndarray) or found.ndim != 3 or found.dtype.kind not in "fiu":
-        raise InputError(where=str(path), found="another kind of array", needed=needed)
-    return found.astype(np.float64)
-
-
 def changes_of_chunks(
     chunks: np.ndarray,
     state: Float[np.ndarray, " dim"],

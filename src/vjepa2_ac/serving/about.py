@@ -14,7 +14,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.camera_check import require_contrast
 from vjepa2_ac.media.images import read_image, require_image
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.goals import GOALS_FILE, GoalFolder, SubGoal, read_goal_folder
+from vjepa2_ac.planning.goals import GOALS_FILE, SubGoal, read_goal_folder
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.serving.session import Session
 
@@ -96,7 +96,7 @@ def warm_up(controller: Controller) -> float:
     return time.perf_counter() - began
 
 
-KeptGoals = Mapping[str, GoalFolder]
+KeptGoals = Mapping[str, tuple[SubGoal, ...]]
 
 _PICTURES = {".png", ".jpg", ".jpeg"}
 
@@ -114,7 +114,7 @@ def read_kept_goals(folder: Path) -> KeptGoals:
         raise InputError(where=f"--goals {folder}", found=found, needed="a folder with goal images")
     if (folder / GOALS_FILE).is_file():
         return {folder.resolve().name: read_goal_folder(folder)}
-    kept: dict[str, GoalFolder] = {}
+    kept: dict[str, tuple[SubGoal, ...]] = {}
     for path in sorted(folder.iterdir()):
         is_order, is_picture = (path / GOALS_FILE).is_file(), path.suffix.lower() in _PICTURES and path.is_file()
         if not is_order and not is_picture:
@@ -126,7 +126,7 @@ def read_kept_goals(folder: Path) -> KeptGoals:
         else:
             require_image(image := read_image(path), where=str(path))
             require_contrast([image], where=str(path))
-            kept[path.stem] = GoalFolder((SubGoal(image, name=path.stem),))
+            kept[path.stem] = (SubGoal(image, name=path.stem),)
     if not kept:
         needed = f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)"
         raise InputError(where=f"--goals {folder}", found="no goal", needed=needed)

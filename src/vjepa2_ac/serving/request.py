@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast, get_args
@@ -24,7 +23,7 @@ MOST_STEPS = 10_000  # of one goal
 _STATE, _POSE, _GRIPPER = "observation/state", "observation/cartesian_position", "observation/gripper_position"
 _GOAL = "goal/"
 _WAYS = ("goal/image", "goal/images", "goal/name")
-_RULES = ("goal/durations", "goal/at_least", "goal/shares", "goal/floors", "goal/grippers", "goal/mask")
+_RULES = ("goal/durations", "goal/at_least", "goal/shares", "goal/grippers", "goal/mask")
 _MODES = get_args(GripperMode)
 _ENDPOINTS = ("infer", "reset", "score")
 _CHUNKS, _FORM, _FORMS = "policy/chunks", "policy/form", get_args(ChunkForm)
@@ -44,7 +43,7 @@ class GivenGoal:
         """The same for the same name, or bytes: a client may send its goal with every request."""
         digest = hashlib.sha256(repr(self.name).encode())
         for goal in self.goals:
-            digest.update(repr((goal.at_least, goal.at_most, goal.share, goal.gripper, goal.floor)).encode())
+            digest.update(repr((goal.at_least, goal.at_most, goal.share, goal.gripper)).encode())
         for one in (*(goal.image for goal in self.goals), *(() if self.mask is None else (self.mask,))):
             digest.update(repr((one.shape, one.dtype.str)).encode())
             digest.update(np.ascontiguousarray(one).tobytes())
@@ -178,8 +177,6 @@ def _in_order(images: Sequence[np.ndarray], message: Mapping[str, Any]) -> tuple
     shares = _row(message, "goal/shares", many, lambda one: 0 <= one < 1, needed)
     needed = f"a whole number {steps} for each goal: its fewest model steps"
     least = _row(message, "goal/at_least", many, _is_steps, needed)
-    needed = "an energy of 0 or more for each goal: the noise of camera and encoder"
-    floors = _row(message, "goal/floors", many, lambda one: 0 <= one < math.inf, needed) or [0.0] * many
     needed = f"{many - 1} whole numbers {steps}: model steps of each goal but the last"
     most = _row(message, "goal/durations", many - 1, _is_steps, needed) or []
     if many > 1 and not most and not (shares and all(shares[:-1])):
@@ -188,10 +185,10 @@ def _in_order(images: Sequence[np.ndarray], message: Mapping[str, Any]) -> tuple
         least = [1.0] * many if shares or not most else [*most, 1.0]
     bounds = [*map(int, most), None] if most else [None] * many
     grippers = _grippers(message.get("goal/grippers"), many)
-    rows = zip(images, least, bounds, shares or [0.0] * many, grippers, floors, strict=True)
+    rows = zip(images, least, bounds, shares or [0.0] * many, grippers, strict=True)
     return tuple(
-        SubGoal(image, str(place), int(fewest), bound, share or None, gripper, floor)
-        for place, (image, fewest, bound, share, gripper, floor) in enumerate(rows)
+        SubGoal(image, str(place), int(fewest), bound, share or None, gripper)
+        for place, (image, fewest, bound, share, gripper) in enumerate(rows)
     )
 
 

@@ -29,7 +29,6 @@ from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.media.film import below_each_other, side_by_side
 from vjepa2_ac.media.video import video_library, write_video
 from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
-from vjepa2_ac.planning.model_setup import goals_of
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.agent import Agent
 from vjepa2_ac.simulation.arm import SimulatedArm
@@ -240,7 +239,7 @@ def with_own_goals(
         InputError: The folder or the demonstrations cannot be used.
     """
     if options.goals is not None:
-        return with_goals(trials, [goals_of(read_goal_folder(Path(options.goals)), agent.subject)] * len(trials.trials))
+        return with_goals(trials, [read_goal_folder(Path(options.goals))] * len(trials.trials))
     if options.sub_goals != "alike":
         return trials
     ends = []

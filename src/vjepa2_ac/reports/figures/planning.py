@@ -20,7 +20,7 @@ from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
     from vjepa2_ac.evaluation.imagined import ImaginedPlan
-    from vjepa2_ac.goals.make_goals import EnergyCourse, MadeGoals
+    from vjepa2_ac.goals.make_goals import MadeGoals
     from vjepa2_ac.planning.planner import Plan
     from vjepa2_ac.policies.monitor import Monitor, WatchedEpisode
 
@@ -180,8 +180,8 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
     """Write the contact sheet of goals as PNG; it is written atomically."""
     images = [made.first, *(goal.image for goal in made.goals)]
     rows = -(-len(images) // _ACROSS)
-    states, course = made.recording.states, made.course
-    heights = [2.0 * rows, *(1.4 for given in (states, course) if given is not None)]
+    states = made.recording.states
+    heights = [2.0 * rows] if states is None else [2.0 * rows, 1.4]
     options = made.options
     how = f"every {options.every} frames" if options.by == "every" else f"by {options.by}"
     count = counted(len(made.goals), "goal")
@@ -193,17 +193,13 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
             if place < len(images):
                 axes.imshow(images[place])
                 axes.set_title(_caption(made, place), fontsize=8)
-        plots = [part.subplots() for part in parts]
-        for axes in plots:
+        if states is not None:
+            axes = parts[0].subplots()
             for key in made.keys:
                 axes.axvline(key.frame, color=GREY, linewidth=0.8, linestyle=":")
-            axes.set_xlim(0, made.recording.frames - 1)
+            axes.plot(states[:, POSE.gripper], color=ORANGE, linewidth=1.3)
+            axes.set(title="Gripper: 0 open, 1 closed", ylim=(-0.05, 1.05), xlim=(0, made.recording.frames - 1))
             axes.locator_params(axis="x", integer=True)
-        if states is not None:
-            plots[0].plot(states[:, POSE.gripper], color=ORANGE, linewidth=1.3)
-            plots[0].set(title="Gripper: 0 open, 1 closed", ylim=(-0.05, 1.05))
-        if course is not None:
-            _energy(plots[-1], made, course)
     return path
 
 
@@ -216,22 +212,7 @@ def _caption(made: MadeGoals, place: int) -> str:
         steps = f"{goal.at_least} to {counted(goal.at_most, 'model step')}"
     lines = [f"goal {place}: {goal.name}" if goal.name else f"goal {place}", f"frame {key.frame}, {steps}"]
     lines.append(f"gripper {goal.gripper or 'as planning.limits say'}")
-    if made.course is not None:
-        lines.append(f"energy {made.course.began[place - 1]:.3g} at its beginning")
     return "\n".join(lines)
-
-
-def _energy(axes: Any, made: MadeGoals, course: EnergyCourse) -> None:
-    axes.plot(course.frames, course.energy, color=BLUE, linewidth=1.3, label="energy to the goal that applies")
-    begins = [0, *(key.frame for key in made.keys)]
-    for begin, end, goal, began in zip(begins, begins[1:], made.goals, course.began, strict=False):
-        if goal.share is not None:
-            label = "its threshold" if goal is made.goals[0] else None
-            axes.plot([begin, end], [goal.share * began] * 2, color=ORANGE, linewidth=1.1, label=label)
-    if made.noise is not None:
-        axes.axhline(made.noise.energy, color=RED, linewidth=1.0, linestyle="--", label="noise of a resting arm")
-    axes.set(title="Energy along the demonstration", xlabel="frame", ylim=(0, None))
-    axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=3)
 
 
 MONITOR_IMAGE = "monitor.png"
