@@ -26,8 +26,8 @@ def test_a_picture_has_its_own_name_and_an_order_of_goals_its_folders(tmp_path: 
     (tmp_path / "empty").mkdir()
     kept = read_kept_goals(tmp_path)
     assert sorted(kept) == ["box", "cup", "pick"]
-    np.testing.assert_array_equal(kept["cup"].goals[0].image, image(5))
-    assert [(goal.name, goal.at_most, goal.gripper) for goal in kept["pick"].goals] == [
+    np.testing.assert_array_equal(kept["cup"][0].image, image(5))
+    assert [(goal.name, goal.at_most, goal.gripper) for goal in kept["pick"]] == [
         ("grasp", 4, "held"),
         ("lift", None, None),
     ]
