@@ -126,18 +126,20 @@ def test_what_fails_inside_is_told_to_the_log_and_to_nobody_else(caplog, monkeyp
     ask(one, **request(1))
 
 
-class _Clock:
-    def __init__(self) -> None:
-        self.now = 0.0
+class _OverAfter:
+    """A clock that passes every deadline when it was read so many times."""
+
+    def __init__(self, reads: int) -> None:
+        self.left = reads
 
     def __call__(self) -> float:
-        self.now += 1.0
-        return self.now
+        self.left -= 1
+        return 0.0 if self.left >= 0 else 1e6
 
 
 def test_past_the_deadline_nobody_moves_and_the_next_decision_is_as_if_nothing_had_been() -> None:
     own = controller()
-    late = Session(own, None, SessionOptions(deadline_s=2.5), clock=_Clock())
+    late = Session(own, None, SessionOptions(deadline_s=2.5), clock=_OverAfter(2))
     found = ask(late, **request(0, goal_image=image(100)))
     assert found["why"] == "past the deadline"
     assert not found["actions"].any()
@@ -376,17 +378,6 @@ def test_a_frozen_camera_moves_nothing_once_the_arm_has_moved_and_a_reset_forget
     assert ask(one, **request(0, goal_image=image(100)) | {"observation/state": moved})["why"] == "planned"
     assert ask(one, **request(0) | {"observation/state": there})["why"] == "frozen frame"
     assert one.counts.decisions == {"planned": 4, "frozen frame": 7}
-
-
-class _OverAfter:
-    """A clock that passes every deadline when it was read so many times."""
-
-    def __init__(self, reads: int) -> None:
-        self.left = reads
-
-    def __call__(self) -> float:
-        self.left -= 1
-        return 0.0 if self.left >= 0 else 1e6
 
 
 CHUNKS = STATE + np.random.default_rng(0).normal(0, 0.01, (300, 4, 7)) * [1, 1, 1, 1, 1, 1, 0]

@@ -35,13 +35,17 @@ def views_of(subject: Path, decoder: Path, data: Path, folder: Path, base: Path)
     return Views.of("the run", explorer, config.model_copy(update={"planning": QUICK}))
 
 
-@pytest.fixture
-def recorded(whole_run: Path, whole_decoder: Path, data_folder: Path, base_folder: Path, tmp_path: Path) -> Views:
+@pytest.fixture(scope="session")
+def recorded(
+    whole_run: Path, whole_decoder: Path, data_folder: Path, base_folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Views:
     """Of data of which only the recording is known."""
-    return views_of(whole_run, whole_decoder, data_folder, tmp_path, base_folder)
+    return views_of(whole_run, whole_decoder, data_folder, tmp_path_factory.mktemp("recorded"), base_folder)
 
 
-@pytest.fixture
-def live(whole_run: Path, whole_decoder: Path, simulated: Path, base_folder: Path, tmp_path: Path) -> Views:
+@pytest.fixture(scope="session")
+def live(
+    whole_run: Path, whole_decoder: Path, simulated: Path, base_folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Views:
     """Of data whose world can be simulated again."""
-    return views_of(whole_run, whole_decoder, simulated, tmp_path, base_folder)
+    return views_of(whole_run, whole_decoder, simulated, tmp_path_factory.mktemp("live"), base_folder)
