@@ -19,6 +19,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.explore.explorer import Explorer, Moment, Pixels, Place, goal_moment, relative_spread, token_errors
 from vjepa2_ac.explore.messages import MOST_STEPS, Image, PageRequest, packed, shown_units
 from vjepa2_ac.explore.search import Search
+from vjepa2_ac.media.film import error_colours
 from vjepa2_ac.planning.planner import Cancelled
 
 _QUICK = {"samples": 64, "iterations": 4}  # of a plan: docs/planning.md says how good it is
@@ -195,7 +196,7 @@ class Views:
             images.append(Image(f"imagined-{name}", explorer.decoded(latents), f"what {name} imagines"))
             errors = None if outcome is None or not place.actions else token_errors(latents, outcome.latents)
             if errors is not None:
-                images.append(Image(f"error-{name}", error_map(errors, explorer), f"where {name} is wrong"))
+                images.append(Image(f"error-{name}", self._error_map(errors), f"where {name} is wrong"))
             tellers.append({
                 "id": name,
                 "error": None if errors is None else float(errors.mean()),
@@ -218,6 +219,11 @@ class Views:
             "copying": None if outcome is None else float(token_errors(start.latents, outcome.latents).mean()),
         }
         return packed("look", request.seq, told, images)
+
+    def _error_map(self, errors: Float[Tensor, " tokens"]) -> Pixels:
+        size = self.explorer.world_model.image_size
+        grid = size // self.explorer.world_model.sizes.patch_size
+        return error_colours(errors.float().reshape(grid, grid).cpu().numpy(), (size, size)).astype(np.uint8)
 
     def _searched(self, request: PageRequest, place: Place, progress: Progress, cancelled: Cancelled) -> bytes:
         names = [one.name for one in self.explorer.contenders]
@@ -253,12 +259,3 @@ class Views:
 
 def _true_alt(outcome: Moment) -> str:
     return f"what really happens, {'simulated' if outcome.is_simulated else 'recorded'}"
-
-
-def error_map(errors: Float[Tensor, " tokens"], explorer: Explorer) -> Pixels:
-    """Return the errors of patches as an image: from black, 0, over red and yellow to white, 1: an unrelated frame."""
-    size = explorer.world_model.image_size
-    grid = size // explorer.world_model.sizes.patch_size
-    shares = errors.float().reshape(grid, grid).cpu().numpy().repeat(size // grid, 0).repeat(size // grid, 1)
-    colours = np.stack([3 * shares, 3 * shares - 1, 3 * shares - 2], axis=-1)
-    return np.asarray(np.clip(255 * colours, 0, 255), dtype=np.uint8)

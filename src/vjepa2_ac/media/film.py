@@ -12,7 +12,8 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
+from matplotlib import colormaps
 from matplotlib.patches import Patch
 
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, RED, in_our_style, new_figure, pixels_of
@@ -165,6 +166,15 @@ def _show(axes: Any, row: StripRow, place: int) -> None:
             axes.contour(row.outlines[place], [0.5], colors=colour, linewidths=width)
     if row.captions:
         axes.set_xlabel(row.captions[place] or " ", fontsize=7, color=GREY)
+
+
+def error_colours(
+    errors: Float[np.ndarray, "grid grid"], size: tuple[int, int], worst: float = 1.0
+) -> Float[np.ndarray, "height width 3"]:
+    """Return the errors of patches as colours from 0 to 255: from black, no error, to bright yellow, the worst one."""
+    colours = 255 * colormaps["inferno"](np.nan_to_num(errors / max(worst, 1e-12)))[..., :3]
+    rows, columns = (np.arange(side) * len(errors) // side for side in size)
+    return np.asarray(colours[rows][:, columns])
 
 
 _CAPTION = 30  # pixels

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib import colormaps
 
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
@@ -26,7 +25,7 @@ from vjepa2_ac.evaluation.result import (
     over_persistence,
 )
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, RED, headline, visible, written_figure
-from vjepa2_ac.media.film import FilmStrip, Kind, StripRow, draw_rows
+from vjepa2_ac.media.film import FilmStrip, Kind, StripRow, draw_rows, error_colours
 from vjepa2_ac.reports.comparison import Comparison
 
 _COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE, "decoded truth": GREEN, "raw persistence": RED}
@@ -216,9 +215,7 @@ def _overlay(
     grey = np.repeat(frame.mean(axis=-1, keepdims=True), 3, axis=-1)
     if errors is None:
         return grey.astype(np.uint8)
-    colours = 255 * colormaps["inferno"](np.nan_to_num(errors / max(worst, 1e-12)))[..., :3]
-    rows, columns = (np.arange(size) * len(errors) // size for size in frame.shape[:2])
-    return np.asarray(0.35 * grey + 0.65 * colours[rows][:, columns]).astype(np.uint8)
+    return np.asarray(0.35 * grey + 0.65 * error_colours(errors, frame.shape[:2], worst)).astype(np.uint8)
 
 
 def _by_horizon(
