@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 import re
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -68,8 +67,6 @@ def write_pages(folder: Path) -> None:
         path.parent.mkdir(exist_ok=True)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
-    for image in (ROOT / "benchmarks/results").glob("*.png"):
-        shutil.copyfile(image, folder / "results" / image.name)
 
 
 def contents_page(title: str, pages: Mapping[str, str]) -> str:
@@ -140,13 +137,13 @@ def examples_page() -> str:
 def results_pages() -> Iterator[tuple[str, str]]:
     """Yield the pages of measured results, and one that lists them."""
     names = []
-    for path in sorted((ROOT / "benchmarks/results").glob("*.md")):
+    for path in (*(ROOT / "benchmarks/results").glob("*.md"), *sorted((ROOT / "evidence/results").glob("*.md"))):
         text = path.read_text(encoding="utf-8")
         names.append(path.stem)
         heading = "" if text.startswith("# ") else f"# {path.stem.replace('_', ' ').capitalize()}\n\n"
         yield (
             f"results/{path.name}",
-            heading + on_site(text, f"benchmarks/results/{path.name}", f"made/results/{path.name}"),
+            heading + on_site(text, str(path.relative_to(ROOT)), f"made/results/{path.name}"),
         )
     entries = "\n".join(f"results/{name}" for name in names)
     text = "Tables that commands of the repository write."

@@ -47,8 +47,8 @@ def _page_of(path: str, anchor: str) -> str | None:
         return path.removeprefix("docs/") + anchor
     if path in _ROOT_PAGES:
         return _ROOT_PAGES[path] + anchor
-    if path.startswith("benchmarks/results/"):
-        return f"made/{path.removeprefix('benchmarks/')}{anchor}"
+    if path.startswith(("benchmarks/results/", "evidence/results/")):
+        return f"made/{path.partition('/')[2]}{anchor}"
     if path.startswith("configs/") and (ROOT / path).exists():
         return f"made/configs.md#{Path(path).stem.replace('_', '-')}"
     if path.startswith("examples") and (ROOT / path).exists():

@@ -1,4 +1,4 @@
-"""Which runs are there, and how is each of their checkpoints measured?"""
+"""The selection study: does a lower error plan better? Low-diversity and diverse demonstrations, every checkpoint."""
 
 from __future__ import annotations
 
@@ -7,18 +7,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from methods import PLANNING, TRAINING
+from prepare import BUILTIN, data_a
+from results import REACHED_CM, rounded
 
-from vjepa2_ac.config import (
-    AdapterConfig,
-    Config,
-    ModelConfig,
-    ReplayConfig,
-    RldsData,
-    TrainingConfig,
-    ValidationConfig,
-)
-from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
+from vjepa2_ac.config import AdapterConfig, Config, ModelConfig, ReplayConfig, ValidationConfig
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
@@ -38,38 +33,25 @@ from vjepa2_ac.training.loop import train
 Motions = Literal["narrow", "varied"]
 
 WORLD = replace(DOMAIN_A, name="near", camera=DOMAIN_A.camera.turned(15.0), look=DOMAIN_B.look, lag_s=DOMAIN_B.lag_s)
-"""A world that the base half knows: other colours and light, the camera turned by 15 degrees, another lag."""
+"""A small domain shift: other colours and light, the camera turned by 15 degrees, another lag."""
 
 RECIPES: dict[Motions, MotionRecipe] = {
     "narrow": MotionRecipe(drift_m=(0.01, 0.0, 0.0), turn_rad=0.0, gripper_share=0.0),
     "varied": MotionRecipe(),
 }
-"""narrow: 1 cm to the front in every model step. varied: random reaching, up to 7.5 cm an axis."""
+"""narrow: 1 cm to the front in every model step. varied: random reaching, up to 7.5 cm along each axis."""
 
 EPISODES, RECORDED, GOALS = 60, 31, 9_000  # demonstrations, seeds of the recordings and of the problems
 STEPS, EVERY = 800, 100
-PLANNING = PlanningConfig(
-    samples=64,
-    iterations=4,
-    start_std=0.67,
-    limits=LimitsConfig(xyz=(0.075, 0.075, 0.075), gripper_mode="held"),
-)
-"""As in the evidence: horizon 1, 7.5 cm an axis and model step."""
 
-
-OFFLINE: dict[str, tuple[str, int]] = {
-    "one-step error / persistence": ("one_step.true", 1),
-    "rollout error / persistence, last horizon": ("rollout.l1.over_persistence.7", 1),
-    "gap of zero actions, negated": ("gap_of_actions.zero", -1),
-    "gap of shuffled actions, negated": ("gap_of_actions.shuffled", -1),
-    "moves: change with the action, negated": ("ranking.change", -1),
-    "own steps: distance of the lowest energy": ("landscapes.distance", 1),
-    "moves: rank in a box": ("ranking.box", 1),
-    "moves: rank among other directions": ("ranking.shell", 1),
-    "moves: rank (the one that selects)": ("ranking.rank", 1),
-    "moves: spread of the energy, negated": ("ranking.spread", -1),
+OFFLINE = {
+    "one_step": ("one_step.true", 1),
+    "error": ("rollout.l1.over_persistence.7", 1),
+    "shuffled": ("gap_of_actions.shuffled", -1),
+    "ranking": ("ranking.rank", 1),
+    "spread": ("ranking.spread", -1),
 }
-"""What `evaluate` finds of a model: the key of a row, and its sign, so that less is meant to be better."""
+"""What `evaluate` measures of a checkpoint: the key of a row, and a sign that makes lower better."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +61,11 @@ class Run:
     motions: Motions
     method: Literal["LoRA", "full"]
     seed: int  # decides the order of clips and fresh weights, and the goals
-    cure: Literal["", "replay"] = ""  # a quarter of the clips from other worlds; `tables.GONE` has those that are gone
+    cure: Literal["", "replay", "contrast"] = ""  # replay: a quarter of the clips from other worlds
 
     @property
     def name(self) -> str:
-        """What its files are called."""
+        """Name of its folder."""
         return f"{self.motions}-{self.method}{f'-{self.cure}' if self.cure else ''}-s{self.seed}"
 
 
@@ -96,28 +78,29 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """What its file is called."""
+        """Name of its file."""
         return f"{self.run.name}-{self.step:04d}"
 
 
-def all_runs(seeds: int) -> Iterator[Run]:
-    """Yield every run, those that matter most first."""
+def all_cells(seeds: int) -> Iterator[Cell]:
+    """Yield the checkpoints of every run, those that matter most first."""
     for seed in range(seeds):
         for motions in RECIPES:
-            yield from (Run(motions, "LoRA", seed), Run(motions, "full", seed))
+            yield from cells_of(Run(motions, "LoRA", seed))
+            yield from cells_of(Run(motions, "full", seed))
     for seed in range(seeds):
-        yield from (Run("narrow", "LoRA", seed, "replay"), Run("narrow", "full", seed, "replay"))
-        yield Run("varied", "LoRA", seed, "replay")
+        for run in (Run("narrow", "LoRA", seed), Run("narrow", "full", seed), Run("varied", "LoRA", seed)):
+            yield from cells_of(replace(run, cure="replay"))
 
 
 def cells_of(run: Run) -> list[Cell]:
-    """Return the checkpoints of a run that are measured: of the cures the base, some, and the last."""
+    """Return the checkpoints of a run that are measured."""
     steps = (0, 200, 400, STEPS) if run.cure else range(0, STEPS + 1, EVERY)
     return [Cell(run, step) for step in steps]
 
 
 def prepare(folder: Path) -> None:
-    """Record what is not there yet: demonstrations, and random worlds as the base was trained on, to replay."""
+    """Record what is missing: demonstrations, and random worlds as the base was trained on, to replay."""
     specs: dict[str, RecordingSpec] = {
         name: RecordingSpec(WORLD, seed=RECORDED, recipe=recipe) for name, recipe in RECIPES.items()
     }
@@ -128,44 +111,33 @@ def prepare(folder: Path) -> None:
 
 
 def config_of(run: Run, folder: Path) -> Config:
-    """Return the config that anybody would write; every checkpoint is kept."""
-    data = RldsData(
-        path=str(folder / f"data-{run.motions}"),
-        frames=8,
-        stride=4,
-        validation_share=0.2,
-        test_share=0.2,
-        workers=0,
-        cache="auto",
-        cache_dir=str(folder / "latents"),
-    )
+    """Return the config of a run; every checkpoint is kept."""
+    shares = {"frames": 8, "validation_share": 0.2, "test_share": 0.2}
+    data = data_a(folder).model_copy(update={"path": str(folder / f"data-{run.motions}"), **shares})
     replayed = data.model_copy(update={"path": str(folder / "data-replay"), "validation_share": 0.0, "test_share": 0.0})
-    adapter = AdapterConfig(rank=16, alpha=32.0, dropout=0.0) if run.method == "LoRA" else AdapterConfig(kind="none")
+    is_lora = run.method == "LoRA"
+    changes = {"steps": STEPS, "learning_rate": 3e-3 if is_lora else 4e-3, "allow_weak_base": True}
     return Config(
-        run_dir=str(folder / "runs" / run.name),
+        run_dir=str(folder / "selection-runs" / run.name),
         seed=run.seed,
         data=data,
         replay=ReplayConfig(share=0.25, data=replayed) if run.cure == "replay" else None,
-        model=ModelConfig(base="builtin:sim-tiny", dtype="float32"),
-        adapter=adapter,
-        training=TrainingConfig(
-            steps=STEPS,
-            batch_size=6,
-            accumulation=1,
-            warmup_steps=20,
-            learning_rate=3e-3 if run.method == "LoRA" else 4e-3,
-            precision="fp32",
-            device="cpu",
-            log_every=50,
-            allow_weak_base=True,
-        ),
+        model=ModelConfig(base=BUILTIN, dtype="float32"),
+        adapter=AdapterConfig(rank=16, alpha=32.0, dropout=0.0) if is_lora else AdapterConfig(kind="none"),
+        training=TRAINING.model_copy(update=changes),
         validation=ValidationConfig(every=EVERY, clips=40, batch_size=20),
         checkpoint=CheckpointConfig(every=EVERY, keep=STEPS),
     )
 
 
+def train_alone(run: Run, folder: Path) -> None:
+    """Train a run on one thread, from its newest checkpoint; a finished run returns at once."""
+    torch.set_num_threads(1)
+    train(config_of(run, folder), SILENT)
+
+
 def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
-    """Measure a checkpoint in a process of its own, on one thread; its run is trained before, if it is not there."""
+    """Measure a checkpoint of a trained run on one thread."""
     torch.set_num_threads(1)
     config = config_of(cell.run, folder)
     home, step = Path(config.run_dir), str(cell.step)
@@ -181,14 +153,35 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     result = run_task(spec, Planning(Controller(model.eval(), PLANNING)))
     measured = {row.key: row.value for row in rows_of(evaluation) if row.model == evaluation.trained}
     return {
-        "cell": asdict(cell.run) | {"step": cell.step, "name": cell.name},
+        "cell": asdict(cell.run) | {"step": cell.step},
         "validation": validated,
         "offline": {name: sign * measured[key] for name, (key, sign) in OFFLINE.items()},
         "distance_cm": result.distance_cm.round(3).tolist(),
     }
 
 
-def train_alone(run: Run, folder: Path) -> None:
-    """Train a run in a process of its own, from its newest checkpoint; nothing to do where it is done."""
-    torch.set_num_threads(1)
-    train(config_of(run, folder), SILENT)
+def name_of(one: dict[str, Any]) -> str:
+    """Return the name of the checkpoint that a result belongs to."""
+    return Cell(run_of(one), one["cell"]["step"]).name
+
+
+def run_of(one: dict[str, Any]) -> Run:
+    """Return the run that a result belongs to."""
+    return Run(**{key: value for key, value in one["cell"].items() if key != "step"})
+
+
+def compact(measured: dict[str, Any]) -> dict[str, Any]:
+    """Return what the tables need of a measurement."""
+    ends = [way[-1] for way in measured["distance_cm"]]
+    validation = measured["validation"]
+    kept = {
+        "cell": measured["cell"],
+        "error": validation["rollout_over_persistence_last"],
+        "action_ranking_error": validation["action_ranking_error"],
+        "left_cm": float(np.mean(ends)),
+        "reached": sum(end < REACHED_CM for end in ends),
+        "goals": len(ends),
+    }
+    if not measured["cell"]["cure"]:  # correlations are of runs without a cure
+        kept["offline"] = measured["offline"]
+    return rounded(kept)  # type: ignore[no-any-return]  # a mapping stays one

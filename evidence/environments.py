@@ -1,4 +1,4 @@
-"""Which tasks of others are part of the evidence, how are their worlds changed, and how does a policy fare there?"""
+"""Tasks of third-party environments in the methods study: their changes, recordings and closed loops."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vjepa2_ac.simulation.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.rollout import ClosedLoopResult, Policy, Trials, run_trials
 from vjepa2_ac.simulation.worlds import OtherWorld, find_trials, record_world
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 STRIDE, EVERY = 4, 2  # control steps of a model step, and from one recorded frame to the next
 SIZE = 96  # pixels: those of the tiny encoder
 EPISODES_BEFORE, EPISODES_AFTER = 120, 60  # recorded in the world before and after its change
@@ -104,23 +104,16 @@ def closed_loop(
     folder: Path, task: str, policy: Policy, *, seed: int, goals: int, when: str = "after"
 ) -> dict[str, Any]:
     """Return how a policy fares before or after the change; by `Trials` of the expert's own problems."""
-    trials, shown = problems(folder, task, seed, goals, when)
+    trials, expert = problems(folder, task, seed, goals, when)
     with OtherWorld(TASKS[task].command(when)) as world:
-        return figures_of(run_trials(world, policy, trials), seed, shown)
+        return figures_of(run_trials(world, policy, trials), expert)
 
 
-def figures_of(result: ClosedLoopResult, seed: int, shown: ClosedLoopResult) -> dict[str, Any]:
-    """Return what was solved, how far the things were from where they have to be, and the hand from the expert's (cm).
-
-    Distances of the things are those before the first step and after each; those of the hand are at the end.
-    """
-    ends = [np.stack([episode.states[-1, :3] for episode in each.episodes]) for each in (result, shown)]
+def figures_of(result: ClosedLoopResult, expert: ClosedLoopResult) -> dict[str, Any]:
+    """Return distances of objects to their goal, what was solved, and how far the hand ends from the expert's (cm)."""
+    ends = [np.stack([episode.states[-1, :3] for episode in each.episodes]) for each in (result, expert)]
     return {
-        "goals_seed": seed,
         "distance_cm": np.round(result.distance_cm, 3).tolist(),
         "hand_cm": np.round(100 * np.linalg.norm(ends[0] - ends[1], axis=1), 3).tolist(),
         "solved": result.successes.tolist(),
-        "solved_ever": [episode.success_ever for episode in result.episodes],
-        "seconds_per_decision": float(result.seconds.mean()),
-        "whys": result.why_counts,
     }

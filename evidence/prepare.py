@@ -1,14 +1,13 @@
-"""What must be there before a cell can run? Data sets of the simulated arm, base models, predictors without a past."""
+"""Make what cells need: data sets, base models, and predictors with fresh weights."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from cells import METHODS, SHIFTS, TRAINING, Base
-from other_worlds import TASKS, data_of, origin_of, record
+from environments import TASKS, data_of, origin_of, record
+from methods import SHIFTS, TRAINING, Base
 
 from vjepa2_ac import encode, read_clips
 from vjepa2_ac.config import Config, DataConfig, ModelConfig, RldsData
@@ -32,8 +31,7 @@ OF_A_WORLD = (
     "training.steps=4000", "training.learning_rate=4e-3", "training.warmup_steps=50", "training.allow_weak_base=true",
 )  # fmt: skip
 """How the base of a world is trained: as `configs/pick.yaml`."""
-LAYERS = (None, *sorted({method.layer for method in METHODS.values() if method.layer}))
-BASE_CONFIG = Path(__file__).with_name("base_one_camera.yaml")
+BASE_CONFIG = "builtin:demo_base"  # the sizes and settings of the demo's base
 
 
 def data_a(folder: Path) -> DataConfig:
@@ -63,13 +61,12 @@ def data_shifted(folder: Path, shift: str) -> DataConfig:
     return data_a(folder).model_copy(update=update)
 
 
-def base_model(folder: Path, base: Base, seed: int, shift: str = "look", layer: int | None = None) -> str:
-    """Return what `model.base` takes for a base, or for a predictor without a past, on features of a layer."""
+def base_model(folder: Path, base: Base, seed: int, shift: str = "look") -> str:
+    """Return the value of `model.base` for a base, or for a predictor with fresh weights."""
     if base == "many cameras":
         return BUILTIN
     of_one = "base-one-camera" if shift in SHIFTS else f"base-{origin_of(shift)}"
-    of_none = f"scratch-{seed}" if layer is None else f"scratch-layer-{layer}-{seed}"
-    return str(folder / (of_none if base == "none" else of_one))
+    return str(folder / (f"scratch-{seed}" if base == "none" else of_one))
 
 
 def prepare_world(folder: Path, task: str, reporter: Reporter = SILENT) -> None:
@@ -89,8 +86,8 @@ def prepare_world(folder: Path, task: str, reporter: Reporter = SILENT) -> None:
 def prepare(folder: Path, shifts: Collection[str], seeds: int, reporter: Reporter = SILENT) -> None:
     """Make everything that is not there yet; of our own arm some 25 minutes on one core, most of it its first base."""
     folder.mkdir(parents=True, exist_ok=True)
-    for seed, layer in itertools.product(range(seeds), LAYERS):
-        _without_a_past(Path(base_model(folder, "none", seed, layer=layer)), seed, layer)
+    for seed in range(seeds):
+        _save_fresh_predictor(Path(base_model(folder, "none", seed)), seed)
     for task in filter(TASKS.__contains__, shifts):
         prepare_world(folder, task, reporter)
     if not any(shift in SHIFTS for shift in shifts):
@@ -142,17 +139,9 @@ def _base_config(folder: Path) -> Config:
     return config.model_copy(update={"data": data_a(folder)})
 
 
-def _without_a_past(folder: Path, seed: int, layer: int | None = None) -> None:
-    """Write the frozen encoder that all share with a predictor of fresh weights, which begins close to copying."""
-    if folder.exists():
-        return
-    if layer is None:
+def _save_fresh_predictor(folder: Path, seed: int) -> None:
+    """Write the frozen encoder that all share with a predictor of fresh weights, which starts close to copying."""
+    if not folder.exists():
         model = load_base(ModelConfig(base=BUILTIN, dtype="float32"), seed=0)
         model.predictor = WorldModel.random(model.sizes, seed=1000 + seed, at_persistence=True).predictor
-    else:
-        whole = folder.with_name(f"scratch-{seed}")
-        sizes = load_base(ModelConfig(base=str(whole), dtype="float32"), seed=0).sizes
-        fresh = {"image_size": sizes.image_size, "predictor": sizes.predictor.model_dump()}
-        cut = {"encoder": {"path": str(whole), "layer": layer}, "base": "random", "sizes": fresh}
-        model = load_base(ModelConfig.model_validate({**cut, "dtype": "float32"}), seed=1000 + seed)
-    model.save_pretrained(folder)
+        model.save_pretrained(folder)

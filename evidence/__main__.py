@@ -1,0 +1,136 @@
+"""Does LoRA fine-tuning help? Measure what is missing of both studies, then make docs/evidence.md with its plots.
+
+    python evidence --table                     # tables and plots from results/*.json, a minute (make evidence)
+    python evidence --only look --seeds 1       # a part of the methods study; resumes where it stopped
+    python evidence --study selection           # every checkpoint of 21 runs in closed loop
+
+methods: each method adapts a base to a changed scene. selection: which number should select a checkpoint? Finished
+measurements are JSON files in the work folder; what the tables need of them is written to evidence/results.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def main() -> int:
+    """Run what is missing, then write tables and plots; return 1 where a cell failed."""
+    options = _parse()
+    failed = 0
+    if not options.table:
+        failed = (_run_methods if options.study == "methods" else _run_selection)(options)
+    write(options.folder)
+    return 1 if failed else 0
+
+
+def write(folder: Path) -> None:
+    """Write results, tables and plots of all that is measured."""
+    import plots
+    import results
+    import selection
+    import selection_tables
+    import tables
+
+    kept, docs = results.KEPT, ROOT / "docs"
+    of_methods = results.read_all(folder / "methods", kept / "methods.json", results.compact, results.name_of)
+    results.write_all(kept / "methods.json", of_methods)
+    tables.write_tables(of_methods, kept / "methods.md", docs / "evidence.md")
+    plots.draw(of_methods, docs / "evidence.png")
+    of_selection = results.read_all(folder / "selection", kept / "selection.json", selection.compact, selection.name_of)
+    results.write_all(kept / "selection.json", of_selection)
+    selection_tables.write_tables(of_selection, kept / "selection.md", docs / "ranking.png")
+    print(f"docs/evidence.md and evidence/results: {len(of_methods)} cells, {len(of_selection)} checkpoints")
+
+
+def _parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--study", choices=("methods", "selection"), default="methods")
+    parser.add_argument("--folder", type=Path, default=Path("build/evidence"), help="data, bases, runs, measurements")
+    parser.add_argument("--seeds", type=int, default=5, help="at most; docs/evidence.md has those of each change")
+    parser.add_argument("--goals", type=int, default=20, help="of each cell; a row pools its seeds")
+    parser.add_argument("--workers", type=int, default=2, help="cells at once, one thread each")
+    parser.add_argument("--only", default="", help="cells whose name contains this")
+    parser.add_argument("--again", action="store_true", help="measure cells again whose results are in the repository")
+    parser.add_argument("--table", action="store_true", help="write tables and plots, run nothing")
+    return parser.parse_args()
+
+
+def _run_methods(options: argparse.Namespace) -> int:
+    from environments import TASKS
+    from measure import measure_alone
+    from methods import all_cells
+    from prepare import prepare
+    from results import KEPT, name_of
+
+    cells = _missing(list(all_cells(options.seeds)), KEPT / "methods.json", name_of, options)
+    absent = {cell.shift for cell in cells if cell.shift in TASKS and not TASKS[cell.shift].is_there}
+    for task in sorted(absent):
+        print(f"{task} is left out: make worlds/{TASKS[task].program} installs its environment (docs/worlds.md)")
+    cells = [cell for cell in cells if cell.shift not in absent]
+    prepare(options.folder, {cell.shift for cell in cells}, options.seeds)
+    return _in_processes(measure_alone, [(cell, options.folder, options.goals) for cell in cells], options)
+
+
+def _run_selection(options: argparse.Namespace) -> int:
+    from results import KEPT
+    from selection import all_cells, measure_alone, name_of, prepare, train_alone
+
+    cells = _missing(list(all_cells(min(options.seeds, 3))), KEPT / "selection.json", name_of, options)
+    prepare(options.folder)
+    runs = list({cell.run.name: cell.run for cell in cells}.values())
+    failed = _in_processes(train_alone, [(run, options.folder) for run in runs], options)
+    return failed + _in_processes(measure_alone, [(cell, options.folder, options.goals) for cell in cells], options)
+
+
+def _missing(cells: list[Any], kept: Path, name_of: Callable[[Any], str], options: argparse.Namespace) -> list[Any]:
+    """Return the cells that are to be measured."""
+    (options.folder / options.study).mkdir(parents=True, exist_ok=True)
+    known = {path.stem for path in (options.folder / options.study).glob("*.json")}
+    if not options.again:
+        known |= {name_of(one) for one in json.loads(kept.read_text())}
+    missing = [cell for cell in cells if options.only in cell.name and cell.name not in known]
+    print(f"{len(missing)} of {len(cells)} cells are to be measured", flush=True)
+    return missing
+
+
+def _in_processes(do: Callable[..., Any], work: Sequence[tuple[Any, ...]], options: argparse.Namespace) -> int:
+    """Do work in processes of their own, and write each result; return how many failed.
+
+    Raises:
+        BrokenProcessPool: A process was killed, most likely for its memory.
+    """
+    os.environ["OMP_NUM_THREADS"] = "1"
+    context, failed = multiprocessing.get_context("spawn"), 0
+    with ProcessPoolExecutor(options.workers, mp_context=context, max_tasks_per_child=1) as pool:
+        waiting = {pool.submit(do, *one): one[0] for one in work}
+        for number, done in enumerate(as_completed(waiting), start=1):
+            name = waiting[done].name
+            try:
+                result = done.result()
+            except BrokenProcessPool:
+                raise
+            except Exception as error:  # the other cells continue
+                print(f"{name} failed: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+                failed += 1
+                continue
+            if result is not None:
+                path = options.folder / options.study / f"{name}.json"
+                path.with_suffix(".part").write_text(json.dumps(result, indent=1))
+                path.with_suffix(".part").rename(path)
+            print(f"{number}/{len(waiting)} {name}", flush=True)
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,186 @@
+"""Train a cell of the methods study, and measure it on held-out episodes and in closed loop."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, get_args
+
+import environments
+import numpy as np
+import torch
+from methods import BEFORE, PLANNING, SHIFTS, Cell, method_of
+from offline import offline_figures
+from prepare import base_model, data_before, data_shifted, encoded, training_episodes
+
+from vjepa2_ac.config import Config, ModelConfig, PlanningConfig, ValidationConfig
+from vjepa2_ac.config.training import CheckpointConfig
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.evaluation.measure import prediction_errors
+from vjepa2_ac.evaluation.result import PredictionErrors, Way
+from vjepa2_ac.model.adapter.lora import merge_adapter
+from vjepa2_ac.model.checkpoints import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.policies.train_prior import train_prior
+from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.runs.checkpoint import NEWEST
+from vjepa2_ac.runs.subject import load_subject
+from vjepa2_ac.simulation.agent import Planning
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_task
+from vjepa2_ac.simulation.domains import Domain, sample_domain
+from vjepa2_ac.simulation.policies import Oracle, RandomActions, ZeroActions
+from vjepa2_ac.simulation.rollout import Policy
+from vjepa2_ac.training.cost import count_parameters
+from vjepa2_ac.training.loop import train
+
+TEST_GOALS = 9_000  # first seed of problems, to which a cell adds its own (`goals_seed`)
+GOALS, CLIPS = 20, 128  # of one run; a row of the table pools its seeds, each with other goals
+
+
+def measure(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]:
+    """Return the figures of a cell.
+
+    Args:
+        cell: What to train.
+        folder: The work folder, which `prepare` filled.
+        goals: Problems of the closed loop.
+    """
+    config, method = config_of(cell, folder), method_of(cell.method)
+    started = time.process_time()
+    figures: dict[str, Any] = {"cell": asdict(cell), "made_with": made_with()}
+    if method.kind == "cloned":
+        prior, figures["held_out"] = _prior(cell, config, folder)
+        figures |= {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": (time.process_time() - started) / 60}
+        model = load_base(config.model, seed=cell.seed)
+        acts = PLANNING.model_copy(update={"planner": Component("prior"), "prior": prior})
+        return figures | {"reach": {"l1": closed_loop(cell, planner(model, acts), folder, goals=goals)}}
+    if method.kind == "zero-shot":
+        model, trained = load_base(config.model, seed=cell.seed), {"trained_share": 0.0, "adapter_mb": 0.0}
+    else:
+        model, trained = _trained(train(config, SILENT))
+    acts = PLANNING.model_copy(update={"prior": _prior(cell, config, folder)[0]}) if method.prior else PLANNING
+    figures |= {**trained, "cpu_minutes": (time.process_time() - started) / 60}
+    figures["shifted"] = _as_dict(held_out(model, config))
+    if cell.shift in SHIFTS:
+        space = open_dataset(config.data).spaces.action
+        figures["offline"] = offline_figures(model, space, encoded(config, model, "test", CLIPS))
+    if model.adaptation is not None:
+        merge_adapter(model)
+    figures["reach"] = {"l1": closed_loop(cell, planner(model, acts), folder, goals=goals)}
+    if cell.method == "zero-shot":
+        figures["baselines"] = baselines(cell, folder, goals=goals)
+    return figures
+
+
+def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
+    """Measure a cell in a process of its own, on one thread."""
+    torch.set_num_threads(1)
+    return measure(cell, folder, goals=goals)
+
+
+def _prior(cell: Cell, config: Config, folder: Path) -> tuple[str, Mapping[str, Any]]:
+    """Train an action prior on a cell's demonstrations; return its folder, and how it does on held-out clips."""
+    place = folder / "priors" / cell.name
+    return str(place), train_prior(config, place).held_out
+
+
+def made_with() -> dict[str, str]:
+    """Return which PyTorch and which commit of this project, if it is a checkout, compute."""
+    git = shutil.which("git")
+    command = [git or "git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=7"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False) if git else None  # noqa: S603
+    commit = found.stdout.strip() if found and found.returncode == 0 else "unknown"
+    return {"torch": torch.__version__, "commit": commit}
+
+
+def config_of(cell: Cell, folder: Path) -> Config:
+    """Return the config of a cell."""
+    method = method_of(cell.method, cell.shift)
+    data = (data_before if cell.method == BEFORE else data_shifted)(folder, cell.shift)
+    left_out = training_episodes(data, cell.episodes, cell.seed) if cell.episodes else ()
+    return Config(
+        run_dir=str(folder / "runs" / cell.name),
+        seed=cell.seed,
+        data=data.model_copy(update={"exclude": left_out}),
+        model=ModelConfig(base=base_model(folder, cell.base, cell.seed, cell.shift), dtype="float32"),
+        adapter=method.adapter,
+        training=method.training,
+        validation=ValidationConfig(every=method.training.steps, clips=40, batch_size=20),
+        checkpoint=CheckpointConfig(every=method.training.steps),
+    )
+
+
+def goals_seed(cell: Cell) -> int:
+    """Return the seed of a cell's problems; in third-party environments it is the first of several seeds."""
+    return TEST_GOALS + (1 if cell.shift in SHIFTS else 100) * cell.seed
+
+
+def baselines(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]:
+    """Return how policies without a model fare on the same goals."""
+    policies: list[Policy] = [ZeroActions(), RandomActions(PLANNING.limits, cell.seed)]
+    policies += [Oracle(PLANNING.limits)] if cell.shift in SHIFTS else []
+    result = {policy.name: closed_loop(cell, policy, folder, goals=goals) for policy in policies}
+    if cell.shift not in SHIFTS:
+        _, expert = environments.problems(folder, cell.shift, goals_seed(cell), goals)
+        result["oracle"] = environments.figures_of(expert, expert)
+    return result
+
+
+def planner(model: WorldModel, config: PlanningConfig) -> Policy:
+    """Return a policy that plans with a model."""
+    return Planning(Controller(model, config))
+
+
+def closed_loop(cell: Cell, policy: Policy, folder: Path, *, goals: int) -> dict[str, Any]:
+    """Return distances to the goal (cm) before the first step and after each, and what was solved."""
+    seed = goals_seed(cell)
+    if cell.shift not in SHIFTS:
+        when = "before" if cell.method == BEFORE else "after"
+        return environments.closed_loop(folder, cell.shift, policy, seed=seed, goals=goals, when=when)
+    results = [run_task(spec, policy) for spec in _rollouts(cell.shift, seed, goals)]
+    return {"distance_cm": np.round(np.concatenate([one.distance_cm for one in results]), 3).tolist()}
+
+
+def _rollouts(shift: str, seed: int, goals: int) -> Iterator[BenchmarkOptions]:
+    """Yield what is to be reached: in one world, or each goal in another that no episode was recorded in."""
+    world = SHIFTS[shift]
+    if isinstance(world, Domain):
+        yield BenchmarkOptions("reach", world, goals, seed)
+        return
+    for goal in range(goals):
+        drawn = sample_domain(np.random.default_rng([seed, goal]), world)
+        yield BenchmarkOptions("reach", drawn, 1, seed * 100 + goal)
+
+
+def held_out(model: WorldModel, config: Config) -> PredictionErrors:
+    """Return errors on clips of held-out episodes, from the latents that training used."""
+    model.eval()
+    return prediction_errors(model, encoded(config, model, "test", CLIPS))
+
+
+def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
+    loaded = load_subject(run, NEWEST)  # as it was made: the last
+    counts = count_parameters(loaded.config, loaded.world_model.sizes)
+    count = counts.trained if loaded.config.adapter.kind == "lora" else counts.predictor
+    files = list((loaded.checkpoint / "adapter").rglob("*.safetensors"))
+    return loaded.world_model, {
+        "trained_share": count / counts.predictor,
+        "adapter_mb": sum(path.stat().st_size for path in files) / 1e6,
+    }
+
+
+def _as_dict(errors: PredictionErrors) -> dict[str, Any]:
+    """Return ratios to persistence."""
+    one_step = {way: errors.of("teacher_forced", way=way).mean(axis=1).sum() for way in get_args(Way)}
+    rolled, nothing = (errors.of("rollout", way=way).sum(axis=0) for way in ("true", "persistence"))
+    return {
+        "rollout_over_persistence": (rolled / nothing).tolist(),
+        "one_step": float(one_step["true"] / one_step["persistence"]),
+        "one_step_zero_actions": float(one_step["zero"] / one_step["persistence"]),
+        "one_step_shuffled_actions": float(one_step["shuffled"] / one_step["persistence"]),
+    }

@@ -1,0 +1,64 @@
+"""Measure a model without a robot: numbers that may predict its success in closed loop, lower is better for each."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.stats import spearmanr
+from torch import Tensor
+
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.action_use import moves_of, rank_actions
+from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of
+from vjepa2_ac.evaluation.request import ProbeOptions
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.spaces import ActionSpace
+
+MOVES = 32  # clips whose moves are ranked
+
+
+def offline_figures(model: WorldModel, space: ActionSpace, held_out: Sequence[LatentBatch]) -> dict[str, float]:
+    """Return what is measured on clips of held-out episodes."""
+    true, predicted = LatentSums(), LatentSums()
+    for batch in held_out:
+        true.add(batch.latents[:, 1:], batch.episode_ids)
+        predicted.add(_rollout(model, batch), batch.episode_ids)
+    distribution = distribution_of(predicted, true)
+    rows = [(batch, row) for batch in held_out for row in range(len(batch.starts))]
+    chosen = [rows[place] for place in np.linspace(0, len(rows) - 1, MOVES).astype(int)]
+    moves = [move for batch, row in chosen for move in moves_of(batch, row, space, 0.075)]
+    ranking = rank_actions(model, moves, space, ProbeOptions(samples=32), seed=0)
+    return {
+        "action-ranking error": ranking.rank.value,
+        "energy spread, negative": -ranking.spread.value,
+        "spread of latents, distance from 1": abs(distribution.spread[-1].value - 1),
+        "latent MMD": distribution.mmd[-1].value,
+    }
+
+
+@torch.no_grad()
+def _rollout(model: WorldModel, batch: LatentBatch) -> Tensor:
+    return model.rollout(batch.latents[:, :1], batch.actions, batch.states[:, :-1])
+
+
+def correlations(
+    rows: Sequence[dict[str, Any]], outcomes: Sequence[float], of: Sequence[Hashable], draws: int = 2000
+) -> dict[str, Any]:
+    """Return Spearman's correlation of each number with an outcome, with a bootstrap interval.
+
+    Rows of one kind, such as the checkpoints of a run, are drawn together, because they are not independent.
+    """
+    outcome, kinds = np.array(outcomes), list(dict.fromkeys(of))
+    places = [np.flatnonzero([one == kind for one in of]) for kind in kinds]
+    drawn = np.random.default_rng(0).integers(len(kinds), size=(draws, len(kinds)))
+    picks = [np.concatenate([places[kind] for kind in one]) for one in drawn]
+    result = {}
+    for name in sorted(set.intersection(*(set(row) for row in rows))):
+        values = np.array([row[name] for row in rows])
+        resampled = [spearmanr(values[one], outcome[one]).statistic for one in picks]
+        low, high = np.nanpercentile(resampled, [2.5, 97.5])
+        result[name] = {"value": float(spearmanr(values, outcome).statistic), "low": float(low), "high": float(high)}
+    return result

@@ -1,0 +1,126 @@
+"""Write the tables of the selection study: which checkpoint each rule selects, and which number predicts success."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+from offline import correlations
+from results import Figures
+from selection import cells_of, run_of
+
+from vjepa2_ac.intervals import share_of
+from vjepa2_ac.runs.checkpoint import RunState
+
+GONE = "The cure `contrast` is gone. It was a loss term, `training.action_contrast`: measured at commit 6117de8."
+TITLES = {
+    "one_step": "one-step error / persistence",
+    "error": "error / persistence, last horizon",
+    "shuffled": "growth with shuffled actions, negated",
+    "ranking": "action-ranking error (selects checkpoints)",
+    "spread": "spread of the energy, negated",
+}
+
+
+def _selected(run: list[Figures]) -> Figures:
+    """Return the checkpoint that a run with these validations selects."""
+    state = RunState(0)
+    for one in run:
+        state = replace(state, step=one["cell"]["step"]).measured(one["error"], one["action_ranking_error"])
+    return next(one for one in run if one["cell"]["step"] == state.best_step)
+
+
+RULES: dict[str, Callable[[list[Figures]], Figures]] = {
+    "base": lambda run: run[0],
+    "last": lambda run: run[-1],
+    "best by error": lambda run: min(run, key=lambda one: float(one["error"])),
+    "best by ranking": _selected,
+}
+
+
+def write_tables(results: Sequence[Figures], path: Path, plot: Path) -> None:
+    """Write the table and the plot, of runs of which every checkpoint is measured."""
+    runs = [run for run in by_run(results) if len(run) == len(cells_of(run_of(run[0])))]
+    path.write_text("\n".join([*_rules(runs), "", GONE, "", *_correlations(runs)]) + "\n")
+    draw(runs, plot)
+
+
+def by_run(results: Sequence[Figures]) -> list[list[Figures]]:
+    """Return the checkpoints of each run, by step."""
+
+    def key(one: Figures) -> tuple[str, str, str, int]:
+        cell = one["cell"]
+        return cell["motions"], cell["method"], cell["cure"], cell["seed"]
+
+    ordered = sorted(results, key=lambda one: (*key(one), one["cell"]["step"]))
+    return [list(group) for _, group in groupby(ordered, key)]
+
+
+def _rules(runs: Sequence[list[Figures]]) -> Iterator[str]:
+    yield "| demonstrations | trained | cure | rule | steps | error | rank | goals reached | left at the end, cm |"
+    yield "|---" * 9 + "|"
+    for kind, group in groupby(runs, lambda run: [run[0]["cell"][name] for name in ("motions", "method", "cure")]):
+        of_kind = list(group)
+        for rule, choose in RULES.items():
+            chosen = [choose(run) for run in of_kind]
+            goals, left = sum(one["goals"] for one in chosen), [one["left_cm"] for one in chosen]
+            share = share_of(sum(one["reached"] for one in chosen), goals)
+            row = [
+                *(*kind, rule, ", ".join(str(one["cell"]["step"]) for one in chosen)),
+                *(_list([one[key] for one in chosen], 3) for key in ("error", "action_ranking_error")),
+                f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}] of {goals}",
+                f"{np.mean(left):.1f} ({_list(left, 1)})",
+            ]
+            yield f"| {' | '.join(row)} |"
+
+
+def _list(values: Sequence[float], digits: int) -> str:
+    return ", ".join(f"{value:.{digits}f}" for value in values)
+
+
+def _correlations(runs: Sequence[list[Figures]]) -> Iterator[str]:
+    """Yield a table of rank correlations with the distance left to the goal; runs are drawn as a whole."""
+    results = [one for run in runs for one in run if not one["cell"]["cure"]]
+    parts = {name: [one for one in results if one["cell"]["motions"] == name] for name in ("narrow", "varied")}
+    parts = {"all": results, **parts}
+    columns = [
+        correlations([one["offline"] for one in part], [one["left_cm"] for one in part], list(map(run_of, part)))
+        for part in parts.values()
+    ]
+    yield f"| offline number, over {len(results)} checkpoints | {' | '.join(parts)} |"
+    yield "|---" * (len(parts) + 1) + "|"
+    for name, title in TITLES.items():
+        cells = [f"{one[name]['value']:+.2f} [{one[name]['low']:+.2f}, {one[name]['high']:+.2f}]" for one in columns]
+        yield f"| {title} | {' | '.join(cells)} |"
+
+
+def draw(runs: Sequence[list[Figures]], path: Path) -> None:
+    """Plot error, ranking and closed loop over steps, a line for each seed: narrow above, varied below."""
+    from vjepa2_ac.media.figure import new_figure
+
+    figure = new_figure(9.2, 5.4, layout="constrained")
+    panels = figure.subplots(2, 3, sharex=True)
+    shown = {
+        "error": "error / persistence",
+        "action_ranking_error": "action-ranking error",
+        "left_cm": "cm left in closed loop",
+    }
+    for row, motions in zip(panels, ("narrow", "varied"), strict=True):
+        for axes, (key, title) in zip(row, shown.items(), strict=True):
+            for run in runs:
+                about = run[0]["cell"]
+                if about["motions"] != motions or about["cure"]:
+                    continue
+                colour = "#1f77b4" if about["method"] == "LoRA" else "#d62728"
+                label = about["method"] if about["seed"] == 0 else None
+                steps = [one["cell"]["step"] for one in run]
+                axes.plot(steps, [one[key] for one in run], color=colour, marker=".", alpha=0.8, label=label)
+            axes.set_ylim(bottom=0)
+            axes.set_title(f"{motions} data: {title}", fontsize=10)
+    for axes in panels[1]:
+        axes.set_xlabel("optimizer steps (0: the base)")
+    panels[0][0].legend()
+    figure.savefig(path, dpi=130)
