@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
 from vjepa2_ac.model.adapter.lora import lora_layers
 from vjepa2_ac.model.checkpoints import to_official
@@ -119,7 +120,7 @@ class Bench:
         """Return upstream's planner with so much to try."""
         return PlanningConfig(
             horizon=horizon, samples=samples, iterations=iterations, energy=EnergyConfig(samples_at_once=at_once),
-            planner={"name": "cem", "options": {"elites": min(10, max(2, samples // 4))}},
+            planner=Component("cem", {"elites": min(10, max(2, samples // 4))}),
         )  # fmt: skip
 
     def decision(self, way: Way, horizon: int) -> Callable[[], object]:

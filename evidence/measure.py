@@ -18,6 +18,7 @@ from offline import offline_figures
 from prepare import base_model, data_before, data_shifted, encoded, training_episodes
 
 from vjepa2_ac.config import Config, ModelConfig, PlanningConfig, ValidationConfig
+from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.evaluation.measure import prediction_errors
@@ -165,6 +166,7 @@ def held_out(model: WorldModel, config: Config) -> PredictionErrors:
 
 def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
     loaded = load_subject(run, NEWEST)  # as it was made: the last
+    assert loaded.checkpoint is not None, "a run"
     counts = count_parameters(loaded.config, loaded.world_model.sizes)
     count = counts.trained if loaded.config.adapter.kind == "lora" else counts.predictor
     files = list((loaded.checkpoint / "adapter").rglob("*.safetensors"))

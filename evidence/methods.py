@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from environments import MANY, TASKS
 
 from vjepa2_ac.config import AdapterConfig, TrainingConfig
-from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges
 
 Base = Literal["one camera", "many cameras", "none"]
@@ -33,7 +33,7 @@ SEEDS, MORE_SEEDS = 3, 5  # of the simulated arm, and where every episode differ
 BASES: tuple[Base, ...] = ("one camera", "many cameras")
 """one camera: trained on domain A alone. many cameras: on 800 worlds, each seen by another camera (the demo's base)."""
 
-IN_OUT = ("predictor_embed", "predictor_proj", "action_encoder", "state_encoder")
+IN_OUT: Any = ("predictor_embed", "predictor_proj", "action_encoder", "state_encoder")
 AXES = "zero-shot, calibrated axes"
 BEST = "LoRA r32 + in/out"
 LONGER = f"{BEST}, 3x steps"
@@ -59,7 +59,6 @@ PLANNING = PlanningConfig(
     iterations=4,
     start_std=0.67,
     limits=LimitsConfig(xyz=(0.075, 0.075, 0.075), gripper_mode="held"),
-    energy=EnergyConfig(distance="l1"),
 )
 
 
