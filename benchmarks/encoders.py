@@ -1,6 +1,6 @@
 """Which encoder should I take? What each published one costs, by the arithmetic of `vjepa2-ac doctor`.
 
-    python benchmarks/encoders.py               # all of them (make encoders)
+    python benchmarks/encoders.py               # all of them
     python benchmarks/encoders.py --only ViT-B  # those whose name has this in it; writes nothing
     python benchmarks/encoders.py --device cuda # frames a second on a GPU, instead, with random weights in bfloat16
 

@@ -1,7 +1,6 @@
 """The errors of docs/troubleshooting.md are those that the program prints."""
 
 import re
-import runpy
 import shlex
 import shutil
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from guides import FEW_STEPS
 from paths import ROOT
 from vjepa2_ac.cli import main
 
@@ -19,7 +19,7 @@ NOT_MADE = {
     "data check builtin:demo data.path=gs://": "needs a network",
     "simulate ws://": "needs a server; tests/serving has one",
 }
-OF_A_RUN = ("data.test_share=0.3", *runpy.run_path(str(ROOT / "scripts/walk.py"))["FEW_STEPS"].split())
+OF_A_RUN = ("data.test_share=0.3", *FEW_STEPS.split())
 
 
 @pytest.fixture(scope="module")

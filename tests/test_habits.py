@@ -1,7 +1,7 @@
 """The habits of the project: one version, pins, notices, hooks, workflows and links that say what is there."""
 
 import re
-import runpy
+import subprocess
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from paths import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 TARGETS = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
-CHECKS = runpy.run_path(str(ROOT / "scripts/check_links.py"))
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
 
 LIBRARIES = "bitsandbytes|Franka|PEFT|PEP 610|protobuf.dev|PyTorch|TFDS|torchmetrics|torchvision|WCAG"
@@ -105,37 +104,20 @@ def test_hooks_are_the_tools_of_make_lint() -> None:
     """From the environment that `make` creates: their versions are those of constraints.txt."""
     repositories = loaded(ROOT / ".pre-commit-config.yaml")["repos"]
     assert [one["repo"] for one in repositories] == ["local"]
-    entries = {hook["entry"].removesuffix(" --force-exclude") for hook in repositories[0]["hooks"]}
+    hooks = {hook["entry"].split()[0] for hook in repositories[0]["hooks"]}
     recipe = re.search(r"^lint:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
     assert recipe
-    tools = {re.search(r"\$\(BIN\)/(.*)", line)[1] for line in recipe[1].splitlines()}  # type: ignore[index]
-    expected = {f".venv/bin/{tool.removesuffix(' .').removesuffix(' --check')}" for tool in tools}
-    assert entries == expected | {".venv/bin/python scripts/strip_notebooks.py"}
+    assert hooks == {f".venv/bin/{tool}" for tool in re.findall(r"\$\(BIN\)/(\w+)", recipe[1])}
 
 
-# Links and notebooks.
+def test_make_help_lists_at_most_twelve_targets() -> None:
+    done = subprocess.run(["make", "-s", "help"], cwd=ROOT, capture_output=True, text=True, check=True)
+    listed = re.findall(r"^make (\S+) - ", done.stdout, flags=re.MULTILINE)
+    assert set(listed) - {"worlds/%"} == TARGETS
+    assert len(listed) <= 12
 
 
-def test_no_link_is_dead() -> None:
-    assert not CHECKS["dead_links"](ROOT)
-
-
-def test_dead_links_are_found(tmp_path: Path) -> None:
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "docs/a.md").write_text("# One `thing`, two\n\n## Twice\n\n## Twice\n\n```sh\n# no heading\n```\n")
-    good = "[a](docs/a.md) [b](docs/a.md#one-thing-two) [c](docs/a.md#twice-1) [d](#here) `[e](not.md)`\n\n# Here\n"
-    (tmp_path / "README.md").write_text(good + "\n```md\n[f](not.md)\n```\n")
-    assert CHECKS["dead_links"](tmp_path) == []
-    bad = ("docs/b.md", "docs/a.md#twice-2", "docs/a.md#no-heading", "#there")
-    (tmp_path / "README.md").write_text("\n".join(f"[x]({link})" for link in bad) + '\n<img src="docs/a.png">\n')
-    assert CHECKS["dead_links"](tmp_path) == [f"README.md: {link}" for link in (*bad, "docs/a.png")]
-
-
-def test_outputs_are_stripped(tmp_path: Path) -> None:
-    strip, path = runpy.run_path(str(ROOT / "scripts/strip_notebooks.py"))["strip"], tmp_path / "a.ipynb"
-    output = nbformat.v4.new_output("stream", text="hello")
-    cell = nbformat.v4.new_code_cell("print('hello')", outputs=[output], execution_count=3)
-    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), path)
-    assert strip(str(path))
-    assert not strip(str(path))
-    assert nbformat.read(path, as_version=4).cells[0].outputs == []
+def test_notebooks_have_no_outputs() -> None:
+    for path in (ROOT / "examples").glob("*.ipynb"):
+        cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+        assert not [cell for cell in cells if cell.outputs or cell.execution_count is not None], path

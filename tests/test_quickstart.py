@@ -1,13 +1,13 @@
 """docs/QUICKSTART.md, walked through line by line: what runs here runs, the rest is what the program takes."""
 
 import re
-import runpy
 import shlex
 import tomllib
 from pathlib import Path
 
 import pytest
 
+import guides
 from paths import ROOT
 from vjepa2_ac.cli import main
 
@@ -16,12 +16,11 @@ SECTIONS = {
     int(number): text for number, text in re.findall(r"^## (\d)\. .*?\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.M)
 }
 HERE = (2, 3, 4)
-WALK = runpy.run_path(str(ROOT / "scripts/walk.py"))  # the same commands on less: they are walked, not measured
 
 
 def commands_of(section: int) -> list[list[str]]:
     """Return the words of every line of a section that is run."""
-    return [shlex.split(line) for line in WALK["commands_of"](SECTIONS[section])]
+    return [shlex.split(line) for line in guides.commands_of(SECTIONS[section])]
 
 
 def test_the_page_has_its_sections() -> None:
@@ -35,7 +34,7 @@ def test_from_data_to_a_number_and_a_plan(
     monkeypatch.chdir(tmp_path)
     printed: dict[str, str] = {}
     for words in [words for section in HERE for words in commands_of(section)]:
-        assert main([*words[1:], *WALK["shorter"](" ".join(words)).split()]) == 0, words
+        assert main([*words[1:], *guides.shorter(" ".join(words))]) == 0, words
         printed[" ".join(words)] = capsys.readouterr().out
     told = printed["vjepa2-ac init data/my_robot --model builtin:sim-tiny"]
     walked = {" ".join(words) for words in commands_of(3)}

@@ -127,9 +127,7 @@ def small(evidence: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[A
         yield evidence
 
 
-@pytest.mark.parametrize(
-    "method", ["LoRA r4 + in/out", "zero-shot", "behaviour cloning"]
-)
+@pytest.mark.parametrize("method", ["LoRA r4 + in/out", "zero-shot", "behaviour cloning"])
 def test_a_cell_is_trained_and_measured(small: Any, method: str) -> None:
     base = "none" if method == "behaviour cloning" else "many cameras"
     cell = small.methods.Cell("look", base, method, 0 if method == "zero-shot" else 4, 0)

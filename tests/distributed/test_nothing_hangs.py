@@ -19,7 +19,7 @@ from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 
 pytestmark = pytest.mark.usefixtures("default_signals")
-KILLS = int(os.environ.get("VJEPA2_AC_SOAK", "1"))  # `make soak`: 20
+KILLS = int(os.environ.get("VJEPA2_AC_SOAK", "1"))  # 20 before a release
 TRAINS = "-m", "vjepa2_ac.cli", "train"
 STORE = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
 SCRIPT = str(ROOT / "tests/support/disagreeing_ranks.py")

@@ -1,5 +1,6 @@
 """Trackers: they get the metrics, and resume the same run; a failing one causes a warning only."""
 
+import importlib.util
 import logging
 import sys
 import types
@@ -120,6 +121,18 @@ def test_tensorboard_gets_the_numbers_and_forgets_steps_that_are_done_again(tmp_
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     assert [(event.step, event.value) for event in events.Scalars("train/loss")] == [(1, 0.25), (2, 0.5)]
+
+
+def test_a_run_without_tensorboard_prints_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "tensorboard" else find(name))
+    trackers = open_trackers(run_config(tmp_path, tensorboard=True), tmp_path, run_id="x", first_step=0)
+    trackers.log("train", 1, {"loss": 0.5})
+    (line,) = warnings_in(caplog)
+    assert "TensorBoard is not installed" in line
+    assert "[tensorboard]" in line
 
 
 def test_weights_and_biases_goes_on_in_the_same_run_without_a_network(tmp_path: Path) -> None:

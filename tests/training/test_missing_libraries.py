@@ -16,7 +16,6 @@ from vjepa2_ac.training.loop import train
         ("bitsandbytes", "training__optimizer", "adamw_8bit", "8bit"),
         ("wandb", "tracking__wandb", "offline", "wandb"),
         ("trackio", "tracking__trackio", True, "trackio"),
-        ("tensorboard", "tracking__tensorboard", True, ""),
     ],
 )
 def test_missing_libraries_are_reported_before_mirror_or_data_are_opened(

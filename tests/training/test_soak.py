@@ -1,6 +1,6 @@
 """A run that is killed repeatedly, at any time, equals one that is not.
 
-A few kills here; many with `make soak` (VJEPA2_AC_SOAK=20: so many kills of each kind of run).
+A few kills here; many before a release (VJEPA2_AC_SOAK=20: so many kills of each kind of run).
 """
 
 import logging

@@ -134,7 +134,7 @@ class TrackingConfig(Section):
     """Where metrics go, besides metrics.jsonl in the run folder."""
 
     tensorboard: bool = True
-    """Event files in RUN/tensorboard."""
+    """Event files in RUN/tensorboard, extra tensorboard. Without the extra a run prints how to install it."""
     wandb: Literal["disabled", "online", "offline"] = "disabled"
     """Weights & Biases, extra wandb. offline: files in RUN/wandb, which `wandb sync` sends later."""
     trackio: bool = False

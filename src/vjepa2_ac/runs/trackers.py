@@ -87,7 +87,6 @@ def require_installed(tracking: TrackingConfig) -> None:
         InputError: A requested one is not installed.
     """
     asked = {
-        "tensorboard": (tracking.tensorboard, pip_install(), "false"),
         "wandb": (tracking.wandb != "disabled", pip_install("wandb"), "disabled"),
         "trackio": (tracking.trackio, pip_install("trackio"), "false"),
     }
@@ -108,7 +107,12 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
     """
     tracking = config.tracking
     openings: dict[str, Opening] = {}
-    if tracking.tensorboard:
+    if tracking.tensorboard and importlib.util.find_spec("tensorboard") is None:
+        missing = (
+            "TensorBoard is not installed: no event files, but metrics.jsonl has every number. To install it, run %s"
+        )
+        logger.warning(missing, pip_install("tensorboard"))
+    elif tracking.tensorboard:
         openings["TensorBoard"] = lambda: _tensorboard(folder, first_step)
     if tracking.wandb != "disabled":
         openings["Weights & Biases"] = lambda: _wandb(config, folder, run_id)

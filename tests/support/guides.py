@@ -1,0 +1,30 @@
+"""The commands that guides show, and what makes them take seconds."""
+
+import re
+
+FEW_STEPS = (
+    "training.steps=2 validation.every=1 checkpoint.every=1 validation.clips=4 validation.ranking_samples=4"
+    " data.workers=0 training.batch_size=2"
+    " training.accumulation=1 training.warmup_steps=0 training.allow_weak_base=true"
+)
+SHORTER = {  # by the first words of a command
+    "train": FEW_STEPS,
+    "evaluate": "--clips 4 --ranking-clips 2 --samples 8 --examples 1 --landscapes 1 --nodes 3",
+    "simulate record": "--episodes 10 --steps 33",
+    "plan": "planning.samples=16 planning.iterations=1",
+    "data calibrate": "--limit 8",
+}
+
+
+def commands_of(text: str) -> list[str]:
+    """Return the commands of a page, or of a part of it, without comments; continued lines are one."""
+    blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    shown = [re.sub(r"\s+", " ", re.sub(r"(^|\s)#\s.*", "", line)).strip() for line in lines]
+    return [line for line in shown if line]
+
+
+def shorter(command: str) -> list[str]:
+    """Return further words of a command of this program, so that it takes seconds."""
+    words = command.removeprefix("vjepa2-ac ")
+    return next((less.split() for start, less in SHORTER.items() if f"{words} ".startswith(f"{start} ")), [])
