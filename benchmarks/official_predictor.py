@@ -138,7 +138,7 @@ def difference(ours: Objective, official: Official, batch: LatentBatch) -> str |
     computed; the gradients of the adapters are not.
     """
     pairs = _share_adapters(ours, official)
-    modules = (ours, official.predictor)
+    modules = (ours.world_model, official.predictor)
     for module in modules:
         module.eval()  # no dropout
     loss = torch.stack(list(ours(batch))).sum()

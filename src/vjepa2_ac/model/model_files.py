@@ -97,7 +97,7 @@ def _find(name: str, where: str, needed: str, fix: str) -> Path:
     path = ASSETS / name.removeprefix(BUILTIN) if name.startswith(BUILTIN) else Path(name)
     if name.startswith(BUILTIN) and not (path / CONFIG).is_file():
         there = ", ".join(sorted(f"{BUILTIN}{config.parent.name}" for config in ASSETS.glob(f"*/{CONFIG}")))
-        found = f"no model of that name in the package; it has {there or 'none: install it again, or run `make base`'}"
+        found = f"no model of that name in the package; it has {there or 'none: install it again'}"
         raise InputError(where=where, found=found, needed=_TINY)
     if not path.exists():
         raise InputError(where=where, found="no such file or folder", needed=needed, fix=fix)
