@@ -8,30 +8,16 @@ import pytest
 
 from benches import imported
 from paths import ROOT
-from vjepa2_ac.config import EncoderSizes, PredictorSizes
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.model.checkpoints import base_sizes
 from vjepa2_ac.model.model_files import PUBLISHED
 from vjepa2_ac.training.cost import count_parameters, estimate_memory
-
-SMALL = EncoderSizes(width=96, depth=2, heads=4, mlp_ratio=4.0, family="v2.1")
 
 
 @pytest.fixture
 def encoders(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The benchmark."""
     yield from imported("encoders", monkeypatch)
-
-
-def test_a_larger_image_or_predictor_costs_more(encoders: Any) -> None:
-    small, large = PredictorSizes(width=48, depth=2, heads=2), PredictorSizes(width=96, depth=3, heads=2)
-    predictors = {"small": small, "large": large}
-    cost = encoders.cost_of("small", SMALL, ("a-name",), predictors, image_sizes=(64, 96))
-    assert cost.gflop_per_frame["96"] > 2.25 * cost.gflop_per_frame["64"]
-    assert cost.peak_gb["64"]["small"] < cost.peak_gb["64"]["large"] < cost.peak_gb["96"]["large"]
-    lines = encoders.table([cost]).splitlines()
-    assert lines[2].startswith("| small | a-name | 96 | ")
-    assert len({line.count("|") for line in lines}) == 1
 
 
 def test_every_encoder_that_can_be_downloaded_has_a_row(encoders: Any) -> None:
@@ -62,7 +48,7 @@ def test_parameters_of_a_published_encoder_are_those_of_its_name(published: Any)
     assert found == pytest.approx(published.encoder.parameters, rel=0.02)
 
 
-@pytest.mark.parametrize(("name", "gpu_gb"), [("scratch_vitb", 8), ("scratch_vitl", 16)])
+@pytest.mark.parametrize(("name", "gpu_gb"), [("scratch_vitl", 16)])
 def test_a_predictor_from_scratch_fits_the_gpu_that_its_config_names(name: str, gpu_gb: int) -> None:
     config = load_config(ROOT / f"configs/{name}.yaml")
     assert f"{gpu_gb} GB GPU" in (ROOT / f"configs/{name}.yaml").read_text().splitlines()[0]

@@ -8,10 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from torch._dynamo.utils import counters
 
 from benches import ELSEWHERE, imported
-from tracing import tracing
 
 
 @pytest.fixture
@@ -40,20 +38,6 @@ def test_quick_benchmark_of_a_decision_completes_without_the_official_code(
         assert min(float(mfu), float(of_plain)) >= 0  # rounded
         assert of_official == "-"
     assert lines[0][5] == "1.00"
-
-
-@pytest.mark.usefixtures("traced")
-@tracing[0]
-@tracing[1]
-def test_decisions_with_compiled_blocks_are_timed_beside_those_without(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--compile"])
-    ways = [way for _, way, *_ in DECISION.findall(capsys.readouterr().out)]
-    assert ways == [
-        "plain", "ours/4", "ours/4+compiled", "ours/2", "ours/2+compiled", "ours/4+adapter", "ours/4+adapter+compiled",
-    ]  # fmt: skip
-    assert counters["stats"]["unique_graphs"]
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])

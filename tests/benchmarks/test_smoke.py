@@ -35,7 +35,7 @@ def test_it_runs_to_its_end(
             short = [replace(one, steps=90, height=90, width=160) for one in video.RECORDINGS]
             monkeypatch.setattr(video, "RECORDINGS", short)
         if name == "index":  # it changes these itself, for a process of its own
-            for attribute in ("FEWEST_IN_FLIGHT", "_possible_copies"):
+            for attribute in ("_IN_FLIGHT", "_possible_copies"):
                 monkeypatch.setattr(module.rlds_index, attribute, getattr(module.rlds_index, attribute))
             monkeypatch.setenv("STORAGE_EMULATOR_HOST", "")
         if name == "loader":
