@@ -125,23 +125,3 @@ def test_every_fix_that_an_error_of_broken_episodes_names_works(
             use(broken_episodes="skip")
         assert list(fixes_of(caught.value)) == ["exclude"]
         follow_exclusions(use, broken_episodes="skip")
-
-
-def test_a_set_without_broken_episodes_is_the_same_with_either_policy(tmp_path: Path) -> None:
-    use = broken_files(3, 0, tmp_path)
-    for policy in ("error", "skip"):
-        dataset = use(broken_episodes=policy)
-        assert (len(dataset.episodes), len(dataset.broken)) == (3, 0)
-
-
-def test_episodes_of_one_identity_are_named_once_and_not_where_nothing_would_be_left() -> None:
-    problem = EpisodeProblem("same", "record 1", "the same identity as record 0: same")
-    for names in (["same", "other"], ["same"]):
-        source = MemorySource([20] * len(names), names=names, problems=[problem] * 4)
-        with pytest.raises(InputError, match=r"record 1: the same identity.*3 more cannot be used either") as caught:
-            open_in_memory(source)
-        fixes = fixes_of(caught.value)
-        assert fixes.get("exclude") == ({"exclude": ("same",)} if "other" in names else None)
-        assert ("skip" in fixes) == ("other" in names)
-        for values in fixes.values():
-            open_in_memory(source, **values)

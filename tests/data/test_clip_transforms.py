@@ -13,9 +13,9 @@ import torch
 from clip_transforms import TRANSFORMS as THINGS
 from clips import open_in_memory
 from memory_source import MemorySource
-from vjepa2_ac.config.loading import config_schema, parse_config
+from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.loader import Mixed, training_loader, validation_batches
+from vjepa2_ac.data.loader import training_loader, validation_batches
 from vjepa2_ac.encoding.encode_dataset import require_encodable
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
@@ -96,14 +96,6 @@ def test_frames_may_get_another_size() -> None:
     assert batch.frames.shape[2:4] == (2, 5)
 
 
-def test_a_second_data_set_has_its_own_transforms() -> None:
-    mixed = Mixed(opened(), opened({"name": "halve"}), 0.5)
-    plain, halved = frames(opened(), 2), frames(opened({"name": "halve"}), 2)
-    found = frames(mixed, 4)
-    assert torch.equal(found[::2], plain)
-    assert torch.equal(found[1::2], halved)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -145,16 +137,3 @@ def test_cached_latents_cannot_be_transformed(data: dict[str, str]) -> None:
     parse_config(values(transforms=[], **data), where="")
     with pytest.raises(InputError, match=r"data\.transforms: .*Leave data\.transforms out"):
         require_encodable(parse_config(values(transforms=[{"name": "halve"}]), where=""))
-
-
-def test_the_schema_names_the_transforms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    del tmp_path
-    names, *with_options = transforms_in_schema()
-    assert names["enum"] == list(THINGS)
-    assert "most" in with_options[0]["properties"]["options"]["properties"]
-    monkeypatch.setattr(TRANSFORMS, "_things", {})
-    assert transforms_in_schema() == [{"type": "string"}]
-
-
-def transforms_in_schema() -> list[dict]:
-    return config_schema()["$defs"]["RldsData"]["properties"]["transforms"]["items"]["anyOf"]

@@ -1,10 +1,7 @@
 """The clips of a split are a PyTorch data set that works in any DataLoader."""
 
-import multiprocessing
 import pickle
-import threading
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader, Subset, random_split
+from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
 from clips import clip_at, open_in_memory
@@ -20,7 +17,7 @@ from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips import collate
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.episode import Batch, Clip, Episode
+from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError
 
 
@@ -84,32 +81,6 @@ def test_default_collation_gives_a_batch() -> None:
     assert moved.starts == explicit.starts
 
 
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # Python 3.12 warns of fork beside threads
-@pytest.mark.parametrize("method", ["fork", "spawn"])
-def test_workers_read_the_same_clips(droid: Path, method: str) -> None:
-    clips = opened(droid, camera=("exterior_1_left", "wrist_left")).clips("train")
-    alone = collate([clips[index] for index in range(len(clips))])
-    context = multiprocessing.get_context(method)
-    batches = list(DataLoader(clips, batch_size=4, num_workers=2, multiprocessing_context=context))
-    assert torch.equal(torch.cat([batch.frames for batch in batches]), alone.frames)
-    assert torch.equal(torch.cat([batch.actions for batch in batches]), alone.actions)
-    assert sum((batch.cameras for batch in batches), ()) == alone.cameras
-    assert len(set(alone.cameras)) == 2
-
-
-def test_shuffled_parts_have_every_clip_once() -> None:
-    clips = open_in_memory(MemorySource([9, 9])).clips()
-    generator = torch.Generator().manual_seed(3)
-    parts = random_split(clips, [0.7, 0.3], generator=generator)
-    loaders = [DataLoader(part, batch_size=3, shuffle=True, generator=generator) for part in parts]
-    found = [
-        name for loader in loaders for batch in loader for name in zip(batch.episode_ids, batch.starts, strict=True)
-    ]
-    assert found != names(list(clips))
-    assert sorted(found) == names(list(clips))
-    assert names([Subset(clips, [4, 2])[1]]) == names([clips[2]])
-
-
 def test_a_pickled_data_set_reads_the_same_clips(droid: Path) -> None:
     clips = opened(droid).clips()
     copy = pickle.loads(pickle.dumps(clips))  # noqa: S301 - our own
@@ -134,27 +105,3 @@ def test_a_broken_episode_is_named_with_a_fix_that_works(
     assert 0 < len(reasons) < len(clips)
     assert all("not a JPEG" in reason for reason in reasons)
     assert all("add to data.exclude" in reason and "skip" not in reason for reason in reasons)
-
-
-def test_clips_behind_a_url_are_read_concurrently() -> None:
-    meeting = threading.Barrier(4, timeout=120)
-
-    class Slow(MemorySource):
-        def read(self, *arguments: Any) -> Episode:
-            meeting.wait()  # nobody continues before four are here
-            return super().read(*arguments)
-
-    dataset = open_in_memory(Slow([30] * 10))
-    remote = replace(dataset, config=dataset.config.model_copy(update={"path": "gs://bucket/set"}))
-    batch = next(iter(DataLoader(remote.clips(), batch_size=4)))
-    assert batch.starts == (0, 1, 2, 3)
-
-
-def test_what_has_no_clips_is_refused() -> None:
-    dataset = open_in_memory(MemorySource([9, 9]))
-    with pytest.raises(InputError, match=r"'tset'.*train, validation, test"):
-        dataset.clips("tset")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="no validation episodes"):
-        dataset.clips("validation")
-    with pytest.raises(InputError, match="stride=4"):
-        open_in_memory(MemorySource([30]), stride="auto").clips()

@@ -1,9 +1,7 @@
 """Any data set becomes a LeRobot data set v3.0, whole or not at all, that reads back with the same values."""
 
 import json
-import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +11,15 @@ import pytest
 from pyarrow import parquet
 
 from lerobot_sets import Recorded, numbered, numbers_of, write_v30
-from memory_source import MemorySource
 from synthetic import draw_frame, synthetic_states
 from vector_sets import draw_vector, vectors, write_vectors
-from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.data import convert
-from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.convert import convert_to_lerobot
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.episode import Episode
-from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.look import look_at
-from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.spaces import actions_from_states
 
 CAMERAS = ("exterior_1_left", "wrist_left")
@@ -175,27 +168,6 @@ def test_the_form_is_that_of_lerobot(droid: Path, tmp_path: Path) -> None:
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
 
 
-def test_the_table_of_episodes_says_where_each_is(droid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(convert, "_EPISODES_AT_ONCE", 4)  # written in two parts
-    convert_to_lerobot(config_of(droid), tmp_path / "out", SILENT)
-    rows = parquet.read_table(tmp_path / "out/meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    key = "observation.images.exterior_1_left"
-    assert [row["episode_index"] for row in rows] == list(range(6))
-    assert [row["length"] for row in rows] == LENGTHS
-    assert [(row["dataset_from_index"], row["dataset_to_index"]) for row in rows[:3]] == [(0, 12), (12, 26), (26, 42)]
-    assert rows[4]["tasks"] == ["move to place 3"]
-    assert (rows[4]["data/chunk_index"], rows[4]["data/file_index"]) == (0, 0)
-    assert (rows[4]["meta/episodes/chunk_index"], rows[4]["meta/episodes/file_index"]) == (0, 0)
-    assert [rows[4][f"videos/{key}/{part}"] for part in ("chunk_index", "file_index")] == [0, 4]
-    times = [rows[4][f"videos/{key}/{part}_timestamp"] for part in ("from", "to")]
-    assert times == [0.0, 1.0]
-    kinds = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
-    features = info_of(tmp_path / "out")["features"]
-    found = {name for name in rows[0] if name.startswith("stats/")}
-    assert found == {f"stats/{name}/{kind}" for name in features for kind in kinds}
-    assert np.shape(rows[0][f"stats/{key}/q50"]) == (3, 1, 1)
-
-
 def test_statistics_are_those_of_the_numbers_and_pixels(droid: Path, tmp_path: Path) -> None:
     convert_to_lerobot(config_of(droid), tmp_path / "out", SILENT)
     dataset = open_dataset(config_of(droid))
@@ -277,105 +249,8 @@ def test_a_broken_episode_is_left_out_where_the_policy_says_so(spoiled: Callable
     )
 
 
-def test_a_last_episode_whose_second_camera_is_broken_leaves_no_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class BrokenAtLast(MemorySource):
-        def read(self, index: int, camera: str | None = None, needed: Any = None) -> Episode:
-            pictureless = frozenset({2} if camera == "wrist_left" else ())
-            return MemorySource.read(replace(self, pictureless=pictureless), index, camera, needed)
-
-    monkeypatch.setattr(opening, "open_source", lambda _: BrokenAtLast([9, 9, 9]))
-    config = config_of("x", broken_episodes="skip", camera=list(CAMERAS))
-    assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (2, 18)
-    videos = [name for name in files_in(tmp_path / "out") if "videos/" in name]
-    assert [name[-7:-4] for name in videos] == ["000", "001"] * 2
-
-
-def test_frames_of_two_sizes_cannot_be_one_feature(tmp_path: Path) -> None:
-    for number, size in enumerate(((36, 48), (36, 64))):
-        frames = np.zeros((6, *size, 3), np.uint8)
-        (tmp_path / "in").mkdir(exist_ok=True)
-        np.savez(tmp_path / f"in/{number}.npz", states=synthetic_states(6), frames=frames, fps_hz=10.0)
-    with pytest.raises(InputError, match=r"images\.frames: frames of 36x64\. needed: 36x48, as in the first episode"):
-        convert_to_lerobot(config_of(tmp_path / "in", source="npz"), tmp_path / "out", SILENT)
-    assert not (tmp_path / "out").exists()
-
-
-def test_odd_sizes_lose_a_row_and_a_column_and_short_episodes_and_odd_rates_are_written(tmp_path: Path) -> None:
-    (tmp_path / "in").mkdir()
-    for number, steps in enumerate((1, 5)):
-        frames = np.stack([np.full((37, 49, 3), 40 * step, np.uint8) for step in range(steps)])
-        arrays = {"states": synthetic_states(steps), "frames": frames, "fps_hz": 12.5}
-        np.savez(tmp_path / f"in/{number}.npz", **arrays)
-    assert convert_to_lerobot(config_of(tmp_path / "in", source="npz"), tmp_path / "out", SILENT) == (2, 6)
-    after = read_back(tmp_path / "out", "frames")
-    frames = after.source.read(1).read_frames(range(5))
-    assert frames.shape == (5, 36, 48, 3)
-    np.testing.assert_allclose(frames.mean(axis=(1, 2, 3)), 40 * np.arange(5), atol=2)
-    assert (after.control_rate_hz, info_of(tmp_path / "out")["fps"]) == (12.5, 12.5)
-
-
-def test_success_that_is_not_known_of_all_is_left_out_with_a_note(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    notes: list[str] = []
-
-    class Noting(Reporter):
-        def note(self, text: str) -> None:
-            notes.append(text)
-
-    for success, expected in (([True, None, False], 1), ([None] * 3, 0)):
-        source = MemorySource([9, 9, 9], success=success)
-        monkeypatch.setattr(opening, "open_source", lambda _, source=source: source)
-        convert_to_lerobot(config_of("x"), tmp_path / f"out{expected}", Noting())
-        assert "is_episode_successful" not in info_of(tmp_path / f"out{expected}")["features"]
-        assert len(notes) == 1
-    assert notes == ["Success is left out: 1 of 3 episodes lack it."]
-
-
 def test_latents_and_names_with_a_slash_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"latents, without frames.*to write its frames"):
         convert_to_lerobot(config_of("x", source="latents"), tmp_path / "out", SILENT)
     with pytest.raises(InputError, match=r"'a/b'.*without /"):
         convert_to_lerobot(config_of("x", source="npz", camera="a/b"), tmp_path / "out", SILENT)
-
-
-def test_a_full_disk_leaves_nothing(droid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(storage, "write_atomically", full)
-    dataset = config_of(droid, disk_cache={"dir": str(tmp_path / "cache")})
-    with pytest.raises(InputError, match="No space left"):
-        convert_to_lerobot(dataset, tmp_path / "out", SILENT)
-    assert not (tmp_path / "out").exists()
-
-
-def test_frames_are_read_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    most = 0
-
-    class Watched(MemorySource):
-        def read(self, *arguments: Any) -> Episode:
-            episode = super().read(*arguments)
-
-            def read_frames(steps: Any) -> np.ndarray:
-                nonlocal most
-                most = max(most, len(steps))
-                return episode.read_frames(steps)
-
-            return replace(episode, read_frames=read_frames)
-
-    monkeypatch.setattr(opening, "open_source", lambda _: Watched([100]))
-    convert_to_lerobot(config_of("x"), tmp_path / "out", SILENT)
-    assert 0 < most <= 32
-
-
-@pytest.mark.parametrize("library", ["pyarrow", "av"])
-def test_without_a_library_nothing_is_written_and_no_episode_is_called_broken(
-    droid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
-) -> None:
-    monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(UnreachableError, match=r"is not installed\. .*pip install"):
-        convert_to_lerobot(config_of(droid, broken_episodes="skip"), tmp_path / "out", SILENT)
-    assert not (tmp_path / "out").exists()

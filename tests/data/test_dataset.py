@@ -43,15 +43,6 @@ def test_every_filter_counts_what_it_took() -> None:
     assert len(open_in_memory(source, exclude=("bad 1", "bad 0"), outcome="failure").windows("train")) == 16 + 46
 
 
-def test_windows_are_not_counted_before_the_stride_is_known() -> None:
-    dataset = open_in_memory(MemorySource([10, 20]), stride="auto", exclude=("episode 1",))
-    assert removed(dataset)["excluded"] == (1, 20, None)
-    known = dataset.with_stride(4)
-    assert removed(known)["excluded"] == (1, 20, 12)
-    assert len(known.windows("train")) == 2
-    assert known.broken is dataset.broken
-
-
 def test_an_outcome_that_nobody_tells_is_refused() -> None:
     with pytest.raises(InputError, match=r"data\.outcome: success: no episode.*Set data\.outcome: all"):
         open_in_memory(MemorySource([10, 10]), outcome="success")
@@ -80,16 +71,6 @@ def test_broken_episodes_are_skipped_by_policy_counted_and_named(caplog: Any) ->
     assert removed(dataset)["broken"] == (12, 0, 0)
 
 
-def test_more_than_one_in_a_hundred_stops_the_run_whatever_the_policy() -> None:
-    with pytest.raises(InputError, match=r"12 of 1199 episodes are broken\. The first, bad 0: .*at most 11 with"):
-        open_in_memory(MemorySource([10] * 1187, problems=problems(12)), broken_episodes="skip")
-
-
-def test_broken_episodes_that_are_excluded_are_nobodys_concern() -> None:
-    names = tuple(problem.name for problem in problems(12))
-    assert len(open_in_memory(MemorySource([10], problems=problems(12)), exclude=names).broken) == 0
-
-
 def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> None:
     def resumed(**knobs: Any) -> BrokenEpisodes:
         ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip", **knobs), 300)
@@ -100,20 +81,6 @@ def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> 
     with pytest.raises(InputError, match=r"4 of 300 episodes are broken\. The first, a: a is damaged\."):
         resumed().met("d", "d is damaged")
     resumed(exclude=("b",)).met("d", "d is damaged")
-
-
-def test_the_broken_episodes_of_all_processes_count_together() -> None:
-    """One in a hundred of the whole, and not in each process."""
-    ledgers = [BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip"), 300) for _ in range(2)]
-    for ledger, names in zip(ledgers, ("ab", "bc"), strict=True):
-        for name in names:
-            ledger.met(name, "damaged")
-    everyone = ledgers[0].reasons | ledgers[1].reasons
-    for ledger in ledgers:
-        ledger.recall(everyone)
-        assert set(ledger.reasons) == set("abc")
-        with pytest.raises(InputError, match="4 of 300 episodes are broken"):
-            ledger.recall(everyone | {"d": "damaged"})
 
 
 def test_excluding_what_there_is_not_is_refused() -> None:

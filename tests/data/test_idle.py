@@ -10,16 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clips import clip_at, open_in_memory
+from clips import open_in_memory
 from gcs import Gcs
 from memory_source import MemorySource
 from paths import GOLDEN
 from synthetic import synthetic_states
-from vjepa2_ac.config import DataConfig, IdleConfig
-from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.config import IdleConfig
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import idle_by_commands, idle_by_motion, kept_ranges, moving_ranges
-from vjepa2_ac.data.index import EpisodeProblem, NotATableError
-from vjepa2_ac.data.selection import StepSelection
 from vjepa2_ac.errors import InputError
 
 COMMANDS = IdleConfig(rule="commands")
@@ -84,12 +82,6 @@ def test_kept_ranges_lie_apart_and_hold_no_long_rest(idle: list[bool]) -> None:
         assert "1" * 7 not in "".join(str(int(one)) for one in idle[start:end])
 
 
-def test_no_steps_and_one_step_are_not_idle() -> None:
-    assert idle_by_commands(np.zeros((0, 7)), COMMANDS).tolist() == []
-    assert idle_by_commands(np.zeros((1, 7)), COMMANDS).tolist() == [False]
-    assert idle_by_motion(np.zeros((1, 7)), MOTION).tolist() == [False]
-
-
 def test_commands_without_velocities_name_the_way_out() -> None:
     episode = MemorySource([20]).read(0)
     with pytest.raises(InputError, match=r"episode 0: no commanded joint velocities.*idle\.rule: motion"):
@@ -129,14 +121,6 @@ def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
     assert removed.windows == 56 + 36 + 76 - len(starts(dataset))
 
 
-def test_an_episode_is_read_with_the_steps_that_clips_may_come_from(open_with: Any) -> None:
-    source = restful()
-    assert open_with(source, idle=MOTION).needed_steps(0) == ((0, 10), (35, 50))
-    assert open_with(source).needed_steps(0) is None
-    clip_at(open_with(source, idle=MOTION), 2, 40)
-    assert source.reads[-1] == (2, None, ((0, 10), (35, 70)))
-
-
 def test_the_episodes_are_indexed_once(open_with: Any) -> None:
     first, second, third = restful(), restful(), restful()
     kept = open_with(first, idle=MOTION).kept
@@ -147,31 +131,6 @@ def test_the_episodes_are_indexed_once(open_with: Any) -> None:
     assert again.of(1) == ()
     open_with(third, idle=MOTION.model_copy(update={"cut_last_steps": 4}))
     assert len(third.reads) == 3, "another rule is another pass"
-
-
-def test_a_data_set_that_changed_is_indexed_anew(tmp_path: Path) -> None:
-    def kept(rests: list[tuple[int, int]]) -> object:
-        states = resting(60, rests).astype(np.float32)
-        (tmp_path / "kitchen").mkdir(exist_ok=True)
-        np.savez(tmp_path / "kitchen/one.npz", states=states, frames=np.zeros((60, 8, 8, 3), np.uint8), fps_hz=15.0)
-        return open_dataset(DataConfig(source="npz", path=str(tmp_path), idle=MOTION, frames=3)).kept.of(0)
-
-    assert kept([(20, 35)]) == ((0, 10), (35, 50))
-    assert kept([(22, 37)]) == ((0, 12), (37, 50)), "another file of the same size and length"
-
-
-def test_an_episode_that_stands_still_all_the_time_has_no_clips(open_with: Any) -> None:
-    source = MemorySource([60, 60], states=lambda index: resting(60, [(1, 60)] if index else []))
-    dataset = open_with(source, idle=MOTION)
-    assert {episode for episode, _ in starts(dataset)} == {0}
-    assert str(dataset.removed[-1]).startswith("1 episode, 70 steps, ")
-    with pytest.raises(InputError, match=r"none of 1 episode is left \(left out: idle 1\)"):
-        open_with(MemorySource([60], states=lambda _: resting(60, [(1, 60)])), idle=MOTION)
-
-
-def test_kept_ranges_shorter_than_a_clip_give_none(open_with: Any) -> None:
-    with pytest.raises(InputError, match=r"no train episode has a range of kept steps.*needed: 59 steps"):
-        open_with(restful(), idle=MOTION, frames=30).windows("train")
 
 
 def test_an_episode_that_breaks_on_the_way_is_a_broken_episode(open_with: Any, caplog: Any) -> None:
@@ -191,17 +150,6 @@ def test_settings_at_fault_end_the_pass_early(open_with: Any) -> None:
     with pytest.raises(InputError, match="no commanded joint velocities"):
         open_with(source, idle=COMMANDS, broken_episodes="skip")
     assert len(source.reads) <= 14
-
-
-def test_what_was_found_survives_the_disk_and_damage_is_seen() -> None:
-    found = StepSelection.of_each([[(0, 3), (5, 9)], EpisodeProblem("x", "here", "bad"), [], [(1, 2)]])
-    data = found.to_bytes()
-    back = StepSelection.from_bytes(data)
-    assert back.problems == found.problems
-    assert np.array_equal([back.episode, back.start, back.end], [[0, 0, 3], [0, 5, 1], [3, 9, 2]])
-    for damaged in (b"", data[:-40], data.replace(b"here", b"gone")):
-        with pytest.raises(NotATableError):
-            StepSelection.from_bytes(damaged)
 
 
 # Ranges from a list that somebody published.

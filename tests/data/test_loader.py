@@ -21,7 +21,6 @@ from clips import clip_at, open_in_memory
 from memory_source import MemorySource
 from recording_cuda import Pinning, RecordingCuda
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data import loader
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare, collate, training_loader, validation_batches
 from vjepa2_ac.data.streams import ToDevice, copies_for
@@ -256,12 +255,6 @@ def test_the_camera_of_a_validation_clip_stays() -> None:
     assert len(set(cameras().values())) == 2  # the names of the exterior cameras are as long
 
 
-@pytest.mark.parametrize("crop", ["released", "square", "letterbox"])
-def test_the_crop_is_the_configs(crop: str) -> None:
-    sizes = {"released": (4, 5), "square": (4, 4), "letterbox": (5, 5)}
-    assert first(open_in_memory(MemorySource([30]), crop=crop), 1)[0].frames.shape[2:4] == sizes[crop]
-
-
 # Poses of the camera.
 
 
@@ -277,23 +270,6 @@ def test_poses_in_the_cameras_frame_lead_to_actions_in_it() -> None:
     np.testing.assert_allclose(clip.actions, actions_from_states(expected), atol=1e-6)
     assert not np.allclose(clip.actions, in_base.actions, atol=1e-3)
     assert np.allclose(clip.extrinsics, cameras[:3])
-
-
-def test_a_camera_without_a_pose_cannot_be_the_frame() -> None:
-    dataset = open_in_memory(MemorySource([30, 30]))
-    dataset = replace(dataset, config=dataset.config.model_copy(update={"pose_frame": "camera"}))
-    with pytest.raises(InputError, match=r"episode 0: no pose of the camera.*pose_frame: base.*data\.exclude"):
-        next(loader.batches_of(dataset, [(0, 0)], batch_size=1))
-
-
-def test_a_batch_has_camera_poses_if_all_its_clips_have() -> None:
-    def poses(index: int) -> np.ndarray | None:
-        return np.full((30, 6), 0.5) if index else None
-
-    dataset = open_in_memory(MemorySource([30, 30], extrinsics=poses))
-    without, with_poses = clip_at(dataset, 0, 0), clip_at(dataset, 1, 0)
-    assert collate([with_poses, with_poses]).extrinsics.shape == (2, 3, 6)
-    assert collate([with_poses, without]).extrinsics is None
 
 
 # Clips that cannot be read.
@@ -329,14 +305,6 @@ def test_the_default_is_to_stop_at_a_clip_that_cannot_be_read() -> None:
         first(broken_set(set(range(300)), broken_episodes="error"), 1)
 
 
-def test_a_validation_of_nothing_but_broken_clips_is_refused() -> None:
-    dataset = broken_set({0}, validation_share=0.5)
-    windows = dataset.windows("validation")
-    nothing = broken_set(set(windows.episodes.tolist()), validation_share=0.5)
-    with pytest.raises(InputError, match=r"none of the clips can be read; broken episodes: episode \d+"):
-        list(validation_batches(nothing, "validation", clips=1, batch_size=1))
-
-
 def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(spoiled: Callable[..., Path]) -> None:
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][3] = b"GIF89a"
@@ -367,21 +335,3 @@ def test_clips_of_a_set_that_lies_elsewhere_are_read_several_at_once() -> None:
     expected = names(first(open_in_memory(MemorySource([30] * 10)), 3, batch_size=4))
     remote = replace(dataset, config=dataset.config.model_copy(update={"path": "gs://bucket/set"}))
     assert names(first(remote, 3, batch_size=4)) == expected
-
-
-def test_bytes_that_were_fetched_are_told_with_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset = open_in_memory(source := MemorySource([30] * 10))
-    monkeypatch.setattr(loader.storage, "bytes_fetched", lambda: 1000 * len(source.reads))
-    assert [batch.bytes_fetched for batch in first(dataset, 3, batch_size=2)] == [2000, 2000, 2000]
-
-
-def test_many_validation_clips_are_read_by_workers_and_are_the_same(
-    droid: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def chosen(workers: int) -> list[Batch]:
-        dataset = open_dataset(config_of(droid, validation_share=0.6, workers=workers))
-        return list(validation_batches(dataset, "validation", clips=30, batch_size=4))
-
-    alone = chosen(0)
-    monkeypatch.setattr(loader, "CLIPS_WORTH_WORKERS", 1)
-    assert_same(chosen(1), alone)

@@ -100,24 +100,3 @@ def test_clips_left_out_ahead_are_noted_when_their_turn_has_come(cuda: Recording
     assert broken.reasons == {}
     next(batches)
     assert broken.reasons == {"e1": "damaged"}
-
-
-def test_on_a_cpu_nothing_is_fetched_ahead_and_batches_are_as_they_were() -> None:
-    rows = Rows(2)
-    batches = batches_of(rows, None)
-    assert next(batches).on_device is None
-    prefetch_next(batches)
-    assert rows.fetched == 1
-    assert next(batches).starts == (1,)
-    prefetch_next(iter([batch(0)]))  # batches of another kind
-
-
-def test_closing_ends_the_rows_and_lets_go_of_what_was_fetched_ahead(cuda: RecordingCuda) -> None:
-    rows = Rows(3)
-    batches = batches_of(rows, ToDevice(cuda))
-    next(batches)
-    prefetch_next(batches)
-    batches.close()
-    assert rows.closed
-    with pytest.raises(StopIteration):
-        next(batches)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.config.sources import RotationFormat
-from vjepa2_ac.data.rotation_formats import FORMATS, RotationSpeeds, rotation_speeds, smoother_format
+from vjepa2_ac.data.rotation_formats import FORMATS, rotation_speeds, smoother_format
 
 MAX_RAD_S = MotionLimits().rotation_rad_s
 RATES_HZ = (1.0, 5.0, 15.0, 30.0)
@@ -112,28 +112,9 @@ def test_speeds_are_those_of_the_rotation_in_each_format() -> None:
     assert [one.num_smooth_jumps for one in speeds.values()] == [1, 0, 0]
 
 
-def test_jumps_that_contradict_each_other_decide_nothing() -> None:
-    speeds = {
-        "euler_xyz": RotationSpeeds(1.0, np.array([20.0, 20, 20, 20, 1])),
-        "rotation_vector": RotationSpeeds(1.0, np.array([1.0, 1, 1, 1, 20])),
-    }
-    assert smoother_format(speeds, "euler_xyz", MAX_RAD_S) is None
-    agreeing = {name: RotationSpeeds(1.0, one.at_jumps[:4]) for name, one in speeds.items()}
-    assert smoother_format(agreeing, "euler_xyz", MAX_RAD_S) == "rotation_vector"
-    assert smoother_format(agreeing, "rotation_vector", MAX_RAD_S) is None
-
-
 def test_numbers_too_large_or_too_fast_for_radians_are_degrees() -> None:
     degrees = np.linspace(-170.0, -120.0, 40)[:, None] * [1.0, 0, 0] + [0.0, 3.0, 20.0]
     assert [*rotation_speeds([degrees], 10.0)] == ["euler_xyz_degrees"]
     assert formats_named([degrees], 10.0) == dict.fromkeys(FORMATS, "euler_xyz_degrees") | {"euler_xyz_degrees": None}
     small = 5 * np.sin(np.arange(60)[:, None] * [1.0, 1.3, 1.7] / 3)
     assert formats_named([small], 10.0)["euler_xyz"] == "euler_xyz_degrees"
-
-
-def test_episodes_without_motion_have_no_speed() -> None:
-    for numbers in ([], [np.zeros((5, 3))], [np.ones((5, 3))], [np.ones((1, 3))], [np.zeros((0, 3))]):
-        speeds = rotation_speeds(numbers, 10.0)
-        assert {(one.median_rad_s, one.num_jumps) for one in speeds.values()} == {(0.0, 0)}
-        assert smoother_format(speeds, "rotation_vector", MAX_RAD_S) is None
-    assert smoother_format(speeds, "quaternion_wxyz", MAX_RAD_S) is None

@@ -1,7 +1,6 @@
 """The splits that a data set has itself are used as such; what is missing is drawn, and what is pooled is said."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,20 +8,17 @@ import pytest
 
 from clips import split_of
 from copied_sets import write_rlds
-from latent_sets import write_cache
-from run_fixtures import SilentReporter
 from split_sets import EPISODES, write_lerobot_splits, write_rlds_splits
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, parse_config
-from vjepa2_ac.data.dataset import Dataset, open_dataset, through_latents
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.splits import describe_splits
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft import Machine, choose_model, make_draft
 from vjepa2_ac.init.found import plain
 from vjepa2_ac.init.look import look_at, measured
 from vjepa2_ac.inspection.check import check_data
-from vjepa2_ac.training.data_sets import open_data_sets
 
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 Opened = Callable[..., Dataset]
@@ -115,34 +111,12 @@ def test_a_set_with_one_split_is_drawn_by_hash_and_keeps_its_index(opened: Opene
     assert describe_splits(one.table, one.config) == ""
 
 
-def test_the_index_does_not_depend_on_how_splits_are_used(opened: Opened, tmp_path: Path) -> None:
-    folder = write_rlds_splits(tmp_path / "set", "train", "val")
-    tables = [opened(folder, splits=splits).table for splits in ("dataset", "hash")]
-    assert tables[0].to_bytes() == tables[1].to_bytes()
-
-
 def test_splits_of_lerobot_are_ranges_of_episode_numbers(opened: Opened, tmp_path: Path) -> None:
     folder = write_lerobot_splits(tmp_path / "set", 6, {"train": "0:3", "val": "3:5", "test": "5:6"})
     found = members(opened(folder, source="lerobot"))
     assert [found[f"episode_{number:06d}"] for number in range(6)] == [
         "train", "train", "train", "validation", "validation", "test",
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize("splits", [{"train": "0:6"}, {}, {"train": "all", "val": "none"}, {"train": 6}])
-def test_splits_of_lerobot_that_are_one_or_written_otherwise_change_nothing(
-    splits: dict[str, str], opened: Opened, tmp_path: Path
-) -> None:
-    folder = write_lerobot_splits(tmp_path / "set", 6, splits)
-    dataset = opened(folder, source="lerobot")
-    assert members(dataset) == members(opened(folder, source="lerobot", splits="hash"))
-    assert describe_splits(dataset.table, dataset.config) == ""
-
-
-def test_a_latent_cache_of_an_older_version_keeps_the_splits(opened: Opened, tmp_path: Path) -> None:
-    dataset = opened(write_rlds_splits(tmp_path / "set", "train", "val"), cache_dir=str(tmp_path / "latents"))
-    folder = write_cache(replace(dataset, table=replace(dataset.table, labels={})))
-    assert members(through_latents(dataset, folder)) == members(dataset)
 
 
 def test_a_split_of_the_set_that_is_left_out_is_an_error_with_the_key(opened: Opened, tmp_path: Path) -> None:
@@ -162,17 +136,6 @@ def test_check_says_which_splits_are_used(opened: Opened, tmp_path: Path) -> Non
     assert advice.endswith("data.splits=hash draws the test split from all episodes")
     single = config.model_copy(update={"path": str(write_rlds_splits(tmp_path / "one", "train")), "test_share": 0.1})
     assert "splits" not in {one.about for one in check_data(single, clips=2)}
-
-
-def test_training_says_which_splits_are_used(opened: Opened, reporter: SilentReporter, tmp_path: Path) -> None:
-    data = opened(write_rlds_splits(tmp_path / "set", "train", "val")).config.model_dump(mode="json")
-    values = {"run_dir": "run", "data": data, "model": {"base": "builtin:sim-tiny"}}
-    for splits, said in (("dataset", "the data set's own: train (4"), ("hash", "drawn by hash from all")):
-        open_data_sets(parse_config(values, [f"data.splits={splits}"], where="here"), reporter)
-        assert reporter.notes.pop().startswith(f"Splits: {said}")
-    one = write_rlds_splits(tmp_path / "one", "train")
-    open_data_sets(parse_config(values, [f"data.path={one}"], where="here"), reporter)
-    assert reporter.notes == []
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from clips import clip_at, open_in_memory
-from gcs import Gcs
+from clips import clip_at
 from lerobot_sets import Recorded, recorded, write_v21, write_v30
-from memory_source import MemorySource
 from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
@@ -22,7 +20,7 @@ from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.check import batch_findings
 from vjepa2_ac.inspection.sheet import plot_dataset
-from vjepa2_ac.inspection.statistics import CHANGED, inspect_dataset
+from vjepa2_ac.inspection.statistics import inspect_dataset
 from vjepa2_ac.spaces import Spaces
 
 JOINTS = ("steps/observation/joint_position", "steps/observation/gripper_position")
@@ -62,16 +60,6 @@ def test_commands_of_a_model_step_are_those_of_its_control_steps_joined(
     np.testing.assert_array_equal(clip.actions, join(written[4:8].reshape(2, 2, 5), axis=1).astype(np.float32))
 
 
-def test_a_pose_that_is_read_as_a_vector_is_not_turned_into_rotations(droid: Path) -> None:
-    states = ["steps/observation/cartesian_position", "steps/observation/gripper_position"]
-    plain = open_dataset(knobs(droid, source="rlds", states="pose"))
-    vector = open_dataset(knobs(droid, source="rlds", fields={"state": states}))
-    one, other = clip_at(plain, 0, 2), clip_at(vector, 0, 2)
-    np.testing.assert_array_equal(one.states, other.states)
-    assert not np.array_equal(one.actions[:, 3:6], other.actions[:, 3:6])
-    np.testing.assert_array_equal(one.actions[:, :3], other.actions[:, :3])
-
-
 def test_rlds_gives_the_features_that_are_named(droid: Path) -> None:
     fields = {"state": JOINTS, "action": VELOCITIES}
     config = knobs(droid, source="rlds", fields=fields, **recorded_by("mean"))
@@ -85,19 +73,6 @@ def test_rlds_gives_the_features_that_are_named(droid: Path) -> None:
     without = config.model_copy(update={"fields": config.fields.model_copy(update={"action": ("steps/actoin",)})})
     with pytest.raises(InputError, match="Did you mean steps/action"):
         open_dataset(without)
-
-
-def test_rlds_far_away_gives_the_same(droid: Path, gcs: Gcs) -> None:
-    gcs.upload(droid, "bucket/droid")
-    fields = {"state": JOINTS, "action": VELOCITIES}
-    here, far = (
-        open_source(knobs(path, source="rlds", fields=fields, **recorded_by("mean")))
-        for path in (droid, "gs://bucket/droid")
-    )
-    assert [info.id for info in here.infos()] == [info.id for info in far.infos()]
-    for index in range(2):
-        np.testing.assert_array_equal(here.read(index).states, far.read(index).states)
-        np.testing.assert_array_equal(here.read(index).commands, far.read(index).commands)
 
 
 def test_rlds_without_a_flag_for_each_step_cannot_say_how_wide_a_vector_is(
@@ -139,14 +114,6 @@ def test_a_robot_of_another_width_is_a_broken_episode(tmp_path: Path) -> None:
         open_dataset(knobs(tmp_path))
 
 
-def test_an_episode_of_another_width_that_no_index_saw_is_named_when_it_is_read() -> None:
-    source = MemorySource([9, 9], states=lambda index: vectors(9, 14 - index, seed=index))
-    dataset = open_in_memory(source, source="npz", states="vector")
-    assert clip_at(dataset, 0, 0).states.shape == (3, 14)
-    with pytest.raises(InputError, match=r"episode 1.*states of 13.*14 and 14, as in the others"):
-        clip_at(dataset, 1, 0)
-
-
 def test_commands_that_are_asked_for_must_be_there_for_every_step(tmp_path: Path) -> None:
     write_vectors(tmp_path / "none", width=8)
     with pytest.raises(InputError, match=r"actions: no such array"):
@@ -154,15 +121,6 @@ def test_commands_that_are_asked_for_must_be_there_for_every_step(tmp_path: Path
     write_vectors(tmp_path / "few", width=8, actions=np.zeros((23, 3)))
     with pytest.raises(InputError, match=r"actions: shape \(23, 3\).*24 x any"):
         open_dataset(knobs(tmp_path / "few", **recorded_by("sum")))
-
-
-def test_an_index_of_poses_is_not_taken_for_one_of_vectors(tmp_path: Path) -> None:
-    write_vectors(tmp_path, width=8)
-    with pytest.raises(InputError, match="any x 7"):
-        open_dataset(knobs(tmp_path, states="pose"))
-    assert open_dataset(knobs(tmp_path)).widths.state == 8
-    with pytest.raises(InputError, match="actions: no such array"):
-        open_dataset(knobs(tmp_path, **recorded_by("sum")))
 
 
 @pytest.mark.parametrize(
@@ -227,13 +185,3 @@ def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
     assert found.summary["states"].startswith("14 numbers: -")
     assert motion_table(found.steps).row_count == 3
     assert plot_dataset(found, tmp_path / "sheet.png").stat().st_size > 10_000
-
-
-def test_a_number_changes_by_a_share_of_its_range(tmp_path: Path) -> None:
-    ramp = np.stack([np.linspace(0, 1, 24), np.linspace(0, 460, 24) / 2], axis=1)
-    ramp[:, 1] = np.minimum(ramp[:, 1], 115.0)  # twice as fast, over half the time
-    dataset = open_dataset(knobs(write_vectors(tmp_path, width=2, states=ramp), stride_candidates=[1, 5]))
-    one, five = (step.sizes[CHANGED] for step in inspect_dataset(dataset).steps)
-    assert one.max() == pytest.approx(100 / 11.5)
-    assert one.min() == pytest.approx(100 / 23)
-    assert five.max() == pytest.approx(500 / 11.5)

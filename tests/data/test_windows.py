@@ -1,7 +1,6 @@
 """Splits, windows and order: pure functions of identities, lengths, seed and position."""
 
 import json
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -48,12 +47,6 @@ def test_a_permutation_hits_every_index_once(size: int, seed: int, epoch: int) -
     assert sorted(permuted(index, size=size, seed=seed, epoch=epoch) for index in range(size)) == list(range(size))
 
 
-def test_neighbours_do_not_stay_together() -> None:
-    places = np.array([permuted(index, size=4_000, seed=0, epoch=0) for index in range(4_000)])
-    assert abs(np.corrcoef(places[:-1], places[1:])[0, 1]) < 0.05
-    assert abs(np.corrcoef(np.arange(4_000), places)[0, 1]) < 0.05
-
-
 def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> None:
     table = EpisodeTable.of([EpisodeInfo("a", 40), EpisodeInfo("b", 20)])
     kept = StepSelection(*(np.array(column, np.int32) for column in ([0, 0, 1], [3, 20, 0], [16, 31, 20])))
@@ -86,17 +79,6 @@ def test_order_and_split_do_not_depend_on_the_order_of_the_episodes() -> None:
             clips = ClipOrder(windows_of(order, config, split), seed=1)
             named.append([(order[episode].id, start) for episode, start in map(clips.window, range(30))])
         assert named[0] == named[1]
-
-
-def test_shares_are_kept_and_growing_one_moves_few_episodes() -> None:
-    names = [f"lab/{number}" for number in range(4_000)]
-    counts = Counter(split_of(name, settings_of(validation_share=0.1, test_share=0.05)) for name in names)
-    assert abs(counts["validation"] / 4_000 - 0.10) < 0.02
-    assert abs(counts["test"] / 4_000 - 0.05) < 0.015
-    for name in names[:500]:
-        before = split_of(name, settings_of(validation_share=0.1, test_share=0.05))
-        after = split_of(name, settings_of(validation_share=0.2, test_share=0.05))
-        assert before == after or (before, after) == ("train", "validation")
 
 
 def test_the_split_never_changes_between_versions() -> None:
@@ -169,18 +151,6 @@ def test_each_episode_is_in_one_split_and_none_that_has_a_share_is_empty(
         assert found["test"] > 0 or test == 0
 
 
-def test_those_whose_number_comes_next_move_and_nobody_else() -> None:
-    hashes = [int(share * 2**64) for share in (0.9, 0.5, 0.3, 0.7)]
-    config = DataConfig(path="nowhere", validation_share=0.05, test_share=0.05)
-    assert in_split(np.array(hashes, np.uint64), config, "test").tolist() == [False, False, True, False]
-    assert in_split(np.array(hashes, np.uint64), config, "validation").tolist() == [False, True, False, False]
-
-
-def test_a_group_moves_as_a_whole() -> None:
-    hashes = [int(share * 2**64) for share in (0.3, 0.3, 0.5, 0.5, 0.9)]
-    assert counts(hashes) == {"train": 1, "validation": 2, "test": 2}
-
-
 def splits_of(source: MemorySource, **knobs: object) -> dict[str, Split]:
     """Return the split of every episode that takes part."""
     dataset = open_in_memory(source, **({"validation_share": 0.02, "test_share": 0.02} | knobs))
@@ -209,8 +179,3 @@ def test_of_the_outcomes_only_the_chosen_one_is_split() -> None:
     found = splits_of(source, outcome="success")
     assert sorted(found.values()).count("train") == 4
     assert set(found.values()) == set(SPLITS)
-
-
-def test_one_or_two_episodes_and_shares_of_zero_stay_as_the_hash_says() -> None:
-    assert counts([2**63, 2**63 + 2**60]) == {"train": 2, "validation": 0, "test": 0}
-    assert counts([2**63] * 9, validation_share=0.0, test_share=0.0) == {"train": 9, "validation": 0, "test": 0}

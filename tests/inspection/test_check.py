@@ -12,7 +12,6 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.inspection.check import batch_findings, check_data
 from vjepa2_ac.inspection.findings import Finding
-from vjepa2_ac.inspection.statistics import at_some_stride
 
 ONLY_MOVES = torch.tensor([1.0, 1, 1, 0, 0, 0, 1])
 TURNS_BY_2_5 = torch.tensor([0.0, 0, 0, 2.5, 0, 0, 0])
@@ -70,14 +69,6 @@ def test_wrong_numbers_are_named(about: str, level: str, words: str, changes: di
     assert (finding.level, words in finding.text) == (level, True), finding
 
 
-def test_blank_frames_are_no_frozen_camera() -> None:
-    frames = good()["frames"].clone()
-    frames[:2] = 0
-    frames[3] = torch.tensor([90, 20, 200], dtype=torch.uint8)
-    assert found_in(frames=frames)["frames"].text.startswith("0 of 4 frames equal")
-    assert found_in(frames=frames * 0)["frames"].level == "skipped"
-
-
 def knobs(droid: Path, **changes: object) -> DataConfig:
     values = {"path": str(droid), "frames": 3, "stride": 2, "workers": 0, "validation_share": 0.3, "test_share": 0.0}
     return DataConfig.model_validate(values | changes)
@@ -98,13 +89,6 @@ def test_an_empty_test_split_is_an_error_line_where_one_is_asked_for_as_training
     for share, level in ((0.001, "error"), (0.0, "skipped")):
         findings = check_data(knobs(droid, test_share=share, validation_share=0.0, **in_one_group), clips=2)
         assert {finding.about: finding.level for finding in findings}["test"] == level
-
-
-def test_an_auto_stride_is_looked_at_at_the_smallest_candidate(droid: Path) -> None:
-    config = knobs(droid, stride="auto", stride_candidates=(4, 2, 5))
-    findings = {finding.about: finding for finding in check_data(config, clips=2)}
-    assert "smallest candidate, 2" in findings["stride"].text
-    assert at_some_stride(open_dataset(config)).config.stride == 2
 
 
 def test_a_test_split_that_cannot_answer_is_told_the_share_that_can(tmp_path: Path) -> None:

@@ -4,15 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.inspection.check import check_data, coverage_findings
-from vjepa2_ac.inspection.coverage import PLAY, Coverage, ReadEpisode, coverage_by, coverage_in, coverage_of
+from vjepa2_ac.inspection.coverage import PLAY, Coverage, ReadEpisode, coverage_in, coverage_of
 from vjepa2_ac.inspection.statistics import inspect_dataset
-from vjepa2_ac.simulation.domains import named_domain
-from vjepa2_ac.simulation.motion import MotionRecipe, random_reaching
 from vjepa2_ac.spaces import POSE, matrices_from_euler, rotation_differences, states_in_camera_frame, vector_states
 
 DIVERSE = "motions are diverse enough to plan with"
@@ -66,33 +63,6 @@ def test_motion_of_few_directions_or_tiny_is_narrow_with_the_reason_and_what_to_
     assert found.verdict == f"motions are not diverse enough to plan with: {found.narrow}. {PLAY}"
 
 
-@pytest.mark.parametrize("changes", [*FIT.values(), *(one for one, _ in NARROW.values())], ids=[*FIT, *NARROW])
-def test_turning_the_axes_changes_no_verdict(changes: np.ndarray) -> None:
-    def reason_of(found: Coverage) -> str:
-        return found.narrow.split("; ")[-1].split(" (")[0].rstrip("0123456789. ")
-
-    found = poses(changes)
-    for rotation in Rotation.random(10, random_state=1):
-        turned = changes.copy()
-        turned[:, :3] = rotation.apply(changes[:, :3])
-        again = poses(turned)
-        assert reason_of(again) == reason_of(found)
-        assert again.metrics["directions"] == pytest.approx(found.metrics["directions"], abs=0.04)
-        assert again.metrics["mean_direction"] == pytest.approx(found.metrics["mean_direction"], abs=1e-6)
-        np.testing.assert_allclose(again.metrics["principal_shares"], found.metrics["principal_shares"], atol=1e-6)
-
-
-def test_the_unit_of_coverage_is_an_equal_share() -> None:
-    """Over the whole sphere the density is 1 on average, of any data: the cells have equal areas."""
-    for changes in (moving(3, 3, 3), moving(1, 2, 3, lift=(1, 1, 0)), NARROW["one way"][0]):
-        assert poses(changes).density.mean() == pytest.approx(1, abs=0.05)
-    up = poses(np.tile([0, 0, 0.03, 0, 0, 0, 0], (200, 1))).density
-    assert up[-1].min() > 10, "z is up"
-    forward = poses(np.tile([0.03, 0, 0, 0, 0, 0, 0], (200, 1))).density
-    assert forward[12, 24] > 10, "x is in the middle"
-    assert forward[12, 0] == 0
-
-
 def test_too_few_steps_decide_nothing() -> None:
     for found in (poses(moving(3, 0, 0, steps=99)), poses(moving(3, 0, 0, steps=399), 4)):
         assert found.narrow == ""
@@ -102,19 +72,6 @@ def test_too_few_steps_decide_nothing() -> None:
         }  # fmt: skip
     still = poses(np.zeros((5, 7)))
     assert (still.metrics["directions"], still.metrics["mean_direction"], still.narrow) == (0, 0, "")
-
-
-@pytest.mark.parametrize("domain", ["A"])
-def test_random_reaching_of_the_simulator_is_fit_and_one_way_reaching_is_narrow(domain: str) -> None:
-    def recorded(recipe: MotionRecipe) -> Coverage | None:
-        generator = np.random.default_rng(0)
-        motions = [random_reaching(named_domain(domain), 61, generator, recipe) for _ in range(12)]
-        states = [np.concatenate([one.poses, one.gripper[:, None]], axis=1) for one in motions]
-        return coverage_by([ReadEpisode(0, one, ((0, 61),)) for one in states], POSE, 4)
-
-    assert recorded(MotionRecipe()).verdict == DIVERSE
-    one_way = recorded(MotionRecipe(drift_m=(0.01, 0.0, 0.0)))
-    assert "they cover 7 % of all directions; nearly all go one way" in one_way.narrow
 
 
 def test_changes_are_those_over_a_stride_within_kept_ranges_in_the_frame_of_the_model() -> None:
@@ -173,12 +130,6 @@ def test_data_check_and_inspect_say_whether_data_are_fit_to_plan_with(tmp_path: 
     assert written_down["narrow"].startswith("they cover 7 %" if one_way else "")
     assert bool(written_down["narrow"]) == one_way
     assert coverage_in(open_dataset(config)).metrics == written_down, "of the same episodes"
-
-
-def test_a_stride_that_fits_nowhere_has_no_coverage(tmp_path: Path) -> None:
-    dataset = open_dataset(written(tmp_path, one_way=False)).with_stride(50)
-    assert coverage_in(dataset) is None
-    assert inspect_dataset(dataset).values["coverage"] is None
 
 
 def test_data_without_a_model_step_are_skipped_with_what_they_need() -> None:

@@ -4,8 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from clips import dataset_in_memory
@@ -15,7 +13,7 @@ from memory_source import MemorySource
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.index import UNKNOWN, hash_of_states
+from vjepa2_ac.data.index import UNKNOWN
 from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.inspection.coverage import Duplicates, find_duplicates
 from vjepa2_ac.inspection.statistics import inspect_dataset
@@ -36,17 +34,6 @@ def in_memory(hashes: list[int]) -> Dataset:
     return replace(dataset, table=replace(dataset.table, state_hash=np.array(hashes, np.uint64)))
 
 
-def test_a_hash_is_that_of_the_numbers_whatever_their_type() -> None:
-    states = synthetic_states(9)
-    assert hash_of_states(states) == hash_of_states(states.astype(np.float32)) != UNKNOWN
-    states[4, 2] = 0.0
-    negative = states.copy()
-    negative[4, 2] = -0.0
-    assert hash_of_states(negative) == hash_of_states(states)
-    for other in (states[:-1], states + 1e-6, states.reshape(-1, 1), states[::-1]):
-        assert hash_of_states(np.ascontiguousarray(other)) != hash_of_states(states)
-
-
 @pytest.mark.parametrize("source", WRITERS)
 def test_copies_are_found_in_every_form_of_data_and_again_from_its_kept_index(source: str, tmp_path: Path) -> None:
     config = config_of(source, WRITERS[source](tmp_path / "set", RECORDINGS), tmp_path)
@@ -58,30 +45,6 @@ def test_copies_are_found_in_every_form_of_data_and_again_from_its_kept_index(so
         one, other = (dataset.table.find(name) for name, _ in found.example)
         assert one != other
         np.testing.assert_array_equal(*(dataset.source.read(place).states for place in (one, other)))  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("source", ["rlds", "lerobot"])
-def test_copies_far_away_are_found_without_reading_all_states(source: str, gcs: Gcs, tmp_path: Path) -> None:
-    folder = WRITERS[source](tmp_path / "set", RECORDINGS)
-    if source == "lerobot":
-        with_statistics(folder)
-    gcs.upload(folder, "bucket/set/1.0.0")
-    dataset = open_dataset(config_of(source, "gs://bucket/set/1.0.0", tmp_path))
-    found = find_duplicates(dataset)
-    assert (found.is_known, found.episodes, found.different) == (True, 5, 2)
-
-
-def with_statistics(folder: Path) -> None:
-    """Add what LeRobot writes of every episode, in its order."""
-    rows = [synthetic_states(STEPS, seed=number).astype(np.float32) for number in RECORDINGS]
-
-    path = folder / "meta/episodes/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    for name, part in (("cartesian_position", slice(6)), ("gripper_position", slice(6, 7))):
-        for kind in ("min", "max", "mean", "std"):
-            values = [getattr(states[:, part], kind)(axis=0).tolist() for states in rows]
-            table = table.append_column(f"stats/observation.state.{name}/{kind}", pa.array(values))
-    pq.write_table(table, path)
 
 
 def test_a_far_set_of_which_nothing_tells_the_states_is_said_to_be_not_known(gcs: Gcs, tmp_path: Path) -> None:
@@ -132,12 +95,6 @@ def test_copies_with_noise_or_rounding_are_found_and_similar_episodes_are_not(tm
         np.savez(folder / f"{name}.npz", states=one, frames=frames, fps_hz=15.0)
     found = find_duplicates(open_dataset(config_of("npz", folder, tmp_path)))
     assert (found.episodes, found.different, found.copies) == (9, 3, ("01", "02", "11", "12", "21", "22"))
-
-
-def test_what_is_left_out_is_no_copy() -> None:
-    dataset = in_memory([7, 7, 8])
-    without = dataset.config.model_copy(update={"exclude": (dataset.table.identity(1),)})
-    assert find_duplicates(replace(dataset, config=without)).episodes == 0
 
 
 def test_check_and_inspect_warn_of_copies_and_are_calm_without(tmp_path: Path) -> None:

@@ -20,8 +20,6 @@ from vjepa2_ac.inspection.findings import Finding
 from vjepa2_ac.inspection.motion import (
     Stretch,
     check_motion,
-    count_at_end,
-    padding_finding,
     speed_finding,
     warnings_from_index,
 )
@@ -65,12 +63,6 @@ def joined(number: int) -> Pair:
     (first, one), (second, other) = clean(number), clean(100 + number)
     second[:, 0] += 0.4
     return np.concatenate([first, second]), np.concatenate([one, other])
-
-
-def with_dropout(number: int) -> Pair:
-    states, frames = clean(number)
-    states[9 + number] = 0
-    return states, frames
 
 
 def with_frozen_camera(number: int) -> Pair:
@@ -170,27 +162,6 @@ def test_one_impossible_position_in_one_episode_is_named(
     assert not warnings_from_index(open_dataset(config_of(tmp_path / "clean", clean)))
 
 
-def test_only_episodes_that_are_too_fast_by_the_index_are_read(tmp_path: Path) -> None:
-    dataset = open_dataset(config_of(tmp_path / "set", with_one_outlier))
-    reads: list[int] = []
-    read = dataset.source.read
-    dataset.source.read = lambda index, *_: reads.append(index) or read(index)  # type: ignore[method-assign, func-returns-value, assignment, misc]
-    assert [one.about for one in warnings_from_index(dataset)] == ["speed"]
-    assert [dataset.table.identity(index) for index in reads] == ["004"]
-
-
-def test_impossible_positions_that_the_idle_filter_removes_do_not_count(tmp_path: Path) -> None:
-    def make(number: int) -> Pair:
-        states, frames = padded(number)
-        states[30:] = states[29] + np.where(np.arange(7) == 0, 2.0, 0.0)
-        return states, frames
-
-    idle = {"rule": "motion", "shortest_idle_steps": 3, "shortest_kept_steps": 5, "cut_last_steps": 2}
-    assert "speed" not in {
-        one.about for one in warnings_from_index(open_dataset(config_of(tmp_path / "set", make, idle=idle)))
-    }
-
-
 def test_black_or_uniform_frames_of_some_episodes_are_named_and_no_frozen_camera(tmp_path: Path) -> None:
     def make(number: int) -> Pair:
         states, frames = clean(number)
@@ -236,15 +207,6 @@ def moved_in_x(number: int) -> Pair:
     return states, frames
 
 
-def test_single_zero_states_are_lost_measurements(tmp_path: Path) -> None:
-    warnings = warnings_of(config_of(tmp_path / "set", with_dropout))
-    assert set(warnings) == {"speed", "padding"}
-    assert warnings["padding"].startswith("6 states in 6 episodes")
-    assert re.search(r"Example: 00\d, step \d+\. ", warnings["padding"])
-    slow = warnings_of(config_of(tmp_path / "slow", with_dropout, rate_hz=1.0))
-    assert set(slow) == {"padding"}, "zeros are named where the rate is too low for an impossible speed"
-
-
 def test_frozen_camera_is_counted_where_the_robot_moves(tmp_path: Path) -> None:
     warnings = warnings_of(config_of(tmp_path / "set", with_frozen_camera))
     assert warnings.keys() == {"episode ends"}
@@ -259,26 +221,6 @@ def test_wraps_are_no_rotation_and_limits_are_those_of_the_config(tmp_path: Path
     assert (finding.level, "at most 0.00 m/s and 3.00 rad/s" in finding.text) == ("ok", True)
     config = config_of(tmp_path / "set", clean, motion_limits={"speed_m_s": 0.1, "rotation_rad_s": 0.1})
     assert "faster than 0.1 m/s or 0.1 rad/s" in warnings_of(config)["speed"]
-
-
-def test_steps_outside_the_kept_ranges_do_not_count(tmp_path: Path) -> None:
-    idle = {"rule": "motion", "shortest_idle_steps": 3, "shortest_kept_steps": 5, "cut_last_steps": 1}
-    assert "padding" not in warnings_of(config_of(tmp_path / "set", padded, idle=idle))
-
-
-def test_short_sequences_are_skipped_and_an_episode_of_zeros_is_padding() -> None:
-    assert speed_finding([], RATE_HZ, LIMITS, "checked").level == "skipped"
-    assert padding_finding([], "checked").level == "ok"
-    zeros = [Stretch("zeros", 0, np.zeros((5, 7))), Stretch("moves", 0, states_of(0))]
-    assert "Example: zeros, steps 0 to 4." in padding_finding(zeros, "checked").text
-
-
-def test_end_of_one_frame_and_vectors_have_no_frozen_frames() -> None:
-    grey, states = np.full((5, 3, 4), 90, np.float32), np.arange(35.0).reshape(5, 7)
-    assert count_at_end(grey, states, is_pose=True) == (0, 5)
-    assert count_at_end(grey, states, is_pose=False) == (0, 0)
-    assert count_at_end(grey[:1], states[:1], is_pose=True) == (0, 0)
-    assert count_at_end(0 * grey, states, is_pose=True) == (5, 0)
 
 
 def test_vectors_and_latent_caches_skip_what_needs_poses_and_frames(tmp_path: Path) -> None:
@@ -320,19 +262,3 @@ def test_rotation_format_of_the_numbers_is_named(tmp_path: Path, true: str, conf
         assert f"if they are read as {true}, and in no other format" in finding.text
     else:
         assert finding.text.endswith(f"Set data.lerobot.rotation: {true}")
-
-
-def test_degrees_too_large_for_radians_need_no_jumps(tmp_path: Path) -> None:
-    config = written_as(tmp_path / "set", FORMATS["euler_xyz_degrees"], "euler_xyz_degrees")
-    assert findings_of(config)["rotation format"].level == "ok"
-
-
-def test_npz_with_rotation_vectors_is_told_what_to_write(tmp_path: Path) -> None:
-    def make(number: int) -> Pair:
-        states, frames = clean(number)
-        states[:, 3:6] = Rotation.from_euler("xyz", states[:, 3:6]).as_rotvec()
-        return states, frames
-
-    text = findings_of(config_of(tmp_path / "set", make))["rotation format"].text
-    assert text.startswith("read as euler_xyz, the hand turns by ")
-    assert text.endswith("Write extrinsic xyz Euler angles in radians")

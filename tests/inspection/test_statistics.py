@@ -1,6 +1,5 @@
 """Statistics of a data set: equal to those computed by hand."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +10,6 @@ from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.inspection import sheet as figure
-from vjepa2_ac.inspection.coverage import sample_of
-from vjepa2_ac.inspection.sheet import plot_dataset
 from vjepa2_ac.inspection.statistics import MOVED, TURNED, idle_runs, inspect_dataset
 
 
@@ -69,13 +65,6 @@ def test_figures_of_a_whole_set(droid: Path) -> None:
     assert found.ranges[6].tolist() == pytest.approx([by_hand[:, 6].min(), by_hand[:, 6].max()])
 
 
-def test_a_sample_is_drawn_from_those_that_take_part_and_is_always_the_same(droid: Path) -> None:
-    dataset = open_dataset(knobs(droid, outcome="failure"))
-    assert sorted(sample_of(dataset, 10)) == np.flatnonzero(dataset.table.success == 0).tolist()
-    assert sample_of(dataset, 1) == sample_of(dataset, 1)
-    assert len(inspect_dataset(dataset, episodes=1).sample) == 1
-
-
 def hundred(broken: frozenset[int], policy: str, pictureless: frozenset[int] = frozenset()) -> Dataset:
     return dataset_in_memory(
         MemorySource([60] * 100, unreadable=broken, pictureless=pictureless), broken_episodes=policy
@@ -91,15 +80,3 @@ def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplo
         inspect_dataset(hundred(frozenset({7, 8, 9, 10}), "skip"))
     with pytest.raises(InputError, match=r"memory: episode 7: damaged\..*add to data\.exclude: \[\"episode 7\"\]"):
         inspect_dataset(hundred(frozenset({7}), "error"))
-
-
-def test_a_broken_frame_is_left_out_of_the_contact_sheet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    rows: list[Sequence[object]] = []
-    monkeypatch.setattr(figure, "plot_contact_sheet", lambda _, strips, path: rows.append(strips) or path)
-    dataset = hundred(frozenset(), "skip", frozenset({7}))
-    plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
-    assert len(rows[0]) == 99
-    assert list(dataset.broken.reasons) == ["episode 7"]
-    dataset = hundred(frozenset(), "error", frozenset({7}))
-    with pytest.raises(InputError, match=r"pictures of episode 7: damaged\..*add to data\.exclude"):
-        plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)

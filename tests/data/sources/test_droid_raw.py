@@ -72,12 +72,6 @@ def test_an_identity_does_not_depend_on_which_part_of_the_tree_is_named(tree: Pa
     assert PLACE in [info.id for info in source(tree / part).infos()]
 
 
-def test_a_folder_of_ones_own_layout_is_an_episode_too(tmp_path: Path) -> None:
-    write(tmp_path, "kitchen/seven", success=False)
-    (info,) = source(tmp_path).infos()
-    assert (info.id, info.success) == ("kitchen/seven", False)
-
-
 @pytest.mark.parametrize("frames", [STEPS - 1, STEPS, STEPS + 1])
 def test_an_episode_has_as_many_steps_as_frames(tmp_path: Path, frames: int) -> None:
     write(tmp_path, pictures={LEFT: (FRAMES[LEFT] * 2)[:frames]})
@@ -87,14 +81,6 @@ def test_an_episode_has_as_many_steps_as_frames(tmp_path: Path, frames: int) -> 
     assert len(raw.read(0).states) == steps
     with pytest.raises(ValueError, match="steps"):
         raw.read(0).read_frames([steps])
-
-
-@pytest.mark.parametrize("right", [STEPS - 2, STEPS + 2])
-def test_every_camera_must_have_a_frame_for_every_step(tmp_path: Path, right: int) -> None:
-    write(tmp_path, pictures={LEFT: FRAMES[LEFT][:-1], RIGHT: (FRAMES[RIGHT] * 2)[:right]})
-    assert source(tmp_path).infos()[0].num_steps == STEPS - 1
-    with pytest.raises(InputError, match=f"24 steps, but {right} frames in {RIGHT}.mp4"):
-        source(tmp_path, camera=("left", "right")).infos()
 
 
 def test_steps_without_an_operator_are_dropped_with_their_frames(tmp_path: Path) -> None:
@@ -117,16 +103,6 @@ def test_extrinsics_are_those_of_the_chosen_camera(tmp_path: Path) -> None:
     assert source(tmp_path, camera="right").read(0).extrinsics is None
     with pytest.raises(InputError, match="pose_frame"):
         source(tmp_path, camera="right", pose_frame="camera").infos()
-
-
-def test_what_was_found_out_is_kept_until_a_file_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = write(tmp_path)
-    assert len(source(tmp_path).infos()) == 1
-    with monkeypatch.context() as patch:
-        patch.setattr(RawDroidSource, "_scan", None)
-        assert len(source(tmp_path).infos()) == 1
-    write_mp4(folder / f"recordings/MP4/{LEFT}.mp4", FRAMES[LEFT][:-1])
-    assert source(tmp_path).infos()[0].num_steps == STEPS - 1
 
 
 @pytest.mark.parametrize("b_frames", [0, 2])
@@ -215,14 +191,6 @@ def test_an_episode_that_cannot_be_used_is_a_named_problem(tree: Path, tmp_path:
         source(root / PLACE).infos()
 
 
-def test_two_episodes_of_one_identity_are_a_problem(tree: Path, tmp_path: Path) -> None:
-    for version in ("1.0.0", "1.0.1"):
-        shutil.copytree(tree, tmp_path / version)
-    infos = source(tmp_path).infos()
-    assert len(infos) == 2
-    assert [problem.name for problem in infos.problems] == [info.id for info in infos]
-
-
 def test_a_tree_in_the_cloud_reads_as_here(tree: Path, gcs: Gcs, tmp_path: Path) -> None:
     url, here = gcs.upload(tree, "bucket/droid_raw/1.0.1"), source(tree)
     raw = source(url, disk_cache={"dir": str(tmp_path)})
@@ -244,15 +212,3 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("noisy")
     write_raw_droid(root / PLACE, synthetic_states(90), pictures={LEFT: noise * 30}, gop=10)
     return root
-
-
-def test_a_clip_of_a_video_in_the_cloud_fetches_much_less_than_the_video(noisy: Path, gcs: Gcs, tmp_path: Path) -> None:
-    raw = source(gcs.upload(noisy, "bucket/raw"), disk_cache={"dir": str(tmp_path)})
-    raw.infos()
-    whole = (noisy / PLACE / MP4).stat().st_size
-    assert whole > 2_000_000
-    assert gcs.bytes_read(".mp4") < whole / 4, "the index reads headers"
-    gcs.forget()
-    frames = raw.read(0).read_frames([40, 44, 48])
-    assert 0 < gcs.bytes_read(".mp4") < whole / 3
-    np.testing.assert_array_equal(frames, source(noisy).read(0).read_frames([40, 44, 48]))

@@ -18,11 +18,10 @@ from gcs import Gcs
 from lerobot_sets import STATE, Recorded, write_v21, write_v30
 from recordings import write_raw_droid
 from synthetic import draw_frame, synthetic_episode
-from vjepa2_ac.config import Config, DataConfig
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import files
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.inspection.excerpts import excerpts_of
@@ -111,11 +110,6 @@ def test_every_form_moves_and_rests_at_the_same_steps(forms: Path, form: str) ->
             for dataset in (expected, found)
         ]
         assert by_rank[0] == by_rank[1]
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_every_form_tells_its_control_rate(forms: Path, form: str) -> None:
-    assert opened(forms, form).control_rate_hz == 15.0
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -215,26 +209,3 @@ def test_what_cannot_be_reached_arrives_from_every_seam(
     for number, failing[0] in enumerate(list(seams), start=1):
         with pytest.raises(UnreachableError, match=r"^gs://robots.*gone"):
             use(number)
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_every_form_is_encoded_whole(forms: Path, form: str, tmp_path: Path) -> None:
-    sizes = {
-        "image_size": 32, "encoder": {"width": 12, "depth": 1, "heads": 1},
-        "predictor": {"width": 12, "depth": 1, "heads": 1},
-    }  # fmt: skip
-    data = opened(forms, form).config
-    config = Config.model_validate(
-        {"run_dir": "none", "data": data,
-         "model": {"base": "random", "sizes": sizes, "dtype": "float32", "encode_chunk": 9},
-         "adapter": {"kind": "none"}, "training": {"device": "cpu", "precision": "fp32"}},
-    )  # fmt: skip
-    encoded = encode_config(config, out=tmp_path / "latents")
-    assert (encoded.encoded, encoded.frames, encoded.broken) == (len(LENGTHS), sum(LENGTHS), {})
-    through = data.as_kind("latents", path=str(tmp_path / "latents"), camera=None)
-    expected_order, expected = clips(opened(forms, form), 8)
-    order, found = clips(open_dataset(through), 8)
-    assert order == expected_order
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one.states, other.states)
-        np.testing.assert_array_equal(one.actions, other.actions)

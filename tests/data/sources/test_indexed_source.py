@@ -5,20 +5,17 @@ import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import pytest
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.sources import NpzData
-from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import as_error
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Scanned, table_of
 from vjepa2_ac.data.sources.npz import NpzSource
-from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 
@@ -75,28 +72,7 @@ def test_a_source_that_contains_another_opens_and_is_pickled_with_its_index(tmp_
     assert EveryOther.looks == 0, "the index is pickled"
 
 
-def test_many_threads_open_a_source_once_and_two_sources_at_the_same_time(tmp_path: Path) -> None:
-    config, both = write_npz(tmp_path / "set", 3), threading.Barrier(2, timeout=10)
-
-    class Meets(EveryOther):
-        looks = 0
-
-        def _look(self, progress: Progress) -> tuple[EpisodeTable, NpzSource]:
-            both.wait()  # for the other source
-            return super()._look(progress)
-
-    sources = [Meets(config), Meets(config)]
-    tables = run_together(*(source.infos for source in sources * 4))
-    assert Meets.looks == 2
-    assert len({id(table) for table in tables}) == 2
-
-
 # ---- identities ----
-
-
-def error_of_problem(table: EpisodeTable) -> str:
-    [problem] = table.problems
-    return str(as_error(problem))
 
 
 @pytest.mark.parametrize("identity", ["a\0", "\0", "a\0b"])
@@ -110,20 +86,3 @@ def test_an_identity_with_a_nul_is_a_problem_of_that_episode(identity: str, tmp_
     assert EpisodeTable.from_bytes(table.to_bytes()).problems == table.problems
     with pytest.raises(InputError, match=r"episode .*: a NUL character in the identity"):
         EpisodeTable.of([EpisodeInfo("a", 30), EpisodeInfo(identity, 30)])
-
-
-def test_a_record_with_a_nul_in_its_identity_is_refused_and_can_be_left_out(spoiled: Callable[..., Path]) -> None:
-    def spoil(features: dict[str, Any]) -> None:
-        features["episode_metadata/file_path"][1][0] += b"\0"
-
-    path = str(spoiled(spoil))
-    table = RldsSource(DataConfig(path=path)).infos()
-    assert len(table) == 5
-    assert "record 0" in error_of_problem(table)
-    with pytest.raises(InputError, match=r"a NUL character in the identity .*data\.exclude: (\[.*\])") as caught:
-        open_dataset(DataConfig(path=path))
-    exclude = re.search(r"data\.exclude: (\[.*\])", caught.value.fix)
-    assert exclude is not None
-    values = {"run_dir": "none", "data": {"path": path}, "model": {"base": "builtin:sim-tiny"}}
-    config = parse_config(values, [f"data.exclude={exclude[1]}"], where="the config")
-    assert len(open_dataset(config.data).table) == 5

@@ -44,7 +44,6 @@ from vjepa2_ac.spaces import euler_from_matrices, matrices_from_euler
 
 LENGTHS = (12, 13, 14, 15, 16)
 KEY = "observation.images.exterior_1_left"
-VIDEO_V30 = f"videos/{KEY}/chunk-000/file-000.mp4"
 
 
 def config_of(path: object, **changes: Any) -> DataConfig:
@@ -142,31 +141,6 @@ def test_what_is_read_does_not_depend_on_the_order_nor_on_threads_nor_on_the_pro
     assert everything(pickle.loads(pickle.dumps(source)), [4, 2, 0, 3, 1]) == forward  # noqa: S301 - our own bytes
 
 
-def test_row_groups_need_not_be_episodes(episodes: list[Recorded], tmp_path: Path) -> None:
-    source = source_of(write_v30(tmp_path / "set", episodes, episodes_per_table=5, row_group=10))
-    assert pq.ParquetFile(first_rows(tmp_path / "set")).num_row_groups == 7
-    for number, episode in enumerate(episodes):
-        np.testing.assert_array_equal(source.read(number).states[:, 6:], episode.columns[STATE[1]])
-
-
-def test_a_row_group_of_several_episodes_is_decoded_once_on_a_machine(
-    episodes: list[Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = write_v30(tmp_path / "set", episodes, episodes_per_table=5)
-    cache = {"dir": str(tmp_path / "cache")}
-    before = [source_of(root, disk_cache=cache).read(number) for number in range(5)]
-
-    def refuse(*_: object, **__: object) -> None:
-        raise AssertionError("decoded again")
-
-    monkeypatch.setattr(pq.ParquetFile, "read_row_group", refuse)
-    source = source_of(root, disk_cache=cache)
-    for number in range(5):
-        np.testing.assert_array_equal(source.read(number).states, before[number].states)
-    with pytest.raises(AssertionError, match="decoded again"):
-        source_of(root, disk_cache={"dir": str(tmp_path / "another")}).infos()
-
-
 @pytest.mark.parametrize("pictures", ["png", "jpeg"])
 @pytest.mark.parametrize("write", [write_v30, write_v21])
 def test_frames_may_be_in_the_table(
@@ -217,19 +191,6 @@ def test_a_later_clip_reads_only_the_images_of_its_frames(
         assert numbers_of(source.read(number).read_frames([3])[0]) == (number, 3, 0)
 
 
-def test_images_are_read_from_the_table_where_the_disk_cache_is_too_small_for_the_data_set(
-    episodes: list[Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root, from_tables = write_v30(tmp_path / "set", episodes[:3], pictures="png"), count_images(monkeypatch)
-    num_bytes = sum(path.stat().st_size for path in root.glob("data/*/*.parquet"))
-    for limit_gb, count in ((0, 2), ((num_bytes - 1) / 1e9, 2), (2 * num_bytes / 1e9, 1)):
-        source = source_of(root, disk_cache={"dir": str(tmp_path / f"cache {limit_gb}"), "limit_gb": limit_gb})
-        for _ in range(2):
-            assert numbers_of(source.read(1).read_frames([7])[0]) == (1, 7, 0)
-        assert from_tables == [LENGTHS[1]] * count
-        from_tables.clear()
-
-
 def test_a_video_three_times_as_dense_as_the_steps_gives_the_frame_of_each_step(
     episodes: list[Recorded], tmp_path: Path
 ) -> None:
@@ -252,26 +213,6 @@ def test_a_video_three_times_as_dense_as_the_steps_gives_the_frame_of_each_step(
         assert findings == [f"ok video rate: {rates}; a step has the frame nearest in time"]
     root = write_v30(tmp_path / "same rate", episodes)
     assert not [*_check_video_rates(open_dataset(config_of(root, validation_share=0.3, frames=2)))]
-
-
-def test_a_frame_in_the_table_that_is_none_is_named(episodes: list[Recorded], tmp_path: Path) -> None:
-    root = write_v21(tmp_path / "set", episodes[:1], pictures="png")
-    rows = pq.read_table(first_rows(root)).column(KEY).to_pylist()
-    rows[3]["bytes"] = rows[3]["bytes"][:40]
-    rows[4]["bytes"] = None
-    kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-    change_table(first_rows(root), **{KEY: pa.array([*rows[:4], rows[5], *rows[5:]], type=kind)})
-    with pytest.raises(InputError, match=r"episode_000000.*step 3: 40 bytes that are no image"):
-        source_of(root).read(0).read_frames([3])
-    change_table(first_rows(root), **{KEY: pa.array(rows, type=kind)})
-    with pytest.raises(InputError, match="names of files in their place"):
-        source_of(root).read(0).read_frames([0])
-
-
-def test_the_rate_is_the_configs_where_it_names_one(v30: Path) -> None:
-    source = source_of(v30, lerobot={"fps": 12.5})
-    assert source.read(0).control_rate_hz == 12.5
-    assert numbers_of(source.read(1).read_frames([9])[0]) == (1, 9, 0), "frames stay where info.json says"
 
 
 # --- conventions -------------------------------------------------------------------------------------------------
@@ -300,13 +241,6 @@ def test_every_way_to_write_a_rotation_is_the_same_rotation(convention: str, tmp
     np.testing.assert_allclose(read[:, [0, 1, 2, 6]], states[:, [0, 1, 2, 6]], atol=1e-12)
 
 
-def test_a_quaternion_that_is_not_of_unit_length_is_refused(tmp_path: Path) -> None:
-    own = np.tile([0.4, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0, 0.5], (5, 1))
-    own[3, 4] = 0.5
-    with pytest.raises(InputError, match=r"episode_000000: step 3: the quaternion .* of length 1\.118"):
-        source_of(own_set(tmp_path / "set", own), lerobot=OWN | {"rotation": "quaternion_wxyz"}).infos()
-
-
 @pytest.mark.parametrize(("opened", "closed"), [(0.08, 0.0), (0.0, 0.08), (100.0, 0.0), (-1.0, 1.0), (1.0, 0.0)])
 def test_the_gripper_is_closedness_whatever_its_range_and_sign(opened: float, closed: float, tmp_path: Path) -> None:
     states = synthetic_states(15, seed=1)
@@ -320,14 +254,6 @@ def test_the_gripper_is_closedness_whatever_its_range_and_sign(opened: float, cl
             InputError, match=r"needed: a gripper between 0 and 1: 0 for open, 1 for closed\. Check data\.lerobot"
         ):
             source_of(root, lerobot=OWN).infos()
-
-
-def test_numbers_are_selected_and_put_in_order(tmp_path: Path) -> None:
-    states = synthetic_states(10)
-    joints = np.full((10, 7), 9.0)
-    root = own_set(tmp_path / "set", np.concatenate([joints, states[:, 6:], states[:, :6]], axis=1))
-    order = (8, 9, 10, 11, 12, 13, 7)
-    np.testing.assert_array_equal(source_of(root, lerobot=OWN | {"select": order}).read(0).states, states)
 
 
 def test_a_data_set_without_commands_or_outcome_says_so(tmp_path: Path) -> None:
@@ -402,21 +328,6 @@ def test_a_depth_map_is_no_camera(mark: dict[str, object], copy: Path) -> None:
     with pytest.raises(InputError, match=rf"no camera {KEY} in .*It has: obs"):
         source_of(copy).infos()
     assert len(source_of(copy, camera="wrist_left").infos()) == len(LENGTHS)
-
-
-def test_language_columns_are_left_alone_and_are_no_numbers(copy: Path) -> None:
-    names = ("language_persistent", "language_events")
-    for name in names:
-        change_feature(copy, name, dtype="language")
-    row = [{"role": "user", "content": "grasp it", "style": "subtask", "timestamp": 0.0}]
-    for path in (copy / "data").rglob("*.parquet"):
-        table = pq.read_table(path)
-        for name in names:
-            table = table.append_column(name, pa.array([row] * len(table)))
-        pq.write_table(table, path)
-    assert len(source_of(copy).read(0).states) == LENGTHS[0]
-    with pytest.raises(InputError, match="no column of numbers language_events in "):
-        source_of(copy, lerobot={"state": ["language_events"]}).infos()
 
 
 @pytest.mark.parametrize(
@@ -500,13 +411,6 @@ def test_an_episode_that_cannot_be_used_is_a_named_problem(damage: str, copy: Pa
     assert re.search(message, only_problem(copy))
 
 
-def test_an_episode_of_no_steps_is_a_problem(v21: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(v21, tmp_path / "set"))
-    lines = (root / "meta/episodes.jsonl").read_text().splitlines()
-    (root / "meta/episodes.jsonl").write_text("\n".join([lines[0].replace("12", "0"), *lines[1:]]))
-    assert "no steps" in only_problem(root)
-
-
 def test_a_wrong_rate_is_found_out_by_the_timestamps(v21: Path, tmp_path: Path) -> None:
     root = Path(shutil.copytree(v21, tmp_path / "set"))
     change_info(root, fps=10)
@@ -514,14 +418,6 @@ def test_a_wrong_rate_is_found_out_by_the_timestamps(v21: Path, tmp_path: Path) 
         InputError, match=r"step 2: the timestamp 0\.1333 s\. needed: 0\.2 s, at the 10 rows per second"
     ):
         source_of(root).infos()
-
-
-def test_a_video_that_says_it_is_shorter_than_its_rows_is_a_problem(v30: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(v30, tmp_path / "set"))
-    path, name = root / "meta/episodes/chunk-000/file-000.parquet", f"videos/{KEY}/to_timestamp"
-    ends = pq.read_table(path).column(name).to_pylist()
-    change_table(path, **{name: pa.array([11 / FPS, *ends[1:]])})
-    assert "0.733 s of video, says the data set, for 12 rows" in only_problem(root)
 
 
 TABLE = "meta/episodes/chunk-000/file-000.parquet"
@@ -597,22 +493,6 @@ def test_episodes_that_claim_the_same_seconds_of_a_video_are_refused_by_name(
         open_dataset(config_of(root))
 
 
-def test_an_overlap_of_a_camera_that_is_not_used_is_no_problem(v30: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(v30, tmp_path / "set"))
-    change_ranges(root, **OVERLAPS["two share a range"][0])
-    assert not source_of(root, camera="wrist_left").infos().problems
-    assert len(source_of(root, camera=["exterior_1_left", "wrist_left"]).infos().problems) == 2
-
-
-def test_an_overlap_by_rounding_is_no_problem(v30: Path, tmp_path: Path) -> None:
-    for steps, problems in ((0.2, 0), (0.3, 2)):
-        root = Path(shutil.copytree(v30, tmp_path / f"{steps}"))
-        change_ranges(root, from_timestamp={1: (12 - steps) / FPS})
-        source = source_of(root)
-        assert len(source.infos().problems) == problems
-    assert numbers_of(source_of(tmp_path / "0.2").read(1).read_frames([0])[0]) == (1, 0, 0)
-
-
 def shorten(path: Path, num_frames: int, rate: int = FPS) -> None:
     with av.open(str(path)) as file:
         frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
@@ -636,13 +516,3 @@ def test_a_video_that_is_shorter_than_its_rows_is_found_while_a_local_set_is_ind
     problems = source_of(root).infos().problems
     assert [problem.name for problem in problems] == ["episode_000002"]
     assert "30 frames at 15 a second, up to 1.933 s" in problems[0].found
-
-
-def test_a_video_slower_than_the_steps_is_named_with_both_rates(copy: Path) -> None:
-    change_info(copy, fps=2 * FPS)
-    for path in copy.glob("data/*/*.parquet"):
-        change_table(path, timestamp=None)
-    episode = source_of(copy).read(0)
-    message = r"episode_000000: no frame at 0\.033 s: the video has 15 frames a second, and .*meta/info\.json says 30"
-    with pytest.raises(InputError, match=message):
-        episode.read_frames([0, 1])

@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from gcs import Gcs
 from hub import Hub, serve_hub
-from lerobot_sets import CAMERAS, STATE, Recorded, change_table, numbers_of, recorded, write_v21, write_v30
+from lerobot_sets import CAMERAS, STATE, Recorded, numbers_of, recorded, write_v21, write_v30
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
-from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.errors import UnreachableError
 
 LENGTHS = (12, 13, 14, 15, 16)
 
@@ -79,32 +78,12 @@ def test_a_bucket_gives_the_same(version: str, folder: Path, gcs: Gcs, tmp_path:
     assert gcs.faults_left == 0
 
 
-def test_episodes_that_claim_the_same_seconds_are_refused_by_what_a_bucket_says_in_meta(
-    gcs: Gcs, tmp_path: Path
-) -> None:
-    root = write_v30(tmp_path / "set", [recorded(number, 12) for number in range(4)])
-    path, name = root / "meta/episodes/chunk-000/file-000.parquet", f"videos/observation.images.{CAMERAS[0]}"
-    changes = {"from_timestamp": [0.0, 0.8, 0.8, 0.0], "to_timestamp": [0.8, 1.6, 1.6, 0.8]}
-    change_table(path, **{f"{name}/{column}": pa.array(values) for column, values in changes.items()})
-    far = source_of(gcs.upload(root, "robots/overlap"), tmp_path / "cache")
-    problems = far.infos().problems
-    assert [problem.name for problem in problems] == ["episode_000001", "episode_000002"]
-    assert problems[0].found == "episode_000001 and episode_000002 claim 0.8 to 1.6 s of file-000.mp4"
-    assert {request.object.split("/")[2] for request in gcs.reads()} == {"meta"}
-
-
 def test_the_outcome_is_in_the_tables_or_in_the_rows(hub: Hub, tmp_path: Path) -> None:
     assert hub.url
     outcomes = [number % 3 != 2 for number in range(5)]
     assert [info.success for info in source_of("v30", tmp_path).infos()] == outcomes
     assert [info.success for info in source_of("v21", tmp_path).infos()] == [None] * 5
     assert [info.success for info in source_of("v21", tmp_path, outcome="success").infos()] == outcomes
-
-
-def test_a_data_set_that_is_not_there_says_how_to_log_in(hub: Hub, tmp_path: Path) -> None:
-    assert hub.url
-    with pytest.raises(InputError, match=r"hf://datasets/lab/nothing.*hf auth login.*HF_TOKEN"):
-        source_of("nothing", tmp_path).infos()
 
 
 def test_a_gated_data_set_says_how_to_log_in(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,5 @@
 """A git-lfs pointer in place of a file is named as such, in every format, on this machine and behind a URL."""
 
-import os
 from pathlib import Path
 
 import pytest
@@ -8,11 +7,9 @@ import pytest
 from copied_sets import STEPS, WRITERS
 from gcs import Gcs
 from lerobot_sets import recorded, write_v21
-from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.tensors import open_safetensors
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 12345678\n"
 FORMS = WRITERS | {
@@ -65,23 +62,3 @@ def test_a_pointer_behind_a_url_is_named(form: str, pattern: str, gcs: Gcs, tmp_
     gcs.upload(replaced_by_pointers(FORMS[form](tmp_path / "set", range(3)), pattern), "robots/set")
     with pytest.raises(InputError, match=r"gs://robots/set/.*a git-lfs pointer"):
         open_dataset(config_of(form, "gs://robots/set", tmp_path / "cache"))
-
-
-def test_a_pointer_in_place_of_any_other_file_is_named(tmp_path: Path) -> None:
-    (path := tmp_path / "model.safetensors").write_bytes(POINTER)
-    with pytest.raises(InputError, match=r"model\.safetensors: a git-lfs pointer"), open_safetensors(path, needed=""):
-        pass
-    with pytest.raises(InputError, match="a git-lfs pointer"):
-        storage.open_to_read(path)
-    with pytest.raises(InputError, match="a git-lfs pointer"):
-        storage.read_bounded(path, 10_000)
-
-
-def test_other_small_files_and_missing_ones_pass_and_pipes_are_refused(tmp_path: Path) -> None:
-    (small := tmp_path / "small").write_bytes(b"{}")
-    os.mkfifo(pipe := tmp_path / "pipe")
-    for path in (small, tmp_path, tmp_path / "none"):
-        storage.require_content(path)
-    with pytest.raises(InputError, match="a pipe or a device"):
-        storage.require_content(pipe)
-    assert storage.read_bounded(small, 9) == b"{}"

@@ -1,7 +1,6 @@
 """.npz episodes: any robot as plain arrays."""
 
 import io
-import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -75,15 +74,6 @@ def test_of_a_plain_file_only_the_asked_frames_are_read(tmp_path: Path, monkeypa
     assert sum(read) < FRAMES[:2].nbytes + 4 * io.DEFAULT_BUFFER_SIZE < FRAMES.nbytes / 2
 
 
-def test_a_source_travels_to_a_worker(tmp_path: Path) -> None:
-    write(tmp_path / "one.npz")
-    plain = pickle.loads(pickle.dumps(source(tmp_path)))  # noqa: S301 - our own
-    reader = pickle.loads(pickle.dumps(plain.read(0).read_frames))  # noqa: S301
-    np.testing.assert_array_equal(reader([3]), FRAMES[[3]])
-    with pytest.raises(ValueError, match="steps"):
-        reader([STEPS])
-
-
 def test_a_file_that_changed_after_indexing_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "one.npz")
     plain = source(tmp_path)
@@ -146,15 +136,6 @@ def test_an_episode_that_cannot_be_used_is_a_named_problem(tmp_path: Path, damag
         shutil.move(path, tmp_path / "alone")
         with pytest.raises(InputError, match=message):
             source(tmp_path / "alone").infos()
-
-
-def test_an_episode_has_one_name_whatever_links_lead_to_its_folder(tmp_path: Path) -> None:
-    write(tmp_path / "set/küche/one.npz")
-    write(tmp_path / "elsewhere/two.npz")
-    (tmp_path / "set/küche/back").symlink_to(tmp_path / "set")
-    (tmp_path / "set/again").symlink_to(tmp_path / "elsewhere")
-    (tmp_path / "set/first").symlink_to(tmp_path / "elsewhere")
-    assert [info.id for info in source(tmp_path / "set").infos()] == ["again/two", "küche/one"]
 
 
 @pytest.mark.parametrize("name", ["\udcff.npz", "\udcff/one.npz"])

@@ -1,10 +1,7 @@
 """RLDS on Google Cloud Storage: read like local RLDS, with few bytes, over networks that fail."""
 
-import pickle
 import sys
-import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +13,8 @@ from run_fixtures import Popen
 from synthetic import write_synthetic_droid
 from tfrecords import in_any_order
 from vjepa2_ac.config import DataConfig, RldsFields
-from vjepa2_ac.data.files import fetched_data
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.episode import Episode
-from vjepa2_ac.errors import InputError
 
 SHARD = r"GET /download/.*tfrecord"
 URL = "gs://robots/droid/1.0.0"
@@ -89,34 +84,6 @@ def test_an_index_reads_a_part_of_the_records_and_is_made_once(
     assert not gcs.reads("-of-00001")
 
 
-def test_shards_are_indexed_at_the_same_time(far: Callable[..., RldsSource], gcs: Gcs, tmp_path: Path) -> None:
-    folder = write_synthetic_droid(tmp_path / "set", episodes=24, steps=2, size=(16, 32), shards=24)
-    source = far(folder)
-    gcs.hold(12, match=r"/download/.*tfrecord-000(0[1-9]|[12])")  # the first is read before the others
-    source.infos()
-    assert gcs.most_in_flight >= 12  # of 24
-
-
-def test_only_the_images_of_needed_steps_are_kept(
-    long: Path, far: Callable[..., RldsSource], gcs: Gcs, tmp_path: Path
-) -> None:
-    source = far(long)
-    source.read(1, needed=[(10, 30)]).read_frames([12])
-    kept = size_of(tmp_path / "cache" / "fetched")
-    gcs.forget()
-    source.read(1, needed=[(10, 30)]).read_frames([10, 29])
-    assert not gcs.requests
-    outside = source.read(1, needed=[(10, 30)]).read_frames([9, 70])
-    assert np.array_equal(outside, RldsSource(DataConfig(path=str(long))).read(1).read_frames([9, 70]))
-    assert gcs.reads()
-    source.read(2).read_frames([12])
-    assert kept < 0.5 * (size_of(tmp_path / "cache" / "fetched") - kept)
-
-
-def size_of(folder: Path) -> int:
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-
-
 READ_ALL = """
 import sys
 from vjepa2_ac.config import DataConfig
@@ -155,13 +122,6 @@ def test_the_disk_cache_stays_within_its_limit_with_several_processes(
     assert sum(entry_sizes(tmp_path / "cache")) <= limit
 
 
-def test_a_process_has_one_cache_for_a_folder(tmp_path: Path) -> None:
-    one, same, other = ({"disk_cache": {"dir": str(tmp_path / name)}} for name in ("a", "a", "b"))
-    caches = [fetched_data(DataConfig(path=URL, **knobs).disk_cache) for knobs in (one, same, other)]
-    assert caches[0] is caches[1]
-    assert caches[0] is not caches[2]
-
-
 @pytest.mark.parametrize("failure", [503, 429, "reset", "cut", "short"])
 def test_a_network_that_fails_now_and_then_changes_nothing(
     droid: Path, far: Callable[..., RldsSource], gcs: Gcs, failure: int | str
@@ -179,46 +139,6 @@ def test_a_network_that_fails_now_and_then_changes_nothing(
     for _ in range(2):  # frames of the whole camera; then, their places known, each by itself
         episode = failing(lambda: source.read(2))
         assert failing(lambda episode=episode: same(episode, here.read(2), [0, 5]))
-
-
-def test_what_no_length_tells_is_found_when_the_episode_is_read(
-    spoiled: Callable[..., Path], far: Callable[..., RldsSource]
-) -> None:
-    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
-        features["steps/observation/cartesian_position"][1][8] = 900.0
-        features["steps/observation/wrist_image_left"][1].pop()
-        features["steps/observation/exterior_image_2_left"][1][4] = b"no picture"
-
-    folder = spoiled(spoil)
-    source = far(folder)
-    table = source.infos()
-    assert len(table) == 6
-    assert source.read(1).info == table[1]
-    with pytest.raises(InputError, match=r"record 0 .*step 1: .*within 5 m"):
-        source.read(0)
-    odd = far(folder, fields=RldsFields(state=("steps/action",)))
-    with pytest.raises(InputError, match=r"wrist_image_left: 11 images.*12 steps"):
-        odd.read(0, "wrist_left").read_frames([0])
-    for _ in range(2):  # also where its neighbours are kept
-        assert len(odd.read(0, "exterior_2_left").read_frames([3, 5])) == 2
-        with pytest.raises(InputError, match=r"exterior_image_2_left: step 4: .*not a JPEG"):
-            odd.read(0, "exterior_2_left").read_frames([3, 4])
-
-
-def test_many_threads_and_another_process_read_the_same(long: Path, far: Callable[..., RldsSource], gcs: Gcs) -> None:
-    source, here = far(long), RldsSource(DataConfig(path=str(long)))
-    source.infos()
-    gate = threading.Barrier(8)
-
-    def read(number: int) -> bool:
-        gate.wait()
-        return same(source.read(number % 4), here.read(number % 4), [number, 60 + number])
-
-    with ThreadPoolExecutor(8) as pool:
-        assert all(pool.map(read, range(8)))
-    gcs.forget()
-    assert same(pickle.loads(pickle.dumps(source)).read(3), here.read(3), [7, 67])  # noqa: S301 - our own bytes
-    assert not gcs.requests
 
 
 def test_a_later_clip_costs_its_frames_where_nothing_is_cached(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -72,23 +71,6 @@ def test_png_images_are_read_by_their_content(mode: str | None, tmp_path: Path) 
         assert (read[..., 0] == read[..., 2]).all()
     tolerance = {None: 0, "RGBA": 0, "P": 60, "L": 255}[mode]
     assert abs(read.astype(int) - expected).max() <= tolerance
-
-
-def test_png_and_jpeg_may_be_mixed_and_other_sizes_are_refused(tmp_path: Path) -> None:
-    def mixed(number: int) -> dict[str, list[bytes]]:
-        images = [encoded(one, "JPEG" if step % 2 else "PNG") for step, one in enumerate(FRAMES[number])]
-        return {IMAGE: [*images[:-1], encoded(FRAMES[number][-1][:-4])]}
-
-    source = open_source(proposed(write(tmp_path / "set", images=mixed))[0])
-    assert abs(source.read(0).read_frames([0, 1]).astype(int) - FRAMES[0][:2]).mean() < 8
-    with pytest.raises(InputError, match="20x32"):
-        source.read(0).read_frames([0, STEPS - 1])
-
-
-def test_sixteen_bits_are_refused_by_name(tmp_path: Path) -> None:
-    deep = lambda number: {IMAGE: [encoded(np.full(SIZE, 900 + number, np.uint16))] * STEPS}  # noqa: E731
-    with pytest.raises(InputError, match="8 bits a channel"):
-        open_source(proposed(write(tmp_path / "set", images=deep))[0]).read(0).read_frames([0])
 
 
 @pytest.mark.parametrize(
@@ -207,35 +189,3 @@ def test_the_same_frames_and_states_are_read_from_a_url(tmp_path: Path) -> None:
         local, remote = open_source(here).read(number), open_source(there).read(number)
         assert np.array_equal(local.states, remote.states)
         assert np.array_equal(local.read_frames([0, 3]), remote.read_frames([0, 3]))
-
-
-def test_one_record_without_a_name_makes_all_of_them_numbered(tmp_path: Path) -> None:
-    names = lambda number: {NAME: [f"/data/{number}".encode() if number else b""]}  # noqa: E731
-    config, _ = proposed(write(tmp_path / "set", names=names))
-    assert config.fields.identity == "record"
-    require_true(config)
-
-
-def test_a_gripper_of_bytes_is_read(tmp_path: Path) -> None:
-    def states(s: Float[np.ndarray, "steps 7"]) -> dict[str, Any]:
-        closed = np.round(255 * s[:, 6]).astype(np.int64)
-        return {"steps/observation/ee_pose": s[:, :6], "steps/observation/gripper_closed": closed}
-
-    kinds = {"steps/observation/ee_pose": ("float32", (6,)), "steps/observation/gripper_closed": ("uint8", (1,))}
-    config, _ = proposed(write(tmp_path / "set", states=states, kinds=kinds))
-    closed = open_source(config).read(0).states[:, 6]
-    assert np.corrcoef(closed, TRUE[0][:, 6])[0, 1] > 0.999
-
-
-@pytest.mark.parametrize("shape", [{"dimensions": ["-1"]}, {"dimensions": ["0"]}, None, {"dimensions": ["many"]}])
-def test_shapes_that_say_no_width_are_left_out_or_refused(shape: Any, tmp_path: Path) -> None:
-    folder = write(tmp_path / "set", kinds={STATE: ("float32", (7,)), "steps/observation/odd": ("float32", (3,))})
-    description = json.loads((folder / "features.json").read_text())
-    steps = description["featuresDict"]["features"]["steps"]["sequence"]["feature"]["featuresDict"]["features"]
-    steps["observation"]["featuresDict"]["features"]["odd"]["tensor"]["shape"] = shape
-    (folder / "features.json").write_text(json.dumps(description))
-    if shape is None or "many" in shape["dimensions"]:
-        with pytest.raises(InputError, match="not a description of features"):
-            look_at(str(folder))
-    else:
-        require_true(proposed(folder)[0])

@@ -1,19 +1,14 @@
 """Writing RLDS: DROID's schema as TFDS writes it (golden/DATA_ORIGIN.md), complete or not at all."""
 
-import errno
 import json
-import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from paths import GOLDEN
 from synthetic import synthetic_episode, write_synthetic_droid
 from tfrecords import decode_example, index_records, read_record
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.simulation.droid_writer import CAMERAS, DroidEpisode, write_droid_rlds
+from vjepa2_ac.simulation.droid_writer import CAMERAS, write_droid_rlds
 
 
 def layout(shard: Path) -> dict[str, list[object]]:
@@ -71,14 +66,3 @@ def test_what_was_given_is_written_and_flags_and_reward_follow_from_length_and_p
             assert np.array_equal(values[f"steps/{name}"], array.astype(np.float32).ravel())
         for camera in CAMERAS:
             assert values[f"steps/observation/{camera}"] == episode.images[camera]
-
-
-def test_a_full_disk_is_the_users_error_and_an_episodes_own_error_is_not(tmp_path: Path) -> None:
-    def episodes(number: int) -> Iterator[DroidEpisode]:
-        yield synthetic_episode(0, steps=2, size=(16, 32))
-        raise OSError(number, os.strerror(number))
-
-    with pytest.raises(InputError, match="/set: cannot be written: No space left"):
-        write_droid_rlds(tmp_path / "set", episodes(errno.ENOSPC), shards=1)
-    with pytest.raises(FileNotFoundError):
-        write_droid_rlds(tmp_path / "set", episodes(errno.ENOENT), shards=1)
