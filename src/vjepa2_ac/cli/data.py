@@ -164,13 +164,17 @@ def _index(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.cli.console.tables import index_lines
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.data.index import record_usage
+    from vjepa2_ac.data.index import cached_file, fingerprint_of
     from vjepa2_ac.reporter import INDEXING
 
-    started = time.perf_counter()
-    with cli.reporter() as reporter, record_usage(rebuild=options.rebuild) as watch:
-        dataset = open_dataset(config, progress=reporter.task(INDEXING))
-    cli.show(*index_lines(dataset.table, watch, time.perf_counter() - started))
+    with cli.reporter() as reporter:
+        for is_rebuilt in (False, True) if options.rebuild else (False,):
+            started = time.perf_counter()
+            table = open_dataset(config, progress=reporter.task(INDEXING)).table
+            file = cached_file(config.disk_cache, fingerprint_of(table))
+            if options.rebuild and not is_rebuilt:
+                file.unlink(missing_ok=True)
+    cli.show(*index_lines(table, file, time.perf_counter() - started))
 
 
 def _inspect(options: argparse.Namespace) -> None:

@@ -5,13 +5,11 @@ DROID has 95,658 episodes: a list of as many objects is slow to load and to send
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextvars import ContextVar
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -253,27 +251,6 @@ def hash_of_bytes(content: bytes) -> int:
     return int.from_bytes(hashlib.blake2b(content, digest_size=_HASH_BYTES).digest(), "big") or 1
 
 
-@dataclass
-class Usage:
-    """The index files used while they were recorded."""
-
-    rebuild: bool
-    files: list[Path] = field(default_factory=list)
-
-
-_usage: ContextVar[Usage | None] = ContextVar("usage", default=None)
-
-
-@contextlib.contextmanager
-def record_usage(*, rebuild: bool = False) -> Iterator[Usage]:
-    """Record which files of the index are used within the block; with `rebuild`, none is read, and all are rebuilt."""
-    token = _usage.set(usage := Usage(rebuild))
-    try:
-        yield usage
-    finally:
-        _usage.reset(token)
-
-
 def cache_folder(config: DiskCacheConfig) -> Path:
     """Return the cache folder on this machine: the config's, $VJEPA2_AC_CACHE, or the user's.
 
@@ -288,6 +265,11 @@ def cache_folder(config: DiskCacheConfig) -> Path:
         except ValueError as error:
             raise InputError(where=_CACHE, found=f"{named!r} {error}", needed="a folder of this machine") from None
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
+
+
+def cached_file(config: DiskCacheConfig, key: str) -> Path:
+    """Return the file that caches the index with this key."""
+    return cache_folder(config) / "index" / f"{key}.index"
 
 
 def key_of(parts: Mapping[str, object]) -> str:
@@ -347,17 +329,13 @@ def get_or_make(
     Raises:
         UnreachableError: It is there and cannot be read.
     """
-    path = cache_folder(config) / "index" / f"{key}.index"
-    usage = _usage.get()
-    if usage:
-        usage.files.append(path)
+    path = cached_file(config, key)
     try:
-        if not (usage and usage.rebuild):
-            with storage.user_can_read(path):
-                data = path.read_bytes()
-            if not data.endswith(key.encode()):
-                raise NotATableError("it is damaged, from an older version, or of other data")  # noqa: TRY301
-            return from_bytes(data.removesuffix(key.encode()))
+        with storage.user_can_read(path):
+            data = path.read_bytes()
+        if not data.endswith(key.encode()):
+            raise NotATableError("it is damaged, from an older version, or of other data")  # noqa: TRY301
+        return from_bytes(data.removesuffix(key.encode()))
     except MissingFileError:
         pass
     except (InputError, NotATableError) as error:

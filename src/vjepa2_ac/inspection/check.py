@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from textwrap import shorten
@@ -17,7 +16,6 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.data.sources.indexed_source import FramesByStep
 from vjepa2_ac.data.splits import describe_splits, held_out_by
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError, counted
@@ -27,7 +25,6 @@ from vjepa2_ac.inspection.findings import Finding, Level, first_case
 from vjepa2_ac.inspection.motion import check_motion, duplicates_finding
 from vjepa2_ac.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.intervals import ENOUGH_EPISODES
-from vjepa2_ac.media.video import is_same_rate
 from vjepa2_ac.spaces import POSE, POSES, Spaces, rotation_angles
 
 _DARK = 8  # of 255: mean of frames that are nearly black
@@ -66,7 +63,6 @@ def check_data(
         yield Finding("ok", "stride", f"auto; this check uses the smallest candidate, {dataset.config.stride}")
     yield from _check_selection(dataset)
     yield from _check_clips(dataset, seed=seed, batch_size=batch_size, clips=clips)
-    yield from _check_video_rates(dataset)
     yield from check_motion(dataset)
     yield from coverage_findings(coverage_in(dataset))
     yield from check_excerpts(dataset)
@@ -122,18 +118,6 @@ def _check_test_split(dataset: Dataset) -> Iterator[Finding]:
     whole = int((dataset.taking_part & is_long_enough).sum())
     fix = f"No data.test_share of {counted(whole, 'episode')} leaves enough for training. Record more episodes"
     yield Finding("warning", "test", f"{text}. {fix}")
-
-
-def _check_video_rates(dataset: Dataset) -> Iterator[Finding]:
-    """Yield a finding for each camera whose videos have another rate than the steps, by the first episode's header."""
-    first = int(dataset.taking_part.argmax())
-    for camera in dataset.config.cameras:
-        with suppress(InputError):  # a damaged video is reported where a clip needs it
-            frames = dataset.source.read(first, camera).read_frames
-            rates_hz = frames.rates_hz() if isinstance(frames, FramesByStep) and frames.rates_hz else (0.0, 0.0)
-            if not is_same_rate(*rates_hz):
-                text = f"{camera}: videos have {rates_hz[0]:.4g} frames a second, steps {rates_hz[1]:g}"
-                yield Finding("ok", "video rate", f"{text}; a step has the frame nearest in time")
 
 
 def _check_clips(dataset: Dataset, *, seed: int, batch_size: int, clips: int) -> Iterator[Finding]:

@@ -17,7 +17,9 @@ from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:
-    from vjepa2_ac.data.index import EpisodeTable, Usage
+    from pathlib import Path
+
+    from vjepa2_ac.data.index import EpisodeTable
     from vjepa2_ac.decoding.decoder_folder import DecoderCard
     from vjepa2_ac.evaluation.calibration.variants import VariantResult
     from vjepa2_ac.goals.make_goals import MadeGoals
@@ -143,16 +145,14 @@ def print_finding(finding: Finding) -> None:
     console.print(text)
 
 
-def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
+def index_lines(table: EpisodeTable, file: Path, seconds: float) -> list[str]:
     """Return the output of `data index`."""
     steps = counted(int(table.num_steps.sum()), "step")
     lines = [f"{counted(len(table), 'episode')}, {steps}; opened in {seconds:.2f} s"]
     if table.problems:
         lines.append(f"{counted(len(table.problems), 'broken episode')}; the first: {table.problems[0].where}")
-    for path in dict.fromkeys(watch.files):
-        size = f"{path.stat().st_size / 1e6:.2f} MB" if path.is_file() else "could not be kept"
-        lines.append(f"  {path}  {size}")
-    return lines
+    size = f"{file.stat().st_size / 1e6:.2f} MB" if file.is_file() else "could not be kept"
+    return [*lines, f"  {file}  {size}"]
 
 
 def motion_table(steps: Sequence[StepSizes]) -> Table:

@@ -189,7 +189,6 @@ class FramesByStep:
     num_steps: int
     where: str  # file and episode, for messages
     decode: Callable[[Sequence[int]], UInt8[np.ndarray, "time height width 3"]]  # of steps within the episode
-    rates_hz: Callable[[], tuple[float, float]] | None = None  # reads a video's frames per second; and its steps
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
         """Return the RGB frames at these control steps, in this order.

@@ -183,10 +183,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         path, start_s = storage.join(info.root, row.video_file(info, key)), row.place[f"{key}.start_s"]
         clock, where = Clock(start_s=start_s, rate_hz=info.fps, source=info.where), f"{path}: {row.id}"
         return FramesByStep(
-            row.length,
-            where,
-            decode=lambda steps: read_frames(self._open_file(path), steps, where=where, clock=clock),
-            rates_hz=lambda: (read_header(self._open_file(path), where=where).rate_hz, info.fps),
+            row.length, where, lambda steps: read_frames(self._open_file(path), steps, where=where, clock=clock)
         )
 
     def _stored_frames(

@@ -1,27 +1,23 @@
 """An episode in a record: its identity, steps and states; and the index of all, by hopping over most of the data.
 
-Of a local record the states are checked, too. Behind a URL a read costs tens of milliseconds: many shards are read at
-once, and of a record only as much as gives its name and its steps; its states are checked when the episode is read, and
-here only where it may be a copy of another. A copy under another name has the same number of steps, and the same record
-length but for the name. Few other records do: of some 15 MB, nearly all of it images, seldom two agree to the byte. A
-copy whose images or texts were encoded again has another length, and is not found.
+The states of a local record are checked, too. Behind a URL a read costs tens of milliseconds: many shards are read at
+once, and of a record only as much as gives its name and its steps; its states are checked when the episode is read.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import RldsData, RldsFields
 from vjepa2_ac.config.sources import RECORD
 from vjepa2_ac.data.files import CONNECTIONS, in_parallel
-from vjepa2_ac.data.index import UNKNOWN, UNREAD, EpisodeProblem, EpisodeTable, hash_of_states, summary_of
+from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, summary_of
 from vjepa2_ac.data.poses import num_rotation_numbers, poses_from, require_selection
 from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.indexed_source import Found, Scanned, require_as_indexed, table_of
@@ -50,7 +46,6 @@ _SAMPLES = 4
 _NUMBERS: tuple[Kind, ...] = ("float_list", "int64_list")  # booleans are stored as integers
 _FIX_IDENTITY = "Name text or integer features in data.fields.identity, or set data.fields.identity: record"
 _PLACE = ("shard", "record", "offset", "length")  # columns of the table
-_LENGTH_BYTES = 5  # lengths that grow with a name: of text, list, feature, entry of the map, and all of them
 
 
 class Record:
@@ -273,8 +268,7 @@ def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str
             return list(_scan(shards[number], number, read, config, cameras))
 
     found = (one for of_shard in in_parallel(scan, range(len(shards)), threads) for one in of_shard)
-    table = table_of(found, config, sum(shard.episodes for shard in shards), progress)
-    return _with_hashes_of_copies(table, shards, config, threads) if is_far else table
+    return table_of(found, config, sum(shard.episodes for shard in shards), progress)
 
 
 def position_of(table: EpisodeTable, shards: Sequence[Shard], index: int) -> tuple[Shard, RecordSpan]:
@@ -366,35 +360,3 @@ def _require_fitting(shards: Sequence[Shard], config: RldsData, cameras: Sequenc
         except InputError as error:
             errors.append(error)
     raise errors[0]
-
-
-def _with_hashes_of_copies(
-    table: EpisodeTable, shards: Sequence[Shard], config: RldsData, threads: int
-) -> EpisodeTable:
-    """Return the table with the state hash of every record that could be a copy of another."""
-
-    def look(index: int) -> int:
-        shard, span = position_of(table, shards, index)
-        try:
-            with open_shard(shard) as read:
-                return hash_of_states(states_of(Record(read, span), config, int(table.num_steps[index]), str(span)))
-        except InputError:
-            return UNKNOWN  # reported when the episode is read
-
-    found = np.full(len(table), UNKNOWN, np.uint64)
-    chosen = _possible_copies(table, tolerance=_LENGTH_BYTES * len(config.fields.identity_features))
-    found[chosen] = np.fromiter(in_parallel(look, chosen.tolist(), threads), np.uint64)
-    return replace(table, state_hash=found)
-
-
-def _possible_copies(table: EpisodeTable, tolerance: int) -> Int64[np.ndarray, " copies"]:
-    """Return the episodes with as many steps as another, and the same record length but for the name.
-
-    Args:
-        table: With the lengths of the records.
-        tolerance: Bytes by which the rest may differ, because encoded lengths of names vary in size.
-    """
-    rest = table.locators["length"] - np.char.str_len(table.ids)
-    order = np.lexsort((rest, table.num_steps))
-    alike = (np.diff(table.num_steps[order]) == 0) & (np.diff(rest[order]) <= tolerance)
-    return np.asarray(order[np.append(alike, False) | np.append(False, alike)], np.int64)
