@@ -95,8 +95,7 @@ def test_validation_clips_are_few_distinct_and_from_all_held_out_episodes(droid:
     assert {name for name, _ in names(batches)} == everyone
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-@pytest.mark.parametrize("pinned", [False, True])
+@pytest.mark.parametrize(("workers", "pinned"), [(0, False), (1, True)])
 def test_an_error_in_a_worker_is_the_error_the_user_reads(
     spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, workers: int, *, pinned: bool
 ) -> None:
@@ -126,31 +125,24 @@ if __name__ == "__main__":
     config = DataConfig(path=sys.argv[1], frames=3, stride=2, workers=1, validation_share=0.0, test_share=0.0)
     batches = training_loader(open_dataset(config), seed=0, batch_size=1)
     next(batches)
-    if sys.argv[2] == "error":
-        raise RuntimeError("boom")
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@pytest.mark.parametrize("death", ["error", "kill"])
-def test_workers_end_with_the_run_however_it_ends(droid: Path, tmp_path: Path, death: str) -> None:
+def test_workers_end_with_a_run_that_is_killed(droid: Path, tmp_path: Path) -> None:
     script = tmp_path / "run.py"
     script.write_text(RUN_THAT_DIES)
     with subprocess.Popen(
-        [sys.executable, "-W", "always", str(script), str(droid), death],
+        [sys.executable, str(script), str(droid)],
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     ) as run:
         try:
-            _, said = run.communicate(timeout=120)  # waits until no process holds the pipe any more
+            run.communicate(timeout=120)  # waits until no process holds the pipe any more
         except subprocess.TimeoutExpired:
             os.killpg(run.pid, signal.SIGKILL)
             pytest.fail("a worker outlives the run")
-    assert said.count("Traceback") == (death == "error")
-    if death == "error":
-        assert said.endswith("RuntimeError: boom\n")
-        assert "Warning" not in said
 
 
 @pytest.mark.parametrize("workers", [0, 1])

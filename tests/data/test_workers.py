@@ -2,8 +2,6 @@
 
 import contextlib
 import signal
-import subprocess
-import sys
 from collections import namedtuple
 from collections.abc import Iterator
 from pathlib import Path
@@ -119,25 +117,3 @@ def test_a_slow_batch_is_waited_for_unless_a_signal_has_come(monkeypatch: pytest
 
 
 # Files in the working directory that are named like modules.
-
-STARTS_A_WORKER = """
-import multiprocessing, os
-from vjepa2_ac.data.streams import _start_servers
-if __name__ == "__main__":
-    _start_servers()
-    worker = multiprocessing.get_context("forkserver").Process(target=os.getpid)
-    worker.start()
-    worker.join()
-    print(worker.exitcode, os.environ.get("PYTHONSAFEPATH"))
-"""
-
-
-def test_a_file_named_like_a_module_is_not_imported_by_workers(tmp_path: Path) -> None:
-    (tmp_path / "here").mkdir()
-    for name in ("random", "signal", "socket"):
-        (tmp_path / f"here/{name}.py").write_text("open('RAN', 'w')")
-    (tmp_path / "program.py").write_text(STARTS_A_WORKER)
-    words = [sys.executable, "-W", "ignore", str(tmp_path / "program.py")]
-    done = subprocess.run(words, cwd=tmp_path / "here", capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == ("0 None\n", "")
-    assert not (tmp_path / "here/RAN").exists()

@@ -15,7 +15,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index import UNKNOWN
 from vjepa2_ac.inspection.check import check_data
-from vjepa2_ac.inspection.coverage import Duplicates, find_duplicates
+from vjepa2_ac.inspection.findings import Duplicates, find_duplicates
 from vjepa2_ac.inspection.statistics import inspect_dataset
 
 RECORDINGS = (0, 1, 2, 3, 0, 4, 5, 0, 6, 4)  # the first one three times, the fifth one twice

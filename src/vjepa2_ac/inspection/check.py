@@ -21,8 +21,8 @@ from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.inspection.coverage import ENOUGH_DIRECTIONS, Coverage, coverage_in, lines_of
 from vjepa2_ac.inspection.excerpts import check_excerpts
-from vjepa2_ac.inspection.findings import Finding, Level, first_case
-from vjepa2_ac.inspection.motion import check_motion, duplicates_finding
+from vjepa2_ac.inspection.findings import Finding, Level, duplicates_finding, first_case
+from vjepa2_ac.inspection.motion import check_motion
 from vjepa2_ac.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.spaces import POSE, POSES, Spaces, rotation_angles

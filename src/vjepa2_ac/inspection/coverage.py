@@ -1,4 +1,4 @@
-"""Measure action coverage (has the motion enough directions and sizes to plan with?), and find duplicates.
+"""Measure action coverage: has the motion enough directions and sizes to plan with?
 
 A planner searches all directions up to its limits and takes the action with the lowest energy. Where the data have no
 such actions, the model extrapolates, and the optimiser exploits its errors. Data have low diversity ("narrow" in the
@@ -11,19 +11,15 @@ reaches plans worse than its base).
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int, UInt64
-from scipy.spatial import KDTree
+from jaxtyping import Float
 
-from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.files import connections_to, in_parallel
-from vjepa2_ac.data.index import SPANS, UNKNOWN, EpisodeTable
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
@@ -36,13 +32,6 @@ PLAY = (
     "Record half an hour of random motion in all directions, with steps as long as the planner's: this helps planning"
     " more than further demonstrations"
 )
-
-_SPLITS: tuple[Split, ...] = ("train", "validation", "test")
-DUPLICATES_FIX = "List copies in data.exclude, or keep related episodes in one split with data.split_by"
-
-_NEAR = 1e-4  # of means and deviations of copies: rounding to 0.1 mm changes them less
-_MOVING = 1e-2  # of deviations: episodes with smaller ones may agree because the robot stands still
-_MOST_COPIES = 8  # of one recording; of more, not all may be found
 
 ENOUGH_NEAR = 0.5  # a direction is covered by this share of the steps that go near it if all are equally frequent
 _SHORT_CM = 0.5  # a shorter step has no direction, and along an axis no sign
@@ -276,76 +265,3 @@ def _of_vectors(changes: Float[np.ndarray, "pairs dim"], usual: Float[np.ndarray
     narrow = f"{len(still)} of {width} numbers hardly move, {width - len(both) - len(still)} move only one way"
     metrics = {"both_ways": both, "still": still}
     return Coverage(narrow if is_narrow else "", len(changes) // stride, usual, lines, metrics)
-
-
-# ---- duplicates: an episode under several names could be in both the training and the validation split ----
-
-
-@dataclass(frozen=True)
-class Duplicates:
-    """Used episodes that have the same, or nearly the same, states as another one."""
-
-    is_known: bool  # whether the states were compared
-    episodes: int = 0
-    different: int = 0  # of these, without copies
-    across: int = 0  # of these: with a copy in another split
-    example: tuple[tuple[str, Split], ...] = ()  # two of them with their splits: of different splits, if there are
-    copies: tuple[str, ...] = ()  # identities of all but the first of each: what to exclude
-
-    def __str__(self) -> str:
-        if not self.is_known:
-            return "need the states of the episodes; the index of this data set has none"
-        if not self.episodes:
-            return "no two episodes have the same states"
-        (one, its_split), (other, others_split) = self.example
-        return (
-            f"{self.episodes:,} episodes have the states of another episode, exactly or nearly"
-            f" ({self.different:,} different recordings). {self.across:,} of them have a copy in another split, such as"
-            f" {one} ({its_split}) and {other} ({others_split}). {DUPLICATES_FIX}"
-        )
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return this as plain values, for `inspect.json`."""
-        return vars(self) | {"example": [name for name, _ in self.example]}
-
-
-def find_duplicates(dataset: Dataset) -> Duplicates:
-    """Compare the states of all used episodes by their hashes and summaries: fast, reads nothing."""
-    table = dataset.table
-    if table.state_hash is None:
-        return Duplicates(is_known=False)
-    members = np.flatnonzero(dataset.taking_part & (table.state_hash != UNKNOWN))
-    members = members[np.argsort(table.id_rank[members])]
-    recordings = _recordings(table, members, table.state_hash[members])
-    is_copied = np.bincount(recordings)[recordings] > 1
-    members, recordings = members[is_copied], recordings[is_copied]
-    if not len(members):
-        return Duplicates(is_known=True)
-    splits = np.argmax([dataset.members(split)[members] for split in _SPLITS], axis=0)
-    groups: dict[int, list[tuple[str, Split]]] = defaultdict(list)
-    for number, member, split in zip(recordings.tolist(), members.tolist(), splits.tolist(), strict=True):
-        groups[number].append((table.identity(member), _SPLITS[split]))
-    across = [group for group in groups.values() if len({split for _, split in group}) > 1]
-    first, *others = (across or list(groups.values()))[0]
-    other = next((one for one in others if one[1] != first[1]), others[0])
-    return Duplicates(
-        is_known=True,
-        episodes=len(members),
-        different=len(groups),
-        across=sum(map(len, across)),
-        example=(first, other),
-        copies=tuple(name for group in groups.values() for name, _ in group[1:]),
-    )
-
-
-def _recordings(
-    table: EpisodeTable, members: Int[np.ndarray, " members"], hashes: UInt64[np.ndarray, " members"]
-) -> Int[np.ndarray, " members"]:
-    """Return a number for each episode: the same for equal and for nearly equal states."""
-    motion = table.motion[members]
-    numbers = np.unique(hashes, return_inverse=True)[1]
-    moving = np.flatnonzero(motion[:, SPANS].max(axis=1, initial=0.0) > _MOVING)  # not those of unknown motion
-    points = np.column_stack([motion[moving, 2:], table.num_steps[members[moving]]])
-    _, nearest = KDTree(points).query(points, k=_MOST_COPIES, p=np.inf, distance_upper_bound=_NEAR)
-    numbers[moving] = np.append(numbers[moving], len(members))[nearest].min(axis=1)  # the last one: no such neighbour
-    return np.asarray(numbers)

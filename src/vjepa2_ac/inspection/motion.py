@@ -18,9 +18,9 @@ from vjepa2_ac.data.rotation_formats import MIN_JUMPS, rotation_speeds, smoother
 from vjepa2_ac.data.selection import named
 from vjepa2_ac.data.sources.indexed_source import IndexedSource
 from vjepa2_ac.errors import counted
-from vjepa2_ac.inspection.coverage import PERCENTILE, ReadEpisode, find_duplicates, read_each, read_sample, sample_of
+from vjepa2_ac.inspection.coverage import PERCENTILE, ReadEpisode, read_each, read_sample, sample_of
 from vjepa2_ac.inspection.excerpts import BLANK, is_still, num_excerpts, small_grey
-from vjepa2_ac.inspection.findings import Finding, Level, first_case
+from vjepa2_ac.inspection.findings import Finding, duplicates_finding, first_case
 from vjepa2_ac.spaces import POSE, step_sizes
 
 _EPISODES, _EPISODES_AT_URL = 200, 12
@@ -79,13 +79,6 @@ def warnings_from_index(dataset: Dataset) -> list[Finding]:
         sample = list(read_sample(dataset, 0, also=_fast_episodes(dataset)))
         findings += scale_finding(dataset), *_check_states(dataset, sample)
     return [one for one in findings if one.level == "warning"]
-
-
-def duplicates_finding(dataset: Dataset) -> Finding:
-    """Return whether episodes are copies of others, by the index."""
-    duplicates = find_duplicates(dataset)
-    level: Level = "skipped" if not duplicates.is_known else "warning" if duplicates.episodes else "ok"
-    return Finding(level, "duplicates", str(duplicates))
 
 
 def scale_finding(dataset: Dataset) -> Finding:

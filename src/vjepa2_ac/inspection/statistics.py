@@ -18,17 +18,15 @@ from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.inspection.coverage import (
     Coverage,
-    Duplicates,
     ReadEpisode,
     coverage_by,
-    find_duplicates,
     lines_of,
     read_sample,
 )
+from vjepa2_ac.inspection.findings import SPLITS, Duplicates, find_duplicates
 from vjepa2_ac.spaces import rotation_angles
 
 PERCENTILES = (10, 50, 90, 99)
-SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 MOVED, TURNED, CHANGED = "moved_cm", "turned_deg", "changed_percent_of_range"
 
 RELEASED_STEP_CM = 12.9  # motion of the flange between the two frames of upstream's example (franka_example_traj.npz)
