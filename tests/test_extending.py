@@ -14,7 +14,6 @@ from PIL import Image
 from killable import nursery
 from paths import ROOT
 from run_fixtures import as_yaml
-from vjepa2_ac.registry import ENERGIES, LOSSES, METRICS, PLANNERS
 
 RECIPES = ("A loss", "A planner", "An energy", "A metric", "A tracker", "A transform", "A form of data")
 STATE = "0.4,0,0.4,3.1,0,0,0"
@@ -41,31 +40,6 @@ def command(*words: str) -> subprocess.CompletedProcess[str]:
     return nursery().run("-m", "vjepa2_ac.cli", *words, folder=Path.cwd().parent)
 
 
-def test_the_transform_adds_its_noise_and_the_run_goes_on_with_it_only(at_home: Path, make_config) -> None:
-    values = yaml.safe_load(as_yaml(make_config(training__steps=1, run_dir=at_home / "run", data__workers=0)))
-    values |= {"plugins": ["my_module"]}
-    values["data"]["transforms"] = [{"name": "sensor_noise", "options": {"std": 5.0}}]
-    (at_home / "own.yaml").write_text(yaml.safe_dump(values))
-    code = """
-import itertools
-from vjepa2_ac import load_config, open_dataset
-from vjepa2_ac.data.loader import training_loader
-read = [next(training_loader(open_dataset(load_config("own.yaml", keys)), seed=0, batch_size=8)).frames.float()
-        for keys in ([], ["data.transforms=[]"])]
-print((read[0] - read[1])[read[1] > 50].std().item())
-"""
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
-    assert 4 < float(done.stdout) < 6
-    assert command("train", "own.yaml").returncode == 0
-    for other in ("[]", "[{name: sensor_noise, options: {std: 6.0}}]"):
-        refused = command("train", "own.yaml", f"data.transforms={other}")
-        assert (refused.returncode, "differs in" in refused.stderr, "data.transforms" in refused.stderr) == (
-            2,
-            True,
-            True,
-        )
-
-
 def test_every_recipe_is_short() -> None:
     for block in PAGE.split("```python\n")[1:]:
         assert len([line for line in block.split("```")[0].splitlines() if line.strip()]) <= 40
@@ -88,16 +62,6 @@ def test_training_loads_the_core_only() -> None:
     assert len(loaded) <= 120
     beside = "simulation init serving inspection calibration goals policies console cli export"
     assert not rooms & set(beside.split())
-
-
-def test_installed_packages_are_searched_once_for_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A search asks for its energy at each part of each iteration."""
-    for registry in (LOSSES, PLANNERS, ENERGIES, METRICS):
-        first = next(iter(registry._things))
-        assert registry.known(first) == first
-        monkeypatch.setattr("vjepa2_ac.registry.installed", lambda _: pytest.fail("searched again"))
-        assert registry.find(registry.known(first)) is registry.find(first)
-        monkeypatch.undo()
 
 
 def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, make_config) -> None:

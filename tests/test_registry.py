@@ -4,13 +4,13 @@ import importlib
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import pytest
 
 from run_fixtures import as_yaml
 from vjepa2_ac import registry as doors
-from vjepa2_ac.config import DataConfig, Section
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.settings import planning_settings
@@ -74,20 +74,6 @@ def test_a_name_of_one_plugin_cannot_be_registered_by_another_nor_twice_in_one(w
             import_plugins([module], where="plugins")
 
 
-def test_objects_without_a_module_belong_to_the_module_that_registers_them(write: Write) -> None:
-    code = "from vjepa2_ac.registry import LOSSES\nLOSSES.register('p_object')(object())\n"
-    import_plugins([write("p_one", code)], where="plugins")
-    with pytest.raises(InputError, match="registered by p_one already"):
-        import_plugins([write("p_two", code)], where="plugins")
-
-
-def test_a_module_that_is_loaded_again_replaces_what_it_registered(write: Write) -> None:
-    import_plugins([write("p_edited")], where="plugins")
-    before = LOSSES.find("p_edited")
-    importlib.reload(sys.modules["p_edited"])
-    assert LOSSES.find("p_edited") is not before
-
-
 def install(folder: Path, package: str, entry_points: str, code: str = "thing = print\n") -> None:
     """Leave in a folder what the installation of a package leaves."""
     about = folder / f"{package}-1.0.dist-info"
@@ -113,13 +99,6 @@ def test_an_entry_point_cannot_have_a_name_of_this_package_or_of_another(site: P
             parse_config({**VALUES, "training": {"loss": name}}, where="own.yaml")
 
 
-def test_a_package_may_register_what_it_lists_as_an_entry_point(site: Path) -> None:
-    code = REGISTERS.format(name="p_both", function="both")
-    install(site, "p_both", "[vjepa2_ac.losses]\np_both = p_both:both\n", code)
-    assert LOSSES.find("p_both").__module__ == "p_both"
-    assert LOSSES.known("p_both") == "p_both"
-
-
 def test_a_source_of_this_package_cannot_be_defined_again(site: Path) -> None:
     with pytest.raises(InputError, match=r"form of data 'npz': registered by vjepa2_ac\.config\.sources already"):
 
@@ -129,20 +108,6 @@ def test_a_source_of_this_package_cannot_be_defined_again(site: Path) -> None:
     install(site, "p_npz", "[vjepa2_ac.sources]\nnpz = p_npz:thing\n")
     with pytest.raises(InputError, match=r"'npz': registered by vjepa2_ac\.config\.sources and by p_npz"):
         parse_config({**VALUES, "data": {"source": "npz", "path": "none"}}, where="own.yaml")
-
-
-class Options(Section):
-    size: int = 3
-
-
-@pytest.mark.parametrize("name", ["idle", "frames", "cameras"])
-@pytest.mark.filterwarnings("ignore:Field name")
-def test_a_section_cannot_have_the_name_of_a_key_of_all_forms(name: str) -> None:
-    values = {"source": "p_own", name: Options(), "first_camera": "a", "__module__": __name__}
-    kinds = {"source": Literal["p_own"], name: Options, "first_camera": ClassVar[str]}
-    with pytest.raises(TypeError, match=rf"Own\.{name}: all forms of data have a key of this name"):
-        type(DataConfig)("Own", (DataConfig,), {**values, "__annotations__": kinds})
-    assert "p_own" not in DataConfig.kinds
 
 
 # Plug-ins that fail give one error.
@@ -168,12 +133,6 @@ def test_a_plugin_that_fails_is_one_error_with_the_line(write: Write, code: str,
 def test_names_that_are_no_modules_are_refused(name: str) -> None:
     with pytest.raises(InputError, match="a module of yours"):
         import_plugins([name], where="plugins")
-
-
-def test_an_entry_point_that_fails_is_one_error(site: Path) -> None:
-    install(site, "p_broken", "[vjepa2_ac.losses]\np_broken = p_broken:thing\n", "raise OSError('boom')")
-    with pytest.raises(InputError, match=r"p_broken = p_broken:thing cannot be imported \(OSError: boom; .*line 1"):
-        LOSSES.find("p_broken")
 
 
 @pytest.mark.usefixtures("write")

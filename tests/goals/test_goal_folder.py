@@ -136,9 +136,3 @@ def test_a_file_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> No
             read_goal_folder(folder)
     edit(folder, lambda goals: goals[1].update(file="inside.png"))
     assert len(read_goal_folder(folder)) == 3
-
-
-def test_an_image_without_contrast_is_no_goal(folder: Path) -> None:
-    (folder / "goal_2.png").write_bytes(encode_png(np.full_like(image(1), 90)))
-    with pytest.raises(InputError, match=r"goal_2\.png: an image without contrast"):
-        read_goal_folder(folder)

@@ -60,11 +60,6 @@ def test_key_frames_are_where_the_gripper_changes_and_the_arm_stops(parts: tuple
     assert named(way(*parts)) == keys
 
 
-def test_pick_and_place_opens_again() -> None:
-    names = [name for _, name in named(way((10, 0.2, 0), (5, 0, 0.5), (10, 0.2, 0), (5, 0, -0.5), (10, -0.2, 0)))]
-    assert names == ["before closing", "closed", "before opening", "opened", "end"]
-
-
 def test_fingers_that_tremble_change_nothing() -> None:
     states = way((10, 0.2, 0), (20, 0.2, 0))
     states[:, 6] += 0.05 * np.random.default_rng(0).random(len(states))

@@ -145,13 +145,6 @@ def test_a_run_plans_by_axes_of_its_own_trained_weights_merged_or_not(make_confi
         Controller.of_subject(load_to_plan(str(run), overrides=[f"planning.axes={for_base}"]))
 
 
-def test_a_wrong_file_is_told_before_a_model_is_loaded(tmp_path: Path) -> None:
-    path = tmp_path / "axes.json"
-    path.write_text("{}")
-    with pytest.raises(InputError, match="format None"):
-        load_to_plan("no/model.pt", overrides=[f"planning.axes={path}"])
-
-
 def test_what_a_fit_writes_can_be_read(tmp_path: Path) -> None:
     errors = 1.1 - np.cos(np.deg2rad(np.array(TRIED_DEGREES) - 90.0))
     fit = fit_axes(np.tile(errors, (40, 1)), [f"{place // 4}" for place in range(40)])

@@ -113,13 +113,6 @@ def test_the_present_energy_is_that_of_an_image_that_stays(steps: str) -> None:
     assert run.decision.energy_now == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_goal_that_is_reached_on_the_way_to_another_is_left() -> None:
-    for steps in ("last", "sum"):
-        run = controller(energy=EnergyConfig(steps=steps))
-        run.reset(image(100), image(101), durations=(1,))
-        assert run.act(image(100), STATE).any()
-
-
 def test_a_decision_that_failed_can_be_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
     undisturbed, run = actions(controller()), controller()
     run.reset(image(100))
@@ -134,11 +127,6 @@ def test_a_decision_that_failed_can_be_asked_for_again(monkeypatch: pytest.Monke
 
 def fail(*_: object) -> None:
     raise RuntimeError("out of memory")
-
-
-def test_a_model_that_was_in_training_is_put_into_eval_mode() -> None:
-    model = tiny_model(adapted=True).train()
-    np.testing.assert_array_equal(actions(controller(model), 1), actions(controller(tiny_model(adapted=True)), 1))
 
 
 def test_one_model_step_of_the_last_plan_is_gone_when_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,16 +162,6 @@ def test_images_are_cropped_as_in_training() -> None:
         run.act(images[1], STATE)
         energies.append(run.decision.energy_now)
     assert energies[0] == energies[1] != energies[2]
-
-
-def test_a_model_without_states_decides_the_same_whatever_the_pose() -> None:
-    found = []
-    for state in (STATE, STATE + np.array([0.1, 0.1, 0.1, 0.5, 0.2, 0.1, 0.0])):
-        run = controller(tiny_model(states=False))
-        run.reset(image(100))
-        found.append([run.act(image(seed), state) for seed in range(2)])
-    np.testing.assert_array_equal(*found)
-    assert (np.abs(found[0]) > 0).any()
 
 
 @pytest.mark.parametrize("joined", ["difference", "sum", "last"])

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from jaxtyping import TypeCheckError
 from torch import Tensor
 
 from decisions import STATE, image
@@ -100,15 +99,6 @@ def test_an_energy_is_upstreams_mean_absolute_difference_of_the_last_step() -> N
     torch.testing.assert_close(measure(tried), expected)
 
 
-@torch.no_grad()
-@pytest.mark.parametrize("kind", ["l1", "l2", "cosine"])
-def test_a_sum_over_steps_adds_the_energies_of_shorter_plans(kind: str) -> None:
-    model, tried = tiny_model(), actions(4, 3)
-    last = cost(model, distance=kind)
-    expected = sum(last(tried[:, :steps]) for steps in (1, 2, 3))
-    torch.testing.assert_close(cost(model, distance=kind, steps="sum")(tried), expected)
-
-
 def test_each_distance_is_its_formula() -> None:
     found, wanted = draw(5, TOKENS, DIM, seed=1), draw(TOKENS, DIM, seed=2)
     torch.testing.assert_close(distance(found, wanted, EnergyConfig()), (found - wanted).abs().mean(dim=(1, 2)))
@@ -119,16 +109,6 @@ def test_each_distance_is_its_formula() -> None:
     torch.testing.assert_close(distance(found, wanted, EnergyConfig(distance="cosine")), 1 - cosine.mean(dim=1))
     for kind in ("l1", "l2", "cosine"):
         assert float(distance(wanted, wanted, EnergyConfig(distance=kind))) == pytest.approx(0, abs=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["l1", "l2", "cosine"])
-def test_patches_without_weight_do_not_count(kind) -> None:
-    found, wanted = draw(5, TOKENS, DIM, seed=1), draw(TOKENS, DIM, seed=2)
-    weights = torch.zeros(TOKENS)
-    weights[[2, 5]] = 3.0
-    by = EnergyConfig(distance=kind)
-    torch.testing.assert_close(distance(found, wanted, by, weights), distance(found[:, [2, 5]], wanted[[2, 5]], by))
-    torch.testing.assert_close(distance(found, wanted, by, torch.ones(TOKENS)), distance(found, wanted, by))
 
 
 def test_a_mask_over_the_image_weighs_its_patches_row_by_row() -> None:
@@ -147,12 +127,6 @@ def test_the_goals_weights_are_used() -> None:
     measure = WorldModelCost(model, scene(), goal(weights=weights), EnergyConfig())
     predicted, _ = measure.imagine(tried)
     torch.testing.assert_close(measure(tried), distance(predicted[:, 0], goal().latents[0], EnergyConfig(), weights))
-
-
-def test_goals_follow_one_another_after_their_durations() -> None:
-    wanted = goal(3, durations=(2, 1))
-    assert [wanted.place(step) for step in range(5)] == [0, 0, 1, 2, 2]
-    torch.testing.assert_close(wanted.ahead(1, 3), wanted.latents)
 
 
 @torch.no_grad()
@@ -188,13 +162,6 @@ def test_every_planner_goes_downhill_in_a_world_model(planner: str) -> None:
     assert plan.iterations[-1].elite_energy < plan.iterations[0].elite_energy
 
 
-def test_planning_leaves_no_gradient_in_the_model() -> None:
-    model = tiny_model(adapted=True)
-    settings = PlanningConfig(planner="gradient", iterations=2)
-    Planner(settings).plan(cost(model), torch.Generator())
-    assert all(value.grad is None for value in model.parameters())
-
-
 def test_a_model_in_training_mode_is_refused() -> None:
     with pytest.raises(ValueError, match="eval"):
         cost(tiny_model(adapted=True).train())
@@ -221,23 +188,3 @@ def test_an_energy_that_is_a_class_is_constructed_once_for_a_controller(monkeypa
         run.act(image(seed), STATE)
     run.score(image(2), STATE, np.zeros((2, 1, 7)))
     assert len(made) == 1
-
-
-def test_a_model_in_bfloat16_plans_on_a_cpu_as_in_float32_to_its_precision() -> None:
-    energies, tried = [], actions(6, 2)
-    for dtype in (torch.float32, torch.bfloat16):
-        config = PlanningConfig(samples=8, iterations=2, horizon=2, planner={"name": "cem", "options": {"elites": 3}})
-        run = Controller(tiny_model().to(dtype), config)
-        run.reset(image(100))
-        assert np.isfinite(run.act(image(0), STATE)).all()
-        assert (np.abs(run.decision.action[:3]) <= 0.05).all()
-        with torch.no_grad():
-            energies.append(run.decision.cost(tried))
-    torch.testing.assert_close(energies[1], energies[0], rtol=0.03, atol=0.0)
-    assert energies[1].std() > 0
-
-
-def test_a_wrong_shape_is_refused_while_testing() -> None:
-    pytest.importorskip("beartype")
-    with pytest.raises(TypeCheckError):
-        cost(tiny_model())(torch.zeros(3, 7))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.planning.energy import energy_slices, fitting_nodes, sequences_of_slices
+from vjepa2_ac.planning.energy import energy_slices
 from vjepa2_ac.planning.search_space import pose_space
 
 CHOSEN = torch.arange(28.0).reshape(4, 7) / 1000
@@ -29,14 +29,6 @@ def test_a_slice_changes_two_numbers_of_the_first_action_and_no_others() -> None
                 assert one.energy[row, column] == pytest.approx(float(weighted(changed[None])[0]), rel=1e-5)
 
 
-def test_an_action_that_is_repeated_changes_as_one() -> None:
-    space = pose_space(PlanningConfig(horizon=4, action_repeat=2, limits=LIMITS))
-    one = energy_slices(weighted, CHOSEN, space, nodes=3)[0]
-    changed = CHOSEN.clone()
-    changed[:2, 0], changed[:2, 1] = one.across[0], one.up[2]
-    assert one.energy[2, 0] == pytest.approx(float(weighted(changed[None])[0]), rel=1e-5)
-
-
 def test_a_slice_reaches_beyond_the_limits_also_along_an_axis_that_is_held() -> None:
     slices = energy_slices(weighted, CHOSEN, pose_space(PlanningConfig(horizon=4, limits=LIMITS)), nodes=3)
     np.testing.assert_allclose(slices[0].across, [-0.05, 0, 0.05], rtol=1e-5)
@@ -44,25 +36,3 @@ def test_a_slice_reaches_beyond_the_limits_also_along_an_axis_that_is_held() -> 
     np.testing.assert_allclose(slices[2].up, [-0.1, 0, 0.1], rtol=1e-5)  # dz is held: as wide as the widest
     held = pose_space(PlanningConfig(horizon=4, limits=LimitsConfig(xyz=(0, 0, 0), rotation=0.1)))
     np.testing.assert_allclose(energy_slices(weighted, CHOSEN, held, nodes=3)[0].up, [-0.0625, 0, 0.0625], rtol=1e-5)
-
-
-@pytest.mark.parametrize("axes", [2, 3])
-def test_chosen_nodes_are_the_most_that_cost_no_more_than_the_search(axes: int) -> None:
-    for searched in range(600):
-        nodes = fitting_nodes(searched, axes)
-        assert nodes in {0, 5, 7, 9, 11, 13}
-        assert sequences_of_slices(nodes, axes) <= searched
-        assert nodes == 13 or sequences_of_slices(max(nodes + 2, 5), axes) > searched
-
-
-def test_progress_of_slices_leads_to_all_that_is_evaluated() -> None:
-    evaluated, reported = [], []
-
-    def counted(actions: Tensor) -> Tensor:
-        evaluated.append(len(actions))
-        return weighted(actions)
-
-    space = pose_space(PlanningConfig(horizon=4, limits=LIMITS))
-    energy_slices(counted, CHOSEN, space, nodes=5, progress=lambda *seen: reported.append(seen))
-    assert sum(evaluated) == sequences_of_slices(5, 3) == 75
-    assert reported == [(0, 75), (25, 75), (50, 75), (75, 75)]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from decisions import QUICK, STATE, asked, image
+from decisions import QUICK, STATE, image
 from paths import ROOT
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import GoalsConfig, LimitsConfig
@@ -14,7 +14,6 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.decision import PlanRequest, decide, plan_as_dict
 from vjepa2_ac.planning.goals import GripperMode, SubGoal, write_goals
 from vjepa2_ac.spaces import Spaces
 
@@ -71,13 +70,6 @@ def test_a_noisy_image_of_the_goal_ends_it_and_what_is_done_stays_done() -> None
     assert plain.act(noisy(100), STATE).any(), "without the rule, only an equal image is the goal"
 
 
-def test_an_equal_image_is_the_goal_without_any_rule() -> None:
-    run = controller()
-    run.reset(image(100), image(101), durations=(1,))
-    assert decided(run, image(100)) == (0, 0, False, False), "not the last goal"
-    assert decided(run, image(101)) == (1, 1, True, True)
-
-
 def test_each_goal_has_its_own_gripper_mode() -> None:
     run = controller()
     modes: list[GripperMode] = ["close", "held", "open"]
@@ -85,30 +77,6 @@ def test_each_goal_has_its_own_gripper_mode() -> None:
     found = [run.act(image(seed), STATE)[6] for seed in range(4)]
     assert found[:3] == [1.0, 0.0, -1.0]
     assert float(run.space.upper[0, 6]) == pytest.approx(0.75)
-
-
-def test_the_progress_of_a_search_is_reported_for_every_gripper_mode() -> None:
-    run, called = controller(), []
-    run.planner.progress = lambda done, _: called.append(done)
-    run.follow([SubGoal(image(100), at_most=1, gripper="held"), SubGoal(image(101))])
-    for seed in range(2):
-        run.act(image(seed), STATE)
-    assert called == [0, 12, 24, 0, 12, 24]
-
-
-def test_fixed_durations_are_a_special_case_of_goals_with_rules() -> None:
-    found = []
-    for horizon in (1, 3):
-        for way in ("durations", "rules"):
-            run = controller(horizon=horizon)
-            if way == "durations":
-                run.reset(image(100), image(101), image(102), durations=(2, 1))
-            else:
-                timed = [SubGoal(image(100), at_least=2, at_most=2), SubGoal(image(101), at_least=1, at_most=1)]
-                run.follow([*timed, SubGoal(image(102))])
-            actions = [run.act(image(seed), STATE) for seed in range(5)]
-            found.append(np.stack(actions))
-        np.testing.assert_array_equal(found[-1], found[-2])
 
 
 def test_a_plan_looks_ahead_to_what_follows_at_the_latest() -> None:
@@ -144,18 +112,6 @@ def test_goals_that_cannot_be_followed_are_refused_and_change_nothing(goals: lis
         run.follow([])
 
 
-@pytest.mark.parametrize(
-    ("numbers", "wrong"),
-    [
-        ({"at_least": 0}, "at least 0"), ({"at_least": 3, "at_most": 2}, "at most 2"), ({"share": 0.0}, "share 0.0"),
-        ({"share": 1.0}, "share 1.0"), ({"share": float("nan")}, "share nan"),
-    ],
-)  # fmt: skip
-def test_numbers_that_contradict_each_other_are_refused(numbers: dict, wrong: str) -> None:
-    with pytest.raises(InputError, match=rf"goal 'grasp': .*{wrong}"):
-        SubGoal(image(0), "grasp", **numbers)
-
-
 def test_the_pages_example_runs(tmp_path: Path) -> None:
     examples = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning.md").read_text(), flags=re.DOTALL)
     (example,) = (one for one in examples if "read_goal_folder" in one)
@@ -179,16 +135,3 @@ def test_a_gripper_mode_needs_a_gripper_and_something_to_plan() -> None:
     held = controller(limits=LimitsConfig(xyz=(0.0, 0.0, 0.0)))
     with pytest.raises(InputError, match="'held' of a goal: nothing that is left to plan"):
         held.follow([SubGoal(image(100), gripper="held")])
-
-
-def test_a_request_of_goals_with_rules_says_in_its_file_which_applies() -> None:
-    goals = [SubGoal(image(100), "grasp", at_most=4, share=0.4, gripper="held"), SubGoal(image(101))]
-    found = decide(controller(), PlanRequest(image(0), STATE, tuple(goals)))
-    assert not found.actions[:, 6].any()
-    written = plan_as_dict(found, {})
-    assert written["sub_goals"][0] == {
-        "name": "grasp", "at_least": 1, "at_most": 4, "share": 0.4, "gripper": "held",
-    }  # fmt: skip
-    assert (written["since"], written["changed"], written["done"]) == (0, "", False)
-    assert written["energy"]["began"] == pytest.approx(written["energy"]["now"], rel=1e-6)
-    assert (written["durations"], plan_as_dict(asked(100, 101), {})["durations"]) == ([], [1])

@@ -80,20 +80,6 @@ def test_the_next_goal_begins_with_its_own_first_energy() -> None:
     assert not found[5].changed
 
 
-def test_without_a_share_only_steps_count() -> None:
-    rules = [rule("", 2, 2), rule()]
-    found = progress_over(rules, [[1.0, 1.0], [0.0, 0.0], [0.5, 1.0], [0.0, 0.0]])
-    assert [one.place for one in found] == [0, 0, 1, 1]
-    assert not found[-1].done
-    assert found[2].changed == "Goal 1, after 2 steps: it ends after 2 steps, at energy 0.5, 50% of 1."
-
-
-def test_no_threshold_is_below_the_noise() -> None:
-    """A camera with noise never shows the goal image itself: what it cannot tell apart is reached."""
-    energies = [[1.0], [0.2], [0.11], [0.09]]
-    assert not progress_over([rule(share=0.05)], energies)[-1].done
-
-
 def test_an_energy_that_is_no_number_moves_nothing_on_before_its_time() -> None:
     nan = float("nan")
     rules = [rule("", 1, 3, 0.5), rule(share=0.5)]

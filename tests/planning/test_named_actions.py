@@ -7,9 +7,8 @@ import pytest
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
-from vjepa2_ac.planning.counterfactual import ACTION_NAMES, named_actions, read_actions
-from vjepa2_ac.spaces import actions_from_states
+from vjepa2_ac.model.state_integration import counterfactual_states
+from vjepa2_ac.planning.counterfactual import named_actions, read_actions
 
 START = np.array([0.4, 0.1, 0.3, np.pi - 0.01, 0.02, -0.7, 0.4])
 ROWS = np.array([[0.05, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0], [0.0, -0.02, 0.01, 0.0, 0.0, 0.0, -0.75]])
@@ -25,25 +24,6 @@ def test_opposites_sum_to_zero_and_lead_apart_along_one_axis(one: str, other: st
     assert ends[0][axis] > START[axis] > ends[1][axis]
     same = np.arange(7) != axis
     np.testing.assert_allclose(ends[0][same], START[same], atol=1e-9)
-
-
-def test_every_name_has_its_own_actions_and_none_stays() -> None:
-    assert len({named_actions(name, 2).tobytes() for name in ACTION_NAMES}) == len(ACTION_NAMES) == 9
-    np.testing.assert_allclose(
-        counterfactual_states(START, named_actions("none", 4)), np.tile(START, (5, 1)), atol=1e-9
-    )
-
-
-@pytest.mark.parametrize("closedness", [0.0, 0.4, 1.0])
-def test_close_ends_closed_open_ends_open_and_a_model_sees_only_what_can_change(closedness: float) -> None:
-    start = np.append(START[:6], closedness)
-    for name, end in (("close", 1.0), ("open", 0.0)):
-        actions = named_actions(name, 3)
-        states = counterfactual_states(start, actions)
-        assert states[-1, 6] == end
-        feasible = feasible_actions(start, actions)
-        np.testing.assert_allclose(feasible, actions_from_states(states), atol=1e-9)
-        assert abs(feasible[:, 6].sum() - (end - closedness)) < 1e-12
 
 
 def test_steps_are_as_long_as_asked_and_never_beyond_the_limits() -> None:

@@ -6,9 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from solver_problems import space
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.planning.search_space import Ball, SearchSpace, pose_space
+from vjepa2_ac.planning.search_space import SearchSpace, pose_space
 
 LIMITS = (0.05, 0.03, 0.07, 0.2, 0.2, 0.2, 0.75)
 
@@ -30,23 +29,6 @@ def test_nothing_beyond_the_limits_comes_out(values: list[float], ball: str, rad
     assert (found.abs() <= torch.tensor(LIMITS, dtype=torch.float64)).all()
     if ball != "none":
         assert torch.linalg.vector_norm(found[:3], ord=int(ball[1])) <= radius
-
-
-def test_allowed_actions_are_not_changed() -> None:
-    inside = torch.tensor([[0.01, -0.02, 0.0, 0.1, -0.1, 0.19, -0.7]])
-    assert torch.equal(pose(ball="l1", radius=0.031).allowed(inside), inside)
-
-
-def test_a_ball_keeps_the_direction() -> None:
-    found = space(dim=3, reach=9.0, ball=Ball("l2", 1.0)).allowed(torch.tensor([[3.0, 0.0, -4.0]]))
-    torch.testing.assert_close(found, torch.tensor([[0.6, 0.0, -0.8]]))
-
-
-def test_rotation_is_held_unless_it_is_asked_for() -> None:
-    wild = torch.full((1, 7), 9.0)
-    assert not pose(rotation=0.0).allowed(wild)[:, 3:6].any()
-    assert pose(rotation=0.1).allowed(wild)[:, 3:6].all()
-    assert pose(rotation=0.0).free.tolist() == [0, 1, 2, 6]
 
 
 @pytest.mark.parametrize(

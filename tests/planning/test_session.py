@@ -9,7 +9,7 @@ import torch
 
 from adapted_run import write_adapted_run
 from decisions import STATE, image
-from vjepa2_ac.config.loading import config_as_dict, config_as_yaml
+from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
@@ -73,15 +73,6 @@ def test_a_model_needs_no_config_and_takes_one(make_config, base_folder: Path, t
     assert next(reported.world_model.parameters()).dtype == torch.bfloat16
 
 
-def test_the_model_that_was_named_is_loaded_not_that_of_the_config(make_config, base_folder, tmp_path: Path) -> None:
-    sizes = config_as_dict(make_config())["model"]["sizes"] | {"image_size": 32}
-    sizes["encoder"] = {"width": 12, "depth": 1, "heads": 1}
-    fresh = make_config(model={"base": "random", "sizes": sizes, "dtype": "float32"}, adapter__kind="none")
-    path = tmp_path / "its.yaml"
-    path.write_text(config_as_yaml(fresh))
-    assert load_to_plan(str(base_folder), config=path).world_model.latent_dim == 24
-
-
 @pytest.mark.parametrize(
     ("given", "complaint"),
     [
@@ -97,15 +88,6 @@ def test_the_model_that_was_named_is_loaded_not_that_of_the_config(make_config, 
 def test_what_a_model_cannot_be_asked_for_is_refused(base_folder: Path, given: dict, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
         load_to_plan(str(base_folder), **given)
-
-
-def test_what_a_run_cannot_be_asked_for_is_refused(run: Path) -> None:
-    with pytest.raises(InputError, match="a config of its own"):
-        load_to_plan(str(run), config="other.yaml")
-    with pytest.raises(InputError, match="one of the steps 10, 20"):
-        load_to_plan(str(run), checkpoint="15")
-    with pytest.raises(InputError, match="no such file or folder"):
-        load_to_plan(str(run / "nowhere"))
 
 
 VECTORS = {
@@ -180,24 +162,3 @@ def test_a_run_is_merged_in_its_bases_type_and_its_fingerprints_are_those_of_wha
     assert reported["base"] == load_base(config.model, seed=0).predictor_fingerprint()
     assert reported["predictor"] == fingerprint(trained.predictor.state_dict())
     assert reported["dtype"] == "bfloat16"
-
-
-def test_a_base_is_known_by_its_own_weights(base_folder: Path) -> None:
-    base = WorldModel.from_pretrained(base_folder)
-    reported = load_to_plan(str(base_folder)).as_dict()["model"]
-    assert reported["encoder"] == base.encoder_fingerprint()
-    assert reported["base"] == base.predictor_fingerprint()
-    assert reported["predictor"] == fingerprint(base.predictor.state_dict())
-
-
-def test_a_run_in_float32_is_planned_with_in_bfloat16_if_that_is_asked_for(run: Path) -> None:
-    steering = load_to_plan(str(run), overrides=["model.dtype=bfloat16"])
-    assert {value.dtype for value in steering.world_model.parameters()} == {torch.bfloat16}
-
-
-def test_how_a_run_was_trained_does_not_keep_it_from_planning_here(make_config) -> None:
-    config = make_config()
-    run = write_adapted_run(
-        config.model_copy(update={"training": config.training.model_copy(update={"precision": "fp16"})})
-    )
-    assert load_to_plan(str(run)).world_model.device.type == "cpu"

@@ -9,7 +9,6 @@ import pytest
 
 from adapted_run import write_adapted_run
 from decisions import image
-from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.errors import InputError
@@ -68,14 +67,6 @@ def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config
     assert settle(str(folder), asked).planning.limits.xyz == limits
 
 
-def test_a_run_that_continues_notes_it_once(make_config, reporter) -> None:
-    folder = train(make_config(training__steps=2, checkpoint__every=1), reporter)
-    path = folder / "changes.json"
-    path.write_text("{}")
-    train(load_config(folder / "config.yaml", ["training.steps=3"]), reporter, allow_config_change=True)
-    assert path.read_text() == "{}"
-
-
 def test_a_run_without_it_plans_as_before_and_its_limits_cannot_be_those_of_the_data(make_config, base_folder) -> None:
     folder = write_adapted_run(make_config(planning=PLANNING))
     assert load_to_plan(str(folder)).warnings == ()
@@ -109,22 +100,6 @@ def test_whoever_loads_a_run_is_warned_of_limits_that_leave_what_it_was_taught(
 
 
 WITHIN = "planning.limits.xyz=[0.033,0.02,0]"
-
-
-def test_every_limit_is_compared_and_a_tenth_more_is_within(run: Path) -> None:
-    assert warnings_of(run, WITHIN) == ()
-    ball = ["planning.limits.ball=l2", "planning.limits.radius=0.01"]
-    assert warnings_of(run, "planning.limits.xyz=[0.05,0.05,0.05]", *ball) == ()
-    (turned,) = warnings_of(run, WITHIN, "planning.limits.rotation=0.15")
-    assert "planning.limits.rotation exceeds" in turned
-    assert "droll 8.59 (0) degrees, dpitch 8.59 (5.73) degrees (99th percentile" in turned
-    note(run, changes=[*TAUGHT[:6], 0.01])
-    (gripper,) = warnings_of(run, WITHIN)
-    assert "dgripper 0.75 (0.01)" in gripper
-    for mode in ("held", "close"):
-        assert warnings_of(run, WITHIN, f"planning.limits.gripper_mode={mode}") == ()
-    note(run, narrow="steps go to 7% of all directions")
-    assert warnings_of(run, WITHIN) == (f"{run} learned from narrow data: steps go to 7% of all directions",)
 
 
 @pytest.mark.parametrize(

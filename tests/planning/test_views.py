@@ -14,20 +14,16 @@ from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.decoding.decoder_folder import load_decoder
-from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.imagined import Seen, imagine_image, imagined_next
 from vjepa2_ac.goals.make_goals import recording_of_episode
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.subject import Subject
-from vjepa2_ac.serving.about import warm_up
 from vjepa2_ac.simulation.agent import Agent
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_benchmark
 from vjepa2_ac.simulation.camera import FRAME_SIZE
-from vjepa2_ac.simulation.domains import DOMAIN_A
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
-from vjepa2_ac.simulation.tasks import arm_for
 
 QUICK = PlanningConfig(
     samples=12,
@@ -64,12 +60,6 @@ def test_the_energy_of_two_views_is_the_mean_of_theirs() -> None:
         torch.testing.assert_close(states, the_same)
 
 
-def test_the_same_view_twice_plans_as_one() -> None:
-    one, two = decided(image(100), image(1), 1), decided(np.hstack([image(100)] * 2), np.hstack([image(1)] * 2), 2)
-    np.testing.assert_allclose(two.decision.action, one.decision.action, atol=1e-5)
-    assert two.decision.energy_now == pytest.approx(one.decision.energy_now)
-
-
 def test_a_mask_may_leave_one_view_out() -> None:
     goal, frame = np.hstack([image(100), image(101)]), np.hstack([image(1), image(2)])
     mask = np.zeros(goal.shape[:2], dtype=bool)
@@ -87,22 +77,6 @@ def test_what_cannot_be_split_is_refused() -> None:
         decided(odd, odd, 2)
     with pytest.raises(ValueError, match="views excludes axes"):
         PlanningConfig(views=2, axes="axes.json")
-
-
-def test_a_server_warms_up_on_as_many_views_and_shows_what_they_imagine() -> None:
-    run = Controller(tiny_model(), QUICK.model_copy(update={"views": 3}))
-    assert warm_up(run) > 0
-    decoder, latents = load_decoder("builtin:sim-tiny").decoder, torch.randn(2, 2 * 36, 128)
-    both = shown(decoder, latents, 2)
-    np.testing.assert_array_equal(
-        both, np.concatenate([shown(decoder, one) for one in latents.split(36, dim=1)], axis=2)
-    )
-
-
-def test_the_arm_is_seen_from_both_sides() -> None:
-    arm = arm_for("reach", DOMAIN_A, size=(24, 32), views=2)
-    np.testing.assert_array_equal(arm.image(), np.hstack([arm.image("exterior_1"), arm.image("exterior_2")]))
-    assert (arm.image("exterior_1") != arm.image("exterior_2")).any()
 
 
 def test_goals_are_made_of_both_cameras_and_a_film_shows_both(tmp_path: Path) -> None:

@@ -54,11 +54,6 @@ def test_every_target_is_inside_and_every_action_allowed(where, wild, ball) -> N
     np.testing.assert_array_equal(kept[:, 3:], actions[:, 3:])
 
 
-def test_actions_that_stay_inside_are_not_touched() -> None:
-    actions = np.full((3, 7), 0.01)
-    np.testing.assert_array_equal(box().kept(position(0.45, 0, 0.3), actions, limits_of()), actions)
-
-
 @given(NEAR)
 def test_the_search_does_not_leave_the_box_with_its_first_decision(where) -> None:
     config, state = PlanningConfig(limits=limits_of(), horizon=4, action_repeat=2), position(*where)
@@ -106,13 +101,6 @@ def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -
     assert not action.any()
     assert run.decision.why == "outside the workspace"
     assert run.decision.plan is None
-
-
-def test_the_energy_of_a_plan_that_was_kept_inside_is_that_of_its_own_actions() -> None:
-    run = controller(workspace=CORNERS)
-    run.act(image(0), position(0.63, 0.0, 0.3))
-    plan = run.decision.plan
-    assert plan.energy == pytest.approx(float(run.decision.cost(plan.actions[None]).detach()), rel=1e-6)
 
 
 @pytest.mark.parametrize("space", [CAMERA_POSE, vector_states(8)])

@@ -10,7 +10,6 @@ from decisions import QUICK, STATE, image
 from tiny_models import tiny_model
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.energy import ChunkScores
 from vjepa2_ac.policies.score import changes_of_chunks
 from vjepa2_ac.spaces import actions_from_states, apply_action, vector_states
 
@@ -62,11 +61,6 @@ def test_what_is_no_chunk_is_refused(chunks: np.ndarray, found: str) -> None:
         changes_of_chunks(chunks, STATE, form="targets", control_steps=4)
 
 
-def test_a_state_of_other_numbers_is_refused() -> None:
-    with pytest.raises(InputError, match=r"state: .*5"):
-        changes_of_chunks(np.zeros((2, 8, 7)), STATE[:5], form="targets", control_steps=4)
-
-
 def test_scores_are_the_planners_energies_and_leave_no_trace() -> None:
     run = Controller(tiny_model(), QUICK)
     run.reset(image(100))
@@ -86,19 +80,3 @@ def test_scores_are_the_planners_energies_and_leave_no_trace() -> None:
     undisturbed.reset(image(100))
     undisturbed.act(image(0), STATE)
     np.testing.assert_array_equal(run.act(image(1), STATE), undisturbed.act(image(1), STATE))
-
-
-def test_ties_and_spread_are_told() -> None:
-    scores = ChunkScores(np.array([0.3, 0.2, 0.2, 0.5]), 0.3, 0.4, 0)
-    assert (scores.best, scores.tied) == (1, 2)
-    assert scores.order.tolist() == [1, 2, 0, 3]
-    assert scores.spread == pytest.approx(np.std([0.3, 0.2, 0.2, 0.5]) / 0.4)
-
-
-def test_a_score_needs_a_goal_and_chunks_of_the_models_actions() -> None:
-    run = Controller(tiny_model(), QUICK)
-    with pytest.raises(ValueError, match="no goal"):
-        run.score(image(0), STATE, np.zeros((1, 1, 7)))
-    run.reset(image(100))
-    with pytest.raises(InputError, match="shape"):
-        run.score(image(0), STATE, np.zeros((1, 1, 6)))

@@ -26,7 +26,7 @@ from vjepa2_ac.policies.action_prior import (
     load_prior,
     save_prior,
 )
-from vjepa2_ac.policies.train_prior import PriorOptions, _Pairs, prior_loss, train_prior
+from vjepa2_ac.policies.train_prior import PriorOptions, train_prior
 
 SIZES = PriorSizes(grid=3, dim=24, state=7, action=7, ahead=3)
 MEAN = (0.03, -0.02, 0.01, 0.0, 0.0, 0.0, 0.3)
@@ -132,48 +132,7 @@ def test_training_is_repeatable_beats_doing_nothing_and_sees_the_goal(make_confi
     assert first.held_out == again.held_out
     assert set(first.held_out) == {"clips", "true_goals", "goals_of_others"}
     assert reporter.tasks["training the prior"][-1] == (60, 60)
-    assert load_prior(tmp_path / "a", where="test").card.sizes.ahead == config.data.frames - 1
-
-
-def test_vectors_are_as_wide_as_the_data_whatever_the_bases_heads_are(make_config: MakeConfig, tmp_path: Path) -> None:
-    (tmp_path / "npz").mkdir()
-    rng = np.random.default_rng(0)
-    for number in range(4):
-        frames = rng.integers(0, 256, (12, 32, 32, 3), dtype=np.uint8)
-        np.savez(tmp_path / f"npz/{number}.npz", states=rng.normal(size=(12, 5)), frames=frames, fps_hz=15.0)
-    config = make_config(data__source="npz", data__path=str(tmp_path / "npz"), data__states="vector")
-    card = train_prior(config, tmp_path / "prior", PriorOptions(steps=2, batch_size=2))
-    assert (card.sizes.state, card.sizes.action) == (5, 5)
-
-
-def test_it_learns_an_action_that_only_the_goal_tells() -> None:
-    """The world is one bright patch, which an action moves: present and goal say by how much."""
-    torch.manual_seed(0)
-    drawn = torch.Generator().manual_seed(1)
-    prior = ActionPrior(PriorSizes(grid=4, dim=8, state=7, action=7, ahead=1))
-    optimizer = torch.optim.Adam(prior.parameters(), lr=3e-3)
-
-    def pairs(count: int) -> _Pairs:
-        from_x, to_x = torch.randint(4, (2, count), generator=drawn)
-        rows = torch.arange(count)
-        seen, wanted = torch.zeros(2, count, 16, 8).unbind()
-        seen[rows, from_x], wanted[rows, to_x] = 1.0, 1.0
-        changes = torch.zeros(count, 7)
-        changes[:, 0] = (to_x - from_x).float()
-        return _Pairs(seen, wanted, torch.ones(count, dtype=torch.long), torch.zeros(count, 7), changes)
-
-    for _ in range(150):
-        one = pairs(64)
-        mean, _ = prior(one.seen, one.wanted, one.remaining, one.states)
-        loss = (mean - one.changes).abs().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    one = pairs(200)
-    mean, _ = prior(one.seen, one.wanted, one.remaining, one.states)
-    blind, _ = prior(one.seen, one.wanted.roll(1, 0), one.remaining, one.states)
-    assert (mean - one.changes)[:, 0].abs().mean() < 0.25
-    assert (blind - one.changes)[:, 0].abs().mean() > 1.0
+    assert load_prior(tmp_path / "a", where="test")[0].sizes.ahead == config.data.frames - 1
 
 
 def test_the_command_writes_it_beside_the_run_and_says_how_to_plan(
@@ -185,17 +144,6 @@ def test_the_command_writes_it_beside_the_run_and_says_how_to_plan(
     assert "relative to the zero action" in said
     assert "planning.prior=" in said
     assert main(["prior", str(tmp_path)]) == 2
-
-
-def test_the_deviation_does_not_pull_the_mean() -> None:
-    changes = torch.tensor([[0.5, -1.0, 2.0]])
-    gradients = []
-    for deviation in (0.01, 1.0, 100.0):
-        mean = torch.zeros(1, 3, requires_grad=True)
-        prior_loss(mean, torch.full((1, 3), deviation), changes).backward()
-        gradients.append(mean.grad)
-    for gradient in gradients:
-        torch.testing.assert_close(gradient, -changes.sign() / 3)
 
 
 def test_a_command_without_a_prior_refuses_the_planner_of_that_name() -> None:

@@ -43,10 +43,3 @@ def rosenbrock(actions: Tensor) -> Tensor:
     """Return a bent valley; its lowest place is (1, 1), here at (0.5, 0.5)."""
     x, y = (2 * actions[:, 0]).unbind(-1)
     return (1 - x) ** 2 + 100 * (y - x**2) ** 2
-
-
-def two_basins(actions: Tensor) -> Tensor:
-    """Return two basins: a wide one at -0.5, and a deeper one at 0.6 where a search from 0 has to go uphill."""
-    from_wide = (actions[:, 0] + 0.5).square().sum(-1)
-    from_deep = (actions[:, 0] - 0.6).square().sum(-1)
-    return torch.minimum(0.5 + from_wide, 4 * from_deep)

@@ -40,8 +40,8 @@ def add_plan(commands: cli.Commands) -> None:
     cli.add(group, "--mask IMAGE", "black where the goal image does not count, of its size", cli.as_local)
     group = parser.add_argument_group("the search, and its image")
     cli.add(group, "--seed N", "of the search (the config's)", cli.whole_number(0, 2**31 - 1))
-    text = "points of the image's energy maps along each axis; 0: no maps (13, or fewer where the search is short)"
-    cli.add(group, "--nodes N", text, cli.whole_number(0, 101))
+    text = "points of the energy maps along each axis; 0: no maps (9)"
+    cli.add(group, "--nodes N", text, cli.whole_number(0, 101), default=9)
     cli.add_decoder(group, "in the image what the planner imagined, beside the goal")
 
 

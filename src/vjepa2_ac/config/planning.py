@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -139,45 +139,21 @@ class PlanningConfig(Section):
 
     @model_validator(mode="after")
     def _numbers_fit(self) -> PlanningConfig:
-        repeat, elites = self.action_repeat, self.planner.options.get("elites", ELITES)
+        views, repeat, elites = self.views > 1, self.action_repeat, self.planner.options.get("elites", ELITES)
         few_samples = self.planner.name in {"cem", "icem"} and elites > self.samples
+        fix = "or set views: 1"
         return self.refused(
             (self.horizon % repeat, f"horizon {self.horizon} is not a multiple of action_repeat {repeat}"),
             (few_samples, f"planner {self.planner.name}: {elites} elites are more than {self.samples} samples"),
-            *(rule.on(self) for rule in RULES),
+            (views and self.axes, f"views excludes axes, which are calibrated with one camera. Leave axes out, {fix}"),
+            (views and self.prior, f"views excludes prior, which is trained with one camera. Leave prior out, {fix}"),
+            (
+                views and self.monitor,
+                f"views excludes monitor, which is made with one camera. Leave monitor out, {fix}",
+            ),
+            (self.prior and self.warm_start, "prior excludes warm_start: each is the start of a search. Leave one out"),
+            (
+                self.planner.name == "prior" and not self.prior,
+                "planner=prior needs prior; `vjepa2-ac prior` trains one",
+            ),
         )
-
-
-class Rule(NamedTuple):
-    """Two options of `planning` of which one excludes or needs the other, and what to do about it.
-
-    An option is set if its value is not the default, or if it is the value after `=`.
-    """
-
-    option: str
-    relation: Literal["excludes", "needs"]
-    other: str
-    reason: str
-    fix: str
-
-    def on(self, config: PlanningConfig) -> tuple[bool, str]:
-        """Return whether a config breaks the rule, and the message for it."""
-        is_broken = _is_set(config, self.option) and _is_set(config, self.other) == (self.relation == "excludes")
-        return is_broken, f"{self.option} {self.relation} {self.other}, because {self.reason}. {self.fix}"
-
-
-def _is_set(config: PlanningConfig, option: str) -> bool:
-    name, _, chosen = option.partition("=")
-    value = getattr(config, name)
-    if isinstance(value, Component):
-        return value.name == chosen
-    return bool(value == chosen if chosen else value != PlanningConfig.model_fields[name].default)
-
-
-RULES = (
-    Rule("views", "excludes", "axes", "axes are calibrated with one camera", "Leave axes out, or set views: 1"),
-    Rule("views", "excludes", "prior", "a prior is trained with one camera", "Leave prior out, or set views: 1"),
-    Rule("views", "excludes", "monitor", "a monitor is made with one camera", "Leave monitor out, or set views: 1"),
-    Rule("prior", "excludes", "warm_start", "each says where a search starts", "Leave one of them out"),
-    Rule("planner=prior", "needs", "prior", "it takes all actions from there", "`vjepa2-ac prior RUN` trains one"),
-)

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac.errors import counted
 from vjepa2_ac.planning.controller import Controller, Decision
-from vjepa2_ac.planning.energy import FEWEST_NODES, EnergySlice, energy_slices, fitting_nodes, sequences_of_slices
+from vjepa2_ac.planning.energy import SAME_ENERGY, EnergySlice, energy_slices
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.planner import Cost, Plan
 from vjepa2_ac.planning.search_space import SearchSpace
@@ -23,8 +23,6 @@ from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import json_text, plain
-
-_SAME = 1e-6  # relative difference below which energies are equal: rounding decides nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,28 +73,18 @@ class PlanResult:
         return {
             name: said.format(name, energy, other, _change(energy, other))
             for name, other in others.items()
-            if energy > other + _SAME * abs(other)
+            if energy > other + SAME_ENERGY * abs(other)
         }
 
-    @property
-    def unused_goals(self) -> tuple[int, ...]:
-        """Goals that do not affect the plan: they begin after its end, or only its last step counts."""
-        ahead = self.decision.goals
-        counted = set(ahead[-1:] if self.controller.config.energy.steps == "last" else ahead)
-        return tuple(place for place in range(len(self.question.goals)) if place not in counted)
 
-
-def decide(
-    controller: Controller, question: PlanRequest, *, nodes: int | None = 0, reporter: Reporter = SILENT
-) -> PlanResult:
+def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0, reporter: Reporter = SILENT) -> PlanResult:
     """Make one decision, and evaluate its alternatives.
 
     Args:
         controller: The planner; it is reset.
         question: The observation and the goal.
-        nodes: Of an energy slice along each axis; below 3: no slices; None: as many as evaluate no more action
-            sequences than the search did.
-        reporter: Shows the progress of the slices, or why there are none. (The search has the controller's.)
+        nodes: Of an energy slice along each axis; below 3: no slices.
+        reporter: Shows the progress of the slices. (The search has the controller's.)
 
     Raises:
         InputError: An image, the state or the mask is invalid.
@@ -131,15 +119,8 @@ def decide(
     )
 
 
-def _slices(
-    controller: Controller, plan: Plan, cost: Cost, nodes: int | None, reporter: Reporter
-) -> tuple[EnergySlice, ...]:
-    axes, searched = controller.shown_axes, sum(one.samples for one in plan.iterations)
-    if nodes is None:
-        nodes = fitting_nodes(searched, len(axes))
-        if not nodes:
-            needed = sequences_of_slices(FEWEST_NODES, len(axes))
-            reporter.note(f"No energy maps: they take {needed} action sequences or more, the search {searched}.")
+def _slices(controller: Controller, plan: Plan, cost: Cost, nodes: int, reporter: Reporter) -> tuple[EnergySlice, ...]:
+    axes = controller.shown_axes
     if nodes < 3 or len(axes) < 2:
         return ()
     task = reporter.task("energy maps", "action sequences")
@@ -235,10 +216,6 @@ def summarize(answer: PlanResult) -> str:
     if at_limit := axes_at_limit(answer):
         knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
         found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
-    if answer.unused_goals and answer.question.durations:  # others are expected to come later
-        unused = ", ".join(str(place + 1) for place in answer.unused_goals)
-        goals = f"Goal {unused} does" if len(answer.unused_goals) == 1 else f"Goals {unused} do"
-        found.append(f"{goals} not affect this plan: see durations, planning.horizon, planning.energy.steps.")
     return " ".join(found)
 
 

@@ -265,7 +265,6 @@ class ChunkScores:
 
 _BEYOND = 1.25  # how far a slice reaches beyond the limits
 _LEAST = 0.05  # metres: half the width of a slice along an axis that is held
-FEWEST_NODES, _MOST_NODES = 5, 13  # of those that are chosen by what they cost
 
 
 @dataclass(frozen=True)
@@ -276,20 +275,6 @@ class EnergySlice:
     across: Float[np.ndarray, " nodes"]  # values along the first of them
     up: Float[np.ndarray, " nodes"]
     energy: Float[np.ndarray, "nodes nodes"]  # [up, across]; NaN where the model gives none
-
-
-def sequences_of_slices(nodes: int, axes: int) -> int:
-    """Return how many action sequences the slices over each pair of some axes evaluate."""
-    return comb(axes, 2) * nodes**2
-
-
-def fitting_nodes(sequences: int, axes: int) -> int:
-    """Return the nodes along each axis of slices that evaluate no more than so many action sequences; 0: none do.
-
-    They are odd, so that no motion is one of them, and 5 to 13.
-    """
-    choices = range(_MOST_NODES, FEWEST_NODES - 1, -2)
-    return next((nodes for nodes in choices if sequences_of_slices(nodes, axes) <= sequences), 0)
 
 
 def energy_slices(
@@ -313,7 +298,7 @@ def energy_slices(
         nodes: Along each axis, three or more.
         progress: Called with the number of evaluated action sequences.
     """
-    total, slices = sequences_of_slices(nodes, len(axes)), []
+    total, slices = comb(len(axes), 2) * nodes**2, []
     progress(0, total)
     for number, pair in enumerate(combinations(axes, 2)):
         with reporting(cost, progress, done=number * nodes**2, share=nodes**2, total=total):

@@ -64,27 +64,6 @@ class PriorCard:
     time: str = ""  # UTC
 
 
-@dataclass(frozen=True, eq=False)
-class TrainedPrior:
-    """A prior, and what is known of it."""
-
-    card: PriorCard
-    network: ActionPrior
-    where: str  # what names it, for messages
-
-    def of(self, encoder: str, crop: str) -> ActionPrior:
-        """Return the network for a model's encoder, by its fingerprint, and crop.
-
-        Raises:
-            InputError: One of them is another.
-        """
-        compared = (("encoder", self.card.encoder, encoder), ("data.crop", self.card.crop, crop))
-        if differing := [f"{name} {ours}, not {theirs}" for name, ours, theirs in compared if ours != theirs]:
-            found, needed = f"the prior of another {'; '.join(differing)}", "one that was trained on this model's"
-            raise InputError(where=self.where, found=found, needed=needed, fix=_FIX)
-        return self.network
-
-
 class ActionPrior(nn.Module):
     """The network, and how a search starts from it."""
 
@@ -186,8 +165,8 @@ def save_prior(folder: Path, card: PriorCard, prior: ActionPrior) -> None:
         (fresh / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
 
 
-def load_prior(folder: str | Path, *, where: str) -> TrainedPrior:
-    """Read a prior, on the CPU.
+def load_prior(folder: str | Path, *, where: str) -> tuple[PriorCard, ActionPrior]:
+    """Read a prior and its card, on the CPU.
 
     Raises:
         InputError: There is none, or it is incomplete or damaged.
@@ -197,14 +176,18 @@ def load_prior(folder: str | Path, *, where: str) -> TrainedPrior:
     card = record_of(PriorCard, values, where=f"{where}: {path / CARD}", needed=_NEEDED, fix=_FIX)
     prior = ActionPrior(card.sizes).eval().requires_grad_(False)
     prior.load_state_dict(read_tensors(path / WEIGHTS, prior.state_dict(), needed=_NEEDED, fix=_FIX))
-    return TrainedPrior(card, prior, f"{where}: {folder}")
+    return card, prior
 
 
 def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> ActionPrior:
     """Return the prior of `planning.prior`, on the device of the model.
 
     Raises:
-        InputError: As `load_prior` and `TrainedPrior.of`.
+        InputError: As `load_prior`; or the prior was trained with another encoder or crop.
     """
-    prior = load_prior(path, where="planning.prior").of(known.encoder, cameras.crop)
+    card, prior = load_prior(path, where="planning.prior")
+    for name, trained, model in (("encoder", card.encoder, known.encoder), ("data.crop", card.crop, cameras.crop)):
+        if trained != model:
+            found, needed = f"the prior of another {name} {trained}, not {model}", "one trained for this model"
+            raise InputError(where=f"planning.prior: {path}", found=found, needed=needed, fix=_FIX)
     return prior.to(cameras.model.device)
