@@ -205,15 +205,6 @@ def test_invalid_input_is_reported_before_a_model_is_loaded(
         evaluate_subject(run, make(config))
 
 
-@pytest.mark.parametrize("command", ["imagine", "explore"])
-def test_several_processes_are_refused_where_all_would_do_the_same(
-    command: str, run: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    assert main([command, run, "--decoder", "builtin:sim-tiny"]) == 2
-    assert "torchrun: 2 processes" in capsys.readouterr().err
-
-
 def test_a_model_without_data_and_a_file_in_the_way_are_errors(run: str, tmp_path: Path, base_folder: Path) -> None:
     with pytest.raises(InputError, match=r"no config\.yaml.*--data CONFIG"):
         evaluate_subject(str(base_folder), asked())
@@ -236,7 +227,7 @@ def card_of(config: Config) -> DecoderCard:
 
 def saved(card: DecoderCard, folder: Path) -> str:
     weights = Decoder(card.shape).state_dict()
-    save_decoder(folder, card, weights, weights)
+    save_decoder(folder, card, weights)
     return str(folder)
 
 

@@ -25,12 +25,6 @@ def test_an_oracle_scores_zero_and_needs_the_true_actions() -> None:
     assert shuffled > 0.8
 
 
-def test_persistence_is_exactly_one_relative_to_itself_and_blind_to_actions() -> None:
-    errors = prediction_errors(Copier(), in_batches(clips_batch(), 4))
-    assert all((r.value, r.low, r.high) == (1.0, 1.0, 1.0) for r in over_persistence(errors, "rollout"))
-    assert {one_step_over_persistence(errors, actions).value for actions in ACTIONS} == {1.0}
-
-
 def test_metrics_equal_a_case_computed_by_hand() -> None:
     predicted = torch.tensor([[[[1.0, 0.0], [0.0, 2.0]]]])
     true = torch.tensor([[[[0.0, 1.0], [0.0, 1.0]]]])

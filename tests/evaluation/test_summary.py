@@ -331,12 +331,6 @@ def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
     assert plans.statement.endswith(f"of {problems} reach problem{'s' * (problems > 1)}")
 
 
-def test_predictions_that_vary_more_than_the_truth_are_not_called_blur() -> None:
-    adapter = with_spread(model("adapter", 0.5, noise=0.0), 1.43)
-    base_model = with_spread(model("base", 1.0, noise=0.0), 3.19)
-    assert not summary_of(base_model, adapter, copies=adapter.distribution).predicts.reference
-
-
 def test_an_equal_success_rate_is_inconclusive_if_its_interval_is_wide() -> None:
     shares = {"adapter": share_of(20, 50), "random": share_of(21, 50), "oracle": share_of(50, 50)}
     where = "in domain B, with key frames"

@@ -14,7 +14,7 @@ from moving_arms import STEPS, spot_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
-from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, StepRanges
+from vjepa2_ac.episode import Batch, Episode, LatentBatch, StepRanges
 from vjepa2_ac.evaluation.calibration.variants import VariantResult
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.inspection.probe import (
@@ -22,7 +22,6 @@ from vjepa2_ac.inspection.probe import (
     VariantProbe,
     mirrored,
     probe_variants,
-    shifted,
     variants_of,
 )
 from vjepa2_ac.intervals import Estimate
@@ -209,21 +208,6 @@ def test_shifts_are_measured_as_far_as_states_reach_on_both_sides(steps: int, wi
     assert probe.better is None
 
 
-def test_long_clips_are_looked_at_in_part_where_whole_ones_fit() -> None:
-    dataset = dataset_of(at(0), steps=41, frames=11, stride=4)
-    seen: list[Batch] = []
-    knowing = Knowing(41)
-
-    def encode(batch: Batch) -> LatentBatch:
-        seen.append(batch)
-        return knowing.encode(batch)
-
-    probe = probe_variants(knowing, encode, dataset, ClipSample("train", 8))
-    assert {batch.states.shape[1] for batch in seen} == {8}
-    assert {start for batch in seen for start in batch.starts} == {0}  # a latent cache has nothing else
-    assert probe.plain.clips == EPISODES
-
-
 def test_vectors_are_shifted_and_turned_only_and_latents_keep_their_colours() -> None:
     def names(**changes: object) -> set[str]:
         return {one.name for one in variants_of(DataConfig.model_validate({"path": "set"} | changes), [1])}
@@ -235,22 +219,6 @@ def test_vectors_are_shifted_and_turned_only_and_latents_keep_their_colours() ->
     assert names(source="latents") == shifted | poses | {"the states backwards"}
     assert names(source="npz", states="vector") == shifted | colours | {"the states backwards"}
     assert names(source="npz", states="vector", actions="recorded", join_actions="sum") == shifted | colours
-
-
-def an_episode(states: np.ndarray, commands: np.ndarray | None = None) -> Episode:
-    def frames(steps: Sequence[int]) -> np.ndarray:
-        return np.array([[[[step, 0, 9]]] for step in steps], np.uint8)
-
-    return Episode(EpisodeInfo("one", len(states)), states, frames, 15.0, commands=commands)
-
-
-def test_commands_are_shifted_with_the_states() -> None:
-    states = np.arange(6.0)[:, None]
-    found = shifted(an_episode(states, states + 10), late=2)
-    assert found.states[:, 0].tolist() == [0, 0, 0, 1, 2, 3]
-    assert found.commands is not None
-    assert found.commands[:, 0].tolist() == [10, 10, 10, 11, 12, 13]
-    assert shifted(an_episode(states), late=-2).states[:, 0].tolist() == [2, 3, 4, 5, 5, 5]
 
 
 def test_of_changed_frames_persistence_is_another_one_too() -> None:

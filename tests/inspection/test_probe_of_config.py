@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from adapted_run import write_adapted_run
 from latent_sets import encode_for
-from vector_sets import write_vectors
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
@@ -53,13 +51,6 @@ def test_the_probe_prints_a_table_and_a_verdict_after_the_findings(
     assert re.fullmatch(r"0 errors, \d warnings?, [1-9] skipped", summary)
 
 
-def test_a_run_is_a_model_too(make_config: MakeConfig) -> None:
-    config = make_config()
-    run = write_adapted_run(config)
-    trained, base = (probed(config, model).plain.ratio.value for model in (str(run), str(config.model.base)))
-    assert trained != pytest.approx(base, rel=1e-3)
-
-
 def test_without_a_validation_split_training_episodes_are_probed(
     make_config: MakeConfig, tmp_path: Path, capsys: Printed
 ) -> None:
@@ -70,26 +61,6 @@ def test_without_a_validation_split_training_episodes_are_probed(
     assert "error    validation" in printed
     assert [line for line in printed.splitlines() if not line.startswith(" ")][-2].split()[1] == "probe"
     assert printed.splitlines()[-1].startswith("1 error, ")
-
-
-def test_vectors_are_probed_by_a_model_that_takes_them_and_others_are_refused(
-    make_config: MakeConfig, tmp_path: Path, capsys: Printed
-) -> None:
-    def of_width(width: int) -> Config:
-        folder = write_vectors(tmp_path / f"set {width}", width=width)
-        return make_config(
-            data__source="npz", data__path=str(folder), data__states="vector", adapter__modules_to_save=[
-                "action_encoder", "state_encoder"
-            ],
-        )  # fmt: skip
-
-    config = of_width(7)
-    assert names(probed(config, str(config.model.base))) == {
-        *(f"frames {n} {when}" for n in ("1 step", "2 steps", "4 steps") for when in ("late", "early")),
-        "the states backwards", "red and blue exchanged", "frames mirrored",
-    }  # fmt: skip
-    assert check(of_width(8), tmp_path, str(config.model.base)) == 2
-    assert "data with states of 8 and actions of 8 numbers" in capsys.readouterr().err
 
 
 def test_a_latent_cache_is_probed_by_the_model_that_encoded_it_without_other_frames(

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def add_evaluate(commands: cli.Commands) -> None:
     """Add `evaluate` to a parser."""
     parser = cli.command(commands, "evaluate", _evaluate, "demo/run --clips 64 --decoder demo/decoder")
-    text = "folder of a run, or (with --data) what model.base takes; several: their spread, too"
+    text = "folder of a run, or (with --data) what model.base takes; several: one after another"
     cli.add(parser, "subjects RUN_OR_MODEL", text, cli.as_subject, nargs="+")
     cli.add(parser, "--against base|RUN|MODEL", "what to compare with (the base of a run)", cli.as_model, nargs="+")
     cli.add(parser, "--clips N", "at most this many clips, spread over the episodes (256)", cli.count)
@@ -101,11 +101,9 @@ def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.distributed import leave_processes
     from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
     from vjepa2_ac.evaluation.rows import rows_of
-    from vjepa2_ac.evaluation.summary import spread_of_errors
     from vjepa2_ac.reporter import SILENT
     from vjepa2_ac.reports.write import write_evaluation
 
-    evaluations = []
     for subject, how in asked:
         cli.say_places_elsewhere(subject)
         with cli.reporter() as reporter:
@@ -114,7 +112,6 @@ def _evaluate(options: argparse.Namespace) -> None:
                 continue
             reporter.task("writing report and figures")
             measured = write_evaluation(evaluation, how.out or Path(subject))
-        evaluations.append(evaluation)
         if options.all:
             checkpoint, notes = evaluation.about.checkpoint, evaluation.notes
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
@@ -123,8 +120,6 @@ def _evaluate(options: argparse.Namespace) -> None:
         cli.show(str(measured.summary), *_next(measured, options, reporter))
         film = "" if evaluation.decoded is None else "film and "
         cli.show(f"Report with {film}all tables: {measured.report}")
-    if len(evaluations) > 1:
-        cli.show(spread_of_errors(evaluations))
     leave_processes()
 
 

@@ -16,10 +16,8 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Literal
 
-import numpy as np
-
 from vjepa2_ac.errors import counted
-from vjepa2_ac.evaluation.result import L1, Evaluation, over_persistence
+from vjepa2_ac.evaluation.result import L1, Evaluation
 from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.intervals import ENOUGH_EPISODES, Estimate
 from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
@@ -212,14 +210,6 @@ def with_closed_loop(summary: Summary, run: Path, checkpoint: str) -> Summary:
         if measured.partition(" ")[0] == checkpoint.partition(" ")[0] and "verdict" in written:
             return replace(summary, plans=Verdict(**written["verdict"]))
     return summary
-
-
-def spread_of_errors(evaluations: Sequence[Evaluation]) -> str:
-    """Return as text how much the errors of several runs differ, at the longest horizon."""
-    errors = [over_persistence(one.errors, "rollout")[-1].value for one in evaluations]
-    mean = f"{np.mean(errors):.3f} (range {min(errors):.3f} to {max(errors):.3f})"
-    ahead = f"{evaluations[0].seconds_ahead:.1f} s ahead"
-    return f"{len(evaluations)} runs: mean error relative to persistence, {ahead}: {mean}"
 
 
 def percent(share: float) -> str:
