@@ -81,11 +81,6 @@ def test_evaluate_ends_with_the_result_in_words_a_picture_and_paths(
         assert word in printed
 
 
-def test_evaluate_of_several_runs_tells_their_spread(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", str(workshop / "lora"), str(workshop / "scratch"), "--clips", "4", *FEW]) == 0
-    assert "2 runs: mean error relative to persistence" in capsys.readouterr().out
-
-
 def test_a_finished_run_has_nothing_left_to_do(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = sorted(path.name for path in (workshop / "lora" / "checkpoints").iterdir())
     assert main(["train", str(workshop / "lora"), "--resume"]) == 0
