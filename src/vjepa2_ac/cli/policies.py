@@ -50,7 +50,7 @@ def add_monitor(commands: cli.Commands) -> None:
 
 
 def _score(options: argparse.Namespace) -> int:
-    """Rank policies by the energy of what they would do at frames of held-out episodes.
+    """Rank policies by the energy of their actions at held-out frames.
 
     A chunk of actions is better than another if the model predicts that it leads nearer to the goal. Exits with status
     1 if the model ranks true actions no better than chance.
