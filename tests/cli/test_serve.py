@@ -1,7 +1,6 @@
 """`vjepa2-ac serve`: a process that a robot drives, and wrong words that are told before it listens."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from PIL import Image
 from served import STATE, ended, image, started
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
-from vjepa2_ac.errors import UnreachableError, pip_install
+from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.serving.client import PlanningClient
 
 QUICK = ["planning.samples=8", "planning.iterations=2", "planning.horizon=2", "planning.planner.options.elites=4"]
@@ -94,14 +93,3 @@ def test_a_model_that_cannot_serve_ends_it_with_a_sentence(workshop: Path, capsy
     tiny_model(extrinsics=True).save_pretrained(workshop / "camera")
     assert main(["serve", str(workshop / "camera"), "--port", "0"]) == 2
     assert "predictor.use_extrinsics" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("library", ["msgpack", "websockets.sync.client"])
-def test_the_simulated_arm_needs_the_libraries_of_serving_for_a_server_only(
-    library: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, library, None)
-    assert main(["simulate", "ws://127.0.0.1:9", "--task", "reach"]) == 2
-    said = capsys.readouterr().err
-    assert "is not installed" in said
-    assert pip_install("serve") in said

@@ -1,5 +1,5 @@
 // @ts-check
-/** How does a page talk with its server, and draw what comes? For explore's page, and for that of a served robot. */
+/** How does the page talk with its server, and draw the answers? */
 
 /** @typedef {{kind: string, seq: number | null, images: {name: string, bytes: number, alt: string}[]}} Common */
 /** @typedef {Common & {[key: string]: any}} Header of a message: its kind says which further fields it has */
