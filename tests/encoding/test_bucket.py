@@ -7,23 +7,19 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-import fsspec
 import pytest
 import torch
 
 from gcs import Failure, Gcs
 from killable import KILLED, Nursery
-from latent_sets import NUMBERS
 from run_fixtures import MakeConfig, SilentReporter, as_yaml, set_up
 from same_run import assert_same_run
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.data.sources.latents import cache_key
 from vjepa2_ac.encoding.encode_dataset import encode_config, with_latents_if_there
-from vjepa2_ac.encoding.latent_cache import LatentCache
-from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
+from vjepa2_ac.errors import InputError, RefusedError
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.training.loop import train
 
@@ -110,7 +106,7 @@ def test_another_machine_goes_on_with_what_is_there_and_then_finds_it_finished(
     assert (len(sizes), sum(sizes)) == (EPISODES, found.bytes)
 
 
-@pytest.mark.parametrize(("kind", "mode"), [("fp32", "auto"), ("bf16", "require"), ("int8", "auto")])
+@pytest.mark.parametrize(("kind", "mode"), [("int8", "auto")])
 @pytest.mark.usefixtures("bucket")
 def test_a_run_on_latents_in_a_bucket_is_the_run_on_those_of_a_folder_bit_for_bit(
     far: Callable[..., Config], tmp_path: Path, kind: str, mode: str, encoded_frames: list[int]
@@ -145,23 +141,10 @@ def test_a_cache_is_opened_by_one_listing_and_read_in_ranges_once(bucket: Gcs, f
     assert not bucket.reads(".safetensors"), "all from this machine's disk"
 
 
-@pytest.mark.parametrize("protocol", ["memory", "file"])
-def test_any_place_of_fsspec_will_do(far: Callable[..., Config], tmp_path: Path, protocol: str) -> None:
-    if protocol == "memory":
-        fsspec.filesystem("memory").rm("/", recursive=True) if fsspec.filesystem("memory").ls("/") else None
-    config = far(data__cache_dir=f"{protocol}://{tmp_path}/there")
-    found = encode_config(config)
-    assert isinstance(found.folder, Path) == (protocol == "file")
-    here = encode_config(far(data__cache_dir=str(tmp_path / "here"))).folder
-    url = f"{protocol}://{tmp_path}/there/{str(found.folder)[-32:]}"
-    assert equal(batches(alone(config, url)), batches(alone(config, here)))
-    assert encode_config(config) == found
-
-
 # ---- what can fail -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("failure", [503, 429, "reset", "cut", "short"])
+@pytest.mark.parametrize("failure", [503, "cut"])
 def test_what_passes_is_tried_again_and_changes_nothing(
     bucket: Gcs, far: Callable[..., Config], failure: Failure
 ) -> None:
@@ -173,15 +156,6 @@ def test_what_passes_is_tried_again_and_changes_nothing(
     bucket.fail_next(failure, times=2, match=LATENTS)
     assert equal(batches(alone(far("three"), folder)), expected)
     assert not bucket.faults_left
-
-
-def test_a_failing_connection_is_no_broken_episode(bucket: Gcs, far: Callable[..., Config]) -> None:
-    folder = encode_config(far()).folder
-    dataset = alone(far("two"), folder, broken_episodes="skip")
-    bucket.fail_next(503, times=ALWAYS, match=LATENTS)
-    with pytest.raises(UnreachableError, match=r"5 attempts.*HTTP 503"):
-        batches(dataset)
-    assert not dataset.broken.reasons
 
 
 @pytest.mark.parametrize(
@@ -203,32 +177,7 @@ def test_a_place_that_cannot_be_written_is_one_error_before_a_frame_is_encoded(
     assert bucket.names("bucket") == ["other"]
 
 
-def test_who_may_not_write_encodes_nothing_of_what_another_began(
-    bucket: Gcs, far: Callable[..., Config], encoded_frames: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setenv("WORLD_SIZE", "2")
-        encode_config(far())
-    encoded_frames.clear()
-    bucket.fail_next(403, times=ALWAYS, match="POST /upload/")
-    with pytest.raises(RefusedError, match="no permission"):
-        encode_config(far("two"))
-    assert not encoded_frames
-
-
-def test_a_finished_cache_is_read_by_who_may_not_write(
-    bucket: Gcs, far: Callable[..., Config], encoded_frames: list[int]
-) -> None:
-    encode_config(far())
-    encoded_frames.clear()
-    bucket.forget()
-    bucket.fail_next(403, times=ALWAYS, match="POST|DELETE")
-    set_up(far("two", data__cache="auto"), SilentReporter())
-    assert encode_config(far("three")).is_finished
-    assert not encoded_frames
-
-
-@pytest.mark.parametrize("damage", [lambda data: data[:-10], lambda data: data[:20], lambda data: bytes(len(data))])
+@pytest.mark.parametrize("damage", [lambda data: data[:-10]])
 def test_a_damaged_file_is_named_and_encoded_again(
     bucket: Gcs, far: Callable[..., Config], damage: Callable[[bytes], bytes], encoded_frames: list[int]
 ) -> None:
@@ -244,32 +193,6 @@ def test_a_damaged_file_is_named_and_encoded_again(
     encode_config(far())
     assert sum(encoded_frames) == EPISODES * 24
     assert equal(batches(alone(far(), folder)), expected)
-
-
-def test_a_deleted_file_is_missed_when_the_cache_is_opened(bucket: Gcs, far: Callable[..., Config]) -> None:
-    folder = encode_config(far()).folder
-    name = next(name for name in storage.file_sizes(folder) if name.endswith(".safetensors"))
-    storage.remove(storage.join(folder, name))
-    bucket.forget()
-    with pytest.raises(InputError, match="no latents of 1 of 8 episodes"):
-        alone(far(), folder)
-
-
-@pytest.mark.usefixtures("bucket")
-def test_another_cache_beside_it_is_named_and_the_disk_is_no_matter(
-    far: Callable[..., Config], monkeypatch: pytest.MonkeyPatch, reporter: SilentReporter
-) -> None:
-    def no_disk(_: Path) -> int:
-        raise AssertionError("a bucket has no free space")
-
-    monkeypatch.setattr("vjepa2_ac.encoding.latent_cache.free_bytes", no_disk)
-    monkeypatch.setattr("vjepa2_ac.encoding.encode_dataset.free_bytes", no_disk)
-    encode_config(far(), reporter)
-    assert f"The latents go into {URL}/" in reporter.notes[1]
-    assert "192 frames" in reporter.notes[0]
-    assert " GB" in reporter.notes[0]
-    with pytest.raises(InputError, match=r"Other caches there: 1; .*data\.crop: released, not square"):
-        train(far(data__crop="square"), SilentReporter())
 
 
 # ---- several processes, and their death --------------------------------------------------------------------------
@@ -307,36 +230,3 @@ def test_a_killed_upload_leaves_nothing_that_looks_finished(
     assert not [
         name for name in bucket.names("bucket") if not name.endswith((".safetensors", ".json", ".npz", "other"))
     ]
-
-
-def test_another_encoder_may_begin_at_any_moment(
-    bucket: Gcs, far: Callable[..., Config], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cache = LatentCache.of(open_dataset(far().data), NUMBERS)
-
-    def then_begins(read: Callable[..., object]) -> Callable[..., object]:
-        def reading(*given: object, **more: object) -> object:
-            try:
-                return read(*given, **more)
-            finally:
-                monkeypatch.undo()
-                monkeypatch.setenv("STORAGE_EMULATOR_HOST", bucket.url)
-                LatentCache.of(open_dataset(far().data), NUMBERS).begin()
-
-        return reading
-
-    monkeypatch.setattr(storage, "list_names", then_begins(storage.list_names))
-    monkeypatch.setattr(cache_key, "read_json_object", then_begins(cache_key.read_json_object))
-    cache.begin()
-    assert cache.is_begun
-
-
-def test_two_encoders_at_once_do_not_disturb_each_other(
-    bucket: Gcs, far: Callable[..., Config], nursery: Nursery, tmp_path: Path
-) -> None:
-    here = encode_config(far(data__cache_dir=str(tmp_path / "whole"))).folder
-    children = [start(nursery, far(rank), tmp_path, rank, RANK=rank, WORLD_SIZE="2") for rank in ("0", "1")]
-    assert [child.wait() for child in children] == [0, 0], [(tmp_path / f"{rank}.err").read_text() for rank in (0, 1)]
-    folder = f"{URL}/{str(here)[-32:]}"
-    assert equal(batches(alone(far("three"), folder)), batches(alone(far("three"), here)))
-    assert len([one for one in bucket.uploads() if ".safetensors" in one.target]) == EPISODES

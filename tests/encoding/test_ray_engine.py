@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -112,36 +112,6 @@ def test_an_interrupted_command_leaves_nothing_behind_and_a_killed_actor_loses_n
     actors(psutil.Process(job.pid))[0].kill()
     (tmp_path / "go").touch()
     assert_finished(job, tmp_path, make_config)
-
-
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[object]:
-    """A head without a core for actors."""
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
-    from ray.cluster_utils import Cluster
-
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-    yield made
-    made.shutdown()
-
-
-@needs_ray
-@pytest.mark.filterwarnings("ignore")
-def test_a_node_that_joins_late_goes_on_alone_where_the_first_one_is_lost(
-    start: Callable, make_config: MakeConfig, tmp_path: Path, cluster: object
-) -> None:
-    first = cluster.add_node(num_cpus=1)
-    job = start(f"ray={cluster.address}")
-    until(two_files(tmp_path), job)
-    before = {one.pid for one in actors(psutil.Process())}
-    late = cluster.add_node(num_cpus=1)
-    assert before
-    until(lambda: {one.pid for one in actors(psutil.Process())} - before, job)
-    cluster.remove_node(first, allow_graceful=False)
-    (tmp_path / "go").touch()
-    assert_finished(job, tmp_path, make_config)
-    assert late in cluster.list_all_nodes()
 
 
 @needs_ray

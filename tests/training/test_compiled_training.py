@@ -36,8 +36,3 @@ def test_a_run_that_nothing_can_compile_is_refused_before_anything_is_loaded(
     monkeypatch.setattr(compilation, "missing_for_compilation", lambda kind: f"no compiler for {kind}")
     with pytest.raises(InputError, match=r"training.compile.*no compiler for cpu.*training.compile=off"):
         train(make_config(training__compile="blocks", data__path="nowhere"), reporter)
-
-
-def test_dora_is_not_compiled(make_config) -> None:
-    with pytest.raises(InputError, match=r"cannot trace adapter\.dora"):
-        make_config(training__compile="blocks", adapter__dora=True)

@@ -7,12 +7,10 @@ import pytest
 
 from run_fixtures import MakeConfig, SilentReporter
 from same_run import metrics
-from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.training import loop
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.optim import describe_changed_rate
 
 
 class LoadedError(Exception):
@@ -87,14 +85,3 @@ def test_a_run_that_is_made_longer_says_at_which_rate_it_continues(
     (line,) = said
     assert line.startswith("The learning rate continues at 5.0e-04 (it had reached 0 at step 6). ")
     assert "training.steps: 6 -> 13" in "".join(reporter.notes)
-
-
-def test_a_rate_that_stays_is_not_mentioned() -> None:
-    before = TrainingConfig(steps=12, warmup_steps=2, learning_rate=1e-3)
-    longer, constant = (before.model_copy(update=one) for one in ({"steps": 24}, {"schedule": "warmup_stable_decay"}))
-    assert describe_changed_rate(12, before, before) == ""
-    assert describe_changed_rate(12, before, before.model_copy(update={"loss": "l2", "steps": 12})) == ""
-    assert describe_changed_rate(0, before, longer) == "", "nothing was trained"
-    assert "continues at 5.0e-04 (it had reached 0 at step 12)" in describe_changed_rate(12, before, longer)
-    assert "continues at 1.0e-03 (it had reached 0.0005 at step 7)" in describe_changed_rate(7, before, constant)
-    assert describe_changed_rate(1, before, longer) == "", "the warm-up is the same"

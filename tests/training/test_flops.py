@@ -22,8 +22,8 @@ SIZES = ModelSizes.model_validate({
 })  # fmt: skip
 LORA: dict[str, Any] = {"rank": 4, "alpha": 8, "dropout": 0.0}
 ADAPTERS: dict[str, dict[str, Any]] = {
-    "lora": LORA, "value only": {**LORA, "targets": ["v"]}, "late": {**LORA, "targets": ["fc2"]},
-    "everywhere": {**LORA, "targets": ["all"]}, "heads": {**LORA, "modules_to_save": ["action_encoder"]},
+    "value only": {**LORA, "targets": ["v"]},
+    "heads": {**LORA, "modules_to_save": ["action_encoder"]},
     "none": {"kind": "none"}, "ends": {**LORA, "modules_to_save": ["predictor_embed", "predictor_proj"]},
     "ranks": {**LORA, "peft": {"rank_pattern": {"fc1": 8, "blocks.0.attn.q": 2}}},
 }  # fmt: skip
@@ -55,7 +55,7 @@ def counted(config: Config, clips: int = 2) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("adapter", ADAPTERS)
-@pytest.mark.parametrize("rollout_steps", [1, 3])
+@pytest.mark.parametrize("rollout_steps", [3])
 def test_a_clip_is_what_pytorch_counts(adapter: str, rollout_steps: int) -> None:
     config = run_config(ADAPTERS[adapter], rollout_steps=rollout_steps)
     flops = clip_flops(config, SIZES)
@@ -67,11 +67,6 @@ def test_a_frame_is_what_pytorch_counts() -> None:
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         model.encode(torch.randn(1, 1, 3, 64, 64))
     assert frame_flops(SIZES) == counter.get_total_flops()
-
-
-def test_what_is_computed_twice_counts_once() -> None:
-    plain, again = run_config(LORA), run_config(LORA, gradient_checkpointing=True)
-    assert clip_flops(plain, SIZES) == clip_flops(again, SIZES)
 
 
 def test_the_default_run_has_the_flops_that_were_worked_out_by_hand() -> None:

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from random_decoder import write_decoder
 from run_fixtures import set_up
@@ -69,21 +68,7 @@ def test_the_clip_is_the_one_with_the_most_motion_and_its_rows_are_true(make_con
     assert found.truth.shape == (3, 32, 32, 3)
 
 
-def test_a_model_without_an_adapter_is_drawn_without_a_base(make_config, reporter, decoder) -> None:
-    run = set_up(make_config(validation__decoder=decoder, adapter__kind="none"), reporter)
-    validate(run, reporter)
-    assert run.strip is not None
-    found = run.strip.imagine(run.world_model, torch.device("cpu"), "run")
-    assert [one.model for one in found.rollouts] == ["model now"]
-
-
-def test_of_a_latent_cache_the_small_frames_are_the_truth(make_config, reporter, decoder, tmp_path) -> None:
-    changes = {"data__cache": "auto", "data__cache_dir": str(tmp_path / "cache"), "training__steps": 3}
-    run = train(make_config(validation__decoder=decoder, **changes), reporter)
-    assert names(run) == STRIPS[:2]
-
-
-@pytest.mark.parametrize("failing", ["draw_strip", "frames_of", "write_atomically"])
+@pytest.mark.parametrize("failing", ["frames_of", "write_atomically"])
 def test_a_strip_that_fails_costs_a_warning_and_never_the_run(
     make_config, reporter, decoder, monkeypatch, caplog, failing: str
 ) -> None:

@@ -2,7 +2,6 @@
 
 import os
 import pty
-import select
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -53,26 +52,6 @@ def pipe(tmp_path: Path) -> Iterator[tuple[str, int]]:
     reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     yield path, reader
     os.close(reader)
-
-
-def test_a_run_whose_reader_leaves_is_the_run_that_it_would_be(start: Start, pipe, tmp_path: Path, whole: Path) -> None:
-    path, reader = pipe
-    err = tmp_path / "err"
-    err.touch()
-    child = start(out=path, err=str(err))
-    assert select.select([reader], [], [], 120)[0], "nothing was said"  # before there is a writer, reading would end
-    assert os.read(reader, 10), "its first line, as `| head -1` would"
-    os.dup2(os.open(os.devnull, os.O_RDONLY), reader)
-    assert child.wait() == 0
-    assert err.read_text() == ""
-    assert_same_run(whole, tmp_path / "run")
-
-
-def test_a_run_whose_log_has_no_room_is_the_run_that_it_would_be(start: Start, tmp_path: Path, whole: Path) -> None:
-    assert start(out="/dev/full", err="/dev/full").wait() == 2, (
-        "finished, and what could not be said is told by the status"
-    )
-    assert_same_run(whole, tmp_path / "run")
 
 
 def test_a_run_whose_terminal_is_gone_continues_and_stops_cleanly_on_a_signal(

@@ -55,20 +55,7 @@ def test_only_a_stride_at_which_the_runs_own_clips_fit_is_chosen(make_config: Ma
         )
 
 
-def test_a_check_only_run_writes_no_choice(make_config: Make, reporter: Any) -> None:
-    config = make_config(data__stride="auto", data__stride_candidates=[2, 3])
-    folder = train(config, reporter, check_only=True)
-    assert not folder.exists()
-
-
 def test_a_model_that_has_learned_nothing_is_not_asked(make_config: Make, reporter: Any) -> None:
     config = make_config(data__stride="auto", model__base="random", model__sizes={}, adapter__kind="none")
     with pytest.raises(InputError, match=r"learned nothing.*Set data\.stride to a number"):
         train(config, reporter)
-
-
-def test_another_number_than_the_chosen_one_is_another_config(make_config: Make, reporter: Any) -> None:
-    config = make_config(data__stride="auto", data__stride_candidates=[2], training__steps=2)
-    train(config, reporter)
-    with pytest.raises(InputError, match=r"data\.stride"):
-        train(make_config(data__stride=3, data__stride_candidates=[2], training__steps=2), reporter)

@@ -73,7 +73,7 @@ def drive(controller: Controller, state: np.ndarray) -> np.ndarray:
     return np.stack(actions)
 
 
-@pytest.mark.parametrize("kind", ["lora", "none"])
+@pytest.mark.parametrize("kind", ["lora"])
 def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path, kind: str) -> None:
     folder = train(make_config(**start_of(kind, base)), reporter)
     losses = [row["loss"] for row in metrics(folder) if row["kind"] == "train"]

@@ -69,11 +69,7 @@ def encode_config(
     """
     require_encodable(config)
     device = computing_device(config.training) if engine is None else torch.device("cpu")
-    dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-    reporter.task(LOADING)
-    model = load_base(config.model, seed=config.seed)
-    cache = LatentCache.of(dataset, encoding_of(model, config), out)
-    cache.require_own()
+    cache, model = open_cache(config, out, reporter)
     left = cache.missing(retry=True)
     if left and engine is not None:
         engine(config, cache, left, reporter)
@@ -95,6 +91,22 @@ def encode_config(
         broken={table.identity(number): reason for number, reason in broken.items()},
         is_finished=absent <= broken.keys(),
     )
+
+
+def open_cache(
+    config: Config, folder: Path | str | None = None, reporter: Reporter = SILENT
+) -> tuple[LatentCache, WorldModel]:
+    """Open the data set of a config and its latent cache, finished or not, and load the model whose encoder is used.
+
+    Raises:
+        InputError: The folder is another cache's.
+    """
+    dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+    reporter.task(LOADING)
+    model = load_base(config.model, seed=config.seed)
+    cache = LatentCache.of(dataset, encoding_of(model, config), folder)
+    cache.require_own()
+    return cache, model
 
 
 def require_encodable(config: Config) -> None:
@@ -139,7 +151,7 @@ def encode_share(
     share: ProcessShare,
     reporter: Reporter,
 ) -> None:
-    """Begin, and encode the share of one process: every so-many-th episode.
+    """Begin, and encode the share of one process: every n-th episode of n processes.
 
     Raises:
         InputError: As of `begin_encoding` and `encode_files`; or too many are broken, by all processes together.
@@ -174,10 +186,8 @@ def with_latents(
     Raises:
         InputError: The cache is another encoder's, is required and missing, or cannot be made.
     """
-    if config.data.is_cache or config.data.cache == "off":
-        require_same_encoder(model, dataset, config)
+    if (cache := _cache_of(config, dataset, model)) is None:
         return dataset
-    cache = LatentCache.of(dataset, encoding_of(model, config))
     if config.data.cache == "auto":
         make_encoder = partial(EncoderOnDevice.of, config, model, accelerator.device)
         if not check_only:
@@ -196,11 +206,16 @@ def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -
     Raises:
         InputError: The data set is itself a cache, of another encoder.
     """
+    cache = _cache_of(config, dataset, model)
+    return dataset if cache is None or cache.missing() else cache.opened()
+
+
+def _cache_of(config: Config, dataset: Dataset, model: WorldModel) -> LatentCache | None:
+    """Return the latent cache that a config has for its data; None: it has none, or the data are one themselves."""
     if config.data.is_cache or config.data.cache == "off":
         require_same_encoder(model, dataset, config)
-        return dataset
-    cache = LatentCache.of(dataset, encoding_of(model, config))
-    return dataset if cache.missing() else cache.opened()
+        return None
+    return LatentCache.of(dataset, encoding_of(model, config))
 
 
 def _encode_together(

@@ -15,14 +15,11 @@ from typing import Any
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
-from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.distributed import computing_device
-from vjepa2_ac.encoding.batch import encoding_of
-from vjepa2_ac.encoding.encode_dataset import begin_encoding, require_shared
+from vjepa2_ac.encoding.encode_dataset import begin_encoding, open_cache, require_shared
 from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
-from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.reporter import Reporter
 
 _MOST_AT_ONCE = 16  # requests in a task: the next one is decoded while one is encoded
@@ -134,12 +131,9 @@ class _Actor:
         with contextlib.suppress(OSError):  # where this node has no such folder, what is missed will be named
             os.chdir(self._here)
         config = parse_config(self._config, where="the config")
-        device = computing_device(config.training)
-        dataset, model = open_dataset(config.data), load_base(config.model, seed=config.seed)
-        cache = LatentCache.of(dataset, encoding_of(model, config), self._folder)
+        cache, model = open_cache(config, self._folder)
         require_shared(cache, lambda: cache.is_begun)
-        cache.require_own()
-        return cache, EncoderOnDevice.of(config, model, device)
+        return cache, EncoderOnDevice.of(config, model, computing_device(config.training))
 
     def __call__(self, row: Mapping[str, Any]) -> dict[str, _Result]:
         wanted = row["wanted"].wanted

@@ -10,7 +10,6 @@ RUN/metrics.json        what `evaluate` measured; report.html and evaluation.png
 RUN/checkpoints/        step-XXXXXXXX folders
 RUN/tensorboard/        event files; RUN/wandb/ likewise
 RUN/imagined/           what is imagined at each validation, where `validation.decoder` is set; and films of `imagine`
-RUN/not_finite/         clips of a step that could not be done
 RUN/.mirror/            links to what is being sent to checkpoint.remote, while it is
 RUN/.lock               a kernel lock, held by the process that is training: released however it ends
 """
@@ -58,7 +57,6 @@ SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS)  # wi
 _ID = re.compile(r"[\w.-]{0,128}")
 _MOST_BYTES_OF_ID = 1_000
 IMAGINED = "imagined"  # images of what the model imagines
-NOT_FINITE = "not_finite"  # each process writes its own, on the disk that it sees
 
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS})
 _OF_DATA = ("path", "idle.ranges", "cache_dir", "disk_cache.dir")
@@ -235,7 +233,7 @@ def environment() -> dict[str, object]:
 
 def _is_without_config(path: Path) -> bool:
     """Return whether a file may be where no config is: after a start that was killed, or of a process not the first."""
-    return path.name in {LOCK, NOT_FINITE} or (path.name.startswith(f".{CONFIG}.") and path.name.endswith(".partial"))
+    return path.name == LOCK or (path.name.startswith(f".{CONFIG}.") and path.name.endswith(".partial"))
 
 
 def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:

@@ -6,7 +6,6 @@ update_to_weight    norm of the update over the norm of the weights before it, o
 data_wait_share     share of the step's wall time spent waiting for the loader; on CUDA only the device's idle time,
                     since it computes queued work while the host waits
 samples_per_second  clips, of all processes
-tokens_per_second   patch tokens of the frames of these clips
 mfu                 model FLOPs per second (`training.flops`) over the ceiling: the rate of this device in a large
                     matrix product in the run's precision, measured for a fraction of a second at the start. NaN (null)
                     above 1: other programs used the device during that measurement, so the ceiling is not usable
@@ -42,9 +41,7 @@ from vjepa2_ac.training.flops import clip_flops
 if TYPE_CHECKING:
     from vjepa2_ac.runs.trackers import Trackers
 
-MEASURED = frozenset(
-    {"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "ceiling_tflops", "memory_gb"}
-)
+MEASURED = frozenset({"data_wait_share", "samples_per_second", "mfu", "ceiling_tflops", "memory_gb"})
 """Metrics of the machine: they differ between identical runs."""
 
 _ERRORS = {
@@ -63,10 +60,10 @@ class WatchedMetricsLog(MetricsLog):
     Only the rows are used, so that a resumed run neither loses nor repeats a warning.
 
     Args:
-        config: Of the run, for its folder and the knobs to change.
+        config: The run.
         reporter: Receives messages for the user.
-        first_step: As of `MetricsLog`.
-        trackers: As of `MetricsLog`.
+        first_step: As for `MetricsLog`.
+        trackers: As for `MetricsLog`.
     """
 
     def __init__(self, config: Config, reporter: Reporter, *, first_step: int, trackers: Trackers) -> None:
@@ -76,19 +73,15 @@ class WatchedMetricsLog(MetricsLog):
             self._watch(str(row.get("kind")), row["step"], row)
 
     def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
-        """Append a row, followed by its warnings."""
+        """Append a row, and a warning if it shows one."""
         super().write(kind, step, metrics)
-        for text in self._watch(kind, step, metrics):
+        if text := self._watch(kind, step, metrics):
             super().write(WARNING, step, {"text": text})
             self._reporter.note(f"Warning: {text}")
 
 
 class Watch:
-    """Checks the rows of a metrics log one after the other; each cause is warned of once.
-
-    Args:
-        config: Of the run.
-    """
+    """Checks the rows of a metrics log one after the other; each cause is reported once."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -97,18 +90,23 @@ class Watch:
         self._losses: deque[float] = deque(maxlen=_LOSSES)
         self._lowest = math.inf
 
-    def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> list[str]:
-        """Return the warning of a row: none if it is fine or the cause is known already."""
-        found: Iterable[tuple[str, str]] = ()
+    def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> str:
+        """Return the warning of a row; empty if it is fine or the cause was reported before."""
+        causes: Iterable[tuple[str, str]] = ()
         if kind == "train":
-            found = self._of_loss(_number(metrics, "loss"))
+            causes = self._of_loss(_number(metrics, "loss"))
         elif kind == "validation" and step == 0:
             self._at_start = metrics
         elif kind == "validation":
-            found = self._of_validation(metrics)
-        new = {cause: text for cause, text in found if cause not in self._reported}
+            causes = self._of_validation(metrics)
+        new = {cause: text for cause, text in causes if cause not in self._reported}
         self._reported |= set(new)
-        return [f"at step {step:,} {'; '.join(new.values())}. {advice(self._config)}"] if new else []
+        training = self._config.training
+        fix = (
+            f"If it stays so, lower training.learning_rate ({training.learning_rate:g}) or adapter.alpha, or raise"
+            f" training.warmup_steps ({training.warmup_steps:,})"
+        )
+        return f"at step {step:,} {'; '.join(new.values())}. {fix}" if new else ""
 
     def _of_validation(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         better = True
@@ -137,20 +135,6 @@ class Watch:
             self._lowest = min(self._lowest, typical)
         if typical > _FAR_ABOVE * self._lowest:
             yield "loss", f"the loss is {typical:.4g}, and was {self._lowest:.4g} (medians of {_LOSSES} rows)"
-
-
-def advice(config: Config) -> str:
-    """Return the knobs to change in a config whose training has made the model worse."""
-    training, adapter = config.training, config.adapter
-    knobs = [f"lower training.learning_rate ({training.learning_rate:g})"]
-    if adapter.kind == "lora":
-        knobs.append(f"lower adapter.alpha ({adapter.alpha:g}) or adapter.rank ({adapter.rank})")
-    if training.max_grad_norm is None:
-        knobs.append("set training.max_grad_norm=1")
-    knobs.append(f"raise training.warmup_steps ({training.warmup_steps:,})")
-    kept = config.checkpoint.keep_best != "off"
-    best = "; the best checkpoint is kept, and used unless another is asked for" if kept else ""
-    return f"If it stays so: {', '.join(knobs)}{best}"
 
 
 class TimedBatches(Iterator[Batch]):
@@ -203,17 +187,16 @@ class Throughput:
     """Turns a step's clips and seconds into metrics."""
 
     flops_per_clip: int
-    tokens_per_clip: int
     ceiling: float  # FLOPs per second of all processes
     device: torch.device
 
     @classmethod
     def of(cls, config: Config, sizes: ModelSizes, accelerator: Accelerator) -> Throughput:
         """Measure the ceiling, once per device, precision and program; the encoder counts unless latents are cached."""
-        tokens, device = config.data.frames * sizes.tokens_per_frame, accelerator.device
+        device = accelerator.device
         ceiling = accelerator.num_processes * matmul_speed(device, PRECISIONS[config.training.precision])
         flops = clip_flops(config, sizes)
-        return cls(flops.predictor if config.data.takes_latents else flops.total, tokens, ceiling, device)
+        return cls(flops.predictor if config.data.takes_latents else flops.total, ceiling, device)
 
     def metrics(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
         """Return the metrics of one step.
@@ -230,7 +213,6 @@ class Throughput:
             peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # Linux counts in KiB
         return {
             "samples_per_second": clips / seconds,
-            "tokens_per_second": clips * self.tokens_per_clip / seconds,
             "data_wait_share": min(1.0, waited_s / seconds),
             "mfu": mfu if mfu <= 1.0 else math.nan,
             "ceiling_tflops": self.ceiling / 1e12,

@@ -22,10 +22,7 @@ from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.network.predictor_network import KeyValueCache, LatentDynamics
 from vjepa2_ac.registry import LOSSES
-from vjepa2_ac.runs.checkpoint import checkpoint_name
-from vjepa2_ac.runs.folder import NOT_FINITE
 from vjepa2_ac.storage import is_url
-from vjepa2_ac.training.not_finite import ClipRecorder
 from vjepa2_ac.training.optim import learning_rate_at
 from vjepa2_ac.training.run import Run
 
@@ -55,13 +52,13 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
         measure_update: Also return how far the weights have moved, which needs a copy of them.
 
     Raises:
-        InputError: The loss or a gradient is not finite; names the clips and saves them. The weights have not moved.
+        InputError: The loss or a gradient is not finite; names the clips. The weights have not moved.
     """
     torch.manual_seed(step_seed(run.config.seed, step, run.accelerator.process_index))
     learning_rate = learning_rate_at(step, run.config.training)
     for group in run.optimizer.param_groups:
         group["lr"] = learning_rate
-    computed = gradients(run, batches, ClipRecorder(), more=step < run.config.training.steps)
+    computed = gradients(run, batches, more=step < run.config.training.steps)
     update = Update(run.trained) if measure_update else None
     if computed.clips:  # without a clip there are no gradients, and nothing moves
         run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
@@ -85,9 +82,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     return metrics
 
 
-def gradients(
-    run: Run, batches: Iterator[Batch], recorder: ClipRecorder | None = None, *, more: bool = False
-) -> Gradients:
+def gradients(run: Run, batches: Iterator[Batch], *, more: bool = False) -> Gradients:
     """Accumulate and clip the gradients of the next micro-batches of all processes; the weights do not move.
 
     Loss and gradient are means over the clips of the step. Where clips are left out (`data.broken_episodes`: skip) they
@@ -96,7 +91,6 @@ def gradients(
     Args:
         run: The run.
         batches: Source of its micro-batches.
-        recorder: Saves clips into the run's folder if a loss or gradient is not finite; None: nothing is written.
         more: Whether another step follows, whose first micro-batch is fetched while the device is computing.
 
     Raises:
@@ -108,7 +102,7 @@ def gradients(
     totals, names, fetched, error = torch.zeros(2), list[str](), 0, None
     try:
         with run.cast_matrices.current():
-            totals, names, fetched = _accumulate(run, batches, recorder)
+            totals, names, fetched = _accumulate(run, batches)
         if more:
             prefetch_next(batches)
     except UserError as raised:
@@ -124,13 +118,11 @@ def gradients(
         return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(bytes_fetched))
     forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
     norm = _finish_gradients(run, factor=expected / clips)
-    _refuse_not_finite(run, forced_loss + rollout_loss, norm, names, recorder)
+    _refuse_not_finite(run, forced_loss + rollout_loss, norm, names)
     return Gradients(forced_loss, rollout_loss, norm, int(clips), int(bytes_fetched))
 
 
-def _accumulate(
-    run: Run, batches: Iterator[Batch], recorder: ClipRecorder | None
-) -> tuple[Float[Tensor, 2], list[str], int]:
+def _accumulate(run: Run, batches: Iterator[Batch]) -> tuple[Float[Tensor, 2], list[str], int]:
     """Return this process's part of both losses, the names of its clips, and the bytes fetched for them."""
     totals, names, fetched = torch.zeros(2, device=run.accelerator.device), list[str](), 0
     for _ in run.share.own:
@@ -142,8 +134,6 @@ def _accumulate(
         parts = run.clips_per_step / len(batch.starts)
         losses = run.micro_step(run, encode(run, batch), parts)
         totals += losses / parts
-        if recorder is not None:
-            recorder.add(batch, losses.sum())
     return totals, names, fetched
 
 
@@ -248,17 +238,13 @@ def _share_broken_episodes(run: Run) -> None:
                 dataset.broken.met(name, reason)
 
 
-def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str], recorder: ClipRecorder | None) -> None:
+def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> None:
     overflow = run.scaler.is_enabled() and run.scaler.get_scale() >= SMALLEST_LOSS_SCALE
     if math.isfinite(loss) and (math.isfinite(norm) or overflow):
         return
-    saved = ""
-    if recorder is not None:
-        folder = run.folder / NOT_FINITE / checkpoint_name(run.state.step + 1)
-        saved = f" ({recorder.save(folder, run.accelerator.process_index)})"
     fp16 = ", or set training.precision to bf16 or fp32" if run.scaler.is_enabled() else ""
     found = f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}"
-    fix = f"The weights have not moved. Look at these clips{saved}, or lower training.learning_rate{fp16}"
+    fix = f"The weights have not moved. Look at these clips, or lower training.learning_rate{fp16}"
     raise InputError(where="training", found=found, fix=fix)
 
 
