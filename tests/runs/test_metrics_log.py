@@ -13,7 +13,7 @@ from same_run import assert_same_run
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs import metrics_log
 from vjepa2_ac.runs.metrics_log import MetricsLog, read_metrics_log
-from vjepa2_ac.training import loop
+from vjepa2_ac.training import outputs
 from vjepa2_ac.training.loop import train
 
 
@@ -105,13 +105,13 @@ def test_a_run_that_cannot_write_its_record_writes_its_checkpoint_and_says_of_wh
 def test_where_a_checkpoint_makes_room_the_run_goes_on_and_its_record_is_whole(
     make_config, reporter, tmp_path, monkeypatch, whole_run
 ) -> None:
-    disk, save = FullDisk(monkeypatch), loop.save_checkpoint
+    disk, save = FullDisk(monkeypatch), outputs.save_checkpoint
 
     def make_room(*arguments: object) -> None:
         save(*arguments)
         disk.is_full = False
 
-    monkeypatch.setattr(loop, "save_checkpoint", make_room)
+    monkeypatch.setattr(outputs, "save_checkpoint", make_room)
     train(make_config(), full_from(disk, reporter, 3))
     assert_same_run(whole_run, tmp_path / "run")
 

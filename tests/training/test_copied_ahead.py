@@ -12,7 +12,6 @@ from same_run import assert_same_run
 from vjepa2_ac.data import streams
 from vjepa2_ac.data.loader import Batches, training_loader
 from vjepa2_ac.data.streams import ToDevice
-from vjepa2_ac.training import setup
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.run import Run
 from vjepa2_ac.training.step import training_step
@@ -71,7 +70,7 @@ def on_device(monkeypatch: pytest.MonkeyPatch) -> RecordingCuda:
 
     cuda = RecordingCuda()
     copies = ToDevice(cuda)
-    monkeypatch.setattr(setup, "copies_for", lambda _: copies)
+    monkeypatch.setattr("vjepa2_ac.training.run.copies_for", lambda _: copies)
     monkeypatch.setattr(streams, "DataLoader", unpinned)
     return cuda
 

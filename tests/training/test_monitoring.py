@@ -66,8 +66,6 @@ def test_every_row_of_training_says_how_the_run_and_the_machine_are(make_config,
     assert not any("mfu" in note for note in reporter.notes)
 
 
-
-
 # Divergence
 
 HUGE = {

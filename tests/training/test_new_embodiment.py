@@ -58,7 +58,7 @@ def test_from_recordings_to_a_model_of_its_own(
     assert len(fresh) == sum(width != 7 for width in widths)
     if widths.state != 7:
         assert f"state encoder: {widths.state} numbers instead of the base's 7: initialised anew" in fresh
-    assert any("Base against persistence: skipped" in note for note in reporter.notes)
+    assert any("Base compared with persistence: skipped" in note for note in reporter.notes)
     run = load_subject(folder)
     assert widths_of_model(run.world_model.sizes) == widths
 

@@ -36,8 +36,7 @@ def ranks_are(monkeypatch):
             error, rank = next(values)
             return {validation.BEST_BY: error, validation.RANK: rank}
 
-        for module in (loop, validation):
-            monkeypatch.setattr(module, "validation_metrics", metrics)
+        monkeypatch.setattr(validation, "validation_metrics", metrics)
 
     return use
 
@@ -97,7 +96,7 @@ def test_a_run_that_stops_after_its_base_was_saved_goes_on_as_if_it_had_not(
 ) -> None:
     whole = train(make_config(run_dir=str(tmp_path / "whole")), reporter)
     halted = make_config(run_dir=str(tmp_path / "halted"))
-    monkeypatch.setattr(loop, "_loop", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(loop, "_optimize", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         train(halted, reporter)
     monkeypatch.undo()
