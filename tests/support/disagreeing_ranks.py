@@ -21,7 +21,7 @@ from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.encoding import encode_dataset
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.training import data_sets, loop, resume, setup, validation
+from vjepa2_ac.training import data_sets, loop, outputs, resume, run, validation
 from vjepa2_ac.training.loop import train
 
 RANK = int(os.environ["RANK"])
@@ -51,7 +51,7 @@ def disk_is_full() -> None:
 
 def run_is_of_another_config() -> None:
     if RANK == 0:
-        loop.open_run = mock.Mock(side_effect=InputError(where="run", found="a run of another config"))
+        outputs.open_run = mock.Mock(side_effect=InputError(where="run", found="a run of another config"))
 
 
 def checkpoint_cannot_be_read() -> None:
@@ -114,7 +114,7 @@ def each_meets_another_broken_episode() -> None:
             yield replace(batch, **{key: getattr(batch, key)[:1] for key in ("states", "actions", "frames")},
                           episode_ids=batch.episode_ids[:1], starts=batch.starts[:1])  # fmt: skip
 
-    setup.training_loader = loader
+    run.training_loader = loader
 
 
 if __name__ == "__main__":
