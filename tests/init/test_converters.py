@@ -175,18 +175,6 @@ def test_a_recording_that_does_not_fit_says_why(
     assert not list(tmp_path.rglob("*.npz"))
 
 
-def test_files_of_cameras_and_macs_are_read_or_ignored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_recording(tmp_path / "own")
-    (folder / "first.mp4").rename(folder / "first.MP4")
-    (folder / "first.csv").rename(folder / "first.CSV")
-    for name in ("._first.mp4", "._first.csv"):
-        (folder / name).write_bytes(b"\0\5\x16\7" + bytes(99))
-    (folder / "second.csv").write_text("x\n")
-    run("mp4_and_csv", folder, tmp_path / "npz")
-    assert [path.name for path in (tmp_path / "npz").rglob("*.npz")] == ["first.npz"]
-    assert "second.csv is not used: there is no second.mp4" in capsys.readouterr().out
-
-
 # Steps at even times.
 
 
@@ -218,14 +206,6 @@ def test_uneven_frame_times_are_refused_with_the_option_that_resamples(tmp_path:
         converted(tmp_path, UNEVEN)
 
 
-def test_small_jitter_is_no_reason_to_resample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    jitter = np.random.default_rng(1).uniform(-0.006, 0.006, STEPS)
-    made = converted(tmp_path, np.arange(STEPS) / RATE_HZ + jitter - jitter[0])
-    require_steps(made, np.arange(STEPS))
-    assert made["fps_hz"] == pytest.approx(RATE_HZ, rel=0.01)
-    assert "warning" not in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("has_times", [False, True], ids=["rows by number", "rows by time"])
 def test_fps_takes_the_nearest_frame_with_its_own_pose(has_times: bool, tmp_path: Path) -> None:
     made = converted(tmp_path, UNEVEN, "--fps", 1.65, row_times=UNEVEN if has_times else None)
@@ -233,35 +213,6 @@ def test_fps_takes_the_nearest_frame_with_its_own_pose(has_times: bool, tmp_path
     expected = np.abs(UNEVEN - grid[:, None]).argmin(axis=1)
     assert made["fps_hz"] == 1.65
     require_steps(made, expected)
-
-
-def test_fps_below_the_rate_leaves_frames_out_and_near_the_rate_keeps_all(tmp_path: Path) -> None:
-    even = np.arange(STEPS) / RATE_HZ
-    require_steps(converted(tmp_path / "half", even, "--fps", 5), np.arange(0, STEPS, 2))
-    nearly = converted(tmp_path / "nearly", even, "--fps", 9.85)
-    require_steps(nearly, np.arange(STEPS))
-    assert nearly["fps_hz"] == 9.85
-
-
-def test_steps_that_repeat_a_frame_are_counted_and_many_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    hole = np.arange(STEPS) / RATE_HZ + 0.3 * (np.arange(STEPS) > 9)  # 0.4 s without a frame
-    require_steps(converted(tmp_path / "hole", hole, "--fps", 10), np.r_[:10, 9, 10, 10, 10:20])
-    assert "warning: " in (out := capsys.readouterr().out)
-    assert "3 of 23 steps repeat the frame of the step before" in out
-    with pytest.raises(SystemExit, match=r"19 of 39 steps repeat the frame.*Expected 20% at most. Pass a lower --fps"):
-        converted(tmp_path / "double", np.arange(STEPS) / RATE_HZ, "--fps", 20)
-
-
-def test_the_times_of_the_table_are_used_if_the_video_has_other_ones(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """OpenCV writes a nominal rate: here 10 per second for frames that were taken at 8 per second."""
-    made = converted(tmp_path, np.arange(STEPS) / RATE_HZ, row_times=np.arange(STEPS) / 8 + 3)
-    require_steps(made, np.arange(STEPS))
-    assert made["fps_hz"] == 8
-    assert "`time` covers 2.38 s and the video 1.90 s" in capsys.readouterr().out
 
 
 # Orientation of a phone.
@@ -298,13 +249,6 @@ def test_frames_are_turned_as_players_show_them(turn: str, tmp_path: Path) -> No
     run("mp4_and_csv", folder, tmp_path / "npz", "--height", 96 if entries[0] == 0 else 64)
     with np.load(tmp_path / "stored/first.npz") as stored, np.load(tmp_path / "npz/first.npz") as made:
         assert np.array_equal(made["frames"], displayed(stored["frames"]))
-
-
-def test_an_oblique_orientation_is_refused(tmp_path: Path) -> None:
-    folder = write_recording(tmp_path / "own")
-    set_display_matrix(folder / "first.mp4", (0.7071, 0.7071, -0.7071, 0.7071))
-    with pytest.raises(SystemExit, match=r"displayed at -4[45] degrees. Expected 0, 90, 180 or 270"):
-        run("mp4_and_csv", folder, tmp_path / "npz")
 
 
 # Cells of a table.
@@ -395,13 +339,6 @@ def test_rotations_are_read_by_name_or_as_requested(
     table = table_of(f"x,y,z,{columns},gripper", with_rotation(numbers))
     states = read_table(tmp_path / "a.csv", table, rotation=rotation)
     assert np.abs(states - STATES).max() < 1e-9
-
-
-def test_the_requested_rotation_is_chosen_from_several(tmp_path: Path) -> None:
-    table = table_of(f"{EULER_HEADER},rx,ry,rz", np.concatenate([STATES[::-1], VECTOR], axis=1))
-    assert np.array_equal(read_table(tmp_path / "a.csv", table), STATES[::-1])
-    states = read_table(tmp_path / "a.csv", table, rotation="rotation_vector")
-    assert np.abs(states[:, 3:6] - STATES[:, 3:6]).max() < 1e-9
 
 
 def test_millimetres_and_an_inverted_gripper_are_converted(tmp_path: Path) -> None:
@@ -568,74 +505,6 @@ def test_a_bag_that_does_not_fit_says_why(
     with pytest.raises(SystemExit, match=found):
         run("ros2_bag", bag, "--out", tmp_path / "npz", "--camera", "frames=/camera", *words)
     assert not (tmp_path / "npz").exists()
-
-
-def test_messages_without_a_measurement_are_left_out_and_counted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    empty = dict.fromkeys(range(3), NO_ORIENTATION) | {7: (np.nan,) * 4}
-    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, orientations=empty)
-    out = tmp_path / "npz"
-    run("ros2_bag", bag, "--out", out, "--rate", RATE_HZ, "--camera", "frames=/camera", *CHOSEN)
-    expected = STATES[3:-1].copy()
-    expected[7 - 3, :6] = STATES[6, :6]  # the newest pose that was measured
-    assert np.abs(states_in(out) - expected).max() < 1e-6
-    found = (
-        "/pose: 4 of 20 messages have no measurement (zeros, NaN or other joints) and are left out, the first at 0.00 s"
-    )
-    assert found in capsys.readouterr().out
-
-
-def test_a_pose_of_default_values_is_no_measurement() -> None:
-    """ROS 2 fills a new pose with zeros and w = 1."""
-    kinds = TYPES.types
-    turned = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    read_pose = runpy.run_path(str(ROOT / "examples/convert/ros2_bag.py"))["read_pose"]
-    point = kinds["geometry_msgs/msg/Point"]
-    assert np.isnan(read_pose(kinds["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turned), [], "")).all()
-    made = read_pose(kinds["geometry_msgs/msg/Pose"](point(0.001, 0.0, 0.0), turned), [], "")
-    assert made.tolist() == [0.001, 0, 0, 0, 0, 0]
-
-
-def test_files_that_are_no_bags_are_ignored_or_named(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "bags/first", StoragePlugin.MCAP)
-    (bag.parent / "._first.mcap").write_bytes(b"\0\5\x16\7" + bytes(99))
-    words = ("--out", tmp_path / "npz", "--camera", "frames=/camera", *CHOSEN)
-    run("ros2_bag", bag.parent, *words)
-    assert [path.name for path in (tmp_path / "npz").iterdir()] == ["first.npz"]
-    (bag.parent / "other.mcap").write_bytes(b"no bag" * 100)
-    with pytest.raises(SystemExit, match=r"other\.mcap: not a readable bag"):
-        run("ros2_bag", bag.parent, *words)
-
-
-def test_a_matrix_of_zeros_is_no_measurement(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, orientations=dict.fromkeys(range(2), NO_ORIENTATION))
-    chosen = ("--pose", "/matrix:data", *CHOSEN[2:])
-    run("ros2_bag", bag, "--out", tmp_path / "npz", "--rate", RATE_HZ, "--camera", "frames=/camera", *chosen)
-    assert np.abs(states_in(tmp_path / "npz") - STATES[2:-1]).max() < 1e-6
-
-
-@pytest.mark.parametrize(
-    ("gripper", "changes"),
-    [
-        ("/fingers:position[left.finger]", {}),
-        ("/fingers:position[7]", {}),
-        ("/fingers:position[left.finger]", {"is_alternating": True}),
-        ("/fingers:position[left.finger, right.finger]", {}),
-        ("/fingers:position", {"arm": np.ones_like(ARM) / 1000}),
-    ],
-    ids=["name", "number", "messages of arm and fingers", "two fingers", "an arm at rest"],
-)
-def test_the_joints_of_the_gripper_are_selected(gripper: str, changes: dict[str, Any], tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, **({"joints": JOINTS, "arm": ARM} | changes))
-    is_sum, offset = "right" in gripper or "[" not in gripper, 0.007 if "[" not in gripper else 0.0
-    ends = ("--gripper-open", 0.04 * (1 + is_sum) + offset, "--gripper-closed", offset)
-    out = tmp_path / "npz"
-    run(
-        "ros2_bag", bag, "--out", out, "--rate", RATE_HZ, "--camera", "frames=/camera",
-        "--pose", "/pose", "--gripper", gripper, *ends,
-    )  # fmt: skip
-    assert np.abs(states_in(out)[:, 6] - STATES[:-1, 6]).max() < 1e-6
 
 
 # Lance tables. In processes of their own: Lance warns of every fork in the process that has imported it.

@@ -120,14 +120,6 @@ def test_precision_is_of_the_machine_and_the_type_of_the_weights_goes_with_it(
     assert ("model.dtype" in training["precision"].why) == (precision == "fp32" and path is None)
 
 
-def test_what_is_fetched_has_its_size_and_time_beside_its_command() -> None:
-    assert "# vjepa2-ac download: 11.7 GB, about 16 minutes at 100 Mbit/s" in of().text(FOUND, MACHINE)
-    text = of(kind="scratch").text(FOUND, MACHINE)
-    assert "# vjepa2-ac download vjepa2.1-vitb-384: 1.66 GB, about 2 minutes at 100 Mbit/s" in text
-    own = make_draft(FOUND, MACHINE, choose_model("released", "own/model.pt"), run_dir="run")
-    assert "vjepa2-ac download" not in own.text(FOUND, MACHINE)
-
-
 def test_a_trial_takes_its_share_of_the_steps_and_all_of_the_encoding() -> None:
     made = of()
     assert made.encoding_hours > 0

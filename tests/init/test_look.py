@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from copied_sets import WRITERS, write_lerobot, write_npz
+from copied_sets import WRITERS, write_lerobot
 from rlds_sets import write_rlds_set
-from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft import Machine, choose_model, make_draft
@@ -63,12 +62,6 @@ def test_each_form_gives_a_config_that_opens_it(form: str, tmp_path: Path) -> No
     assert config.data.stride == 4
 
 
-def test_a_description_is_found_some_folders_down(tmp_path: Path) -> None:
-    WRITERS["rlds"](tmp_path / "set/name/1.0.0", range(3))
-    assert look_at(str(tmp_path / "set")).path == str(tmp_path / "set/name/1.0.0")
-    assert look_at(str(tmp_path / "set"), "rlds").path == str(tmp_path / "set/name/1.0.0")
-
-
 @pytest.mark.parametrize("form", [None, "rlds"])
 def test_the_newest_version_is_taken_and_the_others_are_named(form: str | None, tmp_path: Path) -> None:
     for version in ("1.9.0", "1.10.0", "1.2.0"):
@@ -94,19 +87,6 @@ def test_several_sets_in_a_folder_are_listed_and_none_is_chosen(
         look_at(str(tmp_path), form)
     if pick != place:
         assert look_at(str(tmp_path), place).path == str(tmp_path / "place")
-
-
-def test_a_link_to_a_set_beside_it_is_no_second_set(tmp_path: Path) -> None:
-    WRITERS["lerobot"](tmp_path / "set", range(2))
-    (tmp_path / "the_same").symlink_to(tmp_path / "set")
-    assert look_at(str(tmp_path)).path == str(tmp_path / "set")
-
-
-def test_a_set_with_a_version_folder_is_found_beside_another_one(tmp_path: Path) -> None:
-    WRITERS["rlds"](tmp_path / "rlds/name/1.0.0", range(2))
-    WRITERS["lerobot"](tmp_path / "lerobot", range(2))
-    with pytest.raises(InputError, match=r"2 data sets: .*lerobot, .*rlds/name"):
-        look_at(str(tmp_path))
 
 
 def test_numbers_that_are_no_pose_become_a_vector(tmp_path: Path) -> None:
@@ -191,19 +171,6 @@ def test_the_grippers_range_is_read_from_the_statistics(
     assert (knobs["gripper_open"], knobs["gripper_closed"]) == expected
 
 
-def test_a_set_is_known_by_its_own_name_and_not_by_its_folders(tmp_path: Path) -> None:
-    data, guessed, text = drafted(write_like_bridge(tmp_path / "x_droid/a/1.0.0", "bridge_dataset"))
-    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper_open"], data["stride"]) == (5.0, 1.0, 1)
-    assert not {"data.fields.control_rate_hz", "data.fields.gripper_open", "data.stride"} & set(guessed)
-    assert "5 steps a second" in text
-    assert "as DROID" not in text
-
-    data, guessed, text = drafted(write_like_bridge(tmp_path / "bridge_dataset/droid/1.0.0", "my_kitchen"))
-    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper_open"]) == (10.0, 0.0)
-    assert {"data.fields.control_rate_hz", "data.fields.gripper_open", "data.stride"} <= set(guessed)
-    assert "10 steps a second (guessed)" in text
-
-
 def test_a_set_in_droids_schema_is_droid_if_it_says_so(tmp_path: Path) -> None:
     folder = WRITERS["rlds"](tmp_path / "bridge/1.0.0", range(3))
     for name in ("r2d2_faceblur", "droid_101"):
@@ -238,14 +205,6 @@ def test_a_gripper_of_lerobot_is_known_of_droids_ports_alone(tmp_path: Path) -> 
     assert "data.lerobot.gripper_open" not in drafted(folder)[1]
 
 
-def test_more_cameras_of_npz_are_listed(tmp_path: Path) -> None:
-    folder = write_npz(tmp_path / "set", [0])
-    arrays = dict(np.load(folder / "000.npz"))
-    frames = arrays.pop("frames")
-    np.savez(folder / "000.npz", **arrays, wrist=frames, side=frames)
-    assert plain(look_at(str(folder)).knobs)["camera"] == "side"
-
-
 @pytest.mark.parametrize(
     ("files", "needed"),
     [
@@ -276,11 +235,3 @@ def test_an_npz_without_states_says_what_it_has(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", poses=np.zeros((4, 7)), frames=np.zeros((4, 8, 8, 3), np.uint8))
     with pytest.raises(InputError, match=r"poses \[4, 7\] float64, frames \[4, 8, 8, 3\] uint8.*states \[steps, 7\]"):
         look_at(str(tmp_path))
-
-
-def test_droid_needs_no_look() -> None:
-    found = look_at("gs://gresearch/robotics/droid/1.0.1")
-    assert found.episodes == 95_658
-    values = {"run_dir": "run", "model": {"base": "builtin:sim-tiny"}}
-    data = {"path": found.path, **plain(found.knobs), "idle": plain(found.idle or {})}
-    assert parse_config({**values, "data": data}, where="here").data.idle.rule == "published"

@@ -108,27 +108,12 @@ def test_names_of_a_quaternion_over_a_rotation_vector_and_two_fingers_are_a_gues
     assert knobs == {"gripper_open": 0.04, "gripper_closed": 0.0}
 
 
-def test_numbered_names_of_a_quaternion_over_other_numbers_are_a_guess() -> None:
-    numbers = [np.concatenate([one, -one[:, 6:]], axis=1) for one in EPISODES]
-    state = proposed("x y z quat_0 quat_1 quat_2 quat_3 gripper", numbers)["state"]
-    assert state.is_guess
-    assert "not of length 1" in state.why
-
-
 def test_a_named_pose_with_a_gripper_column_is_no_guess() -> None:
     columns = {STATE: Column(6, tuple(ONE_ARM)), "observation.gripper_open": Column(1)}
     pose = find_pose(columns)
     assert pose is not None
     assert pose["state"].value == list(columns)
     assert not pose["state"].is_guess
-
-
-def test_a_rotation_of_a_known_format_is_preferred_to_a_quaternion_of_unknown_order() -> None:
-    widths = {"eef_pos": 3, "eef_quat": 4, "eef_axis_angle": 3, "gripper": 1}
-    pose = find_pose({f"steps/observation/{name}": Column(width) for name, width in widths.items()})
-    assert pose is not None
-    assert "steps/observation/eef_axis_angle" in pose["state"].value
-    assert (pose["rotation"].value, pose["rotation"].is_guess) == ("rotation_vector", False)
 
 
 def test_degrees_and_millimetres_are_recognised_by_their_size() -> None:
@@ -240,15 +225,6 @@ def test_open_and_closed_follow_from_range_and_name(
     assert bool(guesses(knobs)) == is_guess
 
 
-def test_single_wrong_values_do_not_change_the_proposal() -> None:
-    numbers = [one.copy() for one in EPISODES]
-    numbers[0][3] = np.nan
-    numbers[1][5, :6] = 4000.0
-    pose = proposed("x y z roll pitch yaw gripper", numbers)
-    assert (pose["rotation"].value, pose["rotation"].is_guess) == ("euler_xyz", False)
-    assert "position_unit" not in pose
-
-
 def chosen_names(names: str) -> list[str]:
     """Return the names of the numbers that are proposed; empty: no pose."""
     named = tuple(names.split())
@@ -339,29 +315,11 @@ def test_columns_of_robosuite_are_read() -> None:
     assert pose["gripper_closed"].value == 0.0
 
 
-def test_names_of_position_and_orientation_may_be_in_the_column() -> None:
-    columns = {
-        "observation.tcp_position": Column(3, ("x", "y", "z")),
-        "observation.tcp_orientation": Column(4, ("w", "x", "y", "z")),
-        "observation.gripper": Column(1),
-    }
-    pose = find_pose(columns)
-    assert pose is not None
-    assert (pose["select"].value, pose["rotation"].value) == ([0, 1, 2, 4, 5, 6, 3, 7], "quaternion_xyzw")
-
-
 def test_rotation_vectors_in_degrees_are_a_guess_that_says_so() -> None:
     numbers = [one * [1, 1, 1, 57.3, 57.3, 57.3, 1] for one in (written(one, "rotation_vector") for one in EPISODES)]
     pose = proposed("x y z rotvec_x rotvec_y rotvec_z gripper", numbers)
     assert pose["rotation"].is_guess
     assert "rotation vectors in degrees cannot be read" in pose["rotation"].why
-
-
-def test_quaternions_with_empty_measurements_are_still_quaternions() -> None:
-    numbers = [written(one, "quaternion_xyzw") for one in EPISODES]
-    for one in numbers:
-        one[::4, 3:7] = 0.0
-    assert proposed("x y z qx qy qz qw gripper", numbers)["rotation"].value == "quaternion_xyzw"
 
 
 @pytest.mark.parametrize(
@@ -376,10 +334,3 @@ def test_the_name_of_the_gripper_decides_its_direction(
     name: str, ranges: tuple[float, float], expected: tuple[float, float]
 ) -> None:
     assert tuple(plain(gripper_knobs(name, ranges)).values()) == expected
-
-
-def test_of_eight_numbers_the_gripper_is_the_one_that_moves() -> None:
-    numbers = [np.insert(one, 6, 0.0, axis=1) for one in EPISODES]
-    pose = find_pose({STATE: Column(8)}, {STATE: numbers})
-    assert pose is not None
-    assert pose["select"].value == [0, 1, 2, 3, 4, 5, 7]

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from projections import pixel_of
 from vjepa2_ac.simulation.domains import BLOCK_M, DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.motion import downward_poses, poses_in_base
 from vjepa2_ac.simulation.tasks import GRASP_M, HOLDING
@@ -59,19 +58,6 @@ def test_a_block_is_where_it_was_put_in_the_frame_of_the_base(arm: ContactArm) -
     np.testing.assert_allclose(arm.block[:2], block[:2], atol=5e-3)
 
 
-def test_a_hand_that_goes_through_a_block_pushes_it_ahead(arm: ContactArm) -> None:
-    arm.set_state(state_over(DOMAIN_B, 0.42, 0.0, 0.17, 1.0))
-    arm.place(block_at(DOMAIN_B, 0.50, 0.0), None)
-    before = arm.block
-    for step in range(1, 5):
-        state = arm.command(state_over(DOMAIN_B, 0.42 + 0.035 * step, 0.0, 0.17, 1.0), 4)
-    turn = DOMAIN_B.base_pose()[:3, :3]
-    way, hand = turn @ (arm.block - before)[:3], turn @ state[:3]
-    assert 0.07 < way[0] < 0.14
-    assert abs(way[1]) < 0.015
-    assert (turn @ arm.block[:3])[0] - hand[0] > BLOCK_M / 2  # not through it
-
-
 def test_a_grasped_block_is_lifted_held_and_let_go(arm: ContactArm) -> None:
     arm.set_state(state_over(DOMAIN_B, 0.48, 0.05, BLOCK_M / 2 + GRASP_M))
     arm.place(block_at(DOMAIN_B, 0.48, 0.05), None)
@@ -87,31 +73,6 @@ def test_a_grasped_block_is_lifted_held_and_let_go(arm: ContactArm) -> None:
     assert arm.block[2] < 0.05
 
 
-def test_the_camera_sees_the_block_where_it_is_now(arm: ContactArm) -> None:
-    for y in (-0.15, 0.05):
-        arm.place(block_at(DOMAIN_B, 0.55, y), None)
-        image = arm.image().astype(int)
-        column, row = pixel_of(arm, arm.block[:3]).astype(int)
-        red, green, blue = image[row, column]
-        assert green > 1.8 * max(red, blue)
-        is_green = image[..., 1] > 1.8 * np.maximum(image[..., 0], image[..., 2])
-        rows, columns = np.nonzero(is_green)
-        assert abs(rows.mean() - row) < 6
-        assert abs(columns.mean() - column) < 6
-
-
-def test_a_placed_arm_is_at_rest_whatever_it_did_before(arm: ContactArm) -> None:
-    found = []
-    for first in (0.05, -0.05):
-        arm.command(moved(arm.state, first, 0.0, 0.0, closedness=1.0), 2)
-        arm.set_joints(arm.joints * 0 + [0.0, -0.4, 0.0, -2.4, 0.0, 2.0, 0.8], 0.2)
-        arm.place(block_at(DOMAIN_B, 0.5, 0.2), None)
-        found.append(arm.command_joints(arm.joints, 0.2, 4))
-        arm.command(moved(arm.state, 0.02, 0.0, 0.0), 2)
-    np.testing.assert_array_equal(found[0], found[1])
-    assert found[0][6] == pytest.approx(0.2, abs=1e-3)
-
-
 def test_only_tasks_with_a_block_have_one_and_only_place_has_a_mark_which_has_to_be_put_somewhere() -> None:
     for task in ("reach", "push", "pick"):
         other = arm_for(task, DOMAIN_A, size=(18, 32))
@@ -124,24 +85,3 @@ def test_only_tasks_with_a_block_have_one_and_only_place_has_a_mark_which_has_to
     marked = arm_for("place", DOMAIN_A, size=(18, 32))
     with pytest.raises(ValueError, match=r"give problem\.mark"):
         put(marked, marked.state, None)
-
-
-def test_a_mark_is_seen_where_it_was_put_and_nothing_touches_it(arm: ContactArm) -> None:
-    marked = arm_for("place", DOMAIN_B)
-    found = []
-    for one in (arm, marked):  # grasp, lift and drop a block; with the mark under it, and without
-        start = state_over(DOMAIN_B, 0.5, -0.1, BLOCK_M / 2 + GRASP_M)
-        put(one, start, block_at(DOMAIN_B, 0.5, -0.1), None if one is arm else block_at(DOMAIN_B, 0.5, -0.1)[:2])
-        for way, closedness in ((0.0, 0.9), (0.05, 0.9), (0.05, 0.9), (0.0, 0.0), (0.0, 0.0)):
-            one.command(moved(one.state, 0.0, 0.0, way, closedness=closedness), 4)
-            found.append(np.append(one.block, one.state))
-    np.testing.assert_allclose(found[:5], found[5:], atol=1e-9)
-    assert max(seen[2] for seen in found) > BLOCK_M
-    place = block_at(DOMAIN_B, 0.45, 0.15)[:2]
-    marked.place(None, place)
-    np.testing.assert_allclose(marked.mark, place, atol=1e-12)
-    marked.command(moved(marked.state, 0.0, 0.0, 0.1), 8)
-    seen = marked.image().astype(int)
-    rows, columns = np.nonzero(np.minimum(seen[..., 1], seen[..., 2]) > 2.5 * seen[..., 0])
-    assert len(rows) > 100
-    np.testing.assert_allclose([columns.mean(), rows.mean()], pixel_of(marked, np.append(place, 0.0)), atol=2.0)

@@ -1,21 +1,19 @@
 """Recordings read back as DROID, are consistent with the kinematics, and are reproducible."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import simplejpeg
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, DomainRanges
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from vjepa2_ac.simulation.arm import SimulatedArm
-from vjepa2_ac.simulation.record import RecordingSpec, episode_folder, record_dataset, record_episode
+from vjepa2_ac.simulation.record import RecordingSpec, record_dataset, record_episode
 
 EPISODES, STEPS = 3, 5
 
@@ -52,15 +50,6 @@ def test_the_images_show_the_measured_state(recorded: Path) -> None:
         assert difference.mean() < 4.0  # JPEG, and the arm's spare degree of freedom
 
 
-def test_commands_differ_from_measurements_and_velocities_from_zero() -> None:
-    episode = record_episode(1, RecordingSpec(DOMAIN_A, 9, 0))
-    assert np.abs(episode.action[:, :3] - episode.observation.cartesian_position[:, :3]).max() > 0.005
-    np.testing.assert_array_equal(episode.action[:, :6], episode.action_dict.cartesian_position)
-    moved = np.diff(episode.action_dict.joint_position, axis=0) * 15.0
-    np.testing.assert_allclose(episode.action_dict.joint_velocity[1:], moved)
-    assert np.abs(episode.action_dict.cartesian_velocity).max() < 5.0  # no jump where angles wrap
-
-
 def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -76,34 +65,12 @@ def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(
     assert not Path("RAN").exists()
 
 
-def test_another_look_changes_the_images_and_nothing_else() -> None:
-    looks = DOMAIN_A, replace(DOMAIN_A, look=DOMAIN_B.look)
-    first, second = (record_episode(0, RecordingSpec(domain, 2, 0)) for domain in looks)
-    np.testing.assert_array_equal(first.observation.joint_position, second.observation.joint_position)
-    np.testing.assert_array_equal(first.action, second.action)
-    assert first.images["exterior_image_1_left"] != second.images["exterior_image_1_left"]
-
-
 def test_one_camera_is_shared_by_all_three_and_three_differ() -> None:
     shared = record_episode(0, RecordingSpec(DOMAIN_A, 2, 0))
     own = record_episode(0, RecordingSpec(DOMAIN_A, 2, 0, cameras=3))
     assert len({tuple(images) for images in shared.images.values()}) == 1
     assert len({tuple(images) for images in own.images.values()}) == 3
     assert own.images["exterior_image_1_left"] == shared.images["exterior_image_1_left"]
-
-
-def test_most_episodes_succeed_and_no_two_share_a_folder() -> None:
-    folders = [episode_folder(index, 0, "A") for index in range(500)]
-    assert 0.85 < np.mean(["/success/" in folder for folder in folders]) < 0.95
-    assert len(set(folders)) == 500
-
-
-def test_every_episode_of_a_random_set_has_its_own_world() -> None:
-    walls = []
-    for index in range(3):
-        jpeg = record_episode(index, RecordingSpec(DomainRanges(), 2, 0)).images["exterior_image_1_left"][0]
-        walls.append(simplejpeg.decode_jpeg(jpeg)[:20, :20].reshape(-1, 3).mean(axis=0))
-    assert np.ptp(walls, axis=0).max() > 20
 
 
 def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_written(tmp_path: Path) -> None:

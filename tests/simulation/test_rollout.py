@@ -7,8 +7,7 @@ import pytest
 
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
-from vjepa2_ac.simulation.tasks import GRASP_M, RELEASED, STEPS, TaskName, arm_for, make_problem
-from vjepa2_ac.spaces import actions_from_states
+from vjepa2_ac.simulation.tasks import RELEASED, STEPS, TaskName, arm_for, make_problem
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
@@ -25,7 +24,6 @@ from vjepa2_ac.simulation.rollout import (
     EpisodeResult,
     Observation,
     Trial,
-    put,
     run,
     run_trials,
 )
@@ -93,18 +91,6 @@ def test_the_oracle_solves_it_and_zero_and_random_actions_do_not(task: TaskName,
         assert result.estimates["final_distance_cm"].value > 7.0
 
 
-def test_a_block_that_is_held_over_the_mark_is_near_and_not_placed() -> None:
-    problem = make_problem("place", DOMAIN_A, 0, 0)
-    arm = arm_for("place", DOMAIN_A, size=(18, 32))
-    low = problem.goal.copy()
-    low[2] = problem.block_goal[2] + GRASP_M
-    put(arm, low, problem.block_goal, problem.mark)
-    holding = arm.command(arm.state + 0.9 * np.eye(7)[6], 8)
-    assert problem.distance_m(holding, arm.block) < 0.01
-    assert not problem.succeeded(holding, arm.block)
-    assert problem.succeeded(arm.command(arm.state - holding[6] * np.eye(7)[6], 8), arm.block)
-
-
 @pytest.mark.parametrize("task", ["reach", "push"])
 def test_moving_objects_start_every_episode_where_they_start_for_every_policy(task: TaskName) -> None:
     options = BenchmarkOptions(task, replace(DOMAIN_B, moving=3), episodes=2, steps=2, films=2)
@@ -128,16 +114,6 @@ def test_an_episode_starts_at_the_start_and_shows_the_goal(arm: SimulatedArm) ->
     for step, observation in enumerate(policy.seen):
         np.testing.assert_array_equal(observation.image, result.frames[step])
         np.testing.assert_array_equal(observation.state, result.states[step])
-
-
-def test_an_action_of_a_model_step_is_followed_with_the_arms_lag(arm: SimulatedArm) -> None:
-    action = way(0.05, 0.0, -0.02, 0, 0, 0.1, 0.5)
-    short, long = (run(ArmEnvironment(arm), Scripted(action), trial_of(1, 1, stride)) for stride in (4, 30))
-    sign = 1.0 if short.trial.problem.start[6] == 0 else 0.0  # a closed gripper cannot close further
-    (moved,), (settled,) = (actions_from_states(result.states) for result in (short, long))
-    np.testing.assert_allclose(settled, [*action[:6], 0.5 * sign], atol=1e-3)
-    share = np.linalg.norm(moved[:3]) / np.linalg.norm(action[:3])
-    assert share == pytest.approx(1 - np.exp(-4 / 15 / DOMAIN_B.lag_s), abs=0.01)
 
 
 def test_joints_are_observed_moved_and_kept_within_their_limits(arm: SimulatedArm) -> None:

@@ -1,19 +1,14 @@
 """Demonstrations with a block touch it, and are recorded like all others."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from vjepa2_ac.simulation.domains import BLOCK_M, DOMAIN_A
+from vjepa2_ac.simulation.domains import DOMAIN_A
 from vjepa2_ac.simulation.motion import forward_kinematics
-from vjepa2_ac.simulation.tasks import GRASP_M, arm_for
+from vjepa2_ac.simulation.tasks import arm_for
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.cli import main
-from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.simulation.policies import play
 from vjepa2_ac.simulation.record import RecordingSpec, default_steps, record_episode
 
@@ -64,29 +59,3 @@ def test_an_episode_with_a_block_is_consistent_and_always_the_same() -> None:
     other = record_episode(2, RecordingSpec(DOMAIN_A, 6, 1))
     assert other.language_instruction != first.language_instruction
     assert np.abs(other.action - first.action).max() > 0.01
-
-
-def test_every_other_episode_is_scripted(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vjepa2_ac.simulation import record as module
-
-    asked, real = [], module.play
-    monkeypatch.setattr(module, "play", lambda *args, **more: asked.append(more["script"]) or real(*args, **more))
-    for index in range(3):
-        record_episode(index, RecordingSpec(DOMAIN_A, 2, 0, task="push"))
-    assert asked == [True, False, True]
-
-
-def test_an_episode_of_place_is_long_enough_and_says_what_it_is(tmp_path: Path) -> None:
-    assert main(["simulate", "record", str(tmp_path / "data"), "--task", "place", "--episodes", "1"]) == 0
-    (info,) = RldsSource(DataConfig(path=str(tmp_path / "data"))).infos()
-    assert info.num_steps == 81
-    assert (
-        record_episode(0, RecordingSpec(DOMAIN_A, 2, task="place")).language_instruction == "put the block on the mark"
-    )
-
-
-def test_play_of_place_goes_down_to_the_block_and_uses_the_gripper() -> None:
-    motion = play(arm_for("place", DOMAIN_A), "place", 41, np.random.default_rng(0), script=False)
-    told = motion.commanded_gripper - motion.gripper  # at the first control step of each model step
-    assert (np.abs(told[::4]) > 0.4).any()
-    assert motion.poses[:, 2].min() < BLOCK_M / 2 + GRASP_M + 0.02  # at the height of a grasp

@@ -94,10 +94,3 @@ def record_name(spec: RecordingSpec, index: int) -> str:
 def test_a_damaged_file_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_simulation(written(tmp_path, RecordingSpec(DOMAIN_A, 5), **changes))
-
-
-def test_what_has_another_version_here_is_named(tmp_path: Path) -> None:
-    folder = written(tmp_path, RecordingSpec("A", 5), version="0.0.1", libraries={"mujoco": "2.0"})
-    versions = read_simulation(folder).other_versions
-    assert versions.startswith("vjepa2-ac 0.0.1, here ")
-    assert "mujoco 2.0, here " in versions

@@ -75,11 +75,6 @@ def test_a_world_that_does_not_answer_is_refused_in_time_with_its_last_errors(pr
     assert "--world-timeout" in message
 
 
-def test_the_first_answer_may_take_longer_than_the_others(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worlds, "LOADING", 2)
-    assert "no answer within 0.1 s" in fail(program(first="time.sleep(1000)"), 0.05)
-
-
 @pytest.mark.usefixtures("short_wait")
 def test_a_world_that_closes_its_output_and_still_runs_is_refused(program: Program) -> None:
     assert "it has closed its output" in fail(program("os.close(1); time.sleep(1000)"), 0.1)
@@ -145,13 +140,6 @@ def test_no_task_leaves_the_folder_of_its_recordings(program: Program, tmp_path:
     assert {path.name for path in tmp_path.iterdir()} == {"a", "world.py"}
     assert file.name.endswith("_000000.npz")
     assert file.name.isprintable()
-
-
-def test_play_counts_as_no_solution_and_a_slow_world_is_recorded(program: Program, tmp_path: Path) -> None:
-    solved = "about['rate_hz'] = 0.3; answer['success'] = True\n"
-    with OtherWorld(program(first=f"{solved}{HELLO}")) as world:
-        assert record_world(world, tmp_path / "set", range(3)) == (2, 2)
-        assert record_world(world, tmp_path / "set", range(3)) == (2, 2), "nothing is recorded again"
 
 
 def test_an_error_output_of_any_length_takes_little_memory_and_its_end_is_shown(program: Program) -> None:

@@ -109,18 +109,6 @@ def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) 
         assert image[..., 0].any()
 
 
-def test_every_second_step_is_recorded_where_that_suffices(tmp_path: Path) -> None:
-    with OtherWorld(command()) as world:
-        for every in (1, 2):
-            record_world(world, tmp_path / str(every), range(1), every=every)
-    whole, half = (np.load(tmp_path / str(every) / "Come_000000.npz") for every in (1, 2))
-    steps = min(len(half["states"]), len(whole["states"]) // 2)
-    assert steps > 2
-    assert (float(whole["fps_hz"]), float(half["fps_hz"])) == (10.0, 5.0)
-    np.testing.assert_allclose(half["states"][:steps], whole["states"][::2][:steps])
-    np.testing.assert_allclose(half["actions"][:steps], whole["actions"][1::2][:steps])
-
-
 @pytest.mark.parametrize(
     ("world", "said"),
     [
