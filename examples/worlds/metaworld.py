@@ -7,21 +7,20 @@ State and targets: the hand in the frame of the robot's base: metres, extrinsic 
 targets), closedness from 0 (open) to 1. A wrong task prints all.
 """
 
-import argparse
+from serve_environment import serve  # first: it moves this folder behind installed packages
+
+# isort: split
 import importlib.metadata
-import sys
 
 import mujoco
 import numpy as np
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE as ENVIRONMENTS
-from metaworld.policies import ENV_POLICY_MAP as EXPERTS
+from metaworld_expert import Expert, read_options
 from scipy.spatial.transform import Rotation
-from serve_environment import serve  # isort: split - it moves this folder behind installed packages
 
 RATE_HZ, ENV_STEPS, STEPS = 16, 5, 60  # environment steps of a control step; control steps that suffice
 GAIN, DAMPING, LEAD_M = 20.0, 2.0, 0.1  # the last: how far the point that pulls the hand may be ahead of it
-NEAR_M, REACH_M, TRAVEL_M = 0.01, 0.1, 0.07  # there; the expert's targets are no farther; travel of both fingers
-SURE = 3  # after so many environment steps of success the expert holds still: many go on, and undo it
+NEAR_M, TRAVEL_M = 0.01, 0.07  # there; travel of both fingers
 DOWN = Rotation.from_euler("y", np.pi / 2)  # of the hand: angles count from there, far from their singularity
 
 
@@ -31,14 +30,13 @@ class World:
         self.env._freeze_rand_vec, self.env.seeded_rand_vec, self.env.max_path_length = False, True, np.inf
         self.env.model.vis.quality.shadowsize = 1024  # of 4096: by software the same picture in half the time
         self.renderer = mujoco.Renderer(self.env.model, options.size, options.size)
-        self.policy = EXPERTS[options.task]()  # it calls `move`, which would make an action of a place and a gain
-        sys.modules[self.policy.__module__].move = lambda hand, to_xyz, p: setattr(self, "aim", (to_xyz, p)) or hand
+        self.expert = Expert(options.task)
 
     def reset(self, seed):
         self.env.seed(seed)
         self.env.reset()
         mujoco.mj_forward(self.env.model, self.env.data)  # Meta-World leaves some places as they were before
-        self.observation, self.solved, self.closing = self.env._get_obs(), 0, -1.0
+        self.observation, self.closing, self.expert.solved = self.env._get_obs(), -1.0, 0
         self.found = self.env.evaluate_state(self.observation, np.zeros(4))[1]
         return self.state(), self.info()
 
@@ -52,18 +50,14 @@ class World:
         ahead, way = self.env.data.mocap_pos[0] - hand, scale * np.clip(gain * (place - hand), -1.0, 1.0)
         way = np.clip(ahead + way, -LEAD_M, LEAD_M) - ahead
         self.observation, _, _, _, self.found = self.env.step(np.append(way / scale, self.closing))
-        self.solved = self.solved + 1 if self.found["success"] else 0
-        if self.solved == SURE:
-            self.aim = self.observation[:3], 10.0
+        self.expert.watch(self.observation[:3], self.found["success"])
 
     def step(self, target):
         for left in range(ENV_STEPS, 0, -1):
             if target is None:
-                hand = self.observation[:3]
-                if self.solved < SURE:
-                    self.closing = float(self.policy.get_action(self.observation.copy())[3])
-                held = [*(hand + np.clip(self.aim[0] - hand, -REACH_M, REACH_M)), *self.state()[3:6], self.closing > 0]
-                self.pull(*self.aim)
+                held, aim, self.closing = self.expert.act(self.observation, self.closing)
+                held = [*held, *self.state()[3:6], self.closing > 0]
+                self.pull(*aim)
                 continue
             held, change = target, target - self.state()
             is_there = np.linalg.norm(change[:3]) < NEAR_M or left == 1
@@ -82,11 +76,7 @@ class World:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("task", choices=EXPERTS)
-    parser.add_argument("--camera", default="corner4", help="corner, corner2, corner3, topview, behindGripper")
-    parser.add_argument("--size", type=int, default=256, help="pixels of the square image, at most 480")
-    options = parser.parse_args()
+    options = read_options(__doc__)
     name, words = "Meta-World " + importlib.metadata.version("metaworld"), options.task.removesuffix("-v3")
     serve(World(options), world=name, task=options.task, instruction=words.replace("-", " "), rate_hz=RATE_HZ,
           steps=STEPS, expert=True)  # fmt: skip

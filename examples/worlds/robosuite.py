@@ -7,15 +7,15 @@ State and targets: the grip site in the frame of the robot's base: metres, extri
 closedness of the gripper from 0 (open) to 1. Every arm has the Panda's gripper; the door has no latch.
 """
 
-import argparse
+from serve_environment import serve  # first: it moves this folder behind installed packages
 
+# isort: split
 import numpy as np
 import robosuite
 from robosuite.controllers import load_composite_controller_config
 from robosuite_experts import expert_of, left_m
-from robosuite_view import TASKS, set_view
+from robosuite_view import TASKS, read_options, set_view
 from scipy.spatial.transform import Rotation
-from serve_environment import serve  # isort: split - it moves this folder behind installed packages
 
 RATE_HZ, MOST_M, MOST_RAD = 15, 0.05, 0.5  # the controller's largest change in a control step
 
@@ -74,14 +74,7 @@ class World:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("task", choices=TASKS)
-    parser.add_argument("--robot", default="Panda", help="Panda, Sawyer, IIWA, UR5e, Kinova3")
-    for name in ("--camera", "--mount"):
-        parser.add_argument(name, type=float, default=0.0, help="degrees by which camera or arm is turned")
-    parser.add_argument("--look", choices=["day", "dusk"], default="day", help="light and colours")
-    parser.add_argument("--size", type=int, default=256, help="pixels of the square image")
-    options = parser.parse_args()
+    options = read_options(__doc__)
     words, steps, *_ = TASKS[options.task]
     name = f"robosuite {robosuite.__version__}"
     serve(World(options), world=name, task=options.task, instruction=words, rate_hz=RATE_HZ, steps=steps, expert=True)

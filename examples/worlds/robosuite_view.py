@@ -1,4 +1,9 @@
-"""Camera, light and mounting of robosuite.py. A lamp throws shadows: without them one camera shows no heights."""
+"""Options of robosuite.py, and its camera, light and mounting.
+
+A lamp throws shadows: without them one camera shows no heights.
+"""
+
+import argparse
 
 import mujoco
 import numpy as np
@@ -31,3 +36,14 @@ def set_view(sim, options, mount):
         model.light_dir[:], model.light_diffuse[:] = (-0.6, 0.3, -1.0), (0.35, 0.25, 0.2)
         model.mat_texid[:], model.mat_rgba[:, :3] = -1, model.mat_rgba[:, :3] * (0.4, 0.55, 0.5)
     return np.array(model.body_pos[base])
+
+
+def read_options(description):
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("task", choices=TASKS)
+    parser.add_argument("--robot", default="Panda", help="Panda, Sawyer, IIWA, UR5e, Kinova3")
+    parser.add_argument("--camera", type=float, default=0.0, help="degrees by which it is turned about the table")
+    parser.add_argument("--mount", type=float, default=0.0, help="degrees by which the arm is mounted turned")
+    parser.add_argument("--look", choices=["day", "dusk"], default="day", help="light and colours")
+    parser.add_argument("--size", type=int, default=256, help="pixels of the square image")
+    return parser.parse_args()

@@ -87,7 +87,7 @@ def _converter(options: argparse.Namespace) -> None:
 
     Without NAME: list the scripts.
     """
-    from vjepa2_ac.init.converters import converter_text, converters
+    from vjepa2_ac.init.look import converter_text, converters
 
     if options.name is not None:
         print(converter_text(options.name), end="")

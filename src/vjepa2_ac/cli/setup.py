@@ -161,13 +161,14 @@ def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
     """Return the commands from a trial to the real run, and what each is for."""
     trial, steps = f"runs/{name}-trial", draft.config.training.steps
     short = (f"training.steps={_TRIAL_STEPS}", "validation.every=50", "checkpoint.every=50")
-    of_trial = ", ".join(filter(None, (f"{_TRIAL_STEPS} steps", draft.time_of(_TRIAL_STEPS))))
-    of_run = draft.time_of(steps) or f"{steps:,} times the trial's step time"
     return [
         (shell_command("train", out, "--check"), "everything that can fail, before the first step"),
-        (shell_command("train", out, f"run_dir={trial}", *short), f"{of_trial}: does it learn, how long is a step?"),
+        (
+            shell_command("train", out, f"run_dir={trial}", *short),
+            f"{_TRIAL_STEPS} steps: does it learn, how long is a step?",
+        ),
         (shell_command("evaluate", trial), "against the base, on held-out episodes"),
-        (shell_command("train", out), f"the real run, {of_run}; repeat to resume"),
+        (shell_command("train", out), f"the real run, {steps:,} times the trial's step time; repeat to resume"),
     ]
 
 

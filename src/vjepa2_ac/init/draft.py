@@ -21,12 +21,10 @@ from vjepa2_ac.model.model_files import OFFICIAL, PUBLISHED
 from vjepa2_ac.reporter import duration
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.training.cost import GIGABYTE, USUAL_GPU, estimate_memory
-from vjepa2_ac.training.flops import clip_flops, frame_flops
 
 RELEASED = "checkpoints/vjepa2-ac-vitg.pt"
 SCRATCH_ENCODER = "checkpoints/vjepa2.1-vitb-384.pt"
 TINY = f"{BUILTIN}sim-tiny"
-_UTILIZATION = 0.4  # of the speed of one large product: assumed
 _BATCHES = ((4, False), (4, True), (2, True), (1, True))  # and whether with gradient checkpointing
 _BATCHES_ON_GPU = ((16, False), (8, False), *_BATCHES)
 _CLIPS_A_STEP = 32  # of every model but the tiny one
@@ -52,7 +50,6 @@ class Machine:
     has_bf16: bool  # the GPU
     cores: int
     free_bytes: int  # of the disk where runs and caches go
-    flops: float | None = None  # operations a second of the GPU's products, measured
 
     @property
     def precision(self) -> Literal["bf16", "fp16", "fp32"]:
@@ -77,14 +74,14 @@ def this_machine() -> Machine:
     """Return what this machine has."""
     import torch
 
-    from vjepa2_ac.distributed import cuda_index, has_bf16, matmul_speed
+    from vjepa2_ac.distributed import cuda_index, has_bf16
 
     cores, free = len(os.sched_getaffinity(0)), storage.free_bytes(Path.cwd())
     if not torch.cuda.is_available():
         return Machine(None, USUAL_GPU, False, cores, free)
     device = torch.device("cuda", cuda_index())
-    card, dtype = torch.cuda.get_device_properties(device), torch.bfloat16 if has_bf16() else torch.float16
-    return Machine(card.name, card.total_memory, has_bf16(), cores, free, matmul_speed(device, dtype))
+    card = torch.cuda.get_device_properties(device)
+    return Machine(card.name, card.total_memory, has_bf16(), cores, free)
 
 
 @dataclass(frozen=True)
@@ -141,8 +138,6 @@ class Draft:
     knobs: Knobs
     config: Config
     costs: list[str]  # a line each
-    step_hours: float | None = None  # None: there is no GPU, or the model is the tiny one
-    encoding_hours: float = 0.0  # before the first step
 
     def text(self, found: FoundData, machine: Machine) -> str:
         """Return the config as a person reads it."""
@@ -156,10 +151,6 @@ class Draft:
         if unsure := guesses(self.knobs):
             head.append(f"Look at what is marked GUESSED: {', '.join(unsure)}.")
         return as_yaml(head, self.knobs)
-
-    def time_of(self, steps: int) -> str | None:
-        """Return how long so many optimizer steps take, with encoding before the first; None: not known."""
-        return None if self.step_hours is None else duration(self.encoding_hours + steps * self.step_hours)
 
 
 def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_dir: str) -> Draft:
@@ -203,18 +194,8 @@ def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_di
     size = f"{needed / GIGABYTE:.1f} GB; {fits} on {machine.room}"
     costs = [f"Memory, as `vjepa2-ac doctor` counts: {size}.", *costs]
     if machine.gpu is None:
-        costs.append("Time: not known without the GPU. `vjepa2-ac init` on its machine sets batch size and precision.")
-    if machine.flops is None:
-        return Draft(knobs, config, costs)
-    sizes, flops_per_hour = base_sizes(config.model), machine.flops * _UTILIZATION * 3600
-    clip = clip_flops(config, sizes)
-    step_flops = _CLIPS_A_STEP * (clip.predictor if config.data.takes_latents else clip.total)
-    encoding_flops = num_encoded * frame_flops(sizes)
-    draft = Draft(knobs, config, costs, step_flops / flops_per_hour, encoding_flops / flops_per_hour)
-    speed = f"{machine.flops / 1e12:.0f} TFLOP/s measured here for one product"
-    time = draft.time_of(config.training.steps)
-    costs.append(f"Time: {time}, if a step reaches {_UTILIZATION:.0%} (assumed) of {speed}.")
-    return draft
+        costs.append("`vjepa2-ac init` on the machine with the GPU sets batch size and precision.")
+    return Draft(knobs, config, costs)
 
 
 def _config_of(knobs: Knobs) -> Config:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib.resources
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -21,13 +23,35 @@ from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
 from vjepa2_ac.data.splits import describe_splits, held_out_by
 from vjepa2_ac.episode import STATE_DIM, Progress
 from vjepa2_ac.errors import InputError, UserError, counted, shell_command
-from vjepa2_ac.init.converters import way_by
+from vjepa2_ac.init.described import droid, like_droid, look_at_lerobot, look_at_rlds
 from vjepa2_ac.init.found import FoundData, Knob, idle_rule, pick_camera, plain
-from vjepa2_ac.init.lerobot import look_at_lerobot
-from vjepa2_ac.init.rlds import droid, like_droid, look_at_rlds
 from vjepa2_ac.storage.places import BUILTIN
 
 _CONNECTIONS = 16  # reads at once
+_CONVERTERS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "convert"
+
+
+def converters() -> dict[str, str]:
+    """Return what each converter makes of what, by its name."""
+    texts = {path.stem: path.read_text(encoding="utf-8") for path in sorted(_CONVERTERS.glob("*.py"))}
+    return {name: (ast.get_docstring(ast.parse(text)) or "").split("\n\n")[0] for name, text in texts.items()}
+
+
+def converter_text(name: str) -> str:
+    """Return a converter, whole.
+
+    Raises:
+        InputError: There is none of that name.
+    """
+    if name not in converters():
+        needed = f"one of {', '.join(converters())}"
+        raise InputError(where="command line", found=f"no converter {name}", needed=needed)
+    return (_CONVERTERS / f"{name}.py").read_text(encoding="utf-8")
+
+
+def way_by(name: str) -> str:
+    """Return the line that begins with a converter."""
+    return f"`vjepa2-ac data converter {name} > {name}.py`, then `python {name}.py --help`"
 
 
 def look_at_npz(path: str) -> FoundData:

@@ -1,23 +1,30 @@
-"""An RLDS data set: its episodes by dataset_info.json, its features by features.json."""
+"""Data sets that describe themselves: RLDS by dataset_info.json and features.json, LeRobot by meta/info.json."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import prod
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from vjepa2_ac import storage
+from vjepa2_ac.config import LeRobotData
+from vjepa2_ac.config.sources import JOINT_VELOCITY
+from vjepa2_ac.data.files import EpisodeFiles
+from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled, list_by_template, read_info
+from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
 from vjepa2_ac.data.sources.rlds.episode import Record
 from vjepa2_ac.data.sources.rlds.shards import Shard, dataset_name, find_shards, open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Kind, span_at
 from vjepa2_ac.errors import InputError, MissingFileError, UserError, counted
 from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
-from vjepa2_ac.init.poses import Column, Samples, find_pose, measured_columns, vector_state
-from vjepa2_ac.storage.structured import read_json_object
+from vjepa2_ac.init.poses import Column, Range, Samples, find_pose, measured_columns, vector_state
+from vjepa2_ac.storage.places import SIMULATION_FILE
+from vjepa2_ac.storage.structured import json_object, read_json_object
 
 DROID = "gs://gresearch/robotics/droid/1.0.1"
 RANGES = "gs://openpi-assets/droid/droid_sample_ranges_v1_0_1.json"
@@ -32,9 +39,8 @@ _BRIDGE_POSE = {
     "gripper_closed": Knob(0.0),
 }
 _DROID_RATE_HZ, _BRIDGE_RATE_HZ, _UNKNOWN_RATE_HZ = 15.0, 5.0, 10.0
-_SIMULATION = "simulation.json"  # beside the shards of `vjepa2-ac simulate record`
 _VELOCITIES = "steps/action_dict/joint_velocity"
-_SAMPLED = 24  # records whose values are looked at
+_SAMPLED = 24  # records or episodes whose numbers are compared with their names
 _NUMBERS = ("float", "int", "uint", "bool")
 _ALL_KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")
 _PATHS = frozenset({"file_path", "episode_id", "recording_folderpath"})
@@ -70,7 +76,7 @@ def look_at_rlds(path: str) -> FoundData:
     episodes = sum(shard.episodes for shard in shards)
     name = dataset_name(path)
     if name in _DROID_NAMES and _DROID_FEATURE in features:
-        is_simulated = storage.exists(storage.join(path, _SIMULATION))
+        is_simulated = storage.exists(storage.join(path, SIMULATION_FILE))
         return like_droid(path, episodes, "the simulated arm" if is_simulated else "DROID")
     images, depth = _cameras(features)
     where = storage.join(path, "features.json")
@@ -158,7 +164,7 @@ def _inside(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
         kind = next((one for one in ("image", "text", "tensor") if one in content), "")
         about = content.get(kind) or {}
         sizes = [int(size) for size in about.get("shape", {}).get("dimensions", [])]
-        yield name, _Feature(kind, str(about.get("dtype", "")), prod(sizes), sizes[-1] if len(sizes) == 3 else 0)
+        yield name, _Feature(kind, str(about.get("dtype", "")), math.prod(sizes), sizes[-1] if len(sizes) == 3 else 0)
 
 
 def _cameras(features: Mapping[str, _Feature]) -> tuple[list[str], list[str]]:
@@ -223,3 +229,79 @@ def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[
         return Knob(list(paths or names), "what tells episodes apart; no record could be read", is_guess=True)
     why = "no feature tells the episodes apart; writing the set again may move episodes between train and test"
     return Knob("record", why, is_guess=True)
+
+
+# ---- LeRobot ----
+
+_STATISTICS = "meta/stats.json"  # without it (v2.1) the sampled episodes give the range
+_MAX_BYTES = 16 << 20
+_OURS = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "subtask_index"})
+_DROID_GRIPPER = "observation.state.gripper_position"
+_OF_DROID = frozenset({"building", "collector_id"})  # columns of its ports to LeRobot
+
+
+def look_at_lerobot(path: str) -> FoundData:
+    """Look at a LeRobot data set.
+
+    Raises:
+        InputError: It cannot be used, or has no camera or no numbers of the robot.
+    """
+    info = read_info(path)
+    cameras = [name for name, one in info.features.items() if one.is_camera and not is_no_camera(name)]
+    depth = [name for name, one in info.features.items() if one.is_depth or (one.is_camera and is_no_camera(name))]
+    camera, all_cameras = camera_knobs(cameras, depth, info.where)
+    columns = {
+        name: Column(one.width, one.names)
+        for name, one in info.features.items()
+        if one.is_numbers and name not in _OURS
+    }
+    samples = _sampled_rows(info, measured_columns(columns))
+    pose = find_pose(columns, samples, control_rate_hz=info.fps, range_of=partial(_range_of, path))
+    if pose and _DROID_GRIPPER in pose["state"].value and info.features.keys() >= _OF_DROID:
+        pose |= {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
+    success = next((name for name in info.features if "success" in name), None)
+    return FoundData(
+        source="lerobot",
+        path=path,
+        knobs={
+            "camera": camera,
+            "lerobot": {
+                **(pose or vector_state(columns, info.where)),
+                "cameras": all_cameras,
+                "success": Knob(success),
+            },
+        },
+        rate_hz=Knob(info.fps, "of meta/info.json"),
+        states="pose" if pose else "vector",
+        episodes=info.episodes,
+        steps=info.frames,
+        idle=idle_rule(has_velocities=JOINT_VELOCITY in columns) if pose else None,
+        about=(f"LeRobot {info.version}, {counted(info.episodes, 'episode')} at {info.fps:g} a second",)
+        + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
+    )
+
+
+def _sampled_rows(info: DatasetInfo, columns: Mapping[str, Column]) -> Samples:
+    """Return the numbers of the first episodes; nothing if they cannot be read, which `data check` will explain."""
+    read: dict[str, list[np.ndarray]] = {name: [] for name in columns}
+    with suppress(UserError, OSError, KeyError):
+        files = list_by_template(info.root, info.data_path)
+        first = next(iter(files.values()))
+        rows_in = ParquetRows(EpisodeFiles(LeRobotData(path=info.root)), list(columns), f"{first.version} {first.size}")
+        for number in range(min(_SAMPLED, info.episodes)):
+            file = filled(info.data_path, number // info.chunk_episodes, number if info.version == "v2.1" else 0)
+            rows = rows_in.rows(storage.join(info.root, file), number)
+            for name in columns:
+                read[name].append(rows[name].astype(np.float64))
+    return {name: episodes for name, episodes in read.items() if episodes}
+
+
+def _range_of(root: str, column: str, index: int) -> Range | None:
+    """Return the least and the greatest value of a number by the statistics of the data set; None: not known."""
+    where = storage.join(root, _STATISTICS)
+    with suppress(OSError, UserError, KeyError, IndexError, TypeError, ValueError):
+        statistics = json_object(storage.read_bounded(where, _MAX_BYTES), where=where)[column]
+        low, high = float(statistics["min"][index]), float(statistics["max"][index])
+        if math.isfinite(low) and math.isfinite(high):
+            return low, high
+    return None
