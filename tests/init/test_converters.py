@@ -283,26 +283,17 @@ ONE = "0.1,0.2,0.3,0.4,0.5,0.6,0.7"
     ("rows", "found"),
     [
         (f"{EULER_HEADER}\n{ONE}\n,0.2,0.3,0.4,0.5,0.6,0.7", "line 3, column x: an empty cell. Expected a number"),
-        (f"{EULER_HEADER}\n{ONE}\n0.1,0.2,0.3,0.4", "line 3, column pitch: an empty cell"),
         (f"{EULER_HEADER}\n\n{ONE.replace('0.7', 'open')}", "line 3, column gripper: 'open'. Expected a number"),
-        (f"{EULER_HEADER}\n{ONE.replace('0.2', 'nan')}", "line 2, column y: 'nan'. Expected a number"),
         (f"{EULER_HEADER}\n0,1,0,2,0,3,0,4,0,5,0,6,0,7", "line 2: 14 cells. Expected 7, as in the first line"),
         (f"{EULER_HEADER},X\n{ONE},1", "2 columns are called x. Rename all but one"),
         (f"{EULER_HEADER}", "no rows. Expected a line with the names"),
-        ("", "no rows. Expected a line with the names"),
         (PLAIN.encode("utf-16"), r"not a text table .*Save the table as CSV \(UTF-8\)"),
         (
             f"x,y,z,gripper\n{ONE}",
             "no columns for the rotation; it has x, y, z, gripper. Expected roll, pitch, yaw, or",
         ),
         (f"x,y,z,rx,ry,rz,gripper\n{ONE}", "rx, ry, rz can be rotation_vector, euler_xyz or euler_xyz_degrees. Pass"),
-        ("x,y,z,q0,q1,q2,q3,gripper\n0,0,0,0,0,0,1,0", "q0, q1, q2, q3 can be quaternion_xyzw or quaternion_wxyz"),
         ("x,y,z,qx,qy,qz,qw,gripper\n0,0,0,0,0,0,1,0\n0,0,0,0,0,0,0,0", "line 3: 0, 0, 0, 0. Expected quaternion_xyzw"),
-        ("x,y,z,rx,ry,rz,rw,gripper\n0,0,0,0.1,0.2,0.3,0.4,0", "line 2: 0.1, 0.2, 0.3, 0.4. Expected quaternion_xyzw"),
-        (
-            f"{EULER_HEADER}\n{ONE.replace('0.4', '178')}",
-            "line 2: 178, 0.5, 0.6. Expected euler_xyz .*Check --rotation",
-        ),
         (f"{EULER_HEADER}\n{ONE.replace('0.1', '412')}", "line 2: 412, 0.2, 0.3. Expected .*5 m.*--position-unit"),
         (f"{EULER_HEADER}\n{ONE.replace('0.7', '85')}", "line 2: 85. Expected .*0 to 1. Set --gripper-open"),
     ],
@@ -319,15 +310,10 @@ XYZW, WXYZ, VECTOR = ROTATIONS.as_quat(), ROTATIONS.as_quat(scalar_first=True), 
     ("columns", "rotation", "numbers"),
     [
         ("rx,ry,rz,rw", None, XYZW),
-        ("rw,rx,ry,rz", None, WXYZ),
         ("qw,qx,qy,qz", "quaternion_wxyz", WXYZ),
         ("quat_x,quat_y,quat_z,quat_w", None, XYZW),
-        ("rot.w,rot.x,rot.y,rot.z", "quaternion_xyzw", WXYZ),
         ("q0,q1,q2,q3", "quaternion_wxyz", WXYZ),
-        ("quat_1,quat_2,quat_3,quat_4", "quaternion_xyzw", XYZW),
         ("rotvec_x,rotvec_y,rotvec_z", None, VECTOR),
-        ("axis_angle1,axis_angle2,axis_angle3", None, VECTOR),
-        ("wx,wy,wz", None, VECTOR),
         ("rx,ry,rz", "rotation_vector", VECTOR),
         ("rx,ry,rz", "euler_xyz", STATES[:, 3:6]),
         ("roll,pitch,yaw", "euler_xyz_degrees", np.degrees(STATES[:, 3:6])),
@@ -339,13 +325,6 @@ def test_rotations_are_read_by_name_or_as_requested(
     table = table_of(f"x,y,z,{columns},gripper", with_rotation(numbers))
     states = read_table(tmp_path / "a.csv", table, rotation=rotation)
     assert np.abs(states - STATES).max() < 1e-9
-
-
-def test_millimetres_and_an_inverted_gripper_are_converted(tmp_path: Path) -> None:
-    own = STATES * ([1000] * 3 + [1] * 4)
-    own[:, 6] = 85 * (1 - STATES[:, 6])
-    options = {"position_unit": "mm", "gripper_open": 85.0, "gripper_closed": 0.0}
-    assert np.abs(read_table(tmp_path / "a.csv", table_of(EULER_HEADER, own), **options) - STATES).max() < 1e-12
 
 
 # ROS bags.
@@ -447,7 +426,6 @@ def test_a_bag_becomes_an_episode(storage: StoragePlugin, encoding: str, tmp_pat
         ({"encoding": "16UC1"}, CHOSEN, r"images of 16UC1; read are rgb8.*depth is not"),
         ({"skip": range(5, 15)}, CHOSEN, r"/camera: silent for 1\.\d+ s"),
         ({}, ("--pose", "/tf", *CHOSEN[2:]), "no topic /tf; it has /camera, /fingers, /matrix, /pose"),
-        ({}, ("--pose", "/pose", "--gripper", "/fingers:width"), "has no width; it has header, name, position"),
         (
             {},
             (*CHOSEN[:4], "--gripper-open", 0.001, "--gripper-closed", 0),
@@ -458,38 +436,11 @@ def test_a_bag_becomes_an_episode(storage: StoragePlugin, encoding: str, tmp_pat
             CHOSEN,
             r"/fingers:position: 9 joints, numbered from 0 to 8: arm/joint0, .*right.finger. Expected the gripper",
         ),
-        ({"joints": JOINTS, "arm": np.ones_like(ARM)}, CHOSEN, "9 joints, numbered from 0 to 8: arm/joint0"),
-        (
-            {"joints": JOINTS, "arm": ARM},
-            (*CHOSEN[:4], "--gripper-open", 6, "--gripper-closed", -6),
-            "9 joints, numbered from 0 to 8: arm/joint0",
-        ),
-        (
-            {"joints": JOINTS[-3:], "arm": -3 * FINGER[:, None]},  # the sum of three joints is in range
-            CHOSEN,
-            "3 joints, numbered from 0 to 2: arm/joint6, left.finger, right.finger",
-        ),
-        (
-            {"joints": JOINTS[:2], "arm": np.empty((STEPS, 0)), "second_finger": -1},
-            (*CHOSEN[:4], "--gripper-open", 0.04, "--gripper-closed", -0.04),
-            "2 joints, numbered from 0 to 1: arm/joint0, arm/joint1",
-        ),
-        (
-            {"joints": JOINTS[:1] + JOINTS[-1:], "arm": ARM[:, :0]},
-            ("--pose", "/pose", "--gripper", "/fingers:position[gripper]"),
-            r"no message has a measurement\. The joints of the last one: arm/joint0, right\.finger\.",
-        ),
-        (
-            {"joints": JOINTS, "arm": ARM, "is_alternating": True},
-            CHOSEN,
-            "/fingers:position: messages have different joints",
-        ),
         (
             {"orientations": dict.fromkeys(range(STEPS), NO_ORIENTATION)},
             CHOSEN,
             "/pose: no message has a measurement",
         ),
-        ({"orientations": dict.fromkeys(range(5, 15), NO_ORIENTATION)}, CHOSEN, r"/pose: silent for 1\.\d+ s"),
         (
             {"orientations": {7: (0.0, 0.0, 0.0, 0.5)}},
             CHOSEN,

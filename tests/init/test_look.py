@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from copied_sets import WRITERS, write_lerobot
@@ -125,17 +124,6 @@ def test_camera_of_the_config_is_the_chosen_feature(form: str, features: list[st
     assert "data.camera" in guessed
 
 
-def test_depth_without_a_mark_is_not_offered_as_a_camera(tmp_path: Path) -> None:
-    folder = write_lerobot(tmp_path / "set", range(2))
-    info = json.loads((folder / "meta/info.json").read_text())
-    info["features"]["observation.images.depth"] = info["features"]["observation.images.exterior_1_left"]
-    del info["features"]["observation.images.exterior_1_left"]
-    (folder / "meta/info.json").write_text(json.dumps(info))
-    found = look_at(str(folder))
-    assert plain(found.knobs)["lerobot"]["cameras"] == {"wrist_left": "observation.images.wrist_left"}
-    assert "observation.images.depth" in found.about[1]
-
-
 def test_depth_maps_are_not_offered_as_cameras(tmp_path: Path) -> None:
     folder = write_lerobot(tmp_path / "set", range(3))
     info = json.loads((folder / "meta/info.json").read_text())
@@ -229,9 +217,3 @@ def test_a_name_of_the_hub_is_recognized(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=r"hf://datasets/someone/their_set"):
         look_at("someone/their_set")
-
-
-def test_an_npz_without_states_says_what_it_has(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", poses=np.zeros((4, 7)), frames=np.zeros((4, 8, 8, 3), np.uint8))
-    with pytest.raises(InputError, match=r"poses \[4, 7\] float64, frames \[4, 8, 8, 3\] uint8.*states \[steps, 7\]"):
-        look_at(str(tmp_path))

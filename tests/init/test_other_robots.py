@@ -174,12 +174,6 @@ def test_columns_of_two_arms_are_not_mixed() -> None:
     assert "observation.right_ee_pose" in pose["state"].why
 
 
-def test_a_measured_arm_without_rivals_is_no_guess() -> None:
-    assert not proposed(" ".join([*ONE_ARM, "gripper"]), None)["state"].is_guess
-    assert not proposed(" ".join(f"robot0_{name}" for name in [*ONE_ARM, "gripper"]), None)["state"].is_guess
-    assert proposed(" ".join(f"target_{name}" for name in [*ONE_ARM, "gripper"]), None)["state"].is_guess
-
-
 def test_columns_of_position_rotation_and_fingers_are_joined() -> None:
     samples: Samples = {
         "steps/observation/eef_pos": [one[:, :3] for one in EPISODES],
@@ -278,16 +272,6 @@ def test_the_pose_of_another_thing_is_not_the_robot(name: str) -> None:
     assert find_pose({f"observation.{name}": Column(6), "observation.gripper": Column(1)}) is None
 
 
-def test_two_arms_in_columns_called_as_droids_are_not_mixed() -> None:
-    sides = [("left", "cartesian"), ("right", "gripper"), ("right", "cartesian"), ("left", "gripper")]
-    pose = find_pose(
-        {f"observation.{side}.{kind}_position": Column(6 if kind == "cartesian" else 1) for side, kind in sides}
-    )
-    assert pose is not None
-    assert pose["state"].value == ["observation.left.cartesian_position", "observation.left.gripper_position"]
-    assert pose["state"].is_guess
-
-
 def test_rotation_vectors_in_droids_columns_are_noticed() -> None:
     samples = {
         "steps/observation/cartesian_position": [written(one, "rotation_vector")[:, :6] for one in EPISODES],
@@ -313,13 +297,6 @@ def test_columns_of_robosuite_are_read() -> None:
     assert pose["state"].value == list(samples)[:3]
     assert pose["select"].value == [0, 1, 2, 3, 4, 5, 6, 7]
     assert pose["gripper_closed"].value == 0.0
-
-
-def test_rotation_vectors_in_degrees_are_a_guess_that_says_so() -> None:
-    numbers = [one * [1, 1, 1, 57.3, 57.3, 57.3, 1] for one in (written(one, "rotation_vector") for one in EPISODES)]
-    pose = proposed("x y z rotvec_x rotvec_y rotvec_z gripper", numbers)
-    assert pose["rotation"].is_guess
-    assert "rotation vectors in degrees cannot be read" in pose["rotation"].why
 
 
 @pytest.mark.parametrize(
