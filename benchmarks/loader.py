@@ -7,7 +7,7 @@ each episode on this machine, which checks the CRC of the record, and all later 
 the same records: decoding every frame of every camera; and TFDS in an interpreter that has tensorflow_datasets, with
 one thread as ours, nothing shuffled and nothing interleaved, with all pictures decoded and with SkipDecoding and 16
 frames decoded afterwards. TFDS reads in file order only: a clip costs it an episode. Its steps are taken from
-the episode in two ways (`batch` it and slice; `skip` and `take`), and the faster one counts. Videos: see video.py.
+the episode in two ways (`batch` it and slice; `skip` and `take`), and the faster one counts.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from unittest.mock import patch
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import simplejpeg
-import video
 from synthetic_droid import draw_episodes
 
 from vjepa2_ac.config import DataConfig, DiskCacheConfig, RldsData
@@ -99,7 +98,6 @@ def main(options: Sequence[str] | None = None) -> None:
         measure_workers(config)
         measure_index(config)
     print()
-    video.measure_all(max(arguments.clips // 4, 1))
 
 
 def measure_clips(config: RldsData, clips: int, tfds_python: str | None) -> None:

@@ -64,7 +64,8 @@ SLOW = (
     "benchmarks/", "distributed/test_nothing_hangs", "distributed/test_shared_work", "explore/test_command",
     "explore/test_page_in_browser", "judge/", "reports/test_page_in_browser", "serving/test_real_client",
     "test_extending", "test_missing",
-    "test_notebook", "test_quickstart", "test_site", "test_spot", "test_wheel", "training/test_soak",
+    "test_notebook", "test_quickstart", "test_site", "test_spot", "test_sweeps", "test_wheel",
+    "training/test_soak",
 )  # fmt: skip
 """Whole programs: `make test-slow`."""
 

@@ -1,23 +1,18 @@
-"""The notebook: a real kernel runs it as it is, and with its first line changed to a file of official form."""
+"""The notebook: a real kernel runs it as it is."""
 
-import json
 import re
-import shutil
 from pathlib import Path
-from typing import Any
 
-import matplotlib.pyplot as plt
 import nbformat
 import pytest
 import yaml
 from nbclient import NotebookClient
 
-from paths import GOLDEN, ROOT
+from paths import ROOT
 
 NOTEBOOK = ROOT / "examples/first_hour.ipynb"
 LINE = 'MODEL = "builtin:sim-tiny"'
 OTHER = 'MODEL = "checkpoints/vjepa2-ac-vitg.pt"'
-SIZES = {"image_size": 64, "encoder": {"heads": 4}, "predictor": {"heads": 4}}  # tests/golden/model/tiny.json
 
 
 def executed(folder: Path) -> tuple[str, int]:
@@ -41,13 +36,6 @@ def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def code() -> list[str]:
     return [cell.source for cell in nbformat.read(NOTEBOOK, as_version=4).cells if cell.cell_type == "code"]
-
-
-def test_it_is_stored_without_outputs() -> None:
-    stored = json.loads(NOTEBOOK.read_text())
-    code = [cell for cell in stored["cells"] if cell["cell_type"] == "code"]
-    assert not [cell for cell in code if cell["outputs"] or cell["execution_count"]]
-    assert set(stored["metadata"]) == {"kernelspec", "language_info"}
 
 
 def test_one_line_is_all_that_changes() -> None:
@@ -74,37 +62,3 @@ def test_it_runs_as_it_is(tmp_path: Path) -> None:
         assert words in printed, words
     apart, still = printed.split("On average ")[-1].split(" cm apart; not moving at all would be ")
     assert float(apart) < float(still.split(" cm")[0]), "with LoRA, planning is better than standing still"
-
-
-@pytest.mark.filterwarnings("ignore:__array__ implementation")  # of a tensor that is drawn
-def test_it_runs_with_a_file_of_official_form(
-    tmp_path: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The config of real data, with an address and sizes that a test can have, stands where the notebook looks.
-
-    Without a kernel, which has to import everything anew.
-    """
-    shutil.copyfile(GOLDEN / "model/tiny.pt", tmp_path / "official.pt")
-    config: dict[str, Any] = yaml.safe_load((ROOT / "configs/debug.yaml").read_text())
-    config["data"] |= {"path": str(simulated), "frames": 3, "validation_share": 0.3, "test_share": 0.3}
-    config["data"] |= {"workers": 0, "idle": {"rule": "none"}}  # its commands are not recorded
-    config["model"] |= {"sizes": SIZES, "dtype": "float32"}
-    config["training"] |= {"steps": 2, "warmup_steps": 0, "precision": "fp32", "device": "cpu"}
-    config["training"] |= {"allow_weak_base": True}  # random weights
-    config["validation"] = {"every": 2, "clips": 4, "batch_size": 2}
-    (tmp_path / "configs").mkdir()
-    (tmp_path / "configs/debug.yaml").write_text(yaml.safe_dump(config))
-
-    (tmp_path / "examples").mkdir()
-    monkeypatch.chdir(tmp_path / "examples")
-    images: list[object] = []
-    for shows in ("matplotlib.pyplot.show", "IPython.display.display"):
-        monkeypatch.setattr(shows, lambda *shown: images.append(shown))
-    scope: dict[str, Any] = {}
-    for source in ['MODEL = "official.pt"', *code()[1:]]:
-        exec(source, scope)  # noqa: S102
-    plt.close("all")
-    printed = capsys.readouterr().out
-    assert len(images) == 6
-    assert "official.pt on cpu: 16 tokens of 48 numbers" in printed
-    assert (tmp_path / "demo/first_hour/official/run/report.html").is_file()

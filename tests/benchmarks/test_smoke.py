@@ -1,8 +1,6 @@
 """Every benchmark runs to its end with small sizes; larger ones have files of their own."""
 
 import re
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +16,6 @@ OTHERS = "\n".join(path.read_text() for path in Path(__file__).parent.glob("test
     ("name", "options", "printed"),
     [
         ("index", "--shards 2 --in-flight 4 --latency-ms 1", "a hash's"),
-        ("video", "--clips 1", "ours"),
         ("loader", "--clips 4", "index of 2,000 episodes"),
     ],
 )
@@ -30,10 +27,6 @@ def test_it_runs_to_its_end(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     for module in imported(name, monkeypatch):
-        if name in {"video", "loader"}:
-            video = sys.modules["video"]
-            short = [replace(one, steps=90, height=90, width=160) for one in video.RECORDINGS]
-            monkeypatch.setattr(video, "RECORDINGS", short)
         if name == "index":  # it changes these itself, for a process of its own
             monkeypatch.setattr(module.rlds_index, "_IN_FLIGHT", module.rlds_index._IN_FLIGHT)
             monkeypatch.setenv("STORAGE_EMULATOR_HOST", "")

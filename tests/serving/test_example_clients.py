@@ -96,7 +96,7 @@ class Affine:
 
 
 class Franka:
-    """An arm that goes where it is told: franky's `Robot` and panda-py's `Panda` at once."""
+    """An arm that goes where it is told: franky's `Robot`."""
 
     def __init__(self) -> None:
         self.flange, self.ways = np.eye(4), []
@@ -113,16 +113,6 @@ class Franka:
 
     def move(self, motion: Any, asynchronous: bool = False) -> None:
         self._go(motion.target.matrix)
-
-    def get_state(self) -> Any:
-        return types.SimpleNamespace(F_T_EE=HAND.flatten(order="F").tolist())
-
-    def get_pose(self) -> np.ndarray:
-        return self.flange @ HAND
-
-    def move_to_pose(self, pose: np.ndarray, speed_factor: float = 0.2) -> bool:
-        self._go(pose)
-        return True
 
 
 class CartesianMotion:
@@ -187,7 +177,7 @@ def driven(
     return arm.ways, gripper
 
 
-CLIENTS = ["franky", "panda_py", "droid"]
+CLIENTS = ["franky", "droid"]
 
 
 @pytest.mark.usefixtures("_franky")
