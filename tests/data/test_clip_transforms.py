@@ -91,11 +91,6 @@ def test_options_reach_a_class_and_are_checked() -> None:
             parse_config(values(transforms=[transform]), where="")
 
 
-def test_frames_may_get_another_size() -> None:
-    batch = next(training_loader(opened({"name": "cut"}), seed=0, batch_size=8))
-    assert batch.frames.shape[2:4] == (2, 5)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [

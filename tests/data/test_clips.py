@@ -1,6 +1,5 @@
 """The clips of a split are a PyTorch data set that works in any DataLoader."""
 
-import pickle
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -46,15 +45,6 @@ def test_clip_i_is_the_ith_window_sorted_by_identity_and_start(droid: Path) -> N
     assert all(one < other for one, other in pairwise(every))
 
 
-def test_splits_are_disjoint_and_training_is_the_default(droid: Path) -> None:
-    dataset = opened(droid)
-    training, validation = ({clip.episode_id for clip in dataset.clips(split)} for split in ("train", "validation"))
-    assert training
-    assert validation
-    assert not training & validation
-    assert names(list(dataset.clips())) == names(list(dataset.clips("train")))
-
-
 def test_indices_count_from_the_end_and_iteration_ends() -> None:
     clips = open_in_memory(MemorySource([9, 9])).clips()
     assert len(list(clips)) == len(clips) == 10
@@ -79,13 +69,6 @@ def test_default_collation_gives_a_batch() -> None:
     moved = explicit.to("meta")
     assert {one.device.type for one in (moved.frames, moved.states, moved.actions)} == {"meta"}
     assert moved.starts == explicit.starts
-
-
-def test_a_pickled_data_set_reads_the_same_clips(droid: Path) -> None:
-    clips = opened(droid).clips()
-    copy = pickle.loads(pickle.dumps(clips))  # noqa: S301 - our own
-    assert len(copy) == len(clips)
-    np.testing.assert_array_equal(copy[7].frames, clips[7].frames)
 
 
 @pytest.mark.parametrize("policy", ["error", "skip"])

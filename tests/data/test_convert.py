@@ -12,7 +12,6 @@ from pyarrow import parquet
 
 from lerobot_sets import Recorded, numbered, numbers_of, write_v30
 from synthetic import draw_frame, synthetic_states
-from vector_sets import draw_vector, vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.convert import convert_to_lerobot
@@ -70,24 +69,6 @@ def test_poses_read_back_with_the_same_values(droid: Path, tmp_path: Path) -> No
     ends = np.cumsum(before.table.num_steps) - 1
     assert not actions[ends].any(), "nothing follows the last step of an episode"
     np.testing.assert_allclose(actions[: ends[0]], actions_from_states(before.source.read(0).states), atol=1e-6)
-
-
-def test_vectors_and_recorded_commands_read_back_with_the_same_values(tmp_path: Path) -> None:
-    source = write_vectors(tmp_path / "in", width=14, action_width=5, episodes=3, success=True, language="stack")
-    keys = {"states": "vector", "actions": "recorded", "join_actions": "mean"}
-    assert convert_to_lerobot(config_of(source, source="npz", **keys), tmp_path / "out", SILENT) == (3, 72)
-    after = read_back(tmp_path / "out", "frames", **keys)
-    assert after.control_rate_hz == 10
-    for index in range(3):
-        episode = after.source.read(index)
-        np.testing.assert_array_equal(episode.states, vectors(24, 14, seed=index).astype(np.float32))
-        np.testing.assert_array_equal(episode.commands, vectors(24, 5, seed=1000 + index).astype(np.float32))
-        assert (episode.info.success, episode.metadata) == (True, {"language": "stack"})
-        drawn = np.stack([draw_vector(state) for state in vectors(24, 14, seed=index)])
-        assert mean_difference(episode.read_frames(range(24)), drawn) < 7  # hard edges of bright colours
-    names = {name: feature["names"] for name, feature in info_of(tmp_path / "out")["features"].items()}
-    assert names["observation.state"] == [f"state {number}" for number in range(14)]
-    assert names["action"] == [f"action {number}" for number in range(5)]
 
 
 def test_each_step_has_its_own_frame(tmp_path: Path) -> None:
@@ -218,19 +199,6 @@ def damaged(spoiled: Callable[..., Path]) -> Path:
         features["steps/observation/wrist_image_left"][1][9] = b"GIF89a"  # after frames that were written already
 
     return spoiled(spoil)
-
-
-def test_a_broken_episode_stops_the_conversion_and_nothing_is_left(
-    spoiled: Callable[..., Path], tmp_path: Path
-) -> None:
-    config = config_of(damaged(spoiled), camera=list(CAMERAS))
-    for folder in (tmp_path / "new/out", tmp_path / "empty"):
-        if folder.name == "empty":
-            folder.mkdir()
-        with pytest.raises(InputError, match=r"not a JPEG.*add to data\.exclude"):
-            convert_to_lerobot(config, folder, SILENT)
-        assert not folder.exists() or not list(folder.iterdir())
-    assert not list((tmp_path / "new").iterdir())
 
 
 def test_a_broken_episode_is_left_out_where_the_policy_says_so(spoiled: Callable[..., Path], tmp_path: Path) -> None:

@@ -237,16 +237,6 @@ def test_the_camera_is_drawn_per_clip_by_the_position_alone() -> None:
     assert 70 < drawn.count(CAMERAS[0]) < 130
 
 
-def test_the_camera_of_a_validation_clip_stays() -> None:
-    def cameras() -> dict[tuple[str, int], int]:
-        dataset = open_in_memory(MemorySource([30] * 10), camera=CAMERAS, validation_share=0.5)
-        batches = list(validation_batches(dataset, "validation", clips=40, batch_size=1))
-        return dict(zip(names(batches), (int(batch.frames[0, 0, 0, 0, 2]) for batch in batches), strict=True))
-
-    assert cameras() == cameras()
-    assert len(set(cameras().values())) == 2  # the names of the exterior cameras are as long
-
-
 # Poses of the camera.
 
 

@@ -15,9 +15,6 @@ from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.splits import describe_splits
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.init.draft import Machine, choose_model, make_draft
-from vjepa2_ac.init.found import plain
-from vjepa2_ac.init.look import look_at, measured
 from vjepa2_ac.inspection.check import check_data
 
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -136,25 +133,6 @@ def test_check_says_which_splits_are_used(opened: Opened, tmp_path: Path) -> Non
     assert advice.endswith("data.splits=hash draws the test split from all episodes")
     single = config.model_copy(update={"path": str(write_rlds_splits(tmp_path / "one", "train")), "test_share": 0.1})
     assert "splits" not in {one.about for one in check_data(single, clips=2)}
-
-
-@pytest.mark.parametrize(
-    ("names", "shares"),
-    [
-        (("train", "val"), {"test_share"}),
-        (("train", "val", "test"), set()),
-        (("train", "more"), {"validation_share", "test_share"}),
-    ],
-)
-def test_init_writes_shares_only_for_splits_that_are_drawn(
-    names: tuple[str, ...], shares: set[str], tmp_path: Path
-) -> None:
-    found = measured(look_at(str(write_rlds_splits(tmp_path / "set", *names))))
-    assert found.about[-1].startswith("splits: ")
-    laptop = Machine(None, 24 * 10**9, has_bf16=False, cores=2, free_bytes=10**11)
-    model = choose_model("released", "builtin:sim-tiny")
-    draft = make_draft(found, laptop, model, run_dir="run")
-    assert {key for key in plain(draft.knobs)["data"] if key.endswith("_share")} == shares
 
 
 def test_the_config_of_an_older_run_draws_its_splits() -> None:

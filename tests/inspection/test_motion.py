@@ -214,15 +214,6 @@ def test_frozen_camera_is_counted_where_the_robot_moves(tmp_path: Path) -> None:
     assert "the first 9 frames are one image while the robot moves" in warnings["episode ends"]
 
 
-def test_wraps_are_no_rotation_and_limits_are_those_of_the_config(tmp_path: Path) -> None:
-    turning = np.tile([0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0], (STEPS, 1))
-    turning[:, 5] = (0.3 * np.arange(STEPS) + np.pi) % (2 * np.pi) - np.pi
-    finding = speed_finding([Stretch("e", 0, turning)], RATE_HZ, LIMITS, "checked")
-    assert (finding.level, "at most 0.00 m/s and 3.00 rad/s" in finding.text) == ("ok", True)
-    config = config_of(tmp_path / "set", clean, motion_limits={"speed_m_s": 0.1, "rotation_rad_s": 0.1})
-    assert "faster than 0.1 m/s or 0.1 rad/s" in warnings_of(config)["speed"]
-
-
 def test_vectors_and_latent_caches_skip_what_needs_poses_and_frames(tmp_path: Path) -> None:
     values = {"source": "npz", "path": str(write_vectors(tmp_path / "set", width=7)), "states": "vector"}
     config = DataConfig.model_validate(values | {"frames": 3, "stride": 2, "workers": 0})

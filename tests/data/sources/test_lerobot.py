@@ -247,12 +247,6 @@ def test_the_gripper_is_closedness_whatever_its_range_and_sign(opened: float, cl
             source_of(root, lerobot=OWN).infos()
 
 
-def test_a_data_set_without_commands_or_outcome_says_so(tmp_path: Path) -> None:
-    source = source_of(own_set(tmp_path / "set", synthetic_states(10)), lerobot=OWN)
-    assert source.infos()[0].success is None
-    assert source.read(0).joint_velocities is None
-
-
 # --- settings at fault -------------------------------------------------------------------------------------------
 
 

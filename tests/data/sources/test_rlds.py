@@ -163,14 +163,6 @@ def test_where_no_episode_can_be_used_the_first_says_why(tmp_path: Path, droid: 
         open_droid(droid, fields=RldsFields(state=("steps/nothing",))).infos()
 
 
-def test_commanded_joint_velocities_are_there_where_the_data_set_has_them(droid: Path) -> None:
-    found = open_droid(droid).read(1).joint_velocities
-    assert found is not None
-    assert np.array_equal(found, synthetic_episode(2, steps=14).action_dict.joint_velocity.astype(np.float32))
-    for name in (None, "steps/none"):
-        assert open_droid(droid, fields=RldsFields(joint_velocity=name)).read(1).joint_velocities is None
-
-
 def test_damage_is_found_by_the_first_read_on_this_machine(droid: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(droid, tmp_path / "set")
     shard = sorted(folder.glob("*.tfrecord-*"))[0]

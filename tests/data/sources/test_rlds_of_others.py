@@ -17,7 +17,6 @@ from vjepa2_ac.config import DataConfig, DiskCacheConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.sources.indexed_source import open_source
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.found import guesses, plain
 from vjepa2_ac.init.look import look_at
 
@@ -74,21 +73,6 @@ def test_png_images_are_read_by_their_content(mode: str | None, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("depth", ("uint8", (*SIZE, 3), "png")),
-        ("a_second", ("uint16", (*SIZE, 1), "png")),
-        ("grey", ("uint8", (*SIZE, 1), "png")),
-    ],
-)
-def test_depth_and_single_channels_are_not_proposed_as_the_camera(name: str, kind: Any, tmp_path: Path) -> None:
-    kinds = {STATE: ("float32", (7,)), f"steps/observation/{name}": kind}
-    config, _ = proposed(write(tmp_path / "set", kinds=kinds))
-    assert config.cameras == ("image",)
-    assert config.fields.cameras == {"image": IMAGE}
-
-
-@pytest.mark.parametrize(
     "names",
     [lambda _: {}, lambda _: {NAME: [b""]}, lambda _: {NAME: [b"same"]}],
     ids=["without metadata", "empty names", "equal names"],
@@ -100,14 +84,6 @@ def test_records_without_a_usable_name_are_numbered(names: Any, tmp_path: Path) 
     require_true(config)
     assert len({info.id for info in open_source(config).infos()}) == EPISODES
     assert len(open_dataset(config.model_copy(update={"frames": 3, "stride": 1})).windows("train"))
-
-
-def test_errors_of_unusable_names_say_how_records_are_numbered(tmp_path: Path) -> None:
-    folder = write(tmp_path / "set", names=lambda _: {NAME: [b""]})
-    fields = {**proposed(folder)[0].fields.model_dump(), "identity": (NAME,)}
-    for identity in ((NAME,), ("episode_metadata/none",)):
-        with pytest.raises(InputError, match=r"data\.fields\.identity: record"):
-            open_source(DataConfig(path=str(folder), camera="image", fields={**fields, "identity": identity})).infos()
 
 
 def in_format(states: Float[np.ndarray, "steps 7"], rotation: str) -> Float[np.ndarray, "steps _"]:
@@ -159,21 +135,6 @@ def test_formats_of_states_are_proposed_and_read(
         assert np.corrcoef(closed, true)[0, 1] > 0.999
     else:
         require_true(config, tolerance=1e-3)
-
-
-def test_a_rotation_vector_is_read_from_rlds(tmp_path: Path) -> None:
-    folder = write(tmp_path / "set", states=lambda s: {STATE: in_format(s, "rotation_vector")})
-    config, _ = proposed(folder)
-    fields = config.fields.model_copy(update={"rotation": "rotation_vector"})
-    require_true(config.model_copy(update={"fields": fields}))
-
-
-def test_numbers_that_are_no_pose_become_a_vector(tmp_path: Path) -> None:
-    joints = lambda s: {STATE: np.concatenate([s, s], axis=1)[:, :9]}  # noqa: E731
-    config, guessed = proposed(write(tmp_path / "set", states=joints, kinds={STATE: ("float32", (9,))}))
-    assert (config.states, config.fields.state) == ("vector", (STATE,))
-    assert "fields.state" in guessed
-    assert open_source(config).read(0).states.shape == (STEPS, 9)
 
 
 def test_the_same_frames_and_states_are_read_from_a_url(tmp_path: Path) -> None:
