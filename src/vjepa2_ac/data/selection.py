@@ -1,10 +1,9 @@
-"""Which episodes and control steps a run uses: exclusion, broken episodes, groups of episodes, and ranges of steps."""
+"""Which episodes and control steps a run uses: exclusion, broken episodes, and ranges of steps."""
 
 from __future__ import annotations
 
 import json
 import logging
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,7 +13,7 @@ from jaxtyping import Bool, Int32, UInt64
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, NotATableError, identity_hash
 from vjepa2_ac.episode import StepRanges
-from vjepa2_ac.errors import InputError, counted
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 logger = logging.getLogger(__name__)
@@ -22,13 +21,6 @@ logger = logging.getLogger(__name__)
 NAMED = 10  # episodes in one message, at most
 _ALLOWED_BROKEN = 3  # episodes, in all but the smallest data sets
 _ALLOWED_SHARE = 0.01  # of the episodes, in large data sets
-
-# For DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.
-IN_IDENTITY = {
-    "lab": r"([^/]+)/(?:success|failure)/",
-    "day": r"/(?:success|failure)/([0-9]{4}-[0-9]{2}-[0-9]{2})(?:/|$)",
-    "folder": r"^(.+)/[^/]*$",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,46 +262,3 @@ def named(ids: Sequence[str], count: int | None = None) -> str:
     """Return identities for a message: the first ten, and the number of the rest (of `count` in total)."""
     more = (len(ids) if count is None else count) - NAMED
     return ", ".join(ids[:NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def groups_of(
-    table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig
-) -> UInt64[np.ndarray, " episodes"] | None:
-    """Return the hash of each episode's group (`data.split_by`), which determines its split; None: its identity does.
-
-    Args:
-        table: The episodes.
-        taking_part: Which of them are used; the others need not belong to a group, and then get that of another one.
-        config: `data.split_by`.
-
-    Raises:
-        InputError: There is no such field, one of those has none, or a pattern does not match its identity.
-    """
-    split_by = config.split_by
-    if split_by is None:
-        return None
-    groups = _groups(table, split_by)
-    lacking = [table.identity(place) for place in np.flatnonzero(taking_part).tolist() if not groups[place]]
-    if lacking:
-        from_source = split_by in table.labels
-        reason = "the data set does not say it of" if from_source else "found nothing in the identities of"
-        another = "choose another field" if from_source else "choose a pattern that fits every identity"
-        found = f"{reason} {len(lacking)} of {counted(taking_part.sum(), 'episode')}: {named(lacking)}"
-        fix = f"Leave these out with data.exclude, or {another}"
-        raise InputError(where=f"data.split_by: {split_by}", found=found, fix=fix)
-    hashes = {group: identity_hash(group) for group in groups if group}
-    any_hash = next(iter(hashes.values()), 0)
-    return np.array([hashes[group] if group else any_hash for group in groups], np.uint64)
-
-
-def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
-    if labels := table.labels.get(split_by):
-        return [labels.of_episode(place) for place in range(len(table))]
-    identities = [table.identity(place) for place in range(len(table))]
-    if split_by not in IN_IDENTITY and re.fullmatch(r"[A-Za-z_]+", split_by):
-        own, such = ", ".join(table.labels) or "none of its own", f", such as {identities[0]}" if identities else ""
-        wrong = f"no such field; this data set has {own}, and its identities may have {', '.join(IN_IDENTITY)}"
-        needed = f"a field, or a regular expression with one group for the identity{such}"
-        raise InputError(where=f"data.split_by: {split_by}", found=wrong, needed=needed)
-    search = re.compile(IN_IDENTITY.get(split_by, split_by)).search
-    return [found.group(1) if (found := search(identity)) else None for identity in identities]

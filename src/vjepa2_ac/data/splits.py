@@ -1,7 +1,8 @@
-"""The split that each episode belongs to: as the data set has it, or drawn by a hash of the episode's identity."""
+"""The split that each episode belongs to: as the data set has it, or drawn by a hash of its identity or its group."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -10,8 +11,9 @@ from jaxtyping import Bool, Float, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.index import EpisodeTable, Labels
-from vjepa2_ac.errors import counted
+from vjepa2_ac.data.index import EpisodeTable, Labels, identity_hash
+from vjepa2_ac.data.selection import named
+from vjepa2_ac.errors import InputError, counted
 
 SPLIT = "split"  # label of an episode: the name of its split in the data set
 
@@ -20,6 +22,13 @@ _ROLES: dict[str, Split] = {"val": "validation", "valid": "validation", "validat
 _FEWEST_GROUPS = 3  # one for each split
 
 Members = Bool[np.ndarray, " episodes"]
+
+# For DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.
+IN_IDENTITY = {
+    "lab": r"([^/]+)/(?:success|failure)/",
+    "day": r"/(?:success|failure)/([0-9]{4}-[0-9]{2}-[0-9]{2})(?:/|$)",
+    "folder": r"^(.+)/[^/]*$",
+}
 
 
 def roles_of(names: Iterable[str]) -> dict[str, Split]:
@@ -54,11 +63,11 @@ def describe_splits(table: EpisodeTable, config: DataConfig) -> str:
     if labels is None:
         return ""
     counts = np.bincount(labels.number[labels.number >= 0], minlength=len(labels.names)).tolist()
-    named = [f"{name} ({counted(count, 'episode')})" for name, count in zip(labels.names, counts, strict=True)]
+    listed = [f"{name} ({counted(count, 'episode')})" for name, count in zip(labels.names, counts, strict=True)]
     if not (held_out := held_out_by(table, config)):
         why = "data.splits is hash" if config.splits == "hash" else "no train beside val, validation or test"
-        return f"drawn by hash from all of the data set's own, {', '.join(named)}: {why}"
-    roles = zip(named, roles_of(labels.names).items(), strict=True)
+        return f"drawn by hash from all of the data set's own, {', '.join(listed)}: {why}"
+    roles = zip(listed, roles_of(labels.names).items(), strict=True)
     used = ", ".join(text if name == role else f"{text} as {role}" for text, (name, role) in roles)
     drawn = next((f"; {split} is drawn from train by hash" for split in _HELD_OUT if split not in held_out), "")
     return f"the data set's own: {used}{drawn}"
@@ -121,3 +130,46 @@ def _bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[f
     if config.validation_share > 0 and len(left) > 1 and not (left < held_out).any():
         held_out = float(np.nextafter(left[0], 2.0))
     return test, held_out
+
+
+def groups_of(
+    table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig
+) -> UInt64[np.ndarray, " episodes"] | None:
+    """Return the hash of each episode's group (`data.split_by`), which determines its split; None: its identity does.
+
+    Args:
+        table: The episodes.
+        taking_part: Which of them are used; the others need not belong to a group, and then get that of another one.
+        config: `data.split_by`.
+
+    Raises:
+        InputError: There is no such field, one of those has none, or a pattern does not match its identity.
+    """
+    split_by = config.split_by
+    if split_by is None:
+        return None
+    groups = _groups(table, split_by)
+    lacking = [table.identity(place) for place in np.flatnonzero(taking_part).tolist() if not groups[place]]
+    if lacking:
+        from_source = split_by in table.labels
+        reason = "the data set does not say it of" if from_source else "found nothing in the identities of"
+        another = "choose another field" if from_source else "choose a pattern that fits every identity"
+        found = f"{reason} {len(lacking)} of {counted(taking_part.sum(), 'episode')}: {named(lacking)}"
+        fix = f"Leave these out with data.exclude, or {another}"
+        raise InputError(where=f"data.split_by: {split_by}", found=found, fix=fix)
+    hashes = {group: identity_hash(group) for group in groups if group}
+    any_hash = next(iter(hashes.values()), 0)
+    return np.array([hashes[group] if group else any_hash for group in groups], np.uint64)
+
+
+def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
+    if labels := table.labels.get(split_by):
+        return [labels.of_episode(place) for place in range(len(table))]
+    identities = [table.identity(place) for place in range(len(table))]
+    if split_by not in IN_IDENTITY and re.fullmatch(r"[A-Za-z_]+", split_by):
+        own, such = ", ".join(table.labels) or "none of its own", f", such as {identities[0]}" if identities else ""
+        wrong = f"no such field; this data set has {own}, and its identities may have {', '.join(IN_IDENTITY)}"
+        needed = f"a field, or a regular expression with one group for the identity{such}"
+        raise InputError(where=f"data.split_by: {split_by}", found=wrong, needed=needed)
+    search = re.compile(IN_IDENTITY.get(split_by, split_by)).search
+    return [found.group(1) if (found := search(identity)) else None for identity in identities]
