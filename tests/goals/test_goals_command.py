@@ -1,4 +1,4 @@
-"""`vjepa2-ac goals` makes a folder of goals of an episode or a film, and `plan` and `simulate` take it."""
+"""`vjepa2-ac goals` makes a folder of goals of an episode, and `plan` and `simulate` take it."""
 
 import json
 from pathlib import Path
@@ -9,12 +9,10 @@ import yaml
 from PIL import Image
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-pytest.importorskip("av", reason="the extra `video` is not installed")
 
 from tiny_models import tiny_model
 from vjepa2_ac.api import open_dataset
 from vjepa2_ac.cli import main
-from vjepa2_ac.media.video import write_video
 from vjepa2_ac.planning.goals import read_goal_folder
 from vjepa2_ac.serving.about import read_kept_goals
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
@@ -25,16 +23,12 @@ STATE = "0.4,0.0,0.3,3.1,0.0,0.1,0.2"
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set of two picks, a config, a model, and a film."""
+    """A data set of two picks, a config and a model."""
     here = tmp_path_factory.mktemp("workshop")
     record_dataset(here / "set", RecordingSpec("A", 41, seed=3, task="pick"), episodes=2)
     config = {"run_dir": str(here / "run"), "data": {"path": str(here / "set"), "frames": 4}, "model": {"base": "none"}}
     (here / "config.yaml").write_text(yaml.safe_dump(config))
     tiny_model().save_pretrained(here / "model")
-    rng = np.random.default_rng(0)
-    frames = [rng.integers(0, 256, (48, 64, 3), dtype=np.uint8) for _ in range(3)]
-    ways = [np.linspace(0, 1, 12)[:, None, None, None] * (b.astype(float) - a) + a for a, b in [frames[:2], frames[1:]]]
-    write_video(here / "film.mp4", np.concatenate(ways).astype(np.uint8), rate_hz=15.0)
     return here
 
 
@@ -100,16 +94,6 @@ def test_two_photographs_find_the_episode_that_they_are_alike(
     assert "the image of the start: 320 x 90 pixels (width x height). needed: 320 x 180" in capsys.readouterr().err
 
 
-def test_a_film_becomes_goals_of_every_nth_frame(workshop: Path, tmp_path: Path) -> None:
-    words = ["--every", "8", "--stride", "4", "--stop-share", "0.3"]
-    status, file = goals(workshop, tmp_path / "goals", *words, source="film.mp4")
-    assert status == 0
-    assert [goal["frame"] for goal in file["goals"]] == [8, 16, 23]
-    assert {goal["gripper"] for goal in file["goals"]} == {None}
-    assert file["goals"][-1]["share"] == 0.3
-    assert file["origin"]["film"] == str(workshop / "film.mp4")
-
-
 def test_plan_and_simulate_take_the_folder(workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, model = tmp_path / "goals", str(workshop / "model")
     goals(workshop, folder, "--share", "0.5")
@@ -158,17 +142,12 @@ def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
         (["config.yaml", "--alike", "a.png", "b.png", "--model", "m", "--episode", "0"], "--alike: --episode, too"),
         (["config.yaml", "--episode", "9"], "--episode 9: no such episode"),
         (["config.yaml", "data.stride=auto"], "data.stride: auto"),
-        (["film.mp4", "--stride", "4"], "film.mp4: no measured poses"),
-        (["film.mp4", "--every", "9"], "--stride: a film"),
-        (["text.mp4", "--every", "9", "--stride", "4"], "text.mp4: cannot be read as a video"),
     ],
 )
 def test_what_cannot_be_is_one_line_and_leaves_nothing(
     words: list[str], wrong: str, workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (workshop / "text.mp4").write_text("no film")
     source, *more = words
-    more = [str(workshop / word) if word.endswith(".mp4") else word for word in more]
     status, _ = goals(workshop, tmp_path / "goals", *more, source=source)
     assert status == 2
     error = capsys.readouterr().err

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 _QUICK = " ".join(QUICK_WORDS)
 _COLUMNS = 100
-_FILMS = (".mp4", ".m4v", ".mov")
 
 
 def add_plan(commands: cli.Commands) -> None:
@@ -48,7 +47,7 @@ def add_plan(commands: cli.Commands) -> None:
 def add_goals(commands: cli.Commands) -> None:
     """Add `goals` to a parser."""
     parser = cli.command(commands, "goals", _goals, "my_robot.yaml --episode 3 --out goals/cup")
-    cli.add(parser, "source CONFIG|VIDEO", "a config, of whose data the episode is; or a film, MP4", cli.as_local)
+    cli.add(parser, "source CONFIG", "the config of the data with the episode", cli.as_local)
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
     cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
     cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
@@ -56,10 +55,9 @@ def add_goals(commands: cli.Commands) -> None:
     cli.add(parser, "--alike", text, nargs=2, metavar=("NOW", "GOAL"))
     text = "instead: the last frame of a successful episode of each language label with this text, for prompts"
     cli.add(parser, "--task TEXT", text, nargs="?", const="")
-    text = "instead of where the gripper changes or the arm stops: every N frames; needed for a film"
+    text = "instead of where the gripper changes or the arm stops: every N control steps"
     cli.add(parser, "--every N", text, cli.count)
     cli.add(parser, "--model RUN_OR_MODEL", "the model that will plan, for --alike", cli.as_model)
-    cli.add(parser, "--stride N", "frames of a model step (data.stride); needed of a film", cli.count)
     group = parser.add_argument_group("where goals lie, and when the next one follows")
     cli.add_checkpoint(group, default=None)
     cli.add(group, "--apart N", "least frames from a stop of the arm to another goal (4)", cli.count, default=4)
@@ -170,19 +168,21 @@ def _goals_of(options: argparse.Namespace, config: Config) -> tuple[SubGoal, ...
 def _goals(options: argparse.Namespace) -> None:
     """Make goals that follow one another, from a demonstration.
 
-    The goals are key frames of an episode or a film, with durations and gripper modes, in a folder that `plan --goals`
+    The goals are key frames of an episode, with durations and gripper modes, in a folder that `plan --goals`
     and `simulate --goals` take, with a contact sheet.
     """
+    from vjepa2_ac.data.windows import require_stride
+
     photographs = _photographs(options)
     cli.require_new_place(options.out)
     if options.task is not None:
         _goals_by_label(options)
         return
-    config = None if _is_film(options) else cli.read_config(options.source, options.overrides)
-    stride = _stride(options, config)
+    config = cli.read_config(options.source, options.overrides)
+    stride = require_stride(config.data, to="make goals", fix="Say how many control steps it has: data.stride=4")
 
     from vjepa2_ac.cli.console.tables import goals_table
-    from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals, recording_of_episode, recording_of_film
+    from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals, recording_of_episode
     from vjepa2_ac.goals.nearest import demonstrations_alike, ending_with
     from vjepa2_ac.planning.model_setup import load_to_plan
     from vjepa2_ac.reporter import INDEXING
@@ -192,9 +192,7 @@ def _goals(options: argparse.Namespace) -> None:
     by = "gripper" if options.every is None else "every"
     chosen = cli.record_of_options(KeyFrameOptions, options, by=by, stride=stride)
     with cli.reporter() as reporter:
-        if config is None:
-            recording = recording_of_film(Path(options.source))
-        elif photographs is not None:
+        if photographs is not None:
             cli.say_places_elsewhere(options.model)
             session = load_to_plan(options.model, checkpoint=options.checkpoint or "selected")
             (recording,) = demonstrations_alike(config.data, session, [photographs], reporter)
@@ -219,35 +217,13 @@ def _goals_by_label(options: argparse.Namespace) -> None:
     cli.show(*(f"{label}: {episode}" for label, episode in found.items()), f"Serve them as prompts: --goals {folder}")
 
 
-def _is_film(options: argparse.Namespace) -> bool:
-    return Path(options.source).suffix.lower() in _FILMS
-
-
-def _stride(options: argparse.Namespace, config: Config | None) -> int:
-    """Return the frames of a model step; of a film, which has no config, they are given."""
-    if config is None:
-        for name, given in {"--episode": options.episode, "key=value": options.overrides}.items():
-            if given:
-                raise InputError(where=name, found=f"{options.source}, a film", needed="a config, of whose data it is")
-        if options.stride is None:
-            found = "a film, which has no model steps of its own"
-            fix = "Of 30 frames a second, 8 last 0.27 s, as a model step of the released weights does: --stride 8"
-            raise InputError(where="--stride", found=found, needed="how many frames are a model step", fix=fix)
-        return int(options.stride)
-    stride = options.stride or config.data.stride
-    if stride == "auto":
-        found, fix = "auto", "Say how many control steps a model step has: --stride 4"
-        raise InputError(where="data.stride", found=found, needed="a number", fix=fix)
-    return int(stride)
-
-
 def _photographs(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray] | None:
     """Return start and goal to which a demonstration is to be alike; None: other ways to choose one are given."""
     if options.alike is None:
         return None
     if options.model is None:
         raise InputError(where="--alike", found="no model", needed="--model RUN_OR_MODEL")
-    others = {"a film": _is_film(options), "--episode": options.episode, "--task": options.task is not None}
+    others = {"--episode": options.episode, "--task": options.task is not None}
     for name, given in others.items():
         if given:
             raise InputError(where="--alike", found=f"{name}, too", needed="a config alone, among whose data it looks")

@@ -1,4 +1,4 @@
-"""Goals from one demonstration, an episode or a film: key frames with durations and gripper modes."""
+"""Goals from one demonstration: key frames of an episode, with durations and gripper modes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ from vjepa2_ac.goals.key_frames import (
     sub_goals_of,
 )
 from vjepa2_ac.media.images import encode_png
-from vjepa2_ac.media.video import read_frames, read_header
 from vjepa2_ac.planning.cameras import read_views, require_views
 from vjepa2_ac.planning.goals import SubGoal, write_goals
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
@@ -41,7 +40,7 @@ _LONGEST_LABEL = 120  # letters, in the name of a file
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A demonstration. A frame is a control step of an episode, or a frame of a film.
+    """A demonstration. A frame is a control step of an episode.
 
     Raises:
         InputError: It has one frame.
@@ -162,17 +161,6 @@ def goals_by_label(
         found_text = f"no successful episode with a language label that has {text!r}" if text else "no language labels"
         raise InputError(where=config.path, found=found_text, fix="Take goals of one episode: --episode")
     return found, folder
-
-
-def recording_of_film(path: Path) -> Recording:
-    """Return a film, of which nothing is known but its frames.
-
-    Raises:
-        InputError: PyAV is not installed, or it is no MP4 of two frames or more.
-    """
-    where = str(path)
-    frames = read_header(path, where=where).num_frames
-    return Recording(path.name, frames, partial(read_frames, path, where=where), None, {"film": where})
 
 
 @dataclass(frozen=True)
