@@ -8,6 +8,7 @@ import pytest
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.tasks import RELEASED, STEPS, TaskName, arm_for, make_problem
+from vjepa2_ac.spaces import actions_from_states
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
