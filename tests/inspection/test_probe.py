@@ -15,7 +15,6 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.episode import Batch, Episode, LatentBatch, StepRanges
-from vjepa2_ac.evaluation.calibration.variants import VariantResult
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.inspection.probe import (
     AS_THEY_ARE,
@@ -24,6 +23,7 @@ from vjepa2_ac.inspection.probe import (
     probe_variants,
     variants_of,
 )
+from vjepa2_ac.inspection.variants import VariantResult
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import actions_from_states, matrices_from_euler
 from worlds import Copier

@@ -217,8 +217,8 @@ def _calibrate(options: argparse.Namespace) -> int:
     cli.make_folder(options.out)
 
     from vjepa2_ac.cli.console.tables import variants_table
-    from vjepa2_ac.evaluation.calibration.variants import calibrate_config
     from vjepa2_ac.evaluation.measure import ClipSample
+    from vjepa2_ac.inspection.variants import calibrate_config
     from vjepa2_ac.storage import write_atomically
 
     with cli.reporter() as reporter:

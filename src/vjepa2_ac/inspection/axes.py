@@ -27,8 +27,8 @@ from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.action_use import RolloutStart, start_of
-from vjepa2_ac.evaluation.calibration.variants import load_named
 from vjepa2_ac.evaluation.measure import Predictor
+from vjepa2_ac.inspection.variants import load_named
 from vjepa2_ac.intervals import Estimate, bootstrapped, ratio
 from vjepa2_ac.media.figure import BLUE, GREY, headline, written_figure
 from vjepa2_ac.model.adapter.lora import merge_adapter

@@ -24,7 +24,8 @@ from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Episode, Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.evaluation.calibration.variants import (
+from vjepa2_ac.evaluation.measure import ClipSample, Predictor
+from vjepa2_ac.inspection.variants import (
     Encode,
     ReadOnce,
     SameClips,
@@ -34,7 +35,6 @@ from vjepa2_ac.evaluation.calibration.variants import (
     measure_variants,
     result_of,
 )
-from vjepa2_ac.evaluation.measure import ClipSample, Predictor
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.spaces import POSE, euler_from_matrices, matrices_from_euler
 from vjepa2_ac.storage.structured import plain

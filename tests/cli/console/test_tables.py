@@ -12,11 +12,11 @@ from rich.table import Table
 
 from vjepa2_ac.cli.console.progress import PlainConsole
 from vjepa2_ac.cli.console.tables import benchmark_table, motion_table, plan_table, row_tables, variants_table
-from vjepa2_ac.evaluation.calibration.variants import VariantResult
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.rows import Row, rows_of
 from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
+from vjepa2_ac.inspection.variants import VariantResult
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions, ClosedLoopBenchmark

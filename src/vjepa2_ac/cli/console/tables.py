@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.data.index import EpisodeTable
     from vjepa2_ac.decoding.decoder_folder import DecoderCard
-    from vjepa2_ac.evaluation.calibration.variants import VariantResult
     from vjepa2_ac.goals.make_goals import MadeGoals
     from vjepa2_ac.inspection.findings import Finding
     from vjepa2_ac.inspection.statistics import StepSizes
+    from vjepa2_ac.inspection.variants import VariantResult
     from vjepa2_ac.planning.decision import PlanResult
     from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
 

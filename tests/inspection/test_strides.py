@@ -13,8 +13,8 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.calibration.variants import Calibration, VariantResult, calibrate
 from vjepa2_ac.evaluation.measure import ClipSample
+from vjepa2_ac.inspection.variants import Calibration, VariantResult, calibrate
 from vjepa2_ac.intervals import Estimate
 
 

@@ -10,8 +10,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.distributed import broadcast_object
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.calibration.variants import Calibration, calibrate_model, require_learned
 from vjepa2_ac.evaluation.measure import ClipSample
+from vjepa2_ac.inspection.variants import Calibration, calibrate_model, require_learned
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import Reporter
 
