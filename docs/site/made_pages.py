@@ -182,6 +182,9 @@ def _section(prefix: str, section: Mapping[str, Any], schema: Mapping[str, Any],
     rows, inner = [], []
     for name, one in section.get("properties", {}).items():
         found = _section_of(one, schema)
+        for part in _components_with_options(one):
+            title = f"{prefix}{name}, options of {part['name']['const']}"
+            inner.append((title, part["options"], part["options"].get("description", "")))
         of_items = _section_of(one.get("items") or {}, schema)  # of a list of sections
         if of_items is not None:
             inner.append((f"{prefix}{name}", of_items, f"{_about(one)} A list; each item has these keys."))
@@ -196,12 +199,21 @@ def _section(prefix: str, section: Mapping[str, Any], schema: Mapping[str, Any],
         if key == "replay.data":
             lines += [f"{'#' * min(depth, 4)} {key}", "", f"{about} Its keys are those of [data](#data).", ""]
             continue
-        lines += [f"{'#' * min(depth, 4)} {key}", "", about, "", *_section(f"{key}.", found, schema, depth=depth + 1)]
+        keys = f"{key.partition(',')[0]}.options." if ", options of " in key else f"{key}."
+        lines += [f"{'#' * min(depth, 4)} {key}", "", about, "", *_section(keys, found, schema, depth=depth + 1)]
     return lines
+
+
+def _components_with_options(one: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the name and the options of each component with options that a key may hold."""
+    properties = [option.get("properties", {}) for option in one.get("anyOf", [])]
+    return [part for part in properties if "const" in part.get("name", {})]
 
 
 def _section_of(one: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """Return the section that a key holds, None for a value; of several forms of data the first one."""
+    if _components_with_options(one):
+        return None
     for option in [one, *one.get("anyOf", []), *one.get("allOf", []), *one.get("oneOf", [])]:
         found = _resolved(option, schema)
         if "properties" in found:
@@ -238,7 +250,10 @@ def _kind(one: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
 def _default(one: Mapping[str, Any]) -> str:
     if "default" not in one:
         return ""
-    text = json.dumps(one["default"])
+    default = one["default"]
+    if isinstance(default, dict) and default.get("options") == {}:
+        default = default["name"]  # of a component
+    text = json.dumps(default)
     return f"`{text if len(text) < 80 else text[:76] + ' …'}`"
 
 
