@@ -202,13 +202,6 @@ def test_frames_and_batches_have_the_same_latents(simulated: Path) -> None:
     torch.testing.assert_close(image, seen.latents[1, 0], rtol=1e-4, atol=1e-4)
 
 
-def test_the_crop_is_that_of_training() -> None:
-    model, wide = load_model(TINY), np.zeros((20, 60, 3), np.uint8)
-    wide[:, :15] = 255  # outside of the centre
-    assert torch.equal(encode(model, wide), encode(model, np.zeros_like(wide)))
-    assert not torch.equal(encode(model, wide, crop="letterbox"), encode(model, np.zeros_like(wide), crop="letterbox"))
-
-
 @pytest.mark.parametrize("frames", [np.zeros((4, 4, 3)), np.zeros((4, 4), np.uint8), np.zeros((3, 4, 4), np.uint8)])
 def test_what_is_no_frame_is_told(frames: np.ndarray) -> None:
     with pytest.raises(UserError, match="uint8"):

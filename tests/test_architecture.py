@@ -34,7 +34,6 @@ ORDERS: dict[str, list[str]] = {
     ],
     "data": [
         "poses streams",
-        "rotation_formats",
         "index",
         "selection files transforms",
         "idle splits windows",

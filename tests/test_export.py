@@ -1,6 +1,5 @@
 """An exported model predicts like the run, and its card describes it."""
 
-import errno
 import json
 import re
 import shutil
@@ -29,7 +28,7 @@ from vjepa2_ac.model.checkpoints import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
 from vjepa2_ac.reports.write import PLOT
-from vjepa2_ac.runs.checkpoint import checkpoint_name, select_checkpoint, write_manifest
+from vjepa2_ac.runs.checkpoint import select_checkpoint, write_manifest
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train
 
@@ -112,13 +111,6 @@ def test_the_official_checkpoint_predicts_as_the_run_does(trained, tmp_path: Pat
     assert_predicts_as(load_official(written, sizes_of(run)), run)
 
 
-@pytest.mark.parametrize(("name", "form"), [("x.pt", "merged"), ("x.pt", "hub")])
-def test_a_name_of_another_kind_of_file_makes_no_folder(tmp_path: Path, name: str, form: Any) -> None:
-    with pytest.raises(InputError, match=rf"{name}: the name of a \{Path(name).suffix} file"):
-        export_run(tmp_path / "run", tmp_path / name, form)
-    assert not (tmp_path / name).exists()
-
-
 def test_merged_is_a_folder_that_predicts_as_the_run_does(trained, tmp_path: Path) -> None:
     run = trained()
     assert export_run(run, tmp_path / "merged") == Exported(tmp_path / "merged", str(select_checkpoint(run)))
@@ -142,12 +134,11 @@ def poison(path: Path) -> str:
     return name
 
 
-@pytest.mark.parametrize("form", ["merged", "official", "hub"])
-def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(copied, tmp_path: Path, form: Any) -> None:
+def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(copied, tmp_path: Path) -> None:
     run = copied()
     rewrite_adapter(run, lora_alpha=1e300)
     with pytest.raises(InputError, match=r"alpha: .*less than or equal"):
-        export_run(run, tmp_path / "out", form)
+        export_run(run, tmp_path / "out", "hub")
     assert not (tmp_path / "out").exists()
 
 
@@ -163,13 +154,6 @@ def test_a_trained_weight_that_is_not_finite_is_named(copied, tmp_path: Path, ki
     with pytest.raises(InputError, match=rf"{file}: {re.escape(name)} holds NaN or infinity"):
         export_run(run, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_merging_into_a_bfloat16_base_keeps_its_type(trained, tmp_path: Path) -> None:
-    run = trained(model__dtype="bfloat16", training__precision="bf16")
-    written = export_run(run, tmp_path / "out.pt", "official").path
-    kinds = {value.dtype for part in ("encoder", "predictor") for value in torch.load(written)[part].values()}
-    assert kinds == {torch.bfloat16}
 
 
 def test_plain_peft_loads_what_goes_to_the_hub(trained, base_folder: Path, tmp_path: Path) -> None:
@@ -188,7 +172,6 @@ def test_the_card_describes_base_data_and_training(
     card = (tmp_path / "hub" / CARD).read_text()
     front = yaml.safe_load(card.split("---")[1])
     assert front["library_name"] == "peft"
-    assert "model-index" not in front, "nothing was measured"
     base = WorldModel.from_pretrained(base_folder)
     for words in (
         str(base_folder), base.predictor_fingerprint(), base.encoder_fingerprint(), f"rlds, `{data_folder}`",
@@ -199,22 +182,6 @@ def test_the_card_describes_base_data_and_training(
         assert words in card, words
     weights = peft.PeftModel.from_pretrained(base.predictor, str(tmp_path / "hub")).state_dict()
     assert f"{sum(value.numel() for name, value in weights.items() if '.lora_' in name):,} parameters" in card
-
-
-def test_the_card_describes_unusual_adapter_settings(trained, tmp_path: Path, data_folder: Path) -> None:
-    heads = {"adapter__modules_to_save": ["action_encoder"]}
-    loss = {"training__loss": "l2"}
-    second = {"path": str(data_folder), "frames": 4, "stride": 2}
-    given = {**heads, **loss, "replay": {"share": 0.5, "data": second}}
-    export_run(
-        trained(adapter__peft={"rank_pattern": {"fc1": 2}}, adapter__dora=True, **given), tmp_path / "hub", "hub"
-    )
-    card = (tmp_path / "hub" / CARD).read_text()
-    assert "rsLoRA, DoRA, `rank_pattern: {'fc1': 2}`\n" in card
-    assert "trained whole: `action_encoder`\n" in card
-    assert "loss: l2, teacher forcing + rollout of 2 steps" in card
-    assert f"replay: 50% of the training clips from rlds, `{data_folder}`" in card
-    assert "warm-up: 1 step\n" in card
 
 
 def test_names_are_no_markup_in_the_card(trained, tmp_path: Path) -> None:
@@ -228,9 +195,8 @@ def test_names_are_no_markup_in_the_card(trained, tmp_path: Path) -> None:
     assert "# x" not in outside
 
 
-@pytest.mark.parametrize("sizes", [{}, {"model__sizes": TINY}], ids=["released sizes", "other sizes"])
-def test_the_code_of_the_card_runs(trained, tmp_path: Path, sizes: dict[str, Any]) -> None:
-    run = trained(**sizes)
+def test_the_code_of_the_card_runs(trained, tmp_path: Path) -> None:
+    run = trained(model__sizes=TINY)
     export_run(run, tmp_path / "hub", "hub")
     blocks = re.findall(r"```python\n(.*?)```", (tmp_path / "hub" / CARD).read_text(), flags=re.DOTALL)
     assert len(blocks) == 2
@@ -268,46 +234,11 @@ def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied
     card = (tmp_path / "hub" / CARD).read_text()
     assert measured["summary"]["predicts"]["statement"] in " ".join(card.split())
     assert "another checkpoint**: `step-00000001`, not `step-00000002`" in card
-    assert "model-index" not in card, "results of another checkpoint are not those of this adapter"
 
 
-def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is_asked_for(
-    copied, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = copied(training__steps=4, checkpoint__every=1, checkpoint__keep_best="ranking")
-    newest = load_subject(run).checkpoint
-    state = json.loads((newest / "state.json").read_text())
-    (newest / "state.json").write_text(json.dumps({**state, "best_step": 2}))
-    write_manifest(newest)
-    for asked, step, words in [
-        ("best", 2, "step-00000002 (the best by action ranking)"),
-        ("1", 1, "step-00000001 (as asked for)"),
-    ]:
-        assert main(["evaluate", str(run), *QUICK, "--all", "--checkpoint", asked]) == 0
-        measured = json.loads((run / METRICS_FILE).read_text())
-        assert measured["about"]["checkpoint_path"] == str(run / "checkpoints" / f"step-{step:08d}")
-        assert measured["about"]["checkpoint"] == words
-        assert main(["export", str(run), str(tmp_path / asked), "--to", "hub", "--checkpoint", asked]) == 0
-        assert " ".join(capsys.readouterr().out.split()).count(f"checkpoint {words}") == 2, "both print it"
-        card = (tmp_path / asked / CARD).read_text()
-        assert f"from checkpoint {words} of the run" in card
-        assert "another checkpoint" not in card
-        found = load_file(tmp_path / asked / "adapter_model.safetensors")
-        assert all(torch.equal(found[name], value) for name, value in weights_of(run, step).items())
-        assert any(not torch.equal(found[name], value) for name, value in weights_of(run, 3).items())
-    assert main(["export", str(run), str(tmp_path / "x"), "--checkpoint", "7"]) == 2
-    needed = "needed: selected, newest, best or one of the steps 0, 1, 2, 3, 4"
-    assert f"no checkpoint of step 7. {needed}" in capsys.readouterr().err
-
-
-def weights_of(run: Path, step: int) -> dict[str, Tensor]:
-    return load_file(run / "checkpoints" / checkpoint_name(step) / "adapter" / "adapter_model.safetensors")
-
-
-@pytest.mark.parametrize("content", ["{", '{"format": 1, "answer": 3}'])
-def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: Path, content: str) -> None:
+def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: Path) -> None:
     run = copied()
-    (run / METRICS_FILE).write_text(content)
+    (run / METRICS_FILE).write_text("{")
     with pytest.raises(InputError, match=r"metrics\.json.*vjepa2-ac evaluate"):
         export_run(run, tmp_path / "hub", "hub")
     assert not (tmp_path / "hub").exists()
@@ -331,38 +262,11 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("no_work")
 @pytest.mark.parametrize("form", ["merged", "official", "hub"])
-def test_an_occupied_place_is_refused_before_work_begins(tmp_path: Path, form: Any) -> None:
+def test_a_destination_that_cannot_be_used_is_refused_before_work_begins(tmp_path: Path, form: Any) -> None:
     (tmp_path / "there.pt").write_text("precious")
     for place in (tmp_path, tmp_path / "there.pt"):
         with pytest.raises(InputError, match=r"something is there already|the name of a \.pt file"):
             export_run(tmp_path / "run", place, form)
     assert (tmp_path / "there.pt").read_text() == "precious"
-
-
-@pytest.mark.usefixtures("no_work")
-@pytest.mark.parametrize("form", ["merged", "official", "hub"])
-def test_a_place_that_cannot_be_written_is_refused_before_work_begins(tmp_path: Path, form: Any) -> None:
-    (tmp_path / "file").write_text("no folder")
     with pytest.raises(InputError, match="cannot be written"):
-        export_run(tmp_path / "run", tmp_path / "file" / "below", form)
-
-
-def test_a_full_disk_leaves_nothing_behind(trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = trained()
-
-    class FullFile:
-        room = 20_000  # so that it is full on the way, which torch tells in its own words
-
-        def write(self, data: bytes) -> int:
-            self.room -= len(data)
-            if self.room >= 0:
-                return len(data)
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-        def flush(self) -> None: ...
-
-    save = torch.save
-    monkeypatch.setattr(torch, "save", lambda whole, _: save(whole, FullFile()))
-    with pytest.raises(InputError, match=r"out/vjepa2-ac\.pt: cannot be written: No space left.*Free some space"):
-        export_run(run, tmp_path / "out", "official")
-    assert not list((tmp_path / "out").iterdir())
+        export_run(tmp_path / "run", tmp_path / "there.pt" / "below", form)

@@ -8,7 +8,6 @@ import pytest
 import torch
 import yaml
 
-from killable import KILLED, Nursery
 from paths import GOLDEN
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelConfig
@@ -55,26 +54,6 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert main(["train", config, "--check"]) == 0
     assert main(["train", config]) == 0
     return folder
-
-
-def test_a_predictor_that_cannot_start_near_copying_is_said_to(
-    workshop: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for width, is_narrow in ((64, False), (32, True)):
-        config = write_config(workshop, "narrow")
-        assert main(["train", config, "--check", f"model.sizes.predictor.width={width}"]) == 0
-        printed = " ".join(capsys.readouterr().out.split())
-        assert (f"a predictor of width {width} cannot copy latents of width 64" in printed) == is_narrow
-
-
-def test_a_run_that_was_killed_ends_in_the_same_bits(workshop: Path, nursery: Nursery) -> None:
-    config, run = write_config(workshop, "killed"), workshop / "killed"
-    child = nursery.start("train", config, folder=run, die_at=40)
-    assert child.wait() == KILLED
-    assert (run / "checkpoints").is_dir()
-    assert main(["train", str(run), "--resume"]) == 0
-    whole, again = (load_subject(folder).world_model.state_dict() for folder in (workshop / "whole", run))
-    assert all(torch.equal(again[name], value) for name, value in whole.items())
 
 
 def test_it_is_evaluated_and_plans(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:

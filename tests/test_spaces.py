@@ -22,29 +22,9 @@ from vjepa2_ac.spaces import (
 STATES = np.array([[0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2], [0.5, 0.1, 0.3, -3.1, 0.0, 0.2, 0.3]])
 
 
-def test_a_pose_has_parts_with_names_and_units_and_a_vector_has_numbers() -> None:
-    assert [POSE.names[POSE.position], POSE.names[POSE.rotation], POSE.names[POSE.gripper]] == [
-        ("x", "y", "z"), ("roll", "pitch", "yaw"), "gripper",
-    ]  # fmt: skip
-    assert POSE.units == ("m", "m", "m", "rad", "rad", "rad", "")
-    assert POSE_CHANGE.names == POSE.change_names == ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "dgripper")
-    vector = vector_states(3)
-    assert (vector.names, vector.position, vector.rotation, vector.gripper) == (
-        ("state 0", "state 1", "state 2"), None, None, None,
-    )  # fmt: skip
-    assert (POSES.widths, len(vector)) == (POSE_WIDTHS, 3)
-
-
 def test_rotations_are_composed_and_vectors_subtract() -> None:
     assert abs(POSE.differences(STATES)[0, 3]) < 0.1, "angles jump at pi"
     np.testing.assert_array_equal(vector_states(7).differences(STATES), np.diff(STATES, axis=0))
-
-
-def test_the_size_of_a_motion_is_that_of_its_position_in_cm_or_of_all_numbers() -> None:
-    move = np.array([[0.03, 0.04, 0.0, 9.0, 9.0, 9.0, 1.0]])
-    assert POSE_CHANGE.shown_size(move) == pytest.approx(5.0)
-    assert vector_states(2).shown_size(np.array([3.0, 4.0])) == 5.0
-    assert (POSE.shown_unit, vector_states(2).shown_unit) == ("cm", "")
 
 
 @pytest.mark.parametrize(

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Literal
 
-from huggingface_hub import EvalResult, ModelCardData
+from huggingface_hub import ModelCardData
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from vjepa2_ac import __version__
@@ -143,7 +142,6 @@ def _card(run: Subject, checkpoint: Path, folder: Path, metrics: Metrics | None)
         pipeline_tag="robotics",
         tags=["v-jepa-2-ac", "world-model", "lora"],
         model_name=name,
-        eval_results=_eval_results(config, metrics) if metrics and measured == checkpoint.name else None,
     )
     return environment.get_template("model_card.md.jinja").render(
         **dict(config),
@@ -163,25 +161,6 @@ def _card(run: Subject, checkpoint: Path, folder: Path, metrics: Metrics | None)
         base_arguments=_base_arguments(config),
         every_setting=config_as_yaml(config.model_copy(update={"run_dir": name})),
     )
-
-
-def _eval_results(config: Config, metrics: Metrics) -> list[EvalResult]:
-    """Return the rollout errors over persistence by horizon, as the Hub shows them."""
-    about = metrics.about
-    return [
-        EvalResult(
-            task_type="robotics",
-            task_name="prediction of latents",
-            dataset_type=config.data.source,
-            dataset_name=PurePath(config.data.path).name,
-            dataset_split=about.split,
-            metric_type="l1_over_persistence",
-            metric_name=f"L1 error over persistence, {step * about.seconds_per_step:.2f} s ahead",
-            metric_value=round(row.value, 4),
-        )
-        for step in range(1, about.frames)
-        if (row := metrics.of(f"rollout.l1.over_persistence.{step}")) is not None and math.isfinite(row.value)
-    ]
 
 
 def _measured(metrics: Metrics) -> str:

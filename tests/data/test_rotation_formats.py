@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.config.sources import RotationFormat
-from vjepa2_ac.data.rotation_formats import FORMATS, rotation_speeds, smoother_format
+from vjepa2_ac.data.poses import FORMATS, rotation_speeds, smoother_format
 
 MAX_RAD_S = MotionLimits().rotation_rad_s
 RATES_HZ = (1.0, 5.0, 15.0, 30.0)

@@ -98,12 +98,8 @@ STATE = "0.4,0,0.3,3.1,0,0.1,0.2"
     "command",
     [
         "evaluate RUN --clips 4",
-        "explore RUN --no-open",
         "export RUN exported",
-        "imagine RUN --decoder builtin:sim-tiny",
         "plan RUN --start a.png --goal a.png --state STATE",
-        "serve RUN",
-        "simulate RUN",
         "train RUN --resume",
     ],
 )
@@ -113,11 +109,6 @@ def test_the_error_shows_the_command_with_the_new_path(
     words = command.replace("RUN", run).replace("STATE", STATE)
     assert main(words.split()) == 2
     assert f"run `vjepa2-ac {words} model.base=PATH`" in capsys.readouterr().err
-
-
-def test_a_command_without_settings_of_the_run_names_the_one_that_has_them(run: str, data_folder: Path, capsys) -> None:
-    assert main(["data", "check", f"{run}/config.yaml", f"data.path={data_folder}", "--model", run]) == 2
-    assert f"run `vjepa2-ac train {run} --resume model.base=PATH`" in capsys.readouterr().err
 
 
 def test_a_run_resumes_on_its_moved_base_and_keeps_the_path(

@@ -6,10 +6,7 @@ from typing import Any
 import pytest
 
 from decoders import whole_decoder  # noqa: F401 - a fixture
-from explored import explorer_of
 from run_fixtures import TINY, MakeConfig
-from vjepa2_ac import api
-from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.episode import Widths
@@ -20,7 +17,6 @@ from vjepa2_ac.model.adapter.adapter_folder import save_trained
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import fit_heads
-from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import read_metrics
 from vjepa2_ac.reports.write import write_evaluation
@@ -57,11 +53,9 @@ def base_run(make_config: MakeConfig) -> Path:
     ("changes", "how", "checkpoint", "note"),
     [
         ({}, {}, "selected", SELECTED),
-        ({}, {}, "best", SELECTED),
         ({"adapter__kind": "none"}, {}, "selected", SELECTED),
         ({}, {"rank": None}, "selected", SELECTED.replace("action ranking", "the prediction error")),
         ({}, {}, "0", "Checkpoint 0 is the base model."),
-        ({}, {"newest": 0}, "newest", "The newest checkpoint is the base model."),
         (
             {}, {"newest": 2}, "selected",
             "The selected checkpoint is the base model: no later checkpoint has been validated.",
@@ -108,31 +102,11 @@ def test_the_base_is_measured_once_and_its_metrics_say_so(base_run: Path, caplog
     assert list(compare([base_run, base_run / "newest"]).measured) == ["run", "newest"]
 
 
-def test_the_explorer_shows_one_model_and_the_note(base_run: Path, whole_decoder: Path) -> None:  # noqa: F811
-    explorer, _ = explorer_of(base_run, whole_decoder, EvaluationOptions(out=base_run))
-    assert [one.name for one in explorer.contenders] == ["base"]
-    assert explorer.notes[0] == SELECTED
-
-
-@pytest.mark.parametrize("form", ["merged", "official", "hub"])
 def test_an_export_says_so_before_it_writes(
-    base_run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, form: Any
+    base_run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("vjepa2_ac.export.merge_adapter", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        export_run(base_run, tmp_path / "out", form)
+        export_run(base_run, tmp_path / "out")
     assert caplog.messages == [SELECTED]
     assert not (tmp_path / "out").exists()
-
-
-def test_what_plans_says_so_too(base_run: Path, caplog: pytest.LogCaptureFixture) -> None:
-    session = load_to_plan(str(base_run), overrides=["planning.samples=8", "planning.planner.options.elites=4"])
-    assert session.warnings[0] == session.as_dict()["warnings"][0] == SELECTED
-    api.load_run(base_run, 0)
-    assert caplog.messages == [SELECTED, "Checkpoint 0 is the base model."]
-
-
-def test_the_console_shows_it_in_one_line(base_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", str(base_run), str(tmp_path / "out")]) == 0
-    (line,) = (line for line in capsys.readouterr().err.splitlines() if SELECTED in line)
-    assert len(line) <= 100

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.config.data import MotionLimits
-from vjepa2_ac.data.rotation_formats import FORMATS, rotation_speeds, smoother_format
+from vjepa2_ac.data.poses import FORMATS, rotation_speeds, smoother_format
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.found import Knob
 from vjepa2_ac.spaces import ANGLE_RAD, REACH_M

@@ -13,8 +13,7 @@ from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.config.sources import PoseFields, RotationFormat
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import MEANS, SPANS
-from vjepa2_ac.data.poses import num_rotation_numbers
-from vjepa2_ac.data.rotation_formats import MIN_JUMPS, rotation_speeds, smoother_format
+from vjepa2_ac.data.poses import MIN_JUMPS, num_rotation_numbers, rotation_speeds, smoother_format
 from vjepa2_ac.data.selection import named
 from vjepa2_ac.data.sources.indexed_source import IndexedSource
 from vjepa2_ac.errors import counted

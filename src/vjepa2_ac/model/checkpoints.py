@@ -109,10 +109,7 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
         fix = "Leave out model.encoder; or train a fresh predictor on it, with model.base: random"
         raise InputError(where=f"model.base: {config.base}", found=said, fix=fix)
     if file is not None:
-        model = _with_predictor(file, encoder or _own_encoder(file, config.sizes), config.sizes, dtype)
-        if encoder is not None:
-            _warn_of_unknown_encoder(model, file, encoder)
-        return model
+        return _of_meta(file, encoder, config.sizes, dtype)
     check_sizes(read_sizes(path), config.sizes, where=f"model.base: {config.base}")
     return WorldModel.from_pretrained(path, dtype=dtype)
 
@@ -150,8 +147,7 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
     Raises:
         InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
     """
-    file, given = MetaFile.open(Path(path)), sizes or ModelSizes()
-    return _with_predictor(file, _own_encoder(file, given), given, dtype)
+    return _of_meta(MetaFile.open(Path(path)), None, sizes or ModelSizes(), dtype)
 
 
 def to_official(model: WorldModel) -> dict[str, Any]:
@@ -177,26 +173,9 @@ def to_official(model: WorldModel) -> dict[str, Any]:
     }
 
 
-def _own_encoder(file: MetaFile, given: ModelSizes) -> FoundEncoder:
-    """Return the encoder of a file that holds a predictor, too."""
-    return encoder_in_file(file, None, given.encoder.frame, given.encoder.heads)
-
-
-def _warn_of_unknown_encoder(model: WorldModel, file: MetaFile, encoder: FoundEncoder) -> None:
-    """Warn that a file holds a predictor alone, and that nothing shows which encoder it was trained on."""
-    model.encoder_origin = encoder.origin
-    if not model.sizes.predictor.use_states:
-        logger.warning("%s: a predictor without states and without an encoder. %s", file.path, _NON_COMMERCIAL)
-    logger.warning(
-        "%s does not say which encoder its predictor was trained on: on any other than %s it predicts noise. The first"
-        " validation shows it (its error beside that of persistence).",
-        file.path,
-        encoder.origin,
-    )
-
-
-def _with_predictor(file: MetaFile, found: FoundEncoder, given: ModelSizes, dtype: torch.dtype) -> WorldModel:
-    """Return the model of the predictor in a file and an encoder."""
+def _of_meta(file: MetaFile, encoder: FoundEncoder | None, given: ModelSizes, dtype: torch.dtype) -> WorldModel:
+    """Return the model of the predictor in a file and an encoder; None: that of the file."""
+    found = encoder or encoder_in_file(file, None, given.encoder.frame, given.encoder.heads)
     predictor = file.tensors("predictor")
     if "mask_tokens" in {name.partition(".")[0] for name in predictor} and "action_encoder.weight" not in predictor:
         said = "a checkpoint of pretraining: its predictor fills in masked patches, and knows no actions"
@@ -204,7 +183,6 @@ def _with_predictor(file: MetaFile, found: FoundEncoder, given: ModelSizes, dtyp
         fix += " predictor (configs/scratch_vitb.yaml)"
         raise InputError(where=f"model.base: {file.path}", found=said, fix=fix)
     model = _on_encoder(found, _sizes(file, predictor, found, given), dtype)
-    model.encoder_origin = None  # the file is the model's own
     fill(
         model.predictor,
         predictor,
@@ -214,6 +192,17 @@ def _with_predictor(file: MetaFile, found: FoundEncoder, given: ModelSizes, dtyp
         fix="Check model.base, model.sizes, and model.encoder: the predictor's latents are of one encoder",
     )
     logger.info("read %s: %s", file.path, model.sizes.model_dump())
+    if encoder is None:
+        model.encoder_origin = None  # the file is the model's own
+        return model
+    if not model.sizes.predictor.use_states:
+        logger.warning("%s: a predictor without states and without an encoder. %s", file.path, _NON_COMMERCIAL)
+    logger.warning(
+        "%s does not say which encoder its predictor was trained on: on any other than %s it predicts noise. The first"
+        " validation shows it (its error beside that of persistence).",
+        file.path,
+        encoder.origin,
+    )
     return model
 
 

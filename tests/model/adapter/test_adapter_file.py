@@ -53,19 +53,15 @@ def test_what_this_program_writes_names_its_layers_and_holds_no_pattern_of_the_u
     [
         ({"target_modules": "(.*)*(a+)+$"}, "targets: Input should be a list"),
         ({"target_modules": ["(a+)+$"]}, "matches no layer of the predictor"),
-        ({"target_modules": []}, "no target"),
         ({"target_modules": None}, "'target_modules' None"),
         ({"rank_pattern": {"(a+)+$": 4}}, "'rank_pattern'"),
-        ({"alpha_pattern": {"(a|a)*": 4}}, "'alpha_pattern'"),
         ({"rank_pattern": {"fc1": 2**40}}, "'rank_pattern'"),
         ({"r": 10**9}, "rank: Input should be less than or equal to 1024"),
-        ({"lora_alpha": float("nan")}, "adapter_config.json"),
         ({"lora_alpha": 1e300}, "alpha: Input should be less than"),
         ({"init_lora_weights": "pissa"}, "peft.init_lora_weights 'pissa' changes the base"),
         ({"modules_to_save": ["blocks"]}, "modules_to_save.0: Input should be 'predictor_embed'"),
         ({"peft_type": "IA3"}, "an adapter with 'peft_type' 'IA3'"),
         ({"bias": "all"}, "an adapter with 'bias' 'all'"),
-        ({"exclude_modules": "(a+)+"}, "'exclude_modules'"),
         ({"use_of_the_future": 1}, "'use_of_the_future'"),
     ],
 )
@@ -77,7 +73,7 @@ def test_what_no_adapter_of_ours_can_be_is_refused_by_name(
     load_trained(on, folder)
     rewrite(folder, changes)
     for model in (fresh(), on):
-        if model is on and complaint in {"matches no layer of the predictor", "no target"}:
+        if model is on and complaint == "matches no layer of the predictor":
             complaint = "needed: ('fc1', 'q'), as the model has"
         with pytest.raises(InputError) as caught:
             load_trained(model, folder)
@@ -90,7 +86,7 @@ def test_what_another_version_of_peft_writes_of_what_is_off_is_no_obstacle(fresh
     load_trained(fresh(), folder)
 
 
-@pytest.mark.parametrize("start", ["pissa", "pissa_niter_4", "olora", "loftq", "corda", "eva", "lora_ga"])
+@pytest.mark.parametrize("start", ["pissa", "loftq"])
 def test_a_start_that_changes_the_base_is_refused(start: str) -> None:
     with pytest.raises(ValidationError, match="weights that nobody has"):
         AdapterConfig(peft={"init_lora_weights": start})

@@ -71,18 +71,16 @@ def test_in_float32_outputs_and_gradients_are_those_of_peft(by_peft: list[str], 
 
 @pytest.mark.parametrize("base", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("given", [torch.float32, torch.bfloat16])
-@pytest.mark.parametrize("dropout", [0.0, 0.4])
 def test_in_bfloat16_it_rounds_no_more_than_peft_and_types_stay(
-    by_peft: list[str], base: torch.dtype, given: torch.dtype, dropout: float
+    by_peft: list[str], base: torch.dtype, given: torch.dtype
 ) -> None:
-    exact = output_and_gradients(layer(lora_dropout=dropout), tokens())
-    expected = output_and_gradients(layer(Linear, base, lora_dropout=dropout), tokens(given), autocast=True)
-    found = output_and_gradients(layer(LoraLinear, base, lora_dropout=dropout), tokens(given), autocast=True)
+    exact = output_and_gradients(layer(), tokens())
+    expected = output_and_gradients(layer(Linear, base), tokens(given), autocast=True)
+    found = output_and_gradients(layer(LoraLinear, base), tokens(given), autocast=True)
     assert by_peft == ["Linear"]
     for one, other, true in zip(found, expected, exact, strict=True):
         assert one.dtype == other.dtype
-        if not dropout:  # in another type the CPU draws other masks
-            assert (one - true).norm() < 1.5 * (other - true).norm() + 1e-6
+        assert (one - true).norm() < 1.5 * (other - true).norm() + 1e-6
 
 
 @pytest.mark.parametrize(
@@ -126,9 +124,8 @@ def test_gradients_are_those_of_differences(masked: bool, reached: bool) -> None
 @pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
 @pytest.mark.usefixtures("traced")
 @pytest.mark.parametrize("autocast", [False, True])
-@pytest.mark.parametrize("rows", [False, True], ids=["tokens of clips", "tokens in rows"])
-def test_compiled_it_learns_what_the_plain_one_learns(rows: bool, autocast: bool) -> None:
-    given = tokens()[0] if rows else tokens()
+def test_compiled_it_learns_what_the_plain_one_learns(autocast: bool) -> None:
+    given = tokens()
     expected = output_and_gradients(layer(), given, autocast=autocast)
     made = layer()
     made.forward = torch.compile(made.forward, backend="eager", fullgraph=True)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -84,25 +82,6 @@ def test_another_key_is_another_encoder(golden: Golden) -> None:
     assert usual.encoder_origin.key == golden.facts["checkpoint"]["encoder_key"]
 
 
-def test_norms_of_lower_levels_are_where_they_belong() -> None:
-    """No output of ours depends on them; an export must not mix them up."""
-    io, encoder = load_file(V21.with_suffix(".io.safetensors")), model_of(V21).present_encoder
-    levels: list[Tensor] = []
-    hooks = [
-        encoder.vit.layer[index].register_forward_hook(
-            lambda _, __, out: levels.append(out[0] if isinstance(out, tuple) else out)
-        )
-        for index in (2, 5, 8, 11)
-    ]
-    name = next(name for name in io if name.startswith("hierarchical."))
-    encoder(io[name.replace("hierarchical", "frames")])
-    for hook in hooks:
-        hook.remove()
-    norms = [*encoder.vit.level_norms, encoder.vit.layernorm]
-    found = torch.cat([norm(level) for norm, level in zip(norms, levels, strict=True)], dim=-1)
-    assert_equal_to_rounding(found, io[name])
-
-
 # Every other form of file gives the same latents.
 
 
@@ -113,11 +92,6 @@ def as_plain(weights: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def only_encoder(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name.replace("vit.", "encoder.", 1): value for name, value in weights.items()}
-
-
-def as_classifier(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    head = {"classifier.weight": torch.zeros(5, 48), "pooler.query_tokens": torch.zeros(1, 1, 48)}
-    return {f"vjepa2.{name}": value for name, value in as_plain(weights).items()} | head
 
 
 CARD = {
@@ -142,7 +116,7 @@ def write_transformers(folder: Path, named: Named = as_plain, shards: int = 1, *
     return folder
 
 
-@pytest.mark.parametrize(("named", "shards"), [(as_plain, 1), (as_plain, 3), (as_classifier, 1)])
+@pytest.mark.parametrize(("named", "shards"), [(as_plain, 1), (as_plain, 3)])
 def test_a_transformers_folder_is_the_same_encoder(tmp_path: Path, named: Named, shards: int) -> None:
     model, original = model_of(write_transformers(tmp_path / "hf", named, shards)), model_of(V2)
     assert model.sizes == original.sizes
@@ -298,8 +272,6 @@ def test_a_config_that_contradicts_the_file_is_refused(path: Path, encoder: dict
         ({"num_attention_heads": 4}, "48"),
         ({"hidden_size": 96}, "do not fit"),
         ({"tubelet_size": 4}, "tubelet_size"),
-        ({"hidden_act": "silu"}, "hidden_act"),
-        ({"layer_norm_eps": 1e-5}, "layer_norm_eps"),
         ({"hidden_size": 10**9}, "hidden_size"),
     ],
 )
@@ -312,19 +284,6 @@ def test_a_transformers_folder_that_says_something_else_is_refused(
         return
     with pytest.raises(InputError, match=message):
         model_of(folder)
-
-
-def test_a_folder_that_is_damaged_is_refused(tmp_path: Path) -> None:
-    folder = write_transformers(tmp_path / "hf", shards=2)
-    shard = folder / "model-00002-of-00002.safetensors"
-    shard.write_bytes(shard.read_bytes()[:2000])
-    with pytest.raises(InputError, match="not a whole safetensors file"):
-        model_of(folder)
-    shard.unlink()
-    with pytest.raises(InputError, match=r"tensors do not fit \(missing: "):
-        model_of(folder)
-    with pytest.raises(InputError, match="Leave the key out"):
-        model_of(folder, key="encoder")
 
 
 def test_pretrainings_masked_predictor_is_not_taken_for_one_of_actions() -> None:
@@ -347,25 +306,6 @@ def test_the_encoder_of_a_model_stays_the_same_encoder_under_another_predictor()
     """So its decoder and its caches fit."""
     own = WorldModel.from_pretrained(find_base("builtin:sim-tiny"))
     assert model_of("builtin:sim-tiny").encoder_fingerprint() == own.encoder_fingerprint()
-
-
-def test_only_the_encoder_is_read_from_a_large_file(tmp_path: Path) -> None:
-    """Peak memory is the encoder, whatever the optimizer's part of the file is."""
-    whole = torch.load(V21, weights_only=True)
-    whole["opt"] = {"state": {0: {"exp_avg": torch.zeros(40_000_000)}}}  # 160 MB
-    torch.save(whole, tmp_path / "large.pt")
-    code = f"""
-import resource, torch
-from vjepa2_ac.config import ModelConfig
-from vjepa2_ac.model.checkpoints import load_base
-model = {{"base": "random", "encoder": {{"path": {str(tmp_path / "large.pt")!r}, "heads": 4}}, "dtype": "float32",
-         "sizes": {{"image_size": 96, "predictor": {{"width": 24, "depth": 1, "heads": 2}}}}}}
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-load_base(ModelConfig.model_validate(model), seed=0)
-print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert int(done.stdout) < 120e6
 
 
 # Features of an earlier block.

@@ -29,16 +29,8 @@ def load_with(base: Path | str, sizes: ModelSizes) -> WorldModel:
     return load_base(ModelConfig(base=str(base), sizes=sizes, dtype="float32"), seed=0)
 
 
-def test_a_model_of_the_package_is_found_by_its_name(model: WorldModel, assets: Path) -> None:
-    model.save_pretrained(assets / "sim-tiny")
-    loaded = load_with("builtin:sim-tiny", ModelSizes())
-    assert loaded.predictor_fingerprint() == model.predictor_fingerprint()
-
-
-@pytest.mark.parametrize("empty", [True, False])
-def test_a_package_without_models_says_how_to_make_one(assets: Path, empty: bool) -> None:
-    if empty:
-        assets.mkdir()
+@pytest.mark.usefixtures("assets")
+def test_a_package_without_models_says_how_to_make_one() -> None:
     with pytest.raises(InputError, match=r"it has none: install it again"):
         load_with("builtin:sim-tiny", ModelSizes())
 
@@ -52,25 +44,17 @@ def test_sizes_that_a_folder_does_not_have_are_refused_by_name(model: WorldModel
         load_with(tmp_path / "model", given)
 
 
-@pytest.mark.parametrize("given", [{}, {"image_size": 48, "encoder": EncoderSizes(heads=2)}])
-def test_sizes_that_a_folder_has_and_defaults_are_fine(model: WorldModel, tmp_path: Path, given: dict) -> None:
-    model.save_pretrained(tmp_path / "model")
-    written_out = ModelSizes.model_validate_json(ModelSizes(**given).model_dump_json())  # as in a run's config.yaml
-    assert load_with(tmp_path / "model", written_out).sizes == model.sizes
-
-
 def test_a_folder_that_is_no_model_gives_the_command_that_makes_one_of_a_run(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"config\.json: cannot be read: No such.*`vjepa2-ac export RUN FOLDER`"):
         load_with(tmp_path, ModelSizes())
 
 
 @pytest.mark.parametrize("part", [ENCODER, PREDICTOR])
-@pytest.mark.parametrize("value", [float("nan"), float("-inf")])
-def test_a_weight_that_is_not_finite_is_named(model: WorldModel, tmp_path: Path, part: str, value: float) -> None:
+def test_a_weight_that_is_not_finite_is_named(model: WorldModel, tmp_path: Path, part: str) -> None:
     model.save_pretrained(tmp_path)
     weights = load_file(tmp_path / part)
     name = sorted(weights)[-1]
-    weights[name].flatten()[-1] = value
+    weights[name].flatten()[-1] = float("nan")
     save_file(weights, tmp_path / part)
     with pytest.raises(InputError, match=rf"{part}: {name} holds NaN or infinity"):
         load_with(tmp_path, ModelSizes())
@@ -138,21 +122,3 @@ def test_what_does_not_fit_is_refused(file: Path, encoder: Path, tmp_path: Path)
     torch.save(whole, file)
     with pytest.raises(InputError, match=r"predictor_proj\.bias holds NaN"):
         loaded(file, encoder)
-
-
-def test_beside_an_encoder_it_is_read_whole_and_no_licence_is_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    whole = torch.load(GOLDEN / "model" / "tiny.pt", weights_only=True)
-    for name in [name for name in whole["predictor"] if "state_encoder" in name or "extrinsics_encoder" in name]:
-        del whole["predictor"][name]
-    torch.save(whole, tmp_path / "whole.pt")
-    sizes = ModelSizes(image_size=64, encoder=EncoderSizes(heads=2), predictor=PredictorSizes(heads=4))
-    with caplog.at_level(logging.WARNING):
-        model = load_official(tmp_path / "whole.pt", sizes)
-    assert not model.sizes.predictor.use_states
-    assert not caplog.records
-    assert load_official(tmp_path / "whole.pt", model.sizes).sizes == model.sizes
-    other = sizes.model_copy(update={"predictor": sizes.predictor.model_copy(update={"use_states": False})})
-    with pytest.raises(InputError, match=r"predictor\.use_states True, and model\.sizes says False"):
-        load_official(GOLDEN / "model" / "tiny.pt", other)

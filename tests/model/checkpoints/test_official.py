@@ -1,11 +1,9 @@
 """Official checkpoints: the official code's own numbers for both references, and validation of the file."""
 
-import argparse
 import io
 import json
 import os
 import pickle
-import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -116,13 +114,6 @@ def test_official_weights_go_out_as_they_came_in(reference: Reference) -> None:
         assert all(torch.equal(exported[part][name], value) for name, value in whole[part].items())
 
 
-def test_loading_in_bfloat16_rounds_the_weights(reference: Reference) -> None:
-    rounded = load_official(reference.path, reference.sizes, dtype=torch.bfloat16)
-    expected = dict(reference.model.named_parameters())
-    for name, value in rounded.named_parameters():
-        assert torch.equal(value, expected[name].bfloat16()), name
-
-
 TINY_SIZES = ModelSizes(image_size=64, encoder=EncoderSizes(heads=2), predictor=PredictorSizes(heads=4))
 Whole = dict[str, Any]
 
@@ -144,10 +135,7 @@ def renamed(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {prefix + name.removeprefix("module."): value for name, value in weights.items()}
 
 
-PREFIXES = ["", "backbone.", "module.backbone.", "backbone.module.", "_orig_mod.", "module._orig_mod."]
-
-
-@pytest.mark.parametrize("prefix", [*PREFIXES, "_orig_mod.module.", "module._orig_mod.backbone."])
+@pytest.mark.parametrize("prefix", ["", "module.backbone.", "module._orig_mod.backbone."])
 def test_prefixes_in_any_order_and_an_unused_pos_embed_are_no_obstacle(rewritten, prefix: str) -> None:
     def change(whole: Whole) -> None:
         for part in ("encoder", "target_encoder", "predictor"):
@@ -158,15 +146,6 @@ def test_prefixes_in_any_order_and_an_unused_pos_embed_are_no_obstacle(rewritten
     assert (
         model.predictor_fingerprint() == load_official(GOLDEN / "model" / "tiny.pt", TINY_SIZES).predictor_fingerprint()
     )
-
-
-def test_blocks_that_were_compiled_one_by_one_are_read(rewritten) -> None:
-    def change(whole: Whole) -> None:
-        for part in ("encoder", "target_encoder", "predictor"):
-            whole[part] = {re.sub(r"(locks\.\d+)", r"\1._orig_mod", name): one for name, one in whole[part].items()}
-        assert any("._orig_mod." in name for name in whole["predictor"])
-
-    load_official(rewritten(change), TINY_SIZES)
 
 
 # Two encoders in a file.
@@ -181,24 +160,11 @@ def trained_encoder(whole: Whole) -> None:
     }
 
 
-def renamed_encoder(whole: Whole) -> None:
-    whole["encoder"] = {f"other.{name}": value for name, value in whole["encoder"].items()}
-
-
-@pytest.mark.parametrize("change", [trained_encoder, renamed_encoder, lambda whole: whole.pop("encoder") and None])
+@pytest.mark.parametrize("change", [trained_encoder, lambda whole: whole.pop("encoder") and None])
 def test_the_target_encoder_is_used_whatever_the_other_encoder_is(rewritten, change: Callable[[Whole], None]) -> None:
     expected = load_official(GOLDEN / "model" / "tiny.pt", TINY_SIZES)
     model = load_official(rewritten(change), TINY_SIZES)
     assert model.encoder_fingerprint() == expected.encoder_fingerprint()
-
-
-def test_tensors_that_are_expanded_beyond_the_memory_are_refused(rewritten) -> None:
-    def change(whole: Whole) -> None:
-        for part in ("encoder", "target_encoder"):
-            whole[part]["module.norm.weight"] = torch.zeros(1).expand(1 << 46)
-
-    with pytest.raises(InputError, match=r"norm\.weight is \[70368744177664\], not \[48\]"):
-        load_official(rewritten(change), TINY_SIZES)
 
 
 def rename_one(whole: Whole) -> None:
@@ -210,16 +176,8 @@ def drop_head(whole: Whole) -> None:
     del whole["predictor"]["module.state_encoder.weight"]
 
 
-def drop_predictor(whole: Whole) -> None:
-    del whole["predictor"]
-
-
 def narrow(whole: Whole) -> None:
     whole["predictor"]["module.predictor_proj.weight"] = torch.zeros(24, 64)
-
-
-def other_actions(whole: Whole) -> None:
-    whole["predictor"]["module.action_encoder.weight"] = torch.zeros(64, 4)
 
 
 @pytest.mark.parametrize(
@@ -230,18 +188,11 @@ def other_actions(whole: Whole) -> None:
             r"encoder: 2 tensors do not fit \(missing: blocks.1.norm1.weight; unknown: blocks.1.norm1.scale\)",
         ),
         (drop_head, r"predictor: 1 tensors do not fit \(missing: state_encoder.weight\)"),
-        (drop_predictor, r"no predictor \(keys: encoder, target_encoder, .*torch.save"),
         (narrow, r"predictor_proj.weight is \[24, 64\], not \[48, 64\]"),
-        (other_actions, r"action_encoder.weight is \[64, 4\], not \[64, 7\]"),
         (lambda _: [1, 2], "changed.pt: a list. needed: a checkpoint of V-JEPA"),
         (lambda whole: {"model": whole["encoder"]}, r"no encoder \(keys: model\)"),
         (lambda whole: {"encoder": whole["encoder"]}, r"no predictor \(keys: encoder\)\. needed: both parts"),
-        (lambda whole: {"predictor": whole["predictor"]}, r"no encoder \(keys: predictor\)\. needed: both parts"),
         (lambda whole: whole["predictor"], r"no encoder \(keys: module\.\w+\..*needed: both parts.*torch\.save\("),
-        (
-            lambda whole: whole | {"target_encoder": renamed(whole["encoder"], "model.")},
-            r"no tensor 'patch_embed.proj.weight' in target_encoder \(its tensors: model\.\w+\.",
-        ),
         (
             lambda whole: whole | {"predictor": renamed(whole["predictor"], "model.")},
             r"no tensor 'action_encoder.weight' in predictor \(its tensors: model\.\w+\.",
@@ -317,9 +268,7 @@ def test_a_file_that_is_no_checkpoint_shows_how_it_begins_and_is_never_executed(
     assert not Path("it-was-executed").exists()
 
 
-@pytest.mark.parametrize(
-    "value", [np.float64(0.3), argparse.Namespace(a=1), Path("here")], ids=["numpy", "args", "path"]
-)
+@pytest.mark.parametrize("value", [np.float64(0.3), Path("here")], ids=["numpy", "path"])
 def test_a_file_with_other_objects_prints_the_command_that_saves_its_weights_alone(
     rewritten, tmp_path: Path, value: object
 ) -> None:

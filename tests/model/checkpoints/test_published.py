@@ -36,18 +36,6 @@ twice, at_once = RetryPolicy(attempts=2, first_wait_s=0.0), RetryPolicy(first_wa
 PART = "made-up.pt.made-up.part"
 
 
-class Told:
-    """Keeps what is told of the progress."""
-
-    def __init__(self) -> None:
-        self.lines: list[tuple[str, int, int]] = []
-
-    def note(self, text: str) -> None: ...
-
-    def task(self, title: str, unit: str = "") -> Callable[[int, int], None]:  # noqa: ARG002
-        return lambda done, total: self.lines.append((title, done, total))
-
-
 @dataclass
 class Behaviour:
     """What the server does: how many bytes it sends before it hangs up, which answers come first, what it can."""
@@ -103,15 +91,6 @@ def handler_for(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
         def log_message(self, *_: object) -> None: ...
 
     return Handler
-
-
-def test_a_file_arrives_whole_and_progress_is_told(serve, tmp_path: Path) -> None:
-    content = bytes(range(256)) * 2**13
-    told = Told()
-    path = download(serve(Behaviour(content=content)), tmp_path / "new" / "model.pt", reporter=told)
-    assert path.read_bytes() == content
-    assert told.lines[-1] == ("model.pt (MB)", 2, 2)
-    assert [entry.name for entry in path.parent.iterdir()] == ["model.pt"]
 
 
 @pytest.mark.parametrize(

@@ -72,19 +72,6 @@ def test_compiled_steps_are_the_plain_ones_and_nothing_is_compiled_again_after_t
     assert list(model.state_dict()) == names
 
 
-def test_compiled_steps_with_dropout_and_autocast_are_the_plain_ones(sizes: ModelSizes, inputs) -> None:
-    model, batch = adapted(sizes, dropout=0.5), clips(inputs)
-    with torch.autocast("cpu", torch.bfloat16):
-        expected = loss_and_gradients(model, batch, compiled=False)
-        found = loss_and_gradients(model, batch, compiled=True)
-        assert_same(found, expected)
-        before = graphs()
-        model.set_gradient_checkpointing(True)
-        assert_same(loss_and_gradients(model, batch, compiled=True), expected)
-    assert not counters["graph_break"]
-    assert graphs() == before
-
-
 def test_what_a_machine_lacks_to_compile_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.delenv("CXX", raising=False)

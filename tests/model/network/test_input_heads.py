@@ -10,7 +10,7 @@ from vjepa2_ac.config import AdapterConfig, ModelConfig, ModelSizes
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
-from vjepa2_ac.model.adapter.lora import add_adapter, base_only, merge_adapter
+from vjepa2_ac.model.adapter.lora import add_adapter, merge_adapter
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model
@@ -26,7 +26,7 @@ HEADS = ("action_encoder", "state_encoder")
 LORA = AdapterConfig(rank=2, alpha=4.0, dropout=0.0, modules_to_save=HEADS)  # with more, float32 is ill-conditioned
 EVERYTHING = AdapterConfig(kind="none")
 both_kinds = pytest.mark.parametrize("config", [LORA, EVERYTHING], ids=["lora", "none"])
-widths = pytest.mark.parametrize("widths", [Widths(14, 14), Widths(8, 7), Widths(7, 8)], ids=str)
+widths = pytest.mark.parametrize("widths", [Widths(14, 14), Widths(8, 7)], ids=str)
 
 
 def base() -> WorldModel:
@@ -81,18 +81,6 @@ def test_only_heads_that_do_not_fit_are_replaced_and_each_is_told(widths: Widths
     assert predict(model, widths).shape == (1, 3, 4, 24)
 
 
-def test_fresh_heads_are_decided_by_the_seed_and_drawn_as_the_recipe_draws() -> None:
-    one, same, other = fitted(Widths(14, 14)), fitted(Widths(14, 14)), fitted(Widths(14, 14), seed=1)
-    for name in HEADS:
-        weight = getattr(one.predictor, name).weight
-        assert torch.equal(weight, getattr(same.predictor, name).weight)
-        assert not torch.equal(weight, getattr(other.predictor, name).weight)
-        assert abs(weight.std().item() - 0.02) < 0.004
-        assert not getattr(one.predictor, name).bias.any()
-    assert not torch.equal(one.predictor.action_encoder.weight, one.predictor.state_encoder.weight)
-    assert torch.equal(fitted(Widths(7, 14)).predictor.action_encoder.weight, one.predictor.action_encoder.weight)
-
-
 def test_a_fresh_head_that_would_not_be_trained_is_refused_with_the_line_to_add() -> None:
     plain = LORA.model_copy(update={"modules_to_save": ()})
     with pytest.raises(InputError, match=r"modules_to_save=\[action_encoder, state_encoder\]"):
@@ -118,18 +106,6 @@ def test_what_was_trained_comes_back_onto_the_plain_base(tmp_path: Path, config:
     assert torch.equal(predict(resumed, widths), predict(model, widths))
     names = [name for name, value in resumed.predictor.named_parameters() if value.requires_grad]
     assert all(any(head in name for name in names) for head in HEADS)
-
-
-@both_kinds
-def test_base_only_brings_fresh_heads_back_as_they_were_drawn(tmp_path: Path, config: AdapterConfig) -> None:
-    model, start = trained(Widths(14, 14), config), predict(fitted(Widths(14, 14)), Widths(14, 14))
-    save_trained(model, tmp_path)
-    loaded = base()
-    load_trained(loaded, tmp_path)
-    for one in (model, loaded):
-        with base_only(one):
-            assert torch.equal(predict(one, Widths(14, 14)), start)
-        assert not torch.equal(predict(one, Widths(14, 14)), start)
 
 
 @both_kinds

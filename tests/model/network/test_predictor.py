@@ -32,17 +32,6 @@ def test_a_prediction_depends_on_its_own_and_earlier_steps_only(model: WorldMode
         assert not torch.isclose(before[:, 2:], after[:, 2:]).all(dim=(0, 2, 3)).any(), name
 
 
-@pytest.mark.parametrize("image_size", [16, 80])
-def test_other_image_sizes_work(image_size: int) -> None:
-    small = PredictorSizes(width=12, depth=1, heads=2)
-    model = WorldModel.random(
-        ModelSizes(image_size=image_size, encoder=EncoderSizes(width=12, depth=1, heads=2), predictor=small), seed=0
-    )
-    latents = model.encode(torch.zeros(1, 2, 3, image_size, image_size))
-    assert latents.shape[2] == (image_size // 16) ** 2
-    assert model.predict(latents, torch.zeros(1, 2, 7), torch.zeros(1, 2, 7)).shape == latents.shape
-
-
 @pytest.mark.parametrize("by_transformers", [True, False])
 def test_output_layers_start_smaller_the_deeper_they_are(by_transformers: bool) -> None:
     predictor = ActionConditionedPredictor(PredictorConfig(**predictor_fields(WIDE)))
@@ -59,21 +48,6 @@ def test_output_layers_start_smaller_the_deeper_they_are(by_transformers: bool) 
     assert not any(value.any() for name, value in predictor.named_parameters() if name.endswith("bias"))
 
 
-def test_gradient_checkpointing_keeps_less(model: WorldModel, inputs) -> None:
-    model.predictor.requires_grad_(True)
-
-    def kept_bytes(checkpointing: bool) -> int:
-        model.set_gradient_checkpointing(checkpointing)
-        sizes: list[int] = []
-        with torch.autograd.graph.saved_tensors_hooks(
-            lambda tensor: sizes.append(tensor.nbytes) or tensor, lambda tensor: tensor
-        ):
-            model.predict(inputs.latents, inputs.actions, inputs.states)
-        return sum(sizes)
-
-    assert kept_bytes(True) < kept_bytes(False) / 3
-
-
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of transformers' own loader
 def test_transformers_loads_the_predictor_by_itself(model: WorldModel, tmp_path: Path, inputs) -> None:
     model.save_pretrained(tmp_path / "model")
@@ -88,7 +62,7 @@ ADAPTERS = {
     "dora": LORA.model_copy(update={"dora": True}),
     "none": AdapterConfig(kind="none"),
 }
-PARTS = [(1, 1, 1, 1), (2, 2), (3, 1), (1, 3)]
+PARTS = [(1, 1, 1, 1), (1, 3)]
 
 
 def adapted(sizes: ModelSizes, adapter: str = "lora", *, extrinsics: bool = False) -> WorldModel:
@@ -134,8 +108,7 @@ def assert_same(found: list[Tensor], expected: list[Tensor], tolerance: float = 
 
 
 @pytest.mark.parametrize("parts", PARTS)
-@pytest.mark.parametrize("extrinsics", [False, True])
-@pytest.mark.parametrize("checkpointing", [False, True])
+@pytest.mark.parametrize(("extrinsics", "checkpointing"), [(False, False), (True, True)])
 def test_steps_in_parts_give_the_predictions_and_gradients_of_all_at_once(
     sizes: ModelSizes, inputs, parts: tuple[int, ...], extrinsics: bool, checkpointing: bool
 ) -> None:
@@ -157,32 +130,6 @@ def test_every_kind_of_adapter_lets_gradients_through_the_cache(
     assert_same(output_and_gradients(model, in_parts(model, given, (1, 3)), given), expected)
 
 
-@pytest.mark.parametrize("kind", ["dense", "per_step"])
-def test_every_way_of_attention_sees_the_cache(sizes: ModelSizes, inputs, kind: Any) -> None:
-    model, given = adapted(sizes), arguments(inputs)
-    expected = output_and_gradients(model, model.predict(*given), given)
-    model.set_attention(kind)
-    assert_same(output_and_gradients(model, in_parts(model, given, (2, 2)), given), expected)
-
-
-def test_what_is_kept_of_the_first_steps_is_all_that_later_steps_see(sizes: ModelSizes, inputs) -> None:
-    model, cache = adapted(sizes), KeyValueCache()
-    given = arguments(inputs)
-    model.predict(*given, cache=cache, keep=1)
-    assert cache.tokens == 9 + 2
-    found = model.predict(*(value[:, 2:] for value in given), cache=cache)
-    seen = [torch.cat([value[:, :1], value[:, 2:]], dim=1) for value in given]
-    torch.testing.assert_close(found, model.predict(*seen)[:, 1:], rtol=1e-5, atol=1e-5)
-
-
-def test_what_is_kept_holds_nothing_of_the_rest(sizes: ModelSizes, inputs) -> None:
-    cache = KeyValueCache()
-    adapted(sizes).predict(*arguments(inputs), cache=cache, keep=1)
-    for layer in range(sizes.predictor.depth):
-        (piece,) = cache.layer(layer)
-        assert piece.untyped_storage().nbytes() == piece.nbytes == 2 * 2 * (9 + 2) * sizes.predictor.width * 4
-
-
 def plain_rollout(model: WorldModel, context: Tensor, actions: Tensor, states: Tensor) -> Tensor:
     """Compute everything again for each prediction."""
     latents = context
@@ -193,7 +140,7 @@ def plain_rollout(model: WorldModel, context: Tensor, actions: Tensor, states: T
 
 
 @pytest.mark.parametrize("adapter", [None, "lora"])
-@pytest.mark.parametrize("context", [1, 2, 3, 4])
+@pytest.mark.parametrize("context", [1, 3])
 @torch.no_grad()
 def test_a_rollout_is_the_one_that_computes_everything_again(
     sizes: ModelSizes, inputs, context: int, adapter: str | None
@@ -201,15 +148,6 @@ def test_a_rollout_is_the_one_that_computes_everything_again(
     model = WorldModel.random(sizes, seed=0) if adapter is None else adapted(sizes, adapter)
     given = (inputs.latents[:, :context], inputs.actions, inputs.states)
     torch.testing.assert_close(model.rollout(*given), plain_rollout(model, *given), rtol=1e-5, atol=1e-5)
-
-
-@torch.no_grad()
-def test_a_rollout_in_bfloat16_is_the_plain_one_to_its_precision(fresh, inputs) -> None:
-    model = fresh(dtype=torch.bfloat16)
-    given = (inputs.latents[:, :1], inputs.actions, inputs.states)
-    with torch.autocast("cpu", torch.bfloat16):
-        found, expected = model.rollout(*given), plain_rollout(model, *given)
-    assert (found - expected).norm() <= 2e-2 * expected.norm()
 
 
 @torch.no_grad()

@@ -8,14 +8,12 @@ from torch import Tensor
 from torch.nn.functional import layer_norm
 
 from tiny_models import DIM, draw, tiny_model
-from vjepa2_ac.config import AdapterConfig, ModelConfig
+from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.attention import TokenLayout, rotary_tables
-from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model
 
 STEPS, GRID = 4, 3
@@ -67,19 +65,6 @@ def test_predictions_are_those_of_the_model_with_states_whose_state_tokens_are_c
 
 @both
 @torch.no_grad()
-def test_rollouts_with_cached_keys_are_those_with_the_state_tokens_cut_out(extrinsics: bool) -> None:
-    full, cut = pair(extrinsics=extrinsics)
-    latents, actions, states, *cameras = inputs(extrinsics=extrinsics)
-    seen = latents[:, :2]
-    for end in range(2, STEPS + 1):
-        following = predicted_by_hand(full, seen, actions[:, :end], [camera[:, :end] for camera in cameras])
-        seen = torch.cat([seen, following[:, -1:]], dim=1)
-    found = cut.rollout(latents[:, :2], actions, states, *cameras)
-    torch.testing.assert_close(found, seen[:, 2:], atol=1e-5, rtol=1e-5)
-
-
-@both
-@torch.no_grad()
 def test_other_states_of_any_width_change_no_bit(extrinsics: bool) -> None:
     cut = pair(extrinsics=extrinsics)[1]
     latents, actions, states, *cameras = inputs(extrinsics=extrinsics)
@@ -108,18 +93,3 @@ def test_states_of_any_width_fit_and_other_actions_get_a_fresh_head(width: int, 
     add_adapter(model, LORA.model_copy(update={"modules_to_save": ("action_encoder",)}), seed=0)
     save_trained(model, tmp_path / "adapter")
     load_trained(tiny_model(states=False), tmp_path / "adapter")
-
-
-def test_a_folder_keeps_it_and_contradictions_are_refused(tmp_path: Path) -> None:
-    model = tiny_model(states=False)
-    model.save_pretrained(tmp_path)
-    loaded = load_base(ModelConfig(base=str(tmp_path), dtype="float32"), seed=0)
-    assert loaded.sizes == model.sizes
-    assert torch.equal(loaded.predict(*inputs()), model.predict(*inputs()))
-    alone = ActionConditionedPredictor.from_pretrained(tmp_path / "predictor")
-    assert torch.equal(alone(*inputs()), model.predictor(*inputs()))
-    told = {"base": str(tmp_path), "dtype": "float32", "sizes": {"predictor": {"use_states": False}}}
-    load_base(ModelConfig.model_validate(told), seed=0)
-    tiny_model().save_pretrained(tmp_path / "full")
-    with pytest.raises(InputError, match=r"predictor\.use_states True, and model\.sizes says False"):
-        load_base(ModelConfig.model_validate(told | {"base": str(tmp_path / "full")}), seed=0)
