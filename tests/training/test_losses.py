@@ -16,7 +16,7 @@ from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorS
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.checkpoints import load_official
-from vjepa2_ac.model.network import predictor_network
+from vjepa2_ac.model.network import predictor
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.step import Objective, prediction_losses
 
@@ -130,7 +130,7 @@ def test_losses_and_gradients_equal_those_of_computing_everything_again(
     monkeypatch: pytest.MonkeyPatch, steps: int, adapter: AdapterConfig, checkpointing: bool, extrinsics: bool
 ) -> None:
     # Float64 throughout: otherwise predictions are normalised in float32.
-    monkeypatch.setattr(predictor_network, "normalise_latents", lambda found: layer_norm(found, found.shape[-1:]))
+    monkeypatch.setattr(predictor, "normalise_latents", lambda found: layer_norm(found, found.shape[-1:]))
     model = trained_model(adapter, extrinsics=extrinsics, checkpointing=checkpointing).double()
     batch = clips(extrinsics=extrinsics)
     tensors = {name: value.double() for name, value in vars(batch).items() if isinstance(value, Tensor)}

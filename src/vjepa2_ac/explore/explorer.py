@@ -26,7 +26,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import Models
 from vjepa2_ac.explore.messages import MOST_STEPS, GoalFrame
 from vjepa2_ac.model.distances import absolute_difference
-from vjepa2_ac.model.network.predictor_network import KeyValueCache
+from vjepa2_ac.model.network.predictor import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
 from vjepa2_ac.planning.planner import Cancelled

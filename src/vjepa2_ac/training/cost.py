@@ -34,7 +34,7 @@ from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.network.attention import rotary_tables
-from vjepa2_ac.model.network.predictor_network import LatentDynamics, PredictorNetwork, predictor_fields
+from vjepa2_ac.model.network.predictor import LatentDynamics, PredictorNetwork, predictor_fields
 from vjepa2_ac.training.step import Objective
 
 Kind = Literal["cpu", "cuda"]

@@ -10,8 +10,12 @@ from torch import Tensor
 
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
-from vjepa2_ac.model.network.predictor_network import KeyValueCache, predictor_fields
+from vjepa2_ac.model.network.predictor import (
+    ActionConditionedPredictor,
+    KeyValueCache,
+    PredictorConfig,
+    predictor_fields,
+)
 from vjepa2_ac.model.network.world_model import WorldModel
 
 WIDE = ModelSizes(

@@ -1,13 +1,187 @@
-"""The action-conditioned predictor of V-JEPA 2-AC as transformers stores and loads it, and its initial weights."""
+"""The action-conditioned predictor: layers, pass, cache, its form in transformers; predict a step, roll out many."""
 
 from __future__ import annotations
 
-import torch
-from torch import Generator, nn
-from transformers import PreTrainedConfig, PreTrainedModel
+from collections.abc import Sequence
+from typing import Any
 
-from vjepa2_ac.model.network.blocks import initialise
-from vjepa2_ac.model.network.predictor_network import PredictorNetwork
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+from torch.nn.functional import layer_norm
+from torch.utils.checkpoint import checkpoint
+
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.episode import EXTRINSICS_DIM
+from vjepa2_ac.model.network.attention import Attend, AttentionKind, TokenLayout, rotary_tables
+from vjepa2_ac.model.network.blocks import NORM_EPSILON, Block, hidden_width, initialise, normalised
+from vjepa2_ac.model.network.compilation import When
+from vjepa2_ac.model.quiet_imports import quiet_imports
+
+with quiet_imports():
+    from transformers import PreTrainedConfig, PreTrainedModel
+
+
+class KeyValueCache:
+    """The keys (rotated) and values of earlier steps, in every layer of a predictor; empty at first.
+
+    Gradients flow through it into the passes that filled it. It stores the pieces as they were added: a block
+    concatenates them while it computes, so that with gradient checkpointing no step is stored twice.
+    """
+
+    def __init__(self, pieces: tuple[tuple[Tensor, ...], ...] = ()) -> None:
+        self._pieces = pieces  # of each layer
+
+    @property
+    def tokens(self) -> int:
+        """Number of tokens in the cache."""
+        return sum(piece.shape[3] for piece in self._pieces[0]) if self._pieces else 0
+
+    def layer(self, index: int) -> tuple[Float[Tensor, "2 batch heads _ head_dim"], ...]:
+        """Return the keys and values of a layer, piece by piece."""
+        return self._pieces[index] if self._pieces else ()
+
+    def append(self, added: Sequence[Float[Tensor, "2 batch heads tokens head_dim"]]) -> None:
+        """Add keys and values of further tokens, one piece for every layer."""
+        before = self._pieces or ((),) * len(added)
+        self._pieces = tuple((*pieces, piece) for pieces, piece in zip(before, added, strict=True))
+
+    def copy(self) -> KeyValueCache:
+        """Return a cache that can grow independently; no tensor is copied."""
+        return KeyValueCache(self._pieces)
+
+    def expanded(self, samples: int) -> KeyValueCache:
+        """Return the cache of one start expanded to many samples; no tensor is copied.
+
+        Raises:
+            RuntimeError: It holds more than one start.
+        """
+        return KeyValueCache(tuple(tuple(one.expand(-1, samples, -1, -1, -1) for one in own) for own in self._pieces))
+
+
+class PredictorNetwork(nn.Module):
+    """Predicts, for every step, the latents of the next one from the latents, states and actions up to it.
+
+    The tokens of a step, in order: action, (state), (extrinsics), patches. Output: patches only, not normalised.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, src/models/ac_predictor.py, VisionTransformerPredictorAC.
+    """
+
+    config: Any  # the fields of `predictor_fields`
+    attention: AttentionKind | Attend
+    gradient_checkpointing: bool  # the name transformers switches
+    has_dropout: bool  # in its blocks: then recomputed blocks draw the same masks
+
+    def add_layers(self, config: Any) -> None:
+        """Make the layers of these sizes, uninitialised, and set the switches to their defaults."""
+        width = config.hidden_size
+        hidden = hidden_width(width, config.mlp_ratio)
+        self.predictor_embed = nn.Linear(config.latent_dim, width)
+        self.action_encoder = nn.Linear(config.action_dim, width)
+        if config.use_states:
+            self.state_encoder = nn.Linear(config.state_dim, width)
+        if config.use_states or config.use_extrinsics:  # with states always, as in the official checkpoint
+            self.extrinsics_encoder = nn.Linear(EXTRINSICS_DIM, width)
+        self.blocks = nn.ModuleList(
+            Block(width, config.num_attention_heads, hidden, layer=index + 1)
+            for index in range(config.num_hidden_layers)
+        )
+        self.predictor_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
+        self.predictor_proj = nn.Linear(width, config.latent_dim)
+        self.attention = "auto"
+        self.gradient_checkpointing = False
+        self.has_dropout = False
+
+    @property
+    def grid(self) -> int:
+        """Patches along one side of a frame."""
+        return int(self.config.image_size // self.config.patch_size)
+
+    @property
+    def unused_layers(self) -> tuple[str, ...]:
+        """Layers without input."""
+        return ("extrinsics_encoder",) if self.config.use_states and not self.config.use_extrinsics else ()
+
+    def forward(
+        self,
+        latents: Float[Tensor, "batch time tokens dim"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
+        keep: int | None = None,
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return, at each step, the prediction of the next step's latents, not yet normalised.
+
+        Inputs of any float type are cast to the weights' type.
+
+        Args:
+            latents: Latents of consecutive steps.
+            actions: The action of each.
+            states: The state of each; not used, and of any width, where the model has no states.
+            extrinsics: The camera of each, where the model uses it.
+            cache: The steps come after those in the cache, and see them; then they are added to it.
+            keep: How many of the steps are added, from the first; None: all.
+
+        Raises:
+            ValueError: Extrinsics are missing or unexpected.
+        """
+        tokens, layout = self._assemble(latents, actions, states, extrinsics, cache)
+        tokens = self._through_blocks(tokens, layout, cache, keep)
+        patches = rearrange(tokens, "batch (time token) width -> batch time token width", time=layout.steps)[
+            :, :, layout.conditioning :
+        ]
+        return _in_own_type(self.predictor_proj, normalised(self.predictor_norm, patches), self._dtype)
+
+    def _assemble(
+        self,
+        latents: Tensor,
+        actions: Tensor,
+        states: Tensor,
+        extrinsics: Tensor | None,
+        cache: KeyValueCache | None = None,
+    ) -> tuple[Tensor, TokenLayout]:
+        """Return the sequence of tokens, step by step, and its layout."""
+        if self.config.use_extrinsics != (extrinsics is not None):
+            raise ValueError(
+                f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
+            )
+        given = [(self.action_encoder, actions)]
+        given += [(self.state_encoder, states)] if self.config.use_states else []
+        given += [] if extrinsics is None else [(self.extrinsics_encoder, extrinsics)]
+        conditions = [_in_own_type(layer, values, self._dtype) for layer, values in given]
+        patches = _in_own_type(self.predictor_embed, latents, self._dtype)
+        tokens = torch.cat([torch.stack(conditions, dim=2), patches], dim=2)
+        start = 0 if cache is None else cache.tokens // tokens.shape[2]
+        return tokens.flatten(1, 2), TokenLayout(latents.shape[1], self.grid, len(conditions), start)
+
+    def _through_blocks(
+        self, tokens: Tensor, layout: TokenLayout, cache: KeyValueCache | None, keep: int | None
+    ) -> Tensor:
+        """Return the tokens after all blocks, which see the cache; new keys and values are added to it."""
+        tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
+        how = (tables, layout.tokens_per_step, self.attention)
+        steps = layout.steps if keep is None else min(keep, layout.steps)
+        kept_tokens = 0 if cache is None else steps * layout.tokens_per_step
+        added: list[Tensor] = []
+        for index, block in enumerate(self.blocks):
+            past = () if cache is None else cache.layer(index)
+            if self.gradient_checkpointing and torch.is_grad_enabled():
+                given = (tokens, *how, kept_tokens, *past)
+                tokens, kept = checkpoint(block, *given, use_reentrant=False, preserve_rng_state=self.has_dropout)
+            else:
+                tokens, kept = block(tokens, *how, kept_tokens, *past)
+            if kept is not None:
+                added.append(kept)
+        if cache is not None and added:
+            cache.append(added)
+        return tokens
+
+    @property
+    def _dtype(self) -> torch.dtype:
+        """The base's type; a directly trained head may have another."""
+        return self.predictor_norm.weight.dtype
 
 
 class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
@@ -59,3 +233,109 @@ class ActionConditionedPredictor(PredictorNetwork, PreTrainedModel):  # type: ig
     def is_gradient_checkpointing(self) -> bool:
         """Whether blocks are recomputed in the backward pass; PEFT reads this, and transformers' own property warns."""
         return self.gradient_checkpointing
+
+
+def predictor_fields(sizes: ModelSizes) -> dict[str, Any]:
+    """Return the sizes of the predictor of a world model, by the names of `PredictorConfig`."""
+    own = sizes.predictor.model_dump()
+    renamed = {"width": "hidden_size", "depth": "num_hidden_layers", "heads": "num_attention_heads"}
+    return {
+        "image_size": sizes.image_size,
+        "patch_size": sizes.patch_size,
+        "latent_dim": sizes.encoder.width,
+        **{renamed.get(name, name): value for name, value in own.items()},
+    }
+
+
+def _in_own_type(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Apply a layer that may be trained, hence float32, in a predictor of another type; autocast casts by itself."""
+    if torch.is_autocast_enabled(values.device.type):
+        return layer(values)  # type: ignore[no-any-return]  # PEFT may be around it, untyped
+    return layer(values.to(layer.weight.dtype)).to(dtype)  # type: ignore[no-any-return]  # the same
+
+
+class LatentDynamics(nn.Module):
+    """A predictor of latents, with or without an adapter around it; predictions are layer-normalised, in float32."""
+
+    predictor: nn.Module
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the predictor's weights."""
+        return next(self.predictor.parameters()).device
+
+    @property
+    def base_predictor(self) -> Any:
+        """The predictor itself, without a surrounding adapter."""
+        wrapped = getattr(self.predictor, "get_base_model", None)  # PEFT's
+        return wrapped() if wrapped else self.predictor
+
+    def predict(
+        self,
+        latents: Float[Tensor, "batch time tokens dim"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
+        keep: int | None = None,
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return, at each step, the prediction of the next step's latents from the given ones (teacher forcing).
+
+        With a cache the steps come after those in it; the first `keep` of them are added to it (None: all).
+        """
+        return normalise_latents(self.predictor(latents, actions, states, extrinsics, cache=cache, keep=keep))
+
+    def rollout(
+        self,
+        context: Float[Tensor, "batch context tokens dim"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
+    ) -> Float[Tensor, "batch steps tokens dim"]:
+        """Return predictions of the steps after the context, each fed back to predict the next.
+
+        With frames counted from 0, the context holds frames 0 .. context-1 and the result frames context .. time: the
+        first is predicted from the context alone, so index h - 1 is horizon h, and there are time - context + 1 of
+        them. Actions and states are the true ones throughout. A context need not be true: to continue from a
+        known prediction, append it to the context.
+
+        The context is computed at once, then one step at a time: keys and values are cached. With a cache, context,
+        actions and states come after the steps in it; it is not changed, so that many rollouts can start from it.
+
+        Raises:
+            ValueError: There are fewer actions than context latents.
+        """
+        first, last = context.shape[1], actions.shape[1]
+        if last < first:
+            raise ValueError(f"{last} actions do not reach the end of a context of {first} latents")
+        cache = KeyValueCache() if cache is None else cache.copy()
+        latents, start = context, 0
+        predicted = []
+        for end in range(first, last + 1):
+            camera = None if extrinsics is None else extrinsics[:, start:end]
+            keep = None if end < last else 0  # nothing comes after the last
+            following = self.predict(latents, actions[:, start:end], states[:, start:end], camera, cache, keep)
+            latents, start = following[:, -1:], end
+            predicted.append(latents)
+        return torch.cat(predicted, dim=1)
+
+    def set_gradient_checkpointing(self, enabled: bool) -> None:
+        """Choose whether predictor blocks are recomputed in the backward pass instead of storing their activations."""
+        predictor = self.base_predictor
+        predictor.gradient_checkpointing = enabled
+        predictor.has_dropout = any(isinstance(one, nn.Dropout) and one.p > 0 for one in predictor.blocks.modules())
+
+    def set_compiled(self, when: When) -> None:
+        """Choose when predictor blocks are compiled (see `model.network.compilation`)."""
+        for block in self.base_predictor.blocks:
+            block.compiled = when
+
+    def set_attention(self, kind: AttentionKind | Attend) -> None:
+        """Choose how the predictor computes block-causal attention (see `model.network.attention`)."""
+        self.base_predictor.attention = kind
+
+
+def normalise_latents(features: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+    """Return features layer-normalised over `dim` without affine, in float32."""
+    return layer_norm(features.float(), features.shape[-1:])

@@ -32,8 +32,13 @@ from vjepa2_ac.model.model_files import (
 )
 from vjepa2_ac.model.network.blocks import initialise
 from vjepa2_ac.model.network.encoder import Encoder
-from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
-from vjepa2_ac.model.network.predictor_network import LatentDynamics, normalise_latents, predictor_fields
+from vjepa2_ac.model.network.predictor import (
+    ActionConditionedPredictor,
+    LatentDynamics,
+    PredictorConfig,
+    normalise_latents,
+    predictor_fields,
+)
 from vjepa2_ac.storage import folder_writer
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 
