@@ -283,23 +283,6 @@ def test_a_cache_has_the_clips_of_its_data_set_in_their_order(
     assert by_itself.control_rate_hz == original.control_rate_hz
 
 
-def test_poses_in_the_frame_of_the_camera_go_through_a_cache(tmp_path: Path) -> None:
-    folder = tmp_path / "poses"
-    folder.mkdir()
-    for number in range(8):
-        states = synthetic_states(14, seed=number)
-        camera = np.tile([0.5, 0.1 * number, 0.8, 0.3, -2.0, 1.0], (14, 1))
-        frames = np.random.default_rng(number).integers(0, 256, (14, 20, 24, 3), dtype=np.uint8)
-        np.savez(folder / f"{number}.npz", states=states, frames=frames, fps_hz=15.0, extrinsics=camera)
-    original, through = cached(folder, tmp_path, source="npz", pose_frame="camera")
-    batches = first_batches(original)
-    assert batches[0].extrinsics is not None
-    assert_same_clips(batches, first_batches(through))
-    in_base = alone(through, pose_frame="base")  # states are kept as they were measured
-    base = open_dataset(config_of(folder, tmp_path, source="npz"))
-    assert_same_clips(first_batches(base), first_batches(in_base))
-
-
 # ---- broken episodes ---------------------------------------------------------------------------------------------
 
 
