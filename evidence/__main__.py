@@ -61,14 +61,13 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--goals", type=int, default=20, help="of each cell; a row pools its seeds")
     parser.add_argument("--workers", type=int, default=2, help="cells at once, one thread each")
     parser.add_argument("--only", default="", help="cells whose name contains this")
-    parser.add_argument("--again", action="store_true", help="measure cells again whose results are in the repository")
     parser.add_argument("--table", action="store_true", help="write tables and plots, run nothing")
     return parser.parse_args()
 
 
 def _run_methods(options: argparse.Namespace) -> int:
     from environments import TASKS
-    from measure import measure_alone
+    from measure import measure
     from methods import all_cells
     from prepare import prepare
     from results import KEPT, name_of
@@ -79,7 +78,7 @@ def _run_methods(options: argparse.Namespace) -> int:
         print(f"{task} is left out: make worlds/{TASKS[task].program} installs its environment (docs/worlds.md)")
     cells = [cell for cell in cells if cell.shift not in absent]
     prepare(options.folder, {cell.shift for cell in cells}, options.seeds)
-    return _in_processes(measure_alone, [(cell, options.folder, options.goals) for cell in cells], options)
+    return _in_processes(measure, [(cell, options.folder, options.goals) for cell in cells], options)
 
 
 def _run_selection(options: argparse.Namespace) -> int:
@@ -97,8 +96,7 @@ def _missing(cells: list[Any], kept: Path, name_of: Callable[[Any], str], option
     """Return the cells that are to be measured."""
     (options.folder / options.study).mkdir(parents=True, exist_ok=True)
     known = {path.stem for path in (options.folder / options.study).glob("*.json")}
-    if not options.again:
-        known |= {name_of(one) for one in json.loads(kept.read_text())}
+    known |= {name_of(one) for one in json.loads(kept.read_text())}
     missing = [cell for cell in cells if options.only in cell.name and cell.name not in known]
     print(f"{len(missing)} of {len(cells)} cells are to be measured", flush=True)
     return missing

@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 STRIDE, EVERY = 4, 2  # control steps of a model step, and from one recorded frame to the next
 SIZE = 96  # pixels: those of the tiny encoder
 EPISODES_BEFORE, EPISODES_AFTER = 120, 60  # recorded in the world before and after its change
-EPISODES_MANY, MANY = 150, ("Lift",)  # after the change, for tasks that are learned from 5 and 80 demonstrations, too
+EPISODES_LIFT = 150  # after the change: Lift is learned from 5 and 80 demonstrations, too
 CHANGED = ("--camera", "40", "--mount", "20", "--look", "dusk")  # robosuite: another camera, mounting and light
 FIRST = {"before": 0, "after": 10_000}  # seed of the recordings
 
@@ -77,7 +77,7 @@ def data_of(folder: Path, task: str, when: str) -> DataConfig:
 
 def record(folder: Path, task: str, when: str) -> None:
     """Record the demonstrations of a task that are not there yet."""
-    of_after = EPISODES_MANY if task in MANY else EPISODES_AFTER
+    of_after = EPISODES_LIFT if task == "Lift" else EPISODES_AFTER
     first, count = FIRST[when], EPISODES_BEFORE if when == "before" else of_after
     path = Path(data_of(folder, task, when).path)
     if len(list(path.glob("*.npz"))) < count:

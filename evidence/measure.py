@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
@@ -17,7 +16,7 @@ from methods import BEFORE, PLANNING, SHIFTS, Cell, method_of
 from offline import offline_figures
 from prepare import base_model, data_before, data_shifted, encoded, training_episodes
 
-from vjepa2_ac.config import Config, ModelConfig, PlanningConfig, ValidationConfig
+from vjepa2_ac.config import Config, ModelConfig, ValidationConfig
 from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
@@ -40,17 +39,12 @@ from vjepa2_ac.training.cost import count_parameters
 from vjepa2_ac.training.loop import train
 
 TEST_GOALS = 9_000  # first seed of problems, to which a cell adds its own (`goals_seed`)
-GOALS, CLIPS = 20, 128  # of one run; a row of the table pools its seeds, each with other goals
+CLIPS = 128  # of held-out episodes
 
 
-def measure(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]:
-    """Return the figures of a cell.
-
-    Args:
-        cell: What to train.
-        folder: The work folder, which `prepare` filled.
-        goals: Problems of the closed loop.
-    """
+def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
+    """Train a cell and return its figures, on one thread; `folder` is the work folder, which `prepare` filled."""
+    torch.set_num_threads(1)
     config, method = config_of(cell, folder), method_of(cell.method)
     started = time.process_time()
     figures: dict[str, Any] = {"cell": asdict(cell), "made_with": made_with()}
@@ -59,29 +53,23 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]:
         figures |= {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": (time.process_time() - started) / 60}
         model = load_base(config.model, seed=cell.seed)
         acts = PLANNING.model_copy(update={"planner": Component("prior"), "prior": prior})
-        return figures | {"reach": {"l1": closed_loop(cell, planner(model, acts), folder, goals=goals)}}
+        return figures | {"reach": {"l1": closed_loop(cell, Planning(Controller(model, acts)), folder, goals=goals)}}
     if method.kind == "zero-shot":
         model, trained = load_base(config.model, seed=cell.seed), {"trained_share": 0.0, "adapter_mb": 0.0}
     else:
         model, trained = _trained(train(config, SILENT))
     acts = PLANNING.model_copy(update={"prior": _prior(cell, config, folder)[0]}) if method.prior else PLANNING
     figures |= {**trained, "cpu_minutes": (time.process_time() - started) / 60}
-    figures["shifted"] = _as_dict(held_out(model, config))
+    batches = encoded(config, model.eval(), "test", CLIPS)
+    figures["shifted"] = _as_dict(prediction_errors(model, batches))
     if cell.shift in SHIFTS:
-        space = open_dataset(config.data).spaces.action
-        figures["offline"] = offline_figures(model, space, encoded(config, model, "test", CLIPS))
+        figures["offline"] = offline_figures(model, open_dataset(config.data).spaces.action, batches)
     if model.adaptation is not None:
         merge_adapter(model)
-    figures["reach"] = {"l1": closed_loop(cell, planner(model, acts), folder, goals=goals)}
+    figures["reach"] = {"l1": closed_loop(cell, Planning(Controller(model, acts)), folder, goals=goals)}
     if cell.method == "zero-shot":
-        figures["baselines"] = baselines(cell, folder, goals=goals)
+        figures["baselines"] = baselines(cell, folder, goals)
     return figures
-
-
-def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
-    """Measure a cell in a process of its own, on one thread."""
-    torch.set_num_threads(1)
-    return measure(cell, folder, goals=goals)
 
 
 def _prior(cell: Cell, config: Config, folder: Path) -> tuple[str, Mapping[str, Any]]:
@@ -91,12 +79,10 @@ def _prior(cell: Cell, config: Config, folder: Path) -> tuple[str, Mapping[str, 
 
 
 def made_with() -> dict[str, str]:
-    """Return which PyTorch and which commit of this project, if it is a checkout, compute."""
-    git = shutil.which("git")
-    command = [git or "git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=7"]
-    found = subprocess.run(command, capture_output=True, text=True, check=False) if git else None  # noqa: S603
-    commit = found.stdout.strip() if found and found.returncode == 0 else "unknown"
-    return {"torch": torch.__version__, "commit": commit}
+    """Return the version of PyTorch and the commit of this checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=7"]
+    described = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+    return {"torch": torch.__version__, "commit": described.stdout.strip() or "unknown"}
 
 
 def config_of(cell: Cell, folder: Path) -> Config:
@@ -121,7 +107,7 @@ def goals_seed(cell: Cell) -> int:
     return TEST_GOALS + (1 if cell.shift in SHIFTS else 100) * cell.seed
 
 
-def baselines(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]:
+def baselines(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Return how policies without a model fare on the same goals."""
     policies: list[Policy] = [ZeroActions(), RandomActions(PLANNING.limits, cell.seed)]
     policies += [Oracle(PLANNING.limits)] if cell.shift in SHIFTS else []
@@ -130,11 +116,6 @@ def baselines(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]
         _, expert = environments.problems(folder, cell.shift, goals_seed(cell), goals)
         result["oracle"] = environments.figures_of(expert, expert)
     return result
-
-
-def planner(model: WorldModel, config: PlanningConfig) -> Policy:
-    """Return a policy that plans with a model."""
-    return Planning(Controller(model, config))
 
 
 def closed_loop(cell: Cell, policy: Policy, folder: Path, *, goals: int) -> dict[str, Any]:
@@ -156,12 +137,6 @@ def _rollouts(shift: str, seed: int, goals: int) -> Iterator[BenchmarkOptions]:
     for goal in range(goals):
         drawn = sample_domain(np.random.default_rng([seed, goal]), world)
         yield BenchmarkOptions("reach", drawn, 1, seed * 100 + goal)
-
-
-def held_out(model: WorldModel, config: Config) -> PredictionErrors:
-    """Return errors on clips of held-out episodes, from the latents that training used."""
-    model.eval()
-    return prediction_errors(model, encoded(config, model, "test", CLIPS))
 
 
 def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:

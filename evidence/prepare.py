@@ -35,7 +35,7 @@ BASE_CONFIG = "builtin:demo_base"  # the sizes and settings of the demo's base
 
 
 def data_a(folder: Path) -> DataConfig:
-    """Return the data of domain A, on which the base of one camera is trained; its test split measures forgetting."""
+    """Return the data of domain A, on which the base of one camera is trained."""
     return RldsData(
         path=str(folder / "data-A"),
         frames=4,
@@ -96,7 +96,8 @@ def prepare(folder: Path, shifts: Collection[str], seeds: int, reporter: Reporte
     for shift in SHIFTS:
         _record(data_shifted(folder, shift), shift, EPISODES_SHIFTED, SEED_SHIFTED)
     if not Path(base_model(folder, "one camera", 0)).exists():
-        run = train(_base_config(folder), reporter)
+        config = load_config(BASE_CONFIG, [f"run_dir={folder / 'run-base'}"])
+        run = train(config.model_copy(update={"data": data_a(folder)}), reporter)
         export_run(run, Path(base_model(folder, "one camera", 0)))
     for data in (data_a(folder), *(data_shifted(folder, shift) for shift in SHIFTS)):
         for base in ("one camera", "many cameras"):
@@ -132,11 +133,6 @@ def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...
 def _record(data: DataConfig, domain: str, episodes: int, seed: int) -> None:
     if not Path(data.path).exists():
         record_dataset(data.path, RecordingSpec(SHIFTS.get(domain, DOMAIN_A), seed=seed), episodes=episodes)
-
-
-def _base_config(folder: Path) -> Config:
-    config = load_config(BASE_CONFIG, [f"run_dir={folder / 'run-base'}"])
-    return config.model_copy(update={"data": data_a(folder)})
 
 
 def _save_fresh_predictor(folder: Path, seed: int) -> None:

@@ -102,9 +102,9 @@ def of_policy(results: Sequence[Figures], base: str, name: str, shift: str = "lo
     return [{"reach": {"l1": one["baselines"][name]}} for one in chosen if "baselines" in one]
 
 
-def reached(one: Figures, distance: str = "l1") -> list[bool]:
-    """Return which goals were reached with an energy; in third-party environments, which problems were solved."""
-    episodes = one["reach"][distance]
+def reached(one: Figures) -> list[bool]:
+    """Return which goals were reached; in third-party environments, which problems were solved."""
+    episodes = one["reach"]["l1"]
     if "solved" in episodes:
         return [bool(flag) for flag in episodes["solved"]]
     return [end < REACHED_CM for end in episodes["ends_cm"]]

@@ -61,7 +61,7 @@ class Run:
     motions: Motions
     method: Literal["LoRA", "full"]
     seed: int  # decides the order of clips and fresh weights, and the goals
-    cure: Literal["", "replay", "contrast"] = ""  # replay: a quarter of the clips from other worlds
+    cure: Literal["", "replay"] = ""  # replay: a quarter of the clips from other worlds
 
     @property
     def name(self) -> str:

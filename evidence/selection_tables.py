@@ -15,7 +15,6 @@ from selection import cells_of, run_of
 from vjepa2_ac.intervals import share_of
 from vjepa2_ac.runs.checkpoint import RunState
 
-GONE = "The cure `contrast` is gone. It was a loss term, `training.action_contrast`: measured at commit 6117de8."
 TITLES = {
     "one_step": "one-step error / persistence",
     "error": "error / persistence, last horizon",
@@ -44,7 +43,7 @@ RULES: dict[str, Callable[[list[Figures]], Figures]] = {
 def write_tables(results: Sequence[Figures], path: Path, plot: Path) -> None:
     """Write the table and the plot, of runs of which every checkpoint is measured."""
     runs = [run for run in by_run(results) if len(run) == len(cells_of(run_of(run[0])))]
-    path.write_text("\n".join([*_rules(runs), "", GONE, "", *_correlations(runs)]) + "\n")
+    path.write_text("\n".join([*_rules(runs), "", *_correlations(runs)]) + "\n")
     draw(runs, plot)
 
 

@@ -131,7 +131,7 @@ def small(evidence: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[A
 def test_a_cell_is_trained_and_measured(small: Any, method: str) -> None:
     base = "none" if method == "behaviour cloning" else "many cameras"
     cell = small.methods.Cell("look", base, method, 0 if method == "zero-shot" else 4, 0)
-    figures = json.loads(json.dumps(small.measure.measure(cell, small.folder, goals=1)))
+    figures = json.loads(json.dumps(small.measure.measure(cell, small.folder, 1)))
     assert len(figures["reach"]["l1"]["distance_cm"][0]) == 9
     assert ("offline" in figures) == ("shifted" in figures) == (method != "behaviour cloning")
     assert set(figures["made_with"]) == {"torch", "commit"}
