@@ -216,7 +216,7 @@ def _section_of(one: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[st
         return None
     for option in [one, *one.get("anyOf", []), *one.get("allOf", []), *one.get("oneOf", [])]:
         found = _resolved(option, schema)
-        if "properties" in found:
+        if "properties" in found and found["properties"].keys() != {"name", "options"}:  # a component is a value
             return found
     return None
 
