@@ -1,4 +1,4 @@
-"""From scratch on a pretrained encoder, the whole way: record, encode, train, kill, resume, evaluate, plan, export."""
+"""From scratch on a pretrained encoder, record, encode, train, export."""
 
 import json
 from pathlib import Path
@@ -54,16 +54,6 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert main(["train", config, "--check"]) == 0
     assert main(["train", config]) == 0
     return folder
-
-
-def test_it_is_evaluated_and_plans(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = workshop / "whole"
-    few = ["--clips=4", "--ranking-clips=2", "--samples=6", "--landscapes=1", "--nodes=3"]
-    assert main(["evaluate", str(run), *few]) == 0
-    assert json.loads((run / "metrics.json").read_text())["summary"]["subject"] in capsys.readouterr().out
-    small = ["planning.samples=16", "planning.iterations=1", "planning.horizon=1"]
-    out = ["--out", str(workshop / "simulated"), "--films", "0"]
-    assert main(["simulate", str(run), "--episodes", "1", "--steps", "1", *out, *small]) == 0
 
 
 def test_an_export_is_a_base_with_its_encoder(workshop: Path, tmp_path: Path) -> None:

@@ -64,10 +64,9 @@ def test_compiled_steps_are_the_plain_ones_and_nothing_is_compiled_again_after_t
     # Two halves of: a first block, later ones, and one step of the rollout. Not one for each block.
     assert graphs() == 2 * 3
     assert not counters["graph_break"]
-    for rollout, checkpointing in [(2, False), (3, False), (2, True), (3, True)]:
-        model.set_gradient_checkpointing(checkpointing)
-        expected = loss_and_gradients(model, batch, compiled=False, rollout=rollout)
-        assert_same(loss_and_gradients(model, batch, compiled=True, rollout=rollout), expected)
+    model.set_gradient_checkpointing(True)
+    expected = loss_and_gradients(model, batch, compiled=False, rollout=3)
+    assert_same(loss_and_gradients(model, batch, compiled=True, rollout=3), expected)
     assert graphs() == 2 * 3
     assert list(model.state_dict()) == names
 
