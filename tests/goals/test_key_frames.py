@@ -60,12 +60,6 @@ def test_key_frames_are_where_the_gripper_changes_and_the_arm_stops(parts: tuple
     assert named(way(*parts)) == keys
 
 
-def test_fingers_that_tremble_change_nothing() -> None:
-    states = way((10, 0.2, 0), (20, 0.2, 0))
-    states[:, 6] += 0.05 * np.random.default_rng(0).random(len(states))
-    assert named(states) == [(30, "end")]
-
-
 @given(
     st.lists(
         st.tuples(st.integers(1, 12), st.sampled_from([0.0, 0.1, -0.2]), st.sampled_from([0.0, 0.0, 0.5])), min_size=1

@@ -24,7 +24,6 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.subject import load_subject
-from vjepa2_ac.spaces import CAMERA_POSE, POSE_CHANGE, Spaces
 
 TURN = Axes(math.radians(43.0))
 QUICK = PlanningConfig(samples=24, iterations=3, horizon=2, planner={"name": "cem", "options": {"elites": 4}})
@@ -123,13 +122,6 @@ def test_axes_of_other_weights_and_of_no_file_are_refused(tmp_path: Path) -> Non
         controller(model, axes=write(tmp_path / "axes.json", other))
     with pytest.raises(InputError, match=r"no/axes\.json: cannot be read"):
         controller(model, axes="no/axes.json")
-
-
-def test_states_without_a_vertical_axis_are_refused(tmp_path: Path) -> None:
-    model = tiny_model()
-    config = QUICK.model_copy(update={"axes": write(tmp_path / "axes.json", model)})
-    with pytest.raises(InputError, match=r"poses in the robot's base frame"):
-        Controller(model, config, spaces=Spaces(CAMERA_POSE, POSE_CHANGE))
 
 
 def test_a_run_plans_by_axes_of_its_own_trained_weights_merged_or_not(make_config: Any, tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.camera_check import has_moved, is_uniform
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.decision import PlanRequest, decide
 from vjepa2_ac.planning.goals import timed
 from vjepa2_ac.simulation.arm import SimulatedArm
 from vjepa2_ac.simulation.domains import DOMAIN_A
@@ -59,12 +58,6 @@ def test_a_covered_lens_is_uniform_whatever_its_noise(noise: float) -> None:
     for level in (0, 90, 255):
         assert is_uniform(np.full((180, 320, 3), level, np.uint8))
     assert is_uniform(np.full((180, 320, 3), (0, 140, 30), np.uint8)), "a decoder that failed"
-
-
-@pytest.mark.parametrize("share", [1.0, 0.2, 0.05])
-def test_a_dark_scene_is_not_uniform(share: float) -> None:
-    noise = np.random.default_rng(0).normal(0, 2, (*scene().shape[:2], 3))
-    assert not is_uniform(np.clip(share * scene() + noise, 0, 255).astype(np.uint8))
 
 
 def test_a_frozen_frame_moves_nothing_until_another_one_comes() -> None:
@@ -136,13 +129,3 @@ def test_goals_make_no_progress_on_an_unusable_frame() -> None:
         assert (run.decision.progress.place, run.decision.progress.changed) == (0, "")
     run.act(image(2), STATE)
     assert run.decision.progress.place == 1, "its steps are over"
-
-
-def test_a_plan_from_an_image_without_contrast_is_refused() -> None:
-    goals = timed([image(100)], [])
-    with pytest.raises(InputError, match=r"start: an image without contrast.*needed: an image of the scene"):
-        decide(controller(), PlanRequest(BLACK, STATE, goals))
-    with pytest.raises(InputError, match="goal 0: an image without contrast"):
-        decide(controller(), PlanRequest(image(0), STATE, timed([BLACK], [])))
-    mask = np.ones(BLACK.shape[:2], bool)  # a mask is uniform by right
-    assert decide(controller(), PlanRequest(image(0), STATE, goals, mask)).decision.why == "planned"

@@ -44,12 +44,6 @@ def test_each_gripper_mode_does_what_it_says(mode: str, given: float, expected: 
     assert float(pose(gripper_mode=mode).finished(decisions)[0, 6]) == pytest.approx(expected)
 
 
-def test_an_action_is_repeated_for_consecutive_steps() -> None:
-    where = SearchSpace(-torch.ones(2, 1), torch.ones(2, 1), torch.ones(2, 1), repeat=3)
-    assert where.over_steps(torch.tensor([[[1.0], [2.0]]])).flatten().tolist() == [1, 1, 1, 2, 2, 2]
-    assert where.steps == 6
-
-
 @pytest.mark.parametrize(
     ("values", "complaint"),
     [

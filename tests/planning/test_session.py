@@ -131,14 +131,6 @@ def episodes_of(folder: Path) -> list[Episode]:
     return [source.read(number) for number in range(len(source.infos()))]
 
 
-def test_recorded_commands_of_another_width_cannot_be_planned_with(make_config, reporter) -> None:
-    recorded = {"data__actions": "recorded", "data__join_actions": "last"}
-    recorded["data__fields"] = VECTORS["data__fields"] | {"action": ["steps/action_dict/joint_position"]}
-    folder = train(make_config(**{**VECTORS, **recorded}, training__steps=1), reporter)
-    with pytest.raises(InputError, match=r"data\.actions: recorded: commands of which nobody knows"):
-        Controller.of_subject(load_to_plan(str(folder)))
-
-
 ADAPTERS = {
     "lora": {"rank": 4},
     "dora": {"rank": 4, "dora": True, "modules_to_save": ["predictor_proj", "state_encoder"]},

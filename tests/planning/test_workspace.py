@@ -80,19 +80,6 @@ def controller(**limits: object) -> Controller:
     return made
 
 
-@pytest.mark.parametrize("ball", BALLS)
-def test_a_controller_at_the_edge_stays_inside_and_still_moves(ball: str) -> None:
-    run, state = controller(workspace=CORNERS, xyz=(0.05, 0.05, 0.03), ball=ball, radius=0.04), position(0.6, 0.2, 0.1)
-    for seed in range(4):
-        action = run.act(image(seed), state)
-        target = state[:3] + action[:3]
-        assert (target >= np.array(CORNERS[0]) - SLACK).all()
-        assert (target <= np.array(CORNERS[1]) + SLACK).all()
-        assert action[:3].any()
-        assert run.decision.why == "planned"
-        np.testing.assert_allclose(run.decision.states[1, :3], target, atol=1e-7)
-
-
 def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -> None:
     run = controller(workspace=CORNERS)
     action = run.act(image(0), position(0.63, 0.0, 0.3))

@@ -12,12 +12,10 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import ChunkScores
 from vjepa2_ac.policies.score import (
     PolicyChunks,
-    is_blind,
     ranking_of_run,
     read_policy_chunks,
     score_policies,
@@ -90,14 +88,6 @@ def test_a_model_at_chance_is_said_to_be_blind(dataset: Dataset) -> None:
     found = score_policies(knowing(blind=True), dataset, [policy(dataset, "one", 0.1)])
     assert found.is_blind
     assert found.others_below_true.low < 0.5
-
-
-@pytest.mark.parametrize(
-    ("estimate", "blind"),
-    [((0.3, 0.2, 0.4), False), ((0.45, 0.3, 0.55), True), ((0.4, np.nan, np.nan), False), ((np.nan,) * 3, True)],
-)
-def test_blind_is_where_the_interval_reaches_chance(estimate: tuple[float, float, float], blind: bool) -> None:
-    assert is_blind(Estimate(*estimate)) is blind
 
 
 class Noting(Knowing):

@@ -1,6 +1,5 @@
 """The predictor; and its cache: steps computed one after another equal those computed at once."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -152,19 +151,3 @@ def test_a_rollout_is_the_one_that_computes_everything_again(
     model = WorldModel.random(sizes, seed=0) if adapter is None else adapted(sizes, adapter)
     given = (inputs.latents[:, :context], inputs.actions, inputs.states)
     torch.testing.assert_close(model.rollout(*given), plain_rollout(model, *given), rtol=1e-5, atol=1e-5)
-
-
-@torch.no_grad()
-def test_many_samples_go_on_from_one_start_that_was_computed_once(sizes: ModelSizes, inputs) -> None:
-    model, cache = adapted(sizes), KeyValueCache()
-    one = dataclasses.replace(inputs, latents=inputs.latents[:1], actions=inputs.actions[:1], states=inputs.states[:1])
-    model.predict(one.latents[:, :2], one.actions[:, :2], one.states[:, :2], cache=cache)
-    actions = torch.randn(5, 4, 7, generator=torch.Generator().manual_seed(5))
-    actions[:, :2] = one.actions[:, :2]
-    latents, states = one.latents[:, :3].expand(5, -1, -1, -1), one.states.expand(5, -1, -1)
-    expected = model.rollout(latents, actions, states)
-    many = cache.expanded(5)
-    for _ in range(2):  # the cache is left as it is
-        found = model.rollout(latents[:, 2:], actions[:, 2:], states[:, 2:], cache=many)
-        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-    assert many.layer(0)[0].untyped_storage().data_ptr() == cache.layer(0)[0].untyped_storage().data_ptr()

@@ -51,14 +51,6 @@ class KeyValueCache:
         """Return a cache that can grow independently; no tensor is copied."""
         return KeyValueCache(self._pieces)
 
-    def expanded(self, samples: int) -> KeyValueCache:
-        """Return the cache of one start expanded to many samples; no tensor is copied.
-
-        Raises:
-            RuntimeError: It holds more than one start.
-        """
-        return KeyValueCache(tuple(tuple(one.expand(-1, samples, -1, -1, -1) for one in own) for own in self._pieces))
-
 
 class PredictorNetwork(nn.Module):
     """Predicts, for every step, the latents of the next one from the latents, states and actions up to it.
