@@ -17,7 +17,6 @@ SHOWN = re.findall(r"```console\n\$ vjepa2-ac (.*?)\n(.*?)```", PAGE, flags=re.D
 NOT_MADE = {
     "simulate builtin:sim-tiny": "MuJoCo is there",
     "data check builtin:demo data.path=gs://": "needs a network",
-    "simulate ws://": "needs a server; tests/serving has one",
 }
 OF_A_RUN = ("data.test_share=0.3", *FEW_STEPS.split())
 
