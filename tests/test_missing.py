@@ -11,7 +11,7 @@ from jaxtyping import TypeCheckError
 
 from missing import SHAPES, STORAGE, WITHOUT, absent, is_installed
 from paths import ROOT
-from vjepa2_ac.spaces import apply_action
+from vjepa2_ac.simulation.motion import forward_kinematics
 
 NOT_THERE = "import sys; sys.modules.update(dict.fromkeys({missing!r}))"  # importing them is an error then
 A_TEST_OF_EACH = """
@@ -61,7 +61,7 @@ def test_what_should_be_there_and_is_not_stops_all_tests(lacking: tuple[str, ...
 @pytest.mark.skipif(not is_installed(SHAPES), reason=WITHOUT[SHAPES])
 def test_shapes_of_public_functions_are_checked_in_tests() -> None:
     with pytest.raises(TypeCheckError):
-        apply_action(np.zeros(3), np.zeros(7))
+        forward_kinematics(np.zeros(3))
 
 
 def test_where_all_is_there_nothing_is_said() -> None:
