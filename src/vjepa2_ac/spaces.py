@@ -39,41 +39,39 @@ Follows = Literal["change", "target", "unknown"]
 def matrices_from_euler(angles: Any) -> Any:
     """Return rotation matrices [*batch 3 3] of extrinsic xyz Euler angles [*batch 3] in radians.
 
-    R = Rz(yaw) @ Ry(pitch) @ Rx(roll).
+    R = Rz(yaw) @ Ry(pitch) @ Rx(roll). Arrays are converted by SciPy, as in the official code.
     """
-    array = _array_library(angles)
-    sine, cosine = array.sin(angles), array.cos(angles)
-    (sr, sp, sy), (cr, cp, cy) = ([one[..., axis] for axis in range(3)] for one in (sine, cosine))
+    if isinstance(angles, np.ndarray):
+        return Rotation.from_euler("xyz", angles.reshape(-1, 3)).as_matrix().reshape(*angles.shape[:-1], 3, 3)
+    torch = sys.modules["torch"]
+    (sr, sp, sy), (cr, cp, cy) = angles.sin().unbind(-1), angles.cos().unbind(-1)
     rows = [
-        array.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], -1),
-        array.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], -1),
-        array.stack([-sp, cp * sr, cp * cr], -1),
+        torch.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], -1),
+        torch.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], -1),
+        torch.stack([-sp, cp * sr, cp * cr], -1),
     ]
-    return array.stack(rows, -2)
+    return torch.stack(rows, -2)
 
 
 def euler_from_matrices(matrices: Any) -> Any:
     """Return extrinsic xyz Euler angles [*batch 3] in radians of rotation matrices [*batch 3 3].
 
-    Roll and yaw are in (-pi, pi], pitch in [-pi/2, pi/2]; where the pitch is pi/2 or -pi/2, the yaw is zero. Gradients
-    are finite everywhere.
+    Roll and yaw are in (-pi, pi], pitch in [-pi/2, pi/2]. Arrays are converted by SciPy, as in the official code. For
+    tensors gradients are finite everywhere, and the yaw is zero where the pitch is pi/2 or -pi/2.
     """
-    array = _array_library(matrices)
-    flat = array.hypot(matrices[..., 0, 0], matrices[..., 1, 0])  # cos(pitch), which is never negative
+    if isinstance(matrices, np.ndarray):
+        return Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_euler("xyz").reshape(*matrices.shape[:-2], 3)
+    torch = sys.modules["torch"]
+    flat = torch.hypot(matrices[..., 0, 0], matrices[..., 1, 0])  # cos(pitch), which is never negative
     locked = flat < _LOCKED
-    cosine = array.hypot(*(array.where(locked, 1.0, matrices[..., row, 0]) for row in (0, 1)))
-    pitch = array.arctan2(-matrices[..., 2, 0], array.where(locked, 0.0, cosine))
-    roll = array.arctan2(
-        array.where(locked, -matrices[..., 1, 2], matrices[..., 2, 1]),
-        array.where(locked, matrices[..., 1, 1], matrices[..., 2, 2]),
+    cosine = torch.hypot(*(torch.where(locked, 1.0, matrices[..., row, 0]) for row in (0, 1)))
+    pitch = torch.atan2(-matrices[..., 2, 0], torch.where(locked, 0.0, cosine))
+    roll = torch.atan2(
+        torch.where(locked, -matrices[..., 1, 2], matrices[..., 2, 1]),
+        torch.where(locked, matrices[..., 1, 1], matrices[..., 2, 2]),
     )
-    yaw = array.arctan2(array.where(locked, 0.0, matrices[..., 1, 0]), array.where(locked, 1.0, matrices[..., 0, 0]))
-    return array.stack([roll, pitch, yaw], -1)
-
-
-def _array_library(values: Any) -> Any:
-    """Return NumPy or PyTorch, whichever the values belong to; the functions used here have the same names in both."""
-    return np if isinstance(values, np.ndarray) else sys.modules["torch"]
+    yaw = torch.atan2(torch.where(locked, 0.0, matrices[..., 1, 0]), torch.where(locked, 1.0, matrices[..., 0, 0]))
+    return torch.stack([roll, pitch, yaw], -1)
 
 
 def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time-1 7"]:
@@ -115,7 +113,7 @@ def apply_action(state: Any, action: Any) -> Any:
     """
     rotation = matrices_from_euler(action[..., 3:6]) @ matrices_from_euler(state[..., 3:6])
     parts = [state[..., :3] + action[..., :3], euler_from_matrices(rotation), state[..., 6:] + action[..., 6:]]
-    return _array_library(state).concatenate(parts, -1)
+    return np.concatenate(parts, -1) if isinstance(state, np.ndarray) else sys.modules["torch"].cat(parts, -1)
 
 
 def states_in_camera_frame(
