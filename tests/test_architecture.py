@@ -104,7 +104,7 @@ HOMES = {
     "PIL": ["media/"],
     "accelerate": [
         "distributed.py",
-        "runs/trackers.py",
+        "runs/metrics_log.py",
         "training/",
         "encoding/encode_dataset.py",
         "inspection/stride_choice.py",

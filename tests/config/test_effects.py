@@ -216,24 +216,6 @@ def test_a_knob_that_changes_makes_strangers_of_what_it_affects_and_of_nothing_e
     assert len(changed) > 50
 
 
-def test_each_key_that_is_said_to_matter_to_an_index_does_in_one_form_of_data(
-    sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path
-) -> None:
-    matters, owned = set(), set()
-    for source in WRITERS:
-        for recorded in ({}, recorded_by(source)):
-            if source == "droid_raw" and recorded:
-                continue
-            config = config_of(source, sets[source], tmp_path, **recorded)
-            usual, own = keys_of(config), tuple(f"{name}." for name in config.data.own_sections())
-            for key in knobs_of(config):
-                if (name := key.removeprefix("data.")) in OF_THE_INDEX or name.startswith(own):
-                    owned.add(name)
-                    found = keys_of(with_other(config, key, key, source))
-                    matters |= {name} if found["index"] != usual["index"] else set()
-    assert owned - matters == NOT_OF_THE_INDEX
-
-
 @pytest.mark.parametrize("source", WRITERS)
 def test_a_data_set_that_was_moved_is_the_same_and_one_that_changed_is_another(
     source: str, sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path

@@ -9,8 +9,7 @@ import yaml
 from pydantic import BaseModel
 
 from paths import ROOT
-from vjepa2_ac.cli import main
-from vjepa2_ac.config import AdapterConfig, CheckpointConfig, DataConfig, IdleConfig
+from vjepa2_ac.config import AdapterConfig, CheckpointConfig
 from vjepa2_ac.config.loading import (
     all_keys,
     config_as_yaml,
@@ -148,32 +147,12 @@ def test_every_knob_is_read_somewhere() -> None:
         assert any((owner, name) in read for owner in owners), f"nobody reads {key}"
 
 
-def test_a_place_of_data_may_name_the_home_and_end_in_a_slash(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/somewhere")
-    given = {
-        "~/data/": "/somewhere/data", "data//": "data", "/": "/", "a~b": "a~b",
-        "gs://bucket/droid/": "gs://bucket/droid", "hf://datasets/a/b": "hf://datasets/a/b",
-    }  # fmt: skip
-    for path, meant in given.items():
-        assert DataConfig(path=path).path == meant
-    ranges = {"rule": "published", "ranges": "~/ranges.json"}
-    assert DataConfig(path="d", idle=IdleConfig(**ranges)).idle.ranges == "/somewhere/ranges.json"
-    with pytest.raises(InputError, match=r"data\.path.*empty"):
-        parse_config(MINIMAL | {"data": {"path": " "}}, where="here")
-
-
 @pytest.mark.parametrize(
     "name", ["1e-4", "010", "1:30", "2024-01-01", "089", "on", "null", "0x1F", "1_0", "=", "é #: ü"]
 )
 def test_text_that_looks_like_a_number_stays_text_when_written_and_read(tmp_path: Path, name: str) -> None:
     config = parse_config(MINIMAL | {"run_dir": name, "data": {"path": "d", "exclude": [name]}}, where="")
     assert load_config(write(tmp_path, config_as_yaml(config))) == config
-
-
-@pytest.mark.parametrize(("steps", "warmup"), [(100_000, 1_000), (10_000, 1_000), (100, 10), (3, 0)])
-def test_a_short_run_warms_up_for_a_tenth_of_its_steps(steps: int, warmup: int) -> None:
-    training = load_config(ROOT / "configs/default.yaml", [f"training.steps={steps}"]).training
-    assert training.warmup_steps == warmup
 
 
 # ---- configs of the package ----
@@ -189,13 +168,6 @@ def test_the_folder_of_a_checkout_is_that_of_the_package() -> None:
 def test_a_name_that_is_none_lists_those_that_are(name: str) -> None:
     with pytest.raises(InputError, match=r"no config of that name.*builtin:demo, .*builtin:scratch_vitl"):
         config_path(f"builtin:{name}")
-
-
-def test_text_prints_the_file_with_its_comments(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["config", "text", "builtin:own_robot"]) == 0
-    assert capsys.readouterr().out == (ROOT / "configs/own_robot.yaml").read_text()
-    assert main(["config", "list"]) == 0
-    assert capsys.readouterr().out.count("builtin:") >= 14
 
 
 @pytest.mark.parametrize(("older", "values"), [("closedness", (0.0, 1.0)), ("openness", (1.0, 0.0))])

@@ -47,12 +47,6 @@ def test_incomplete_variables_are_one_error(launched: Any, changes: dict[str, st
     assert all(f"{name}={value}" in str(caught.value) for name, value in variables.items())
 
 
-@pytest.mark.parametrize("variables", [{}, {"RANK": "0", "WORLD_SIZE": "1"}])
-def test_one_process_meets_no_other(launched: Any, variables: dict[str, str]) -> None:
-    launched(variables)
-    distributed._meet("gloo")
-
-
 class Store:
     def set_timeout(self, _: object) -> None: ...
 

@@ -3,7 +3,6 @@
 import os
 import signal
 import time
-from dataclasses import replace
 from itertools import chain, islice
 
 import pytest
@@ -12,17 +11,15 @@ from hypothesis import strategies as st
 
 from paths import ROOT
 from ranks import Rank, finish, free_port, start_rank
-from run_fixtures import set_up
 from same_run import assert_equal_up_to_rounding
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.data.loader import ProcessShare, first_clips, training_loader
+from vjepa2_ac.data.loader import ProcessShare, first_clips
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.process import EXIT_STATUS, StoppedError
 from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import micro_batches_of
-from vjepa2_ac.training.run import batches_from
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 
@@ -112,15 +109,6 @@ def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
     assert [f"{each} micro-batches of 2 in each" in note for note in reporter.notes] == [True] * (each is not None)
 
 
-@pytest.mark.parametrize("starts", [(2, 1, 1, 2), (1, 4, 3, 2), (4, 3, 8, 5, 1)])
-def test_a_step_keeps_its_clips_however_often_the_run_goes_on(make_config, starts: tuple[int, ...], reporter) -> None:
-    config, state = make_config(training__batch_size=2, training__accumulation=4), RunState(step=0)
-    for processes in starts:
-        clips = micro_batches_of(config, state, processes, reporter) * 2
-        state = replace(state, processes=processes, clips_per_step=clips, clips_asked=8)
-        assert clips == 8 * starts[0]
-
-
 def test_more_processes_than_micro_batches_are_refused(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
     with pytest.raises(InputError, match=r"5 processes.*needed: 4 at most, for the 8 clips"):
@@ -141,13 +129,6 @@ def test_every_clip_of_a_step_has_one_process(processes: int, of_step: int, batc
         if (share := ProcessShare(rank, processes, of_step)).own
     ]
     assert sorted(chain(*firsts)) == list(range(5, 5 + steps * of_step * batch_size, batch_size))
-
-
-def test_a_run_whose_step_changes_goes_on_in_the_row_of_clips_where_it_stood(make_config, reporter) -> None:
-    run = set_up(make_config(), reporter)
-    run.state = replace(run.state, step=1, clips_done=6)
-    expected = training_loader(run.dataset, seed=run.config.seed, batch_size=2, start_position=6)
-    assert next(batches_from(run)).starts == next(expected).starts
 
 
 def test_a_run_whose_step_changes_counts_on_from_the_clips_it_has_had(make_config, reporter) -> None:

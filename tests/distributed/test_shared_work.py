@@ -11,7 +11,6 @@ from paths import ROOT
 from ranks import finish, free_port, start_rank
 from same_run import metrics
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.distributed import gathered, own_part, shared
 from vjepa2_ac.training.loop import train
 
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -76,11 +75,3 @@ def test_an_error_of_one_in_shared_work_is_raised_in_all(make_config, tmp_path: 
     ranks = [start_rank([script, str(path), "one_cannot_read_a_validation_clip"], rank, 2, port) for rank in range(2)]
     said = [out for out, _ in finish(ranks, 3, timeout=300)]
     assert said == ["InputError: episode 3: its image is damaged.\n"] * 2
-
-
-def test_alone_a_process_has_all_the_work() -> None:
-    assert list(own_part(7, 3)) == list(range(7))
-    assert gathered([1, 2]) == [1, 2]
-    told: list[tuple[int, int]] = []
-    assert shared([3, 4], lambda item: item**2, lambda *given: told.append(given)) == [9, 16]
-    assert told == [(1, 2), (2, 2)]

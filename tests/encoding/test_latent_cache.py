@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from pydantic import ValidationError
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -113,15 +112,6 @@ def changed(path: Path, change: Callable[[dict[str, torch.Tensor], dict[str, str
         tensors, about = load_file(path), file.metadata()
     change(tensors, about)
     save_file({name: one.contiguous() for name, one in tensors.items()}, path, about)
-
-
-def test_a_file_of_another_cache_is_refused(tmp_path: Path) -> None:
-    files = written(tmp_path)
-    other = replace(files, key="other")
-    assert files.has(0, "left")
-    assert not other.has(0, "left")
-    with pytest.raises(InputError, match="a file of another cache"):
-        other.open(0, "left")
 
 
 @pytest.mark.parametrize(
@@ -403,16 +393,3 @@ def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_p
             read()
     with pytest.raises(InputError, match="no latent cache"):
         alone(through, path=str(tmp_path))
-
-
-@pytest.mark.parametrize(
-    ("knobs", "reported"),
-    [
-        ({"source": "latents", "cache": "require"}, "itself a cache"),
-        ({"source": "latents", "cache": "off", "stride": "auto"}, "stride auto"),
-    ],
-    ids=str,
-)
-def test_knobs_that_contradict_a_cache_are_errors(tmp_path: Path, knobs: dict[str, Any], reported: str) -> None:
-    with pytest.raises(ValidationError, match=reported):
-        config_of(tmp_path, tmp_path, **knobs)

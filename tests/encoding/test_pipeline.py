@@ -11,11 +11,9 @@ import pytest
 import torch
 
 from memory_source import MemorySource
-from vjepa2_ac.api import encode
 from vjepa2_ac.config import DataConfig, ModelSizes
 from vjepa2_ac.data import dataset
 from vjepa2_ac.data.sources.latents.cache_files import CacheType, LatentFiles, unpack_latents
-from vjepa2_ac.encoding import batch as batches
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.episode import Batch, LatentBatch
@@ -107,15 +105,3 @@ def test_what_is_on_its_way_to_the_device_is_taken_from_there() -> None:
         assert torch.equal(found.latents, expected.latents)
         assert torch.equal(found.states, expected.states)
         assert torch.equal(found.actions, expected.actions)
-
-
-def test_no_more_frames_than_a_chunk_are_converted_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, converted = WorldModel.random(ModelSizes.model_validate(TINY), seed=0), []
-    frames = np.random.default_rng(0).integers(0, 256, (7, 40, 60, 3), dtype=np.uint8)
-    expected = encode(model, frames)
-    convert = batches.pixels_to_input
-    monkeypatch.setattr(
-        batches, "pixels_to_input", lambda pixels, size: converted.append(pixels.shape[1]) or convert(pixels, size)
-    )
-    torch.testing.assert_close(encode(model, frames, chunk=3), expected)
-    assert converted == [3, 3, 1]

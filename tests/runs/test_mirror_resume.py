@@ -22,7 +22,8 @@ from vjepa2_ac.process import StoppedError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state, write_checkpoint
 from vjepa2_ac.runs.folder import SMALL_FILES, RunLock, check_run_folder
-from vjepa2_ac.runs.mirror import Mirror, RemoteCheckpoints, complete, open_remote
+from vjepa2_ac.runs.mirror import Mirror, RemoteCheckpoints, complete
+from vjepa2_ac.runs.open_run import open_remote
 from vjepa2_ac.training.loop import train
 
 PLACE = "gs://bucket/run"
@@ -189,7 +190,7 @@ def test_what_is_seen_there_and_cannot_be_fetched_is_not_done_again_from_the_sta
     caplog.clear()
     write(local(config), 10)
     assert open_remote(config, SILENT) == config
-    assert f"Training goes on after step 10, though {checkpoint_name(20)} is there" in caplog.text
+    assert f"what is on this machine, after step 10, though {checkpoint_name(20)} is there" in caplog.text
 
 
 @pytest.mark.parametrize(

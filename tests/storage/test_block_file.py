@@ -1,14 +1,11 @@
 """The block file: reads like a file, fetches little more than is read, and that once per machine, up to a limit."""
 
 import errno
-import fcntl
 import io
 import logging
 import os
 import pickle
 import sys
-import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -269,39 +266,6 @@ def test_partial_files_of_killed_writers_count_and_are_evicted_like_entries(tmp_
     assert not old.exists()
     assert fresh.exists()
     assert size_of(tmp_path) == 800
-
-
-def test_an_entry_that_is_evicted_while_it_is_stored_causes_no_warning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    cache, write_bytes = DiskCache(tmp_path, 1000), Path.write_bytes
-
-    def write_and_evict(path: Path, data: bytes) -> int:
-        size = write_bytes(path, data)
-        monkeypatch.setattr(Path, "write_bytes", write_bytes)
-        cache.write("b", bytes(796))  # of another process
-        return size
-
-    monkeypatch.setattr(Path, "write_bytes", write_and_evict)
-    cache.write("a", bytes(796))
-    assert cache.read("a") is None
-    assert cache.read("b") is not None
-    assert not caplog.records
-
-
-def test_a_writer_waits_until_another_process_has_evicted(tmp_path: Path) -> None:
-    cache = DiskCache(tmp_path, 1000)
-    cache.write("a", bytes(96))
-    with (tmp_path / "lock").open("rb") as lock, ThreadPoolExecutor(1) as pool:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        stored = pool.submit(cache.write, "b", bytes(96))
-        time.sleep(0.2)
-        assert not stored.done()
-        assert cache.read("a") is not None, "readers do not wait"
-        assert cache.read("b") is None
-        fcntl.flock(lock, fcntl.LOCK_UN)
-        stored.result(timeout=60)
-    assert cache.read("b") is not None
 
 
 WRITE_MANY = """

@@ -15,7 +15,6 @@ import pytest
 from run_fixtures import Popen
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.process import tidy_end
 from vjepa2_ac.storage.files import remove_abandoned
 
 WRITING = """
@@ -154,15 +153,6 @@ def test_what_was_not_whole_never_has_its_name(tmp_path: Path, popen: Popen, kin
         age(path, days=1.1)
     remove_abandoned.__wrapped__(tmp_path)
     assert names(tmp_path) == []
-
-
-@pytest.mark.usefixtures("default_signals")
-def test_a_writer_under_nohup_outlives_its_terminal(tmp_path: Path) -> None:
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    with tidy_end():
-        os.kill(os.getpid(), signal.SIGHUP)
-        storage.write_atomically(tmp_path / "target", "a")
-    assert names(tmp_path) == ["target"]
 
 
 def test_a_folder_that_changed_today_names_of_others_and_links_are_left_alone(tmp_path: Path) -> None:

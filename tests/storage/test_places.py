@@ -69,10 +69,6 @@ def test_a_url_stays_one_elsewhere(key: str) -> None:
     assert read(key, "gs://bucket/~x/") == "gs://bucket/~x"
 
 
-def test_a_model_of_the_package_is_no_path() -> None:
-    assert read("model.base", "builtin:sim-tiny") == "builtin:sim-tiny"
-
-
 def test_the_cache_of_the_environment_is_a_path_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/of/mine")
     monkeypatch.setenv("VJEPA2_AC_CACHE", "~/cache")

@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import os
 import re
 import subprocess
 import sys
@@ -122,13 +121,6 @@ def test_a_long_read_comes_in_pieces(gcs: Gcs, file: str, monkeypatch: pytest.Mo
     assert storage.read_ranges(file, [(5, 2500), (7, 3)]) == [DATA[5:2505], DATA[7:10]]
 
 
-def test_the_bytes_fetched_are_counted(file: str) -> None:
-    before = storage.bytes_fetched()
-    storage.read_ranges(file, [(0, 10), (50, 20)])
-    storage.file_size(file)
-    assert storage.bytes_fetched() - before == 30
-
-
 def test_a_folder_is_listed_at_once_with_sizes_and_versions(gcs: Gcs) -> None:
     for number in range(100):
         gcs.put(f"bucket/set/{number:03d}", bytes(number))
@@ -171,17 +163,6 @@ def test_a_missing_library_is_named_with_the_extra_that_brings_it(
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(InputError, match=rf"is not installed\. Install it: {re.escape(pip_install(extra))}"):
         storage.exists(url)
-
-
-def test_zonal_buckets_are_off_unless_the_user_wants_them(file: str) -> None:
-    code = (
-        "import os, sys; from vjepa2_ac import storage\n"
-        "storage.read_range(sys.argv[1], 0, 1)\n"
-        "assert os.environ['GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT'] == 'false'\n"
-        "assert 'gcsfs.extended_gcsfs' not in sys.modules\n"
-    )
-    environment = {name: value for name, value in os.environ.items() if name != "GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT"}
-    subprocess.run([sys.executable, "-c", code, file], check=True, timeout=120, env=environment)
 
 
 # ---- who logs in ----

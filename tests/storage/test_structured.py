@@ -15,7 +15,7 @@ from pydantic import Field
 from gcs import Gcs
 from paths import ROOT
 from vjepa2_ac.errors import InputError, MissingFileError
-from vjepa2_ac.storage.structured import json_list, json_object, json_text, parse_yaml, read_json_object, record_of
+from vjepa2_ac.storage.structured import json_object, json_text, parse_yaml, read_json_object, record_of
 
 # ---- JSON ----
 
@@ -27,15 +27,6 @@ def test_what_is_no_json_object_is_refused_with_its_file(text: str | bytes) -> N
     with pytest.raises(InputError, match=r"^x\.json: .*JSON.*needed: a card\. Copy it again\.") as caught:
         json_object(text, where="x.json", needed="a card", fix="Copy it again")
     assert len(str(caught.value)) < 400
-
-
-@pytest.mark.parametrize(
-    "value", [{}, {"a": [1, -2, 3.5, 1e-300, None, True, math.inf, "ü\U0001f600"]}, {"n": 2**63, "m": {"": {"": []}}}]
-)
-def test_what_python_writes_is_read_as_it_was(value: dict[str, Any]) -> None:
-    for text in (json.dumps(value), json.dumps(value, ensure_ascii=False), json.dumps(value).encode("utf-8-sig")):
-        assert json_object(text, where="") == value
-    assert json_list(json.dumps([value]).encode("utf-16"), where="") == [value]
 
 
 def test_no_more_of_a_file_is_read_than_its_reader_wants_and_a_missing_one_is_named(tmp_path: Path, gcs: Gcs) -> None:

@@ -24,7 +24,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from accelerate import Accelerator
@@ -35,11 +35,8 @@ from vjepa2_ac.data.streams import Cuda
 from vjepa2_ac.distributed import PRECISIONS, matmul_speed
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, read_metrics_log
+from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, Trackers, read_metrics_log
 from vjepa2_ac.training.flops import clip_flops
-
-if TYPE_CHECKING:
-    from vjepa2_ac.runs.trackers import Trackers
 
 MEASURED = frozenset({"data_wait_share", "samples_per_second", "mfu", "ceiling_tflops", "memory_gb"})
 """Metrics of the machine: they differ between identical runs."""

@@ -19,9 +19,8 @@ from vjepa2_ac.registry import TRAINING_HOOKS
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, newest_checkpoint, read_state
 from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, asks_nothing_new, config_changes, read_run_config, write_config
-from vjepa2_ac.runs.metrics_log import MetricsLog
+from vjepa2_ac.runs.metrics_log import MetricsLog, open_trackers, require_installed
 from vjepa2_ac.runs.open_run import OpenRun, open_run
-from vjepa2_ac.runs.trackers import open_trackers, require_installed
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.monitoring import WatchedMetricsLog
 from vjepa2_ac.training.optim import describe_changed_rate
