@@ -62,7 +62,7 @@ def test_a_plan_its_image_a_table_and_words_come_out(workshop: Path, capsys: pyt
     status, file = plan(workshop, *QUICK, "--seed", "9", "--nodes", "3")
     assert status == bool(file["worse_than"])
     reported = capsys.readouterr().out
-    assert "Planning: 16 action sequences in 2 iterations, 1 model step each.\n" in reported
+    assert "Planning: 16 action sequences of 1 step in 2 iterations.\n" in reported
     assert "planning 16/16" in reported
     assert "energy maps 27/27" in reported
     assert "Plan of 1 model step\n" in reported

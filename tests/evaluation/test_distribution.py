@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from vjepa2_ac.evaluation import distribution as latent_sums
 from vjepa2_ac.evaluation.distribution import (
     LatentSums,
     distance_of_halves,
@@ -45,28 +44,14 @@ def test_spread_is_the_ratio_of_the_traces_of_the_covariances() -> None:
     predicted, true = latents(1, spread=0.5), latents(2)
     found = spread_of(summed(predicted), summed(true))
     assert [one.value for one in found] == pytest.approx(trace(predicted) / trace(true))
-    assert all(one.low < one.value < one.high < 1 for one in found)
+    assert not any(one.has_interval for one in found)
 
 
 def test_latents_as_varied_as_the_truth_have_spread_1() -> None:
     true = latents(2)
-    assert all(one.low < 1 < one.high for one in spread_of(summed(latents(3)), summed(true)))
+    assert [one.value for one in spread_of(summed(latents(3)), summed(true))] == pytest.approx([1, 1], abs=0.3)
     (one, other) = spread_of(summed(true + 5), summed(true))  # where their mean is does not matter
     assert (one.value, other.value) == pytest.approx((1, 1))
-
-
-def test_a_sketch_changes_no_estimate_and_hardly_an_interval(monkeypatch: pytest.MonkeyPatch) -> None:
-    predicted, true = latents(1, 0.5, 36, 64), latents(2, 1.0, 36, 64)
-    predicted *= torch.linspace(0.7, 1.3, EPISODES).repeat(CLIPS // EPISODES)[:, None, None, None]  # unlike episodes
-    exact = spread_of(summed(predicted), summed(true))
-    monkeypatch.setattr(latent_sums, "MOST_SKETCHED", 512)
-    latent_sums._hashes.cache_clear()
-    sketched = spread_of(summed(predicted), summed(true))
-    latent_sums._hashes.cache_clear()
-    for one, other in zip(exact, sketched, strict=True):
-        assert other.value == pytest.approx(one.value, rel=1e-9)
-        assert other.low != one.low
-        assert other.high - other.low == pytest.approx(one.high - one.low, rel=0.15)
 
 
 def test_mmd_is_of_latents_averaged_over_tokens_and_fvd_over_frames_too() -> None:
@@ -87,7 +72,6 @@ def test_one_clip_has_no_distribution_and_one_episode_no_interval() -> None:
     same = LatentSums()
     same.add(latents(1)[:3], ["only"] * 3)
     assert spread_of(same, same)[0].value == pytest.approx(1)
-    assert not spread_of(same, same)[0].has_interval
     assert math.isnan(distribution_of(same, same).mmd[0].value)
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.cli.console.waiting import Work
-from vjepa2_ac.cli.next_command import next_simulation, option_words
+from vjepa2_ac.cli.next_command import option_words
 from vjepa2_ac.errors import InputError, counted, shell_command
 
 if TYPE_CHECKING:
@@ -290,7 +290,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
         title = f"{subject.name}: checkpoint {subject.chosen}" if subject.chosen else subject.name
         cli.show(title, benchmark_table(benchmark), files=files)
     summary = _summary(benchmark, verdict, options)
-    cli.show(*benchmark_notes(benchmark), str(summary), *_next(summary, verdict, benchmark, options))
+    cli.show(*benchmark_notes(benchmark), str(summary), *_next(summary, verdict, options))
     cli.show(*(f"Film: {file}" for file in files[1:2]))
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
 
@@ -313,42 +313,21 @@ def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse
     return summary
 
 
-def _next(summary: Summary, verdict: Verdict, benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> list[str]:
+def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> list[str]:
     """Return the command that follows from the verdicts of a closed loop, as lines; none if no command does."""
     from vjepa2_ac.runs.folder import is_of_moved
 
-    if verdict.needs:
-        return _next_benchmark(benchmark, options)
-    command = _evaluate_command(options)
-    if options.sub_goals is not None:  # a server would plan without these sub-goals
+    is_evaluated, command = summary.predicts.value is not None, _evaluate_command(options)
+    if verdict.needs or options.sub_goals is not None:  # the verdict names the fix; a server plans without sub-goals
         return []
-    if verdict.conclusion == "yes" and (summary.predicts.value is not None or not command):
+    if verdict.conclusion == "yes" and (is_evaluated or not command):
         words = option_words(options, "checkpoint", "config", "goals", "plugin")
         command = shell_command("serve", options.subject, *words, *options.overrides)
-    elif command and summary.predicts.value is not None:
+    elif command and is_evaluated:
         if any(map(is_of_moved, options.overrides)):  # `data calibrate` needs the base in its place
             return []
         command = shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
     return [f"Next: {command}"] * bool(command)
-
-
-def _next_benchmark(benchmark: ClosedLoopBenchmark, options: argparse.Namespace) -> list[str]:
-    """Return the same command with more problems, and with more steps if the oracle needs them, as lines."""
-    import numpy as np
-
-    from vjepa2_ac.distributed import is_on_cpu
-    from vjepa2_ac.evaluation.summary import CHANCE
-    from vjepa2_ac.planning.planner import samples_of_iterations
-
-    planning, trials, oracle = benchmark.agent.planning, benchmark.trials, benchmark.results[-1]
-    episodes, steps = max(50, len(trials.trials)), trials.steps * (1 + (oracle.success_rate.value < CHANCE))
-    changes = {"episodes": episodes} | ({"steps": steps} if steps != trials.steps else {})
-    prediction_s = float(np.median(benchmark.results[0].seconds)) / (
-        sum(samples_of_iterations(planning)) * planning.horizon
-    )
-    words = [options.subject, *option_words(options, **changes), *options.overrides]
-    on_cpu = is_on_cpu(cli.require_to_plan(options).training)
-    return next_simulation(words, planning, episodes * steps, prediction_s, on_cpu=on_cpu)
 
 
 def _evaluate_command(options: argparse.Namespace) -> str:

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.cli.next_command import next_simulation, option_words
+from vjepa2_ac.cli.next_command import option_words, quick_words
 from vjepa2_ac.config.model import RANDOM
 from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.process import is_first
 
 if TYPE_CHECKING:
-    from vjepa2_ac.cli.console.progress import ConsoleReporter
     from vjepa2_ac.decoding.imagine import Imagination
     from vjepa2_ac.evaluation.request import EvaluationOptions
+    from vjepa2_ac.evaluation.result import About
     from vjepa2_ac.reporter import Reporter
     from vjepa2_ac.reports.write import Evaluated
 
@@ -117,68 +115,50 @@ def _evaluate(options: argparse.Namespace) -> None:
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
             tables = row_tables(rows_of(evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
-        cli.show(str(measured.summary), *_next(measured, options, reporter))
+        cli.show(str(measured.summary), *_next(measured, options))
         film = "" if evaluation.decoded is None else "film and "
         cli.show(f"Report with {film}all tables: {measured.report}")
     leave_processes()
 
 
-def _next(measured: Evaluated, options: argparse.Namespace, reporter: ConsoleReporter) -> list[str]:
+def _next(measured: Evaluated, options: argparse.Namespace) -> list[str]:
     """Return the command that follows from the summary, as lines."""
     from vjepa2_ac.runs.folder import is_of_moved
 
-    about, summary = measured.evaluation.about, measured.summary
-    settings = options.overrides
+    about, summary, settings = measured.evaluation.about, measured.summary, options.overrides
     config = options.data or f"{about.subject}/config.yaml"
     words = ["data", "check", config]
     if not about.checkpoint:
         is_other = cli.read_config(config).model.base not in {RANDOM, about.subject}
         words = ["train", config, *[f"model.base={about.subject}"] * is_other]
-    elif not summary.predicts.needs and (
-        about.is_base or "no" in {verdict.conclusion for verdict in summary.verdicts[:3]}
-    ):
-        words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
     elif not summary.predicts.needs:
-        if summary.plans is None and (lines := _next_closed_loop(measured, settings, options, reporter)):
-            return lines
-        if summary.verdicts[2].conclusion != "yes":  # a robot is not recommended without a measured gain
+        if about.is_base or "no" in {verdict.conclusion for verdict in summary.verdicts[:3]}:
+            words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
+        elif summary.plans is None and (simulation := _simulation(about, options)):
+            words = simulation
+        elif summary.verdicts[2].conclusion == "yes":  # a robot is not recommended without a measured gain
+            words = ["serve", about.subject, *option_words(options, "checkpoint"), *settings]
+        else:
             return []
-        words = ["serve", about.subject, *option_words(options, "checkpoint"), *settings]
     return [f"Next: {shell_command(*words, *option_words(options, 'plugin'))}"]
 
 
-def _next_closed_loop(
-    measured: Evaluated, settings: Sequence[str], options: argparse.Namespace, reporter: ConsoleReporter
-) -> list[str]:
-    """Return the command that tests a run in closed loop, as lines; none for data that `simulate record` did not make.
-
-    Its time follows from that of the action ranking.
-    """
+def _simulation(about: About, options: argparse.Namespace) -> list[str]:
+    """Return the words of the command that tests a run in closed loop; none for data not made by `simulate record`."""
     from vjepa2_ac.distributed import is_on_cpu
     from vjepa2_ac.planning.settings import planning_settings
-    from vjepa2_ac.simulation.benchmark import BenchmarkOptions
     from vjepa2_ac.simulation.domains import Domain
     from vjepa2_ac.simulation.record import read_simulation
 
-    evaluation, prediction_s = measured.evaluation, None
     try:
-        recorded = read_simulation(Path(evaluation.about.data).resolve(strict=True))
+        recorded = read_simulation(Path(about.data).resolve(strict=True))
     except (OSError, UserError):
         return []
     domain = recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
-    seconds, ranking = (
-        reporter.seconds.get(f"action ranking, {evaluation.trained}"),
-        evaluation.models[evaluation.trained].ranking,
-    )
-    if ranking is not None and seconds is not None:
-        seconds *= int(os.environ.get("WORLD_SIZE", "1"))
-        prediction_s = seconds / (len(ranking.ranks) * (1 + 2 * ranking.samples))
-    problems = BenchmarkOptions(task=recorded.task or "reach")
-    words = ["--task", problems.task, "--domain", domain, *option_words(options, "checkpoint", "plugin"), *settings]
-    config = planning_settings(evaluation.about.subject, overrides=settings)
-    decisions = problems.episodes * problems.model_steps
-    words, on_cpu = [evaluation.about.subject, *words], is_on_cpu(config.training)
-    return next_simulation(words, config.planning, decisions, prediction_s, on_cpu=on_cpu)
+    config = planning_settings(about.subject, overrides=options.overrides)
+    quick = quick_words(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
+    words = ["simulate", about.subject, "--task", recorded.task or "reach", "--domain", domain]
+    return [*words, *option_words(options, "checkpoint"), *options.overrides, *quick]
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:

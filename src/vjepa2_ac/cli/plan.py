@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.cli.next_command import QUICK_SEQUENCES, QUICK_WORDS
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.cli.next_command import QUICK_WORDS, quick_words
+from vjepa2_ac.errors import InputError, counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -118,14 +118,11 @@ def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     """Return what a search predicts, and on a CPU what is quicker."""
     from vjepa2_ac.planning.planner import samples_of_iterations
 
-    count = sum(samples_of_iterations(config))
-    text = f"Planning: {count:,} action sequence{'s' * (count != 1)}"
-    text += f" in {config.iterations} iteration{'s' * (config.iterations > 1)}"
-    text += f", {config.horizon} model step{'s' * (config.horizon > 1)} each"
-    if config.budget_s is not None:
-        text += f", for {config.budget_s:g} s at most"
-    is_long = on_cpu and config.planner.name != "gradient" and count > QUICK_SEQUENCES
-    return f"{text}." + f"\nQuick, for a CPU: {_QUICK}" * is_long
+    sequences, steps = counted(sum(samples_of_iterations(config)), "action sequence"), counted(config.horizon, "step")
+    text = f"Planning: {sequences} of {steps} in {counted(config.iterations, 'iteration')}"
+    text += "" if config.budget_s is None else f", for {config.budget_s:g} s at most"
+    quick = quick_words([], config, on_cpu=on_cpu)
+    return f"{text}." + f"\nQuick, for a CPU: {_QUICK}" * bool(quick)
 
 
 def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

@@ -22,41 +22,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from vjepa2_ac.evaluation.result import LatentDistribution
 from vjepa2_ac.intervals import Estimate, bootstrapped_by_weights
 
 _SCALE = 100.0  # of the MMD
-MOST_SKETCHED = 8192  # numbers of a latent (tokens x dim); of more, a sketch of this length stands in for intervals
 
 
 class LatentSums:
     """Sums of one kind of latents over clips: those that one model predicts in a rollout, or the true ones.
 
-    Stored are, by horizon: of each clip the mean over tokens [dim] and the squared norm; the sum over clips
-    [tokens dim], in float64; and of each episode a sketch of its own sum. No clip's latents are stored: for 7 horizons
-    of 256 x 1408 and 250 episodes some 20 MB of sums, 115 MB of sketches, and 0.08 MB a clip. A covariance does not
-    depend on where the origin is: norms and sums are of the distance to an origin, so they are small; that of the first
-    batch by default. Sums that are `joined` have one.
-
-    The sketch (a count sketch: each number is added, with a random sign, to one of 8,192 random places) preserves the
-    inner products of episodes' sums up to about 1 %. Only intervals need them, estimates are exact. Latents of 8,192
-    numbers or fewer are stored as they are, and intervals are exact, too.
+    Stored are, by horizon: of each clip the mean over tokens [dim]; the sum over clips [tokens dim] and the sum of
+    squared norms, in float64. No clip's latents are stored. A covariance does not depend on where the origin is: norms
+    and sums are of the distance to an origin, so they are small; that of the first batch by default. Sums that are
+    `joined` have one.
     """
 
     def __init__(self, origin: Float[Tensor, "horizon tokens_dim"] | None = None) -> None:
         self.episode_ids: list[str] = []
         self._pooled: list[Float[np.ndarray, "batch horizon dim"]] = []
-        self._squares: list[Float[np.ndarray, "batch horizon"]] = []
         self._origin = origin
-        self._total: Float[Tensor, "horizon tokens_dim"] | None = None
-        self._sketches: dict[str, Float[np.ndarray, "horizon places"]] = {}
+        self._total: Float[Tensor, "horizon tokens_dim"] | float = 0.0
+        self._squares: Float[Tensor, " horizon"] | float = 0.0
 
     def add(self, latents: Float[Tensor, "batch horizon tokens dim"], episode_ids: Sequence[str]) -> None:
         """Add the latents of a batch of clips, in the order of all clips."""
@@ -67,55 +59,31 @@ class LatentSums:
         flat = flat - self._origin.to(flat)
         self.episode_ids += episode_ids
         self._pooled.append(latents.mean(dim=2).double().cpu().numpy())
-        self._squares.append(flat.square().sum(dim=2, dtype=torch.float64).cpu().numpy())
-        total = flat.sum(dim=0, dtype=torch.float64).cpu()
-        self._total = total if self._total is None else self._total + total
-        for name, sketch in zip(episode_ids, _sketched(flat).cpu().numpy(), strict=True):
-            self._add_sketch(name, sketch)
+        self._total = self._total + flat.sum(dim=0, dtype=torch.float64).cpu()
+        self._squares = self._squares + flat.square().sum(dim=(0, 2), dtype=torch.float64).cpu()
 
     @classmethod
     def joined(cls, parts: Sequence[LatentSums]) -> LatentSums:
         """Return the sums of all clips of some parts of one origin."""
         whole = cls()
-        whole.episode_ids = [name for part in parts for name in part.episode_ids]
-        whole._pooled = [values for part in parts for values in part._pooled]
-        whole._squares = [values for part in parts for values in part._squares]
-        whole._total = sum(part._total for part in parts if part._total is not None)  # type: ignore[assignment]
         for part in parts:
-            for name, sketch in part._sketches.items():
-                whole._add_sketch(name, sketch)
+            whole.episode_ids += part.episode_ids
+            whole._pooled += part._pooled
+            whole._total = whole._total + part._total
+            whole._squares = whole._squares + part._squares
         return whole
-
-    def _add_sketch(self, name: str, sketch: Float[np.ndarray, "horizon places"]) -> None:
-        self._sketches[name] = self._sketches[name] + sketch if name in self._sketches else sketch
 
     @property
     def pooled(self) -> Float[np.ndarray, "clips horizon dim"]:
         """The latents of each clip, averaged over tokens."""
         return np.concatenate(self._pooled)
 
-    def variances(self) -> tuple[float, ...]:
-        """Return the trace of the covariance over clips, by horizon."""
-        assert self._total is not None  # noqa: S101  # there are clips
+    def variances(self) -> Float[np.ndarray, " horizon"]:
+        """Return the trace of the covariance over clips, by horizon; 0 where it is no more than rounding."""
         clips = len(self.episode_ids)
-        traces = self.squares().sum(axis=1) / clips - (self._total / clips).square().sum(dim=1).numpy()
-        return tuple(traces.tolist())
-
-    def squares(self) -> Float[np.ndarray, "horizon episodes"]:
-        """Return the sum of squared distances of each episode to the origin, in the order of sorted names."""
-        names, episode_of = np.unique(np.array(self.episode_ids), return_inverse=True)
-        by_clip = np.concatenate(self._squares)
-        return np.stack([np.bincount(episode_of, column, len(names)) for column in by_clip.T])
-
-    def products(self) -> Float[np.ndarray, "horizon episodes episodes"]:
-        """Return the inner products of the episodes' sums, scaled so that their total is the exact one."""
-        assert self._total is not None  # noqa: S101  # there are clips
-        sketches = np.stack([self._sketches[name] for name in sorted(self._sketches)], axis=1)
-        products = sketches @ sketches.swapaxes(1, 2)
-        exact = self._total.square().sum(dim=1).numpy()
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = exact / products.sum(axis=(1, 2))
-        return np.asarray(products * np.where(np.isfinite(scale), scale, 1)[:, None, None])
+        squares, mean = torch.as_tensor(self._squares / clips), torch.as_tensor(self._total / clips)
+        traces = squares - mean.square().sum(dim=1)
+        return np.where(traces > 1e-12 * squares, traces, 0.0)
 
     @property
     def features(self) -> Float[np.ndarray, "clips dim"]:
@@ -130,8 +98,8 @@ def distribution_of(predicted: LatentSums, true: LatentSums) -> LatentDistributi
         spread=spread_of(predicted, true),
         mmd=tuple(mmd(one, other, true.episode_ids) for one, other in pairs),
         fvd=frechet_distance(predicted.features, true.features),
-        variance=predicted.variances(),
-        true_variance=true.variances(),
+        variance=tuple(predicted.variances().tolist()),
+        true_variance=tuple(true.variances().tolist()),
     )
 
 
@@ -162,44 +130,13 @@ def distance_of_halves(true: LatentSums) -> float:
 
 
 def spread_of(predicted: LatentSums, true: LatentSums) -> tuple[Estimate, ...]:
-    """Return the trace of the covariance over clips, predicted over true, by horizon; NaN of one clip.
+    """Return the trace of the covariance over clips, predicted over true, by horizon, without intervals.
 
-    Both are resampled together, by episodes.
+    It is NaN of one clip.
     """
-    names, counts = np.unique(np.array(true.episode_ids), return_counts=True)
-    sums = [(kind.squares(), kind.products()) for kind in (predicted, true)]
-
-    def of_weights(weights: np.ndarray) -> np.ndarray:
-        clips = (weights @ counts)[:, None]
-        above, below = (
-            weights @ squares.T / clips
-            - np.einsum("re,hef,rf->rh", weights, products, weights, optimize=True) / clips**2
-            for squares, products in sums
-        )
-        return np.asarray(above / np.where(below > 1e-12 * (weights @ sums[1][0].T / clips), below, np.nan))
-
-    return bootstrapped_by_weights(of_weights, len(names))
-
-
-def _sketched(flat: Float[Tensor, "batch horizon numbers"]) -> Float[Tensor, "batch horizon places"]:
-    numbers = flat.shape[-1]
-    if numbers <= MOST_SKETCHED:
-        return flat.double()
-    place, sign = _hashes(numbers, flat.device)
-    sketch = torch.zeros(*flat.shape[:-1], MOST_SKETCHED, dtype=torch.float64, device=flat.device)
-    for row, latents in zip(sketch, flat, strict=True):  # one clip at a time: in float64 a batch would be large
-        row.index_add_(-1, place, latents.double() * sign)
-    return sketch
-
-
-@lru_cache(maxsize=2)
-def _hashes(numbers: int, device: torch.device) -> tuple[Int[Tensor, " numbers"], Float[Tensor, " numbers"]]:
-    """Return the place and the sign of each number: the same for every model and horizon."""
-    generator = torch.Generator().manual_seed(0)
-    with torch.inference_mode(False):
-        place = torch.randint(MOST_SKETCHED, (numbers,), generator=generator)
-        sign = torch.randint(2, (numbers,), generator=generator).double() * 2 - 1
-        return place.to(device), sign.to(device)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.where(true.variances() > 0, predicted.variances() / true.variances(), np.nan)
+    return tuple(Estimate(value, math.nan, math.nan) for value in values.tolist())
 
 
 def mmd(

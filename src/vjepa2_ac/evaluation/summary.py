@@ -361,7 +361,7 @@ def closed_loop(
     needs = ""
     if reference.value < CHANCE:
         solved = f"The oracle solves only {percent(reference.value)} % of these problems"
-        needs = f"{solved}, so they cannot be used for comparison."
+        needs = f"{solved}, so they cannot be used for comparison; raise --steps."
     elif problems < ENOUGH_EPISODES:
         needs = f"{_are_too_few(problems, 'problem')}; use --episodes 50."
     others = ", ".join(f"{name} {percent(one.value)} %" for name, one in shares.items() if name != model)

@@ -122,7 +122,6 @@ class ProgressBar:
 
     def __init__(self, title: str, unit: str = "") -> None:
         self.title, self._unit, self._total = title, unit, -1
-        self.created = time.monotonic()
         self._first, self._began, self._next_line = 0, 0.0, 0.0
         self._bar: Progress | None = None
 
@@ -180,7 +179,7 @@ class ConsoleReporter(Reporter):
     """Shows messages, and one task after another as a bar; at the end of its `with` block the terminal is restored."""
 
     def __init__(self) -> None:
-        self._bar, self.seconds = ProgressBar(""), dict[str, float]()  # of finished tasks, by title
+        self._bar = ProgressBar("")
 
     def note(self, text: str) -> None:
         """Print a message."""
@@ -188,14 +187,10 @@ class ConsoleReporter(Reporter):
 
     def task(self, title: str, unit: str = "") -> ProgressBar:
         """Begin another task; return its bar."""
-        self._end()
+        self._bar.close()
         self._bar = ProgressBar(title, unit)
         Work.begin(title)
         return self._bar
-
-    def _end(self) -> None:
-        self._bar.close()
-        self.seconds[self._bar.title] = time.monotonic() - self._bar.created
 
     def __enter__(self) -> Self:
         """Return this reporter."""
@@ -203,4 +198,4 @@ class ConsoleReporter(Reporter):
 
     def __exit__(self, *_: object) -> None:
         """Restore the terminal."""
-        self._end()
+        self._bar.close()
