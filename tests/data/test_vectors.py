@@ -179,7 +179,7 @@ def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
     dataset = open_dataset(knobs(write_vectors(tmp_path / "set", width=14)))
     found = inspect_dataset(dataset)
     figures = json.loads(json.dumps(found.values))
-    assert (figures["state_dim"], figures["action_dim"], len(figures["ranges"])) == (14, 14, 14)
+    assert len(figures["ranges"]) == 14
     assert "gripper" not in figures
     assert [one["stride"] for one in figures["per_model_step"]] == [3, 5, 10]
     assert found.summary["states"].startswith("14 numbers: -")

@@ -12,14 +12,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.patches import Patch, Rectangle
 
-from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import runs_of
 from vjepa2_ac.data.transforms import CropBox, crop_box
 from vjepa2_ac.episode import Progress, no_progress, short_names
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.inspection.coverage import ENOUGH_NEAR, ReadEpisode
-from vjepa2_ac.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, Inspection, idle_runs, largest_change
+from vjepa2_ac.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, Inspection, largest_change
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, written_figure
 
 _PLACES = 6000  # points of the map, at most
@@ -47,7 +45,7 @@ class Strip:
     frames: UInt8[np.ndarray, "time height width 3"]
     speed: Float[np.ndarray, " steps"]  # per second, in cm of the flange; of vectors see `plot_contact_sheet`
     closedness: Float[np.ndarray, " steps"] | None  # None: the states are no poses
-    shaded: tuple[tuple[int, int], ...]  # ranges [start, end) of steps: idle, or left out
+    shaded: tuple[tuple[int, int], ...]  # ranges [start, end) of steps that are left out
     seen: CropBox  # what the model sees of a picture
 
 
@@ -59,7 +57,7 @@ def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress:
     Raises:
         InputError: A frame cannot be read, and `data.broken_episodes` does not leave its episode out.
     """
-    dataset, shown = inspection.dataset, _rows_of(inspection, rows)
+    dataset, shown = inspection.dataset, inspection.sample[:rows]
     identities = [dataset.table.identity(one.index) for one in shown]
     names = short_names(identities)
     strips = []
@@ -72,24 +70,6 @@ def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress:
     return plot_contact_sheet(inspection, strips, path)
 
 
-def _shaded_means(config: DataConfig) -> str:
-    if config.idle.rule != "none":
-        return f"left out by data.idle ({config.idle.rule})"
-    return "standing still" if config.states == "pose" else ""
-
-
-def _rows_of(inspection: Inspection, rows: int) -> list[ReadEpisode]:
-    """Return episodes of the sample, some of each outcome."""
-    success = inspection.dataset.table.success
-    by_outcome = ([one for one in inspection.sample if success[one.index] == kind] for kind in (1, 0, -1))
-    groups = [group for group in by_outcome if group]
-    whole = sum(map(len, groups))
-    shares = [max(1, round(rows * len(group) / whole)) for group in groups]
-    shares[shares.index(max(shares))] += rows - sum(shares)
-    chosen = [one for group, share in zip(groups, shares, strict=True) for one in group[: max(share, 0)]]
-    return sorted(chosen, key=lambda one: inspection.sample.index(one))
-
-
 def _strip_of(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
     dataset = inspection.dataset
     episode = dataset.source.read(one.index)
@@ -100,6 +80,9 @@ def _strip_of(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
     at = pictured[((np.arange(count) + 0.5) * len(pictured) / count).astype(np.int64)].astype(np.int64)
     changes = np.gradient(one.states, axis=0) if steps > 1 else np.zeros_like(one.states)
     is_pose, space = inspection.has_poses, dataset.spaces.state
+    left_out = np.ones(steps, bool)
+    for start, end in one.kept:
+        left_out[start:end] = False
     changed = space.shown_size(changes) if is_pose else largest_change(changes, inspection.ranges)
     return Strip(
         name=name,
@@ -107,20 +90,9 @@ def _strip_of(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
         frames=episode.read_frames([int(step) for step in at]),
         speed=changed * episode.control_rate_hz,
         closedness=one.states[:, space.gripper] if is_pose else None,
-        shaded=_shaded(dataset, one),
+        shaded=tuple(runs_of(left_out)),
         seen=crop_box(height, width, dataset.config.crop),
     )
-
-
-def _shaded(dataset: Dataset, one: ReadEpisode) -> tuple[tuple[int, int], ...]:
-    if dataset.config.idle.rule != "none":
-        left_out = np.ones(len(one.states), bool)
-        for start, end in one.kept:
-            left_out[start:end] = False
-        return tuple(runs_of(left_out))
-    if dataset.config.states == "vector":
-        return ()  # what standing still means is not known
-    return tuple(runs_of(idle_runs(one.states, dataset.config)))
 
 
 # ---- drawing ----
@@ -181,10 +153,8 @@ def _panels(part: Any, inspection: Inspection) -> None:
         axes.bar(np.arange(len(ranges)), ranges[:, 1] - ranges[:, 0], bottom=ranges[:, 0], color=BLUE)
         axes.set(title="Range of each number of the state", xlabel="number, from 0")
         axes.locator_params(axis="x", integer=True)
-    shaded = _shaded_means(dataset.config)
     speed = "speed (cm/s)" if has_poses else "fastest number (% of its range per second)"
-    meanings = {speed: BLUE} | ({"gripper: 0 open, 1 closed": ORANGE} if has_poses else {})
-    meanings |= {shaded: _IDLE} if shaded else {}
+    meanings = {speed: BLUE} | ({"gripper: 0 open, 1 closed": ORANGE} if has_poses else {}) | {"left out": _IDLE}
     meanings["bright part of a picture: what the model sees"] = "none"
     handles = [Patch(color=colour, label=label) for label, colour in meanings.items()]
     part.legend(handles=handles, loc="lower right", ncols=4, fontsize=9, handlelength=1)
@@ -194,10 +164,7 @@ def _directions(part: Any, axes: Any, directions: Float[np.ndarray, "rows column
     """Draw the sphere of directions, each of the same area, as a map: x forward in the middle, z up."""
     extent = (-180.0, 180.0, -1.0, 1.0)
     shown = axes.imshow(directions, extent=extent, origin="lower", aspect="auto", cmap="Blues", vmin=0, vmax=2)
-    if directions.min() < ENOUGH_NEAR < directions.max():
-        axes.contour(directions, [ENOUGH_NEAR], extent=extent, origin="lower", colors=ORANGE, linewidths=1.2)
-    share = (directions >= ENOUGH_NEAR).mean()
-    axes.set_title(f"Directions: {share:.0%} taught")
+    axes.set_title(f"Directions: {(directions >= ENOUGH_NEAR).mean():.0%} covered")
     axes.set_xticks([-180, -90, 0, 90, 180], ["-x", "-y", "+x", "+y", "-x"])
     axes.set_yticks([-1, 0, 1], ["-z", "", "+z"])
     part.colorbar(shown, ax=axes, fraction=0.04, pad=0.02, ticks=[0, ENOUGH_NEAR, 1, 2])

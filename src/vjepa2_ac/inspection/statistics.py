@@ -99,20 +99,10 @@ class Inspection:
         """All statistics as plain values, as in `inspect.json`."""
         config, table, rate = self.dataset.config, self.dataset.table, self.dataset.control_rate_hz
         known, lengths = table.success[table.success >= 0], np.percentile(table.num_steps, [0, 10, 50, 90, 100])
-        about_states = {"ranges": self.ranges.tolist()}
-        if self.has_poses:
-            idle = [idle_runs(one.states, config) for one in self.sample]
-            about_states = {
-                "still_share": float(np.concatenate(idle).mean()),
-                "xyz_m": self.ranges[:3].tolist(),
-                "gripper": self.ranges[-1].tolist(),
-                "released_weights": RELEASED,
-            }
-        return {
+        values: dict[str, Any] = {
             "path": config.path,
             "source": config.source,
             "cameras": list(config.offered_cameras),
-            "camera": list(config.cameras),
             "control_rate_hz": rate,
             "episodes": len(table),
             "broken_episodes": len(table.problems),
@@ -121,17 +111,17 @@ class Inspection:
             "length_percentiles_0_10_50_90_100": lengths.astype(int).tolist(),
             "success_share": float(known.mean()) if len(known) else None,
             "success_known_of": len(known),
-            "removed": [vars(one) for one in self.dataset.removed],
             "splits": {split: self._size_of(split) for split in SPLITS},
             "duplicates": self.duplicates.as_dict(),
             "sampled_episodes": len(self.sample),
-            "state_dim": self.dataset.widths.state,
-            "action_dim": self.dataset.widths.action,
+            "ranges": self.ranges.tolist(),
             "percentiles": list(PERCENTILES),
             "per_model_step": [{"stride": one.stride, "seconds": one.seconds, **one.percentiles} for one in self.steps],
             "coverage": None if self.coverage is None else dict(self.coverage.metrics),
-            **about_states,
         }
+        if self.has_poses:
+            values["still_share"] = float(np.concatenate([idle_runs(one.states, config) for one in self.sample]).mean())
+        return values
 
     def _size_of(self, split: Split) -> dict[str, int]:
         try:
@@ -152,23 +142,24 @@ class Inspection:
         removed = ", ".join(f"{one.name} {one}" for one in self.dataset.removed if one.episodes or one.steps)
         known = f"of {counted(values['success_known_of'], 'episode')} of which it is known"
         ranges = [f"{low:.2f} to {high:.2f}" for low, high in self.ranges]
-        how = f", joined by {config.join_actions}" if config.join_actions else ""
-        about_states = {
-            "states": f"{values['state_dim']} numbers: {', '.join(ranges)}",
-            "actions": f"{values['action_dim']} numbers, {config.actions}{how}",
-        }
         if self.has_poses:
             about_states = {
                 "standing still": f"{values['still_share']:.1%} of the steps, by the measured motion",
                 "position": f"{', '.join(f'{axis} {one}' for axis, one in zip('xyz', ranges, strict=False))} m",
                 "gripper": f"{ranges[-1]} (0 open, 1 closed)",
             }
+        else:
+            widths, joined = self.dataset.widths, f", joined by {config.join_actions}" if config.join_actions else ""
+            about_states = {
+                "states": f"{widths.state} numbers: {', '.join(ranges)}",
+                "actions": f"{widths.action} numbers, {config.actions}{joined}",
+            }
         return {
             "data set": f"{config.path} ({config.source})",
             "episodes": f"{values['episodes']:,} ({values['broken_episodes']:,} broken)",
             "steps": f"{values['steps']:,} at {values['control_rate_hz']:g} per second: {lasting}",
             "length": f"{lengths} steps (least, 10 %, median, 90 %, most)",
-            "cameras": f"{', '.join(values['cameras'])}; used: {', '.join(values['camera'])}",
+            "cameras": f"{', '.join(values['cameras'])}; used: {', '.join(config.cameras)}",
             "success": "not recorded" if success is None else f"{success:.1%} {known}",
             "left out": removed or "no episodes and no steps",
             "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
