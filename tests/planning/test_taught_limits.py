@@ -63,7 +63,7 @@ def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config
     taught = PlanningConfig.model_validate({**PLANNING, "limits": {"xyz": "data"}})
     of_run = Controller.of_run(load_subject(folder), taught)
     np.testing.assert_allclose(of_run.space.upper[0, :3], limits, rtol=1e-6)
-    asked = EvaluationOptions(planning=("planning.limits.xyz=data",))
+    asked = EvaluationOptions(overrides=("planning.limits.xyz=data",))
     assert settle(str(folder), asked).planning.limits.xyz == limits
 
 

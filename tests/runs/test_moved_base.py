@@ -52,7 +52,7 @@ def exported(run: str, overrides: list[str]) -> WorldModel:
 
 
 def evaluated(run: str, overrides: list[str]) -> WorldModel:
-    asked = EvaluationOptions(planning=tuple(overrides))
+    asked = EvaluationOptions(overrides=tuple(overrides))
     config = settle(run, asked)
     return load_models(run, config, asked, open_dataset(config.data)).world_model
 
@@ -84,11 +84,11 @@ def test_nothing_else_is_changed_on_the_way(run: str, base_folder: Path) -> None
         load_run(run, overrides=["adapter.rank=8"])
     with pytest.raises(InputError, match="not the folder of a run"):
         load_to_plan(str(base_folder), overrides=["model.base=elsewhere"])
-    asked = EvaluationOptions(planning=(f"model.base={base_folder}", "planning.samples=30"))
+    asked = EvaluationOptions(overrides=(f"model.base={base_folder}", "planning.samples=30"))
     config = settle(run, asked)
     assert (config.model.base, config.planning.samples) == (str(base_folder), 30)
     with pytest.raises(InputError, match=r"override: model\.dtype"):
-        settle(run, EvaluationOptions(planning=("model.dtype=bfloat16",)))
+        settle(run, EvaluationOptions(overrides=("model.dtype=bfloat16",)))
 
 
 STATE = "0.4,0,0.3,3.1,0,0.1,0.2"

@@ -13,6 +13,8 @@ from vjepa2_ac.config.model import RANDOM
 from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.process import is_first
 
+_NAMED = ("none", "up", "left", "close")  # actions from an image, whose true ones are not known
+
 if TYPE_CHECKING:
     from vjepa2_ac.decoding.imagine import Imagination
     from vjepa2_ac.evaluation.request import EvaluationOptions
@@ -69,7 +71,7 @@ def add_imagine(commands: cli.Commands) -> None:
         "with commas between them: true (as recorded), none, up, down, left, right, forward, back, open, close; or"
         " files, .npy or .csv, with a row of 7 numbers for each step (true,none,up,left,close)"
     )
-    cli.add(parser, "--actions NAMES", text)
+    cli.add(parser, "--actions NAMES", text, _names)
     cli.add(parser, "--steps N", "model steps to imagine (7)", cli.count, default=7)
     cli.add(parser, "--size CM", "of a named action in each step, within planning.limits (5)", float, default=5.0)
     cli.add(parser, "--out FOLDER", "where the film goes (imagined, in the run's)", cli.as_path)
@@ -163,23 +165,16 @@ def _simulation(about: About, options: argparse.Namespace) -> list[str]:
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     """Return the options for each subject; refuse settings without effect."""
-    from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+    from vjepa2_ac.evaluation.request import ProbeOptions
     from vjepa2_ac.runs.folder import is_of_moved
 
     if unused := [word for word in options.overrides if not is_of_moved(word)]:
         needed = "model.base=PATH, for a run whose base was moved: evaluate does not change other config keys"
         raise InputError(where="command line", found=" ".join(unused), needed=needed)
-    several = len(options.subjects) > 1
-    every = cli.record_of_options(
-        EvaluationOptions,
-        options,
-        data=cli.read_config(options.data) if options.data else None,
-        against=tuple(options.against) if options.against else None,
-        probes=cli.record_of_options(ProbeOptions, options),
-        planning=tuple(options.overrides),
-    )
+    every = cli.evaluation_options(options, probes=cli.record_of_options(ProbeOptions, options))
+    several = every.out is not None and len(options.subjects) > 1
     return [
-        (subject, replace(every, out=options.out / Path(subject).name if options.out and several else options.out))
+        (subject, replace(every, out=every.out / Path(subject).name if several and every.out else every.out))
         for subject in options.subjects
     ]
 
@@ -234,30 +229,14 @@ def _require_one_start(options: argparse.Namespace) -> None:
         raise InputError(where="--image", found=f"{', '.join(given)}, too", needed="a clip or an image, not both")
 
 
-def _words(options: argparse.Namespace) -> tuple[str, ...]:
-    usual = "none,up,left,close" if options.image is not None else "true,none,up,left,close"
-    return tuple(word for word in (options.actions or usual).split(",") if word)
-
-
 def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imagination:
     from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
-    from vjepa2_ac.evaluation.request import EvaluationOptions, settle
+    from vjepa2_ac.evaluation.request import settle
     from vjepa2_ac.simulation.counterfactual import simulated_outcome
 
     cli.say_places_elsewhere(options.subject)
-    data = None if options.data is None else cli.read_config(options.data)
-    asked = ImagineOptions(
-        decoder=options.decoder,
-        actions=_words(options),
-        steps=options.steps,
-        size_m=options.size / 100,
-        split=options.split,
-        episode=options.episode,
-        start=options.start,
-        evaluation=EvaluationOptions(
-            checkpoint=options.checkpoint, data=data, out=out, planning=tuple(options.overrides)
-        ),
-    )
+    how = {"evaluation": cli.evaluation_options(options, out=out), "size_m": options.size / 100}
+    asked = cli.record_of_options(ImagineOptions, options, **how)
     cli.require_subject(options.subject, settle(options.subject, asked.evaluation), options.words)
     return imagine_clip(options.subject, asked, simulate=simulated_outcome, reporter=reporter)
 
@@ -268,6 +247,11 @@ def _of_image(options: argparse.Namespace) -> Imagination:
 
     state, extrinsics = cli.as_numbers(options.state, "--state"), cli.camera_pose(options.extrinsics)
     cli.require_to_plan(options)
-    seen = Seen(read_image(options.image), state, extrinsics)
-    session, words = cli.load_planning_session(options), _words(options)
-    return imagine_image(session, options.decoder, seen, words, steps=options.steps, size_m=options.size / 100)
+    seen, words = Seen(read_image(options.image), state, extrinsics), options.actions or _NAMED
+    session, size_m = cli.load_planning_session(options), options.size / 100
+    return imagine_image(session, options.decoder, seen, words, steps=options.steps, size_m=size_m)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Parse the value of --actions."""
+    return tuple(word for word in text.split(",") if word)

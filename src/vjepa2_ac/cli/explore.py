@@ -133,15 +133,13 @@ def _views(
     subject: str, data: Config | None, decoder: TrainedDecoder, options: argparse.Namespace, reporter: Reporter
 ) -> Views:
     from vjepa2_ac.evaluation.evaluate_run import load_models
-    from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
+    from vjepa2_ac.evaluation.request import require_one_process, settle
     from vjepa2_ac.explore.explorer import open_explorer
     from vjepa2_ac.explore.views import Views
     from vjepa2_ac.simulation.counterfactual import SimulatedFutures
 
     require_one_process()
-    against = tuple(options.against) if options.against else None
-    how = {"split": options.split, "checkpoint": options.checkpoint, "data": data, "against": against}
-    asked = EvaluationOptions(**how, out=Path(), planning=tuple(options.overrides))
+    asked = cli.evaluation_options(options, data=data, out=Path())
     config = settle(subject, asked)
 
     def load(dataset: Dataset, decoder: TrainedDecoder) -> Models:

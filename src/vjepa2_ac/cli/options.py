@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.cli.console.progress import ConsoleReporter
     from vjepa2_ac.config import Config
     from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+    from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.runs.subject import Subject
     from vjepa2_ac.serving.access import Access
 
@@ -199,6 +200,14 @@ def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace,
     """Return a record whose fields are the options of their names that were given, and others."""
     given = {field.name: getattr(options, field.name, None) for field in fields(kind)}  # type: ignore[arg-type]
     return kind(**{name: value for name, value in given.items() if value is not None} | others)
+
+
+def evaluation_options(options: argparse.Namespace, **others: Any) -> EvaluationOptions:
+    """Return the options of an evaluation that were given, with the config of --data, and others."""
+    from vjepa2_ac.evaluation.request import EvaluationOptions
+
+    data = read_config(options.data) if options.data else None
+    return record_of_options(EvaluationOptions, options, **({"data": data} | others))
 
 
 def show(*parts: Any, files: Iterable[str | Path] = ()) -> None:

@@ -158,8 +158,6 @@ def _measured(images: _Images) -> dict[tuple[str, str], Float[Tensor, "batch hor
             for region, where in regions.items():
                 found[source, f"psnr_db.{region}.{reference}"] = psnr(shown, true, where)
                 found[source, f"ssim.{region}.{reference}"] = mean_where(similar, where)
-    if moving is not None:
-        found[TRUE_FRAMES, "moving_share"] = moving.float().mean(dim=(-2, -1))
     return found
 
 

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.config import Config, LimitsConfig
-from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.sources.indexed_source import measured_space
@@ -142,10 +141,9 @@ class ImagineOptions:
     actions: tuple[str, ...] = (TRUE, "none", "up", "left", "close")  # names, `true`, or files
     steps: int = 7  # model steps
     size_m: float = STEP_M  # of a named action, in each step, if the limits allow it
-    split: Split = "test"
     episode: str | None = None  # None: the held-out clip with the most motion
     start: int | None = None  # first control step; None: likewise
-    evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, against
+    evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, split
 
 
 def imagine_clip(
@@ -228,15 +226,15 @@ def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: L
 
 def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
     """Return episode and first control step of the clip."""
-    lengths, clip = dataset.table.num_steps, dataset.config.clip_steps
+    lengths, clip, split = dataset.table.num_steps, dataset.config.clip_steps, asked.evaluation.split
     if asked.episode is None:
-        members = dataset.members(asked.split)[dataset.episodes]
+        members = dataset.members(split)[dataset.episodes]
         longest = int(lengths[dataset.episodes[members]].max(initial=0))
         if 0 < longest < clip:
             most = (longest - 1) // dataset.config.model_stride
-            found = f"{counted(asked.steps, 'model step')}, and the longest {asked.split} episode has {most}"
+            found = f"{counted(asked.steps, 'model step')}, and the longest {split} episode has {most}"
             raise InputError(where="--steps", found=found, needed=f"{most} at most")
-        windows = validation_windows(dataset, asked.split, clips=_SEARCHED)
+        windows = validation_windows(dataset, split, clips=_SEARCHED)
         return max(windows, key=lambda window: _motion(dataset, *window))
     episode = _episode(dataset, asked.episode)
     start, last = asked.start or 0, int(lengths[episode]) - clip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -38,13 +38,11 @@ class EvaluationOptions:
     clips: int = 256  # at most, spread over the episodes
     checkpoint: str = SELECTED  # of a run: selected, newest, best, or a number of optimizer steps
     data: Config | None = None  # data other than the run's own; a model has none of its own
-    against: tuple[str, ...] | None = None  # base, runs, models; None: the base of a run, nothing for a model
+    against: Sequence[str] | None = None  # base, runs, models; None: the base of a run, nothing for a model
     out: Path | None = None  # output folder; None: the run's
     probes: ProbeOptions = field(default_factory=ProbeOptions)
     decoder: str | None = None  # folder of a decoder, or builtin:sim-tiny: rollouts are decoded and measured as images
-    # Settings in place of the config's: model.base=PATH for a run whose base was moved; planning.… for commands that
-    # plan or roll out.
-    planning: tuple[str, ...] = ()
+    overrides: Sequence[str] = ()  # of the config: planning.…, or for a run whose base was moved model.base=PATH
 
 
 def settle(subject: str, asked: EvaluationOptions) -> Config:
@@ -58,11 +56,11 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
         InputError: The subject is no run and no data are named, a setting is wrong, or a folder is missing.
     """
     config = _config_of(subject, asked)
-    for setting in asked.planning:
-        if not (setting.startswith("planning.") or (is_run(subject) and is_of_moved(setting))):
-            needed = "settings of planning, such as planning.samples=200; or, for a run, model.base=PATH"
-            raise InputError(where="override", found=setting, needed=needed)
-    config = parse_config(config_as_dict(config), asked.planning, where="overrides")
+    for override in asked.overrides:
+        if not (override.startswith("planning.") or (is_run(subject) and is_of_moved(override))):
+            needed = "keys of planning, such as planning.samples=200; or, for a run, model.base=PATH"
+            raise InputError(where="override", found=override, needed=needed)
+    config = parse_config(config_as_dict(config), asked.overrides, where="overrides")
     return with_taught_limits(config, Path(subject)) if is_run(subject) else config
 
 
