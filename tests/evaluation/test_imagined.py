@@ -124,7 +124,7 @@ def test_frames_are_those_of_the_clip_that_was_named(imagine: Imagine, make_conf
 
 def test_the_clip_is_that_of_the_split_with_the_most_motion(imagine: Imagine, make_config: MakeConfig) -> None:
     split = "validation"
-    found = imagine(actions=("true",), split=split)
+    found = imagine(actions=("true",), evaluation=EvaluationOptions(split=split))
     dataset = open_dataset(make_config(data__frames=STEPS + 1).data)
 
     def motion(name: str, start: int) -> float:
