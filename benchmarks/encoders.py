@@ -26,7 +26,7 @@ from timing import about, add_basics, add_repeats, introduction, prepare, settle
 
 from vjepa2_ac.config import Config, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.data.sources.latents.cache_files import bytes_per_frame
+from vjepa2_ac.data.sources.latent_files import bytes_per_frame
 from vjepa2_ac.distributed import matmul_speed
 from vjepa2_ac.encoding.latent_cache import picture_bytes
 from vjepa2_ac.model.model_files import PUBLISHED

@@ -31,9 +31,9 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig, RldsData
-from vjepa2_ac.data.sources.rlds import episode as rlds_index
-from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.data.sources.rlds.tfrecord import Kind, encode_entry
+from vjepa2_ac.data.sources import rlds_episode as rlds_index
+from vjepa2_ac.data.sources.rlds import RldsSource
+from vjepa2_ac.data.sources.tfrecord import Kind, encode_entry
 from vjepa2_ac.simulation.droid_writer import dataset_info
 
 DROID_SHARDS, DROID_EPISODES, PER_SHARD = 2048, 95_658, 47

@@ -35,7 +35,7 @@ from vjepa2_ac.data.dataset import open_dataset, read_clip
 from vjepa2_ac.data.index import EpisodeTable, get_or_build
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.selection import StepSelection
-from vjepa2_ac.data.sources.rlds import source as rlds_source
+from vjepa2_ac.data.sources import rlds as rlds_source
 from vjepa2_ac.data.windows import ClipOrder, clip_starts, windows_of
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.simulation.droid_writer import write_droid_rlds

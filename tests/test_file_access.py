@@ -16,7 +16,8 @@ from random_decoder import write_decoder
 from run_fixtures import TINY, MakeConfig
 from vjepa2_ac.config import AdapterConfig, DiskCacheConfig, EncoderConfig, ModelConfig, ModelSizes
 from vjepa2_ac.data.index import EpisodeTable, get_or_build
-from vjepa2_ac.data.sources.latents.cache_files import EPISODES, LatentFiles, read_tables
+from vjepa2_ac.data.sources.latent_files import LatentFiles
+from vjepa2_ac.data.sources.latents import EPISODES, read_tables
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError, RefusedError, in_words

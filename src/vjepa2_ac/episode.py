@@ -77,7 +77,7 @@ FrameReader = Callable[[Sequence[int]], UInt8[np.ndarray, "time height width 3"]
 
 @dataclass(frozen=True)
 class StoredLatents:
-    """Latents of frames as a cache stores them; `cache_files.unpack_latents` converts them to float32 on the device."""
+    """Latents of frames as a cache stores them; `latent_files.unpack_latents` makes them float32 on the device."""
 
     values: Num[Tensor, "*batch time tokens dim"]  # bfloat16, float32 or int8
     scales: Float32[Tensor, "*batch time tokens"] | None = None  # of int8: the value of 1, for each token

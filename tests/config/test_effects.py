@@ -21,7 +21,7 @@ from vjepa2_ac.config.section import Affects, Section, mark_of, marks_of, values
 from vjepa2_ac.data import idle as idle_ranges
 from vjepa2_ac.data.index import EpisodeInfo, EpisodeTable
 from vjepa2_ac.data.sources.indexed_source import open_source
-from vjepa2_ac.data.sources.latents.cache_key import key_of_cache
+from vjepa2_ac.data.sources.latents import key_of_cache
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -142,8 +142,7 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
         raise Found(keys)
 
     for source in WRITERS:
-        module = source if source in {"npz", "droid_raw"} else f"{source}.source"
-        monkeypatch.setattr(f"vjepa2_ac.data.sources.{module}.get_or_build", stop)
+        monkeypatch.setattr(f"vjepa2_ac.data.sources.{source}.get_or_build", stop)
     monkeypatch.setattr(idle_ranges, "get_or_make", stop)
 
     def found(action: Callable[[], Any]) -> Any:

@@ -11,8 +11,8 @@ from lerobot_sets import STATE, Recorded, recorded, write_v30
 from synthetic import synthetic_states
 from vjepa2_ac.config import LeRobotData, LeRobotFields, RldsData
 from vjepa2_ac.data.poses import poses_from
-from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
-from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.lerobot import LeRobotSource
+from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.errors import InputError
 
 IN_OTHER_UNITS = {"position_unit": "mm", "rotation": "euler_xyz_degrees"}

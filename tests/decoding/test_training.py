@@ -18,8 +18,8 @@ from killable import KILLED, Nursery
 from run_fixtures import TINY, MakeConfig, SilentReporter, as_yaml
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DecoderConfig, ModelSizes
-from vjepa2_ac.data.sources.latents.cache_files import LatentFiles
-from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.latent_files import LatentFiles
+from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.decoding import training
 from vjepa2_ac.decoding.decoder_folder import CARD, WEIGHTS, load_decoder, read_card
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs

@@ -34,7 +34,7 @@ UPLOAD = r"POST /upload/.*safetensors"
 @pytest.fixture(autouse=True)
 def _small_heads(monkeypatch: pytest.MonkeyPatch) -> None:
     """These episodes are so small that the head of a file would be most of it."""
-    monkeypatch.setattr("vjepa2_ac.data.sources.latents.tensor_file._HEAD_BYTES", 512)
+    monkeypatch.setattr("vjepa2_ac.data.sources.latent_files._HEAD_BYTES", 512)
 
 
 @pytest.fixture

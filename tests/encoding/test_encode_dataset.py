@@ -165,7 +165,7 @@ def test_what_is_damaged_deleted_or_takes_part_from_now_on_is_encoded_by_the_nex
 @pytest.fixture
 def mend(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Episode 3 has a frame that cannot be decoded; a call repairs it."""
-    from vjepa2_ac.data.sources.rlds.source import RldsSource
+    from vjepa2_ac.data.sources.rlds import RldsSource
 
     read, is_broken = RldsSource.read, True
 

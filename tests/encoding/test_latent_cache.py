@@ -22,10 +22,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
-from vjepa2_ac.data.sources.latents.cache_files import (
-    CACHE,
-    EPISODES,
-    KEPT,
+from vjepa2_ac.data.sources.latent_files import (
     OPTIONAL,
     CacheType,
     EncodedEpisode,
@@ -33,6 +30,7 @@ from vjepa2_ac.data.sources.latents.cache_files import (
     pack_latents,
     unpack_latents,
 )
+from vjepa2_ac.data.sources.latents import CACHE, EPISODES, KEPT
 from vjepa2_ac.encoding import batch
 from vjepa2_ac.encoding.latent_cache import LatentCache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents

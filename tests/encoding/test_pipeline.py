@@ -13,7 +13,7 @@ import torch
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig, ModelSizes
 from vjepa2_ac.data import dataset
-from vjepa2_ac.data.sources.latents.cache_files import CacheType, LatentFiles, unpack_latents
+from vjepa2_ac.data.sources.latent_files import CacheType, LatentFiles, unpack_latents
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.episode import Batch, LatentBatch

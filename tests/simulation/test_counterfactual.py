@@ -15,7 +15,7 @@ from paths import ROOT
 from projections import hand_pixel, pixel_of
 from run_fixtures import MakeConfig
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, CameraPlace, DomainRanges
 

@@ -9,7 +9,7 @@ import pytest
 
 from synthetic import write_synthetic_droid
 from tfrecords import decode_example, index_records, read_record
-from vjepa2_ac.data.sources.rlds.tfrecord import encode_example, write_record
+from vjepa2_ac.data.sources.tfrecord import encode_example, write_record
 
 Features = dict[str, tuple[Any, Any]]
 

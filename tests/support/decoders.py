@@ -9,7 +9,7 @@ import torch
 from run_fixtures import MakeConfig, one_thread, tiny_config
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.sources.latents.cache_files import LatentFiles
+from vjepa2_ac.data.sources.latent_files import LatentFiles
 from vjepa2_ac.decoding.frame_pairs import FramePairs, wanted_frames
 from vjepa2_ac.decoding.training import train_decoder
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, encode_files

@@ -12,8 +12,8 @@ from safetensors import safe_open
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.sources.latents.cache_files import EncodedEpisode, pack_latents
-from vjepa2_ac.data.sources.latents.cache_key import Encoding
+from vjepa2_ac.data.sources.latent_files import EncodedEpisode, pack_latents
+from vjepa2_ac.data.sources.latents import Encoding
 from vjepa2_ac.data.transforms import pixels_to_input, view
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.latent_cache import LatentCache

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from vjepa2_ac.data.sources.rlds.tfrecord import encode_example, write_record
+from vjepa2_ac.data.sources.tfrecord import encode_example, write_record
 
 Values = Mapping[str, Any]  # features of one record by name: list of bytes, or numbers
 

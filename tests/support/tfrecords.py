@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from vjepa2_ac.data.sources.rlds.shards import find_shards
-from vjepa2_ac.data.sources.rlds.tfrecord import (
+from vjepa2_ac.data.sources.rlds_shards import find_shards
+from vjepa2_ac.data.sources.tfrecord import (
     HEADER_BYTES,
     Kind,
     RecordSpan,

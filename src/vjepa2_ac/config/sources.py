@@ -107,7 +107,7 @@ class LeRobotFields(PoseFields):
 class RldsData(DataConfig):
     """TFRecord shards with a dataset_info.json, as TFDS writes them."""
 
-    reader: ClassVar[str] = "vjepa2_ac.data.sources.rlds.source:RldsSource"
+    reader: ClassVar[str] = "vjepa2_ac.data.sources.rlds:RldsSource"
     has_camera_poses: ClassVar[bool] = False
     gripper_fix: ClassVar[str] = "exchange data.fields.gripper_open and gripper_closed"
     same_identity_fix: ClassVar[str] = (
@@ -152,7 +152,7 @@ class RawDroidData(DataConfig):
 class LeRobotData(DataConfig):
     """A LeRobotDataset v2.1 or v3.0."""
 
-    reader: ClassVar[str] = "vjepa2_ac.data.sources.lerobot.source:LeRobotSource"
+    reader: ClassVar[str] = "vjepa2_ac.data.sources.lerobot:LeRobotSource"
     gripper_fix: ClassVar[str] = "exchange data.lerobot.gripper_open and gripper_closed"
     constants: ClassVar[dict[str, dict[str, Any]]] = {"lerobot": {"joint_velocity": JOINT_VELOCITY}}
     has_camera_poses: ClassVar[bool] = False
@@ -190,7 +190,7 @@ class NpzData(DataConfig):
 class LatentsData(DataConfig):
     """A latent cache alone."""
 
-    reader: ClassVar[str] = "vjepa2_ac.data.sources.latents.source:LatentSource"
+    reader: ClassVar[str] = "vjepa2_ac.data.sources.latents:LatentSource"
     is_cache: ClassVar[bool] = True
     gripper_fix: ClassVar[str] = "change the convention of the data set that the cache was made from"
 

@@ -20,9 +20,8 @@ from jaxtyping import Float32, Shaped, UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, IdleConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.sources.lerobot.episodes import TABLES
-from vjepa2_ac.data.sources.lerobot.info import INFO, filled
-from vjepa2_ac.data.sources.lerobot.parquet import parquet_library
+from vjepa2_ac.data.sources.lerobot_meta import INFO, TABLES, filled
+from vjepa2_ac.data.sources.parquet import parquet_library
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError, counted

@@ -12,11 +12,10 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, DiskCacheConfig
-from vjepa2_ac.data.index import cache_folder
+from vjepa2_ac.data.index import NotATableError, cache_folder, pack, unpack
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
-from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 CONNECTIONS = 16  # concurrent reads of a process, for remote data
 DEEPEST = 8  # folders below the data set's
@@ -69,13 +68,13 @@ class EpisodeFiles:
     def arrays(self, key: str) -> dict[str, np.ndarray] | None:
         """Return the arrays that were kept under a key; None if there are none, or they are damaged."""
         data = self.cache.read(key)
-        with suppress(InputError):
-            return None if data is None else read_arrays(data)
+        with suppress(NotATableError):
+            return None if data is None else unpack(data)[0]
         return None
 
     def keep(self, key: str, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep what was parsed of an episode."""
-        self.cache.write(key, arrays_as_bytes(arrays))
+        self.cache.write(key, pack(arrays))
 
 
 def connections_to(config: DataConfig) -> int:

@@ -42,9 +42,7 @@ def find_ranges(
         make = partial(published_ranges, path, table)
         with storage.user_can_read(path):
             parts["list"] = [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
-    return get_or_make(
-        config.disk_cache, key_of(parts), make, to_bytes=StepSelection.to_bytes, from_bytes=StepSelection.from_bytes
-    )
+    return get_or_make(config.disk_cache, key_of(parts), make, StepSelection)
 
 
 def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress) -> StepSelection:

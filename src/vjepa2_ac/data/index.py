@@ -6,13 +6,15 @@ DROID has 95,658 episodes: a list of as many objects is slow to load and to send
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import logging
 import os
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float32, Int8, Int32, UInt64
@@ -23,11 +25,8 @@ from vjepa2_ac.episode import STATE_DIM, EpisodeInfo
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.spaces import step_sizes
 from vjepa2_ac.storage import places
-from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 logger = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 UNKNOWN = 0  # hash of an episode whose states were not read, since no other is similar
 
@@ -35,6 +34,7 @@ _NOT_KNOWN = -1  # number of a label, or success
 _COLUMNS = ("num_steps", "success", "ids", "id_hash", "id_rank")
 _HASH, _MOTION, _LOCATOR, _LABEL = "state_hash", "motion", "locator.", "label."
 _HASH_BYTES = 8
+_TEXT = "text"
 _NO_MOTION = (np.nan,) * 8
 MEANS, SPANS = slice(2, 5), slice(5, 8)  # of `StatesSummary.motion`
 _CACHE = "VJEPA2_AC_CACHE"
@@ -43,6 +43,47 @@ _VERSION = 5  # of the cache: another number makes all of it be rebuilt
 
 class NotATableError(ValueError):
     """The bytes are not a table by `to_bytes`."""
+
+
+class Storable(Protocol):
+    """A table that can be stored as a file."""
+
+    def to_bytes(self) -> bytes:
+        """Return this as a file's content; equal tables give equal bytes, and each array has a checksum."""
+        ...
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """Read the result of `to_bytes`, or raise a NotATableError."""
+        ...
+
+
+T = TypeVar("T", bound=Storable)
+
+
+def pack(arrays: Mapping[str, np.ndarray], text: object = None) -> bytes:
+    """Return arrays and a JSON value as the content of a file; equal ones give equal bytes."""
+    file = io.BytesIO()
+    np.savez(file, **{_TEXT: np.frombuffer(json.dumps(text).encode(), np.uint8)}, **arrays)  # type: ignore[arg-type] # none is called allow_pickle
+    return file.getvalue()
+
+
+def unpack(data: bytes) -> tuple[dict[str, np.ndarray], Any]:
+    """Return what `pack` was given; nothing is unpickled, and nothing expands beyond the file's size.
+
+    Raises:
+        NotATableError: It is another kind of file, or damaged.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if sum(member.file_size for member in archive.infolist()) > len(data) or archive.testzip() is not None:
+                raise NotATableError("compressed or damaged arrays")  # noqa: TRY301
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            arrays = dict(file)
+        text = arrays.pop("problems" if "problems" in arrays else _TEXT)  # the former: older ranges of steps
+        return arrays, json.loads(text.tobytes())
+    except Exception as error:  # zipfile and numpy raise whatever damage makes of a file
+        raise NotATableError(str(error)[:200] or type(error).__name__) from None
 
 
 @dataclass(frozen=True)
@@ -156,17 +197,17 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         return None
 
     def to_bytes(self) -> bytes:
-        """Return the table as a file's content; equal tables give equal bytes, and each array has a checksum."""
-        text = json.dumps({
+        """Return the table as a file's content."""
+        text = {
             "problems": [vars(problem) for problem in self.problems],
             "texts": dict(self.texts),
             "labels": {name: labels.names for name, labels in self.labels.items()},
-        })  # fmt: skip
+        }
         arrays = {name: getattr(self, name) for name in (*_COLUMNS, _MOTION)}
         arrays |= {} if self.state_hash is None else {_HASH: self.state_hash}
         arrays |= {f"{_LOCATOR}{name}": column for name, column in self.locators.items()}
         arrays |= {f"{_LABEL}{name}": labels.number for name, labels in self.labels.items()}
-        return arrays_as_bytes({"text": np.frombuffer(text.encode(), np.uint8), **arrays})
+        return pack(arrays, text)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> EpisodeTable:
@@ -175,9 +216,8 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         Raises:
             NotATableError: It is another kind of file, or damaged.
         """
+        arrays, text = unpack(data)
         try:
-            arrays = read_arrays(data)
-            text = json.loads(arrays["text"].tobytes())
             columns = {name: arrays[name] for name in _COLUMNS}
             unknown = np.array([_NO_MOTION for _ in columns["ids"]], np.float32)
             columns |= {_MOTION: arrays.get(_MOTION, unknown).reshape(-1, len(_NO_MOTION))}
@@ -190,7 +230,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
                 state_hash=arrays.get(_HASH),
                 labels={name: Labels(tuple(names), arrays[_LABEL + name]) for name, names in text["labels"].items()},
             )
-        except (InputError, LookupError, TypeError, ValueError, AttributeError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise NotATableError(str(error)) from None
         if len({len(column) for column in (*columns.values(), *locators.values())}) != 1:
             raise NotATableError("columns of several lengths")
@@ -309,20 +349,13 @@ def get_or_build(config: DiskCacheConfig, key: str, place: str, build: Callable[
         table = build()
         return replace(table, texts={**table.texts, "index": key, "place": now})
 
-    table = get_or_make(config, key, build_marked, to_bytes=EpisodeTable.to_bytes, from_bytes=EpisodeTable.from_bytes)
+    table = get_or_make(config, key, build_marked, EpisodeTable)
     problems = [replace(one, where=one.where.replace(table.texts["place"], now, 1)) for one in table.problems]
     return replace(table, problems=tuple(problems))
 
 
-def get_or_make(
-    config: DiskCacheConfig,
-    key: str,
-    make: Callable[[], T],
-    *,
-    to_bytes: Callable[[T], bytes],
-    from_bytes: Callable[[bytes], T],
-) -> T:
-    """Return the object cached under a key; make and cache it if it is missing or damaged (a NotATableError).
+def get_or_make(config: DiskCacheConfig, key: str, make: Callable[[], T], kind: type[T]) -> T:
+    """Return the table cached under a key; make and cache it if it is missing or damaged (a NotATableError).
 
     The file ends with its key, so that the file of another key is not used under this name.
 
@@ -335,14 +368,14 @@ def get_or_make(
             data = path.read_bytes()
         if not data.endswith(key.encode()):
             raise NotATableError("it is damaged, from an older version, or of other data")  # noqa: TRY301
-        return from_bytes(data.removesuffix(key.encode()))
+        return kind.from_bytes(data.removesuffix(key.encode()))
     except MissingFileError:
         pass
     except (InputError, NotATableError) as error:
         logger.warning("%s: cannot be used (%s); the index is built again", path, error)
     made = make()
     try:
-        storage.write_atomically(path, to_bytes(made) + key.encode())
+        storage.write_atomically(path, made.to_bytes() + key.encode())
     except OSError as error:
         logger.warning("%s: cannot be written (%s); the index will be built again next time", path, error)
     return made

@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Int32, UInt64
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, NotATableError, identity_hash
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, NotATableError, identity_hash, pack, unpack
 from vjepa2_ac.episode import StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 logger = logging.getLogger(__name__)
 
@@ -63,9 +62,8 @@ class StepSelection:
 
     def to_bytes(self) -> bytes:
         """Return this as a file's content."""
-        text = json.dumps([[place, vars(problem)] for place, problem in self.problems]).encode()
-        columns = {"episode": self.episode, "start": self.start, "end": self.end}
-        return arrays_as_bytes({"problems": np.frombuffer(text, np.uint8), **columns})
+        problems = [(place, vars(problem)) for place, problem in self.problems]
+        return pack({"episode": self.episode, "start": self.start, "end": self.end}, problems)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> StepSelection:
@@ -74,11 +72,10 @@ class StepSelection:
         Raises:
             NotATableError: It is another kind of file, or damaged.
         """
+        arrays, problems = unpack(data)
         try:
-            arrays = read_arrays(data)
-            problems = json.loads(arrays.pop("problems").tobytes())
             return cls(**arrays, problems=tuple((place, EpisodeProblem(**values)) for place, values in problems))
-        except (InputError, LookupError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError) as error:
             raise NotATableError(f"no ranges of steps ({error})") from None
 
 

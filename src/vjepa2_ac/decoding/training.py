@@ -23,8 +23,8 @@ from torch import Tensor
 from vjepa2_ac.config import Config, DecoderConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.sources.latents.cache_files import LatentFiles, bytes_per_frame
-from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, require_own_folder
+from vjepa2_ac.data.sources.latent_files import LatentFiles, bytes_per_frame
+from vjepa2_ac.data.sources.latents import CacheKey, Encoding, require_own_folder
 from vjepa2_ac.data.splits import SPLIT
 from vjepa2_ac.data.windows import permuted, require_frames, require_stride
 from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, read_card, save_decoder

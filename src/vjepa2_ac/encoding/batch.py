@@ -14,9 +14,8 @@ from torch import Tensor
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.sources.latents.cache_files import unpack_latents
-from vjepa2_ac.data.sources.latents.cache_key import Encoding
-from vjepa2_ac.data.sources.latents.source import LatentSource, another_cache
+from vjepa2_ac.data.sources.latent_files import unpack_latents
+from vjepa2_ac.data.sources.latents import Encoding, LatentSource, another_cache
 from vjepa2_ac.data.transforms import Crop, pixels_to_input, split_views, view
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError

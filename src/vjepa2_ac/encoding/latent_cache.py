@@ -15,8 +15,17 @@ from vjepa2_ac.data.dataset import Dataset, through_latents
 from vjepa2_ac.data.files import CONNECTIONS, fetched_data, in_parallel
 from vjepa2_ac.data.idle import find_ranges
 from vjepa2_ac.data.index import cache_folder, fingerprint_of
-from vjepa2_ac.data.sources.latents.cache_files import CACHE, EPISODES, KEPT, LatentFiles, bytes_per_frame, read_key
-from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, key_of_cache, require_own_folder
+from vjepa2_ac.data.sources.latent_files import LatentFiles, bytes_per_frame
+from vjepa2_ac.data.sources.latents import (
+    CACHE,
+    EPISODES,
+    KEPT,
+    CacheKey,
+    Encoding,
+    key_of_cache,
+    read_key,
+    require_own_folder,
+)
 from vjepa2_ac.encoding.pipeline import FramesToEncode
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.storage import free_bytes

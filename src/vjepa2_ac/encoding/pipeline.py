@@ -22,7 +22,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips import joined_latents
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.sources.latents.cache_files import CacheType, EncodedEpisode, LatentFiles, pack_latents
+from vjepa2_ac.data.sources.latent_files import CacheType, EncodedEpisode, LatentFiles, pack_latents
 from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
 from vjepa2_ac.distributed import autocast
 from vjepa2_ac.episode import Episode, Progress, StoredLatents, no_progress

@@ -15,11 +15,11 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.sources import JOINT_VELOCITY
 from vjepa2_ac.data.files import EpisodeFiles
-from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled, list_by_template, read_info
-from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
-from vjepa2_ac.data.sources.rlds.episode import Record
-from vjepa2_ac.data.sources.rlds.shards import Shard, dataset_name, find_shards, open_shard
-from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Kind, span_at
+from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo, filled, list_by_template, read_info
+from vjepa2_ac.data.sources.parquet import ParquetRows
+from vjepa2_ac.data.sources.rlds_episode import Record
+from vjepa2_ac.data.sources.rlds_shards import Shard, dataset_name, find_shards, open_shard
+from vjepa2_ac.data.sources.tfrecord import HEADER_BYTES, Kind, span_at
 from vjepa2_ac.errors import InputError, MissingFileError, UserError, counted
 from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
 from vjepa2_ac.init.poses import Column, Range, Samples, find_pose, measured_columns, vector_state

@@ -18,7 +18,7 @@ from vjepa2_ac.data.files import in_parallel, walk
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.droid_raw import find_episodes
 from vjepa2_ac.data.sources.indexed_source import open_source
-from vjepa2_ac.data.sources.lerobot.info import INFO
+from vjepa2_ac.data.sources.lerobot_meta import INFO
 from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
 from vjepa2_ac.data.splits import describe_splits, held_out_by
 from vjepa2_ac.episode import STATE_DIM, Progress

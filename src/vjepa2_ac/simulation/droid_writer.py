@@ -18,7 +18,7 @@ import simplejpeg
 from jaxtyping import Float
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.rlds.tfrecord import Kind, encode_example, write_record
+from vjepa2_ac.data.sources.tfrecord import Kind, encode_example, write_record
 from vjepa2_ac.errors import InputError, counted
 
 CAMERAS = ("exterior_image_1_left", "exterior_image_2_left", "wrist_image_left")

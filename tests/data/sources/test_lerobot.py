@@ -35,8 +35,8 @@ from recordings import write_mp4
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
-from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
+from vjepa2_ac.data.sources.lerobot import LeRobotSource
+from vjepa2_ac.data.sources.parquet import ParquetRows
 from vjepa2_ac.episode import Episode, EpisodeSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import euler_from_matrices, matrices_from_euler

@@ -12,7 +12,7 @@ from gcs import Gcs
 from hub import Hub, serve_hub
 from lerobot_sets import CAMERAS, STATE, Recorded, numbers_of, recorded, write_v21, write_v30
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
+from vjepa2_ac.data.sources.lerobot import LeRobotSource
 from vjepa2_ac.errors import UnreachableError
 
 LENGTHS = (12, 13, 14, 15, 16)

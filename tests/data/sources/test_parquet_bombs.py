@@ -11,8 +11,8 @@ from pyarrow import parquet as pq
 from paths import GOLDEN
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import EpisodeFiles
-from vjepa2_ac.data.sources.lerobot import parquet
-from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows, read_table
+from vjepa2_ac.data.sources import parquet
+from vjepa2_ac.data.sources.parquet import ParquetRows, read_table
 from vjepa2_ac.errors import InputError
 
 _MB = 1 << 20

@@ -17,7 +17,7 @@ from synthetic import synthetic_episode, synthetic_states
 from tfrecords import index_records
 from vjepa2_ac.config import DataConfig, RldsFields
 from vjepa2_ac.data.index import EpisodeProblem
-from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.simulation.droid_writer import CAMERAS, write_droid_rlds
 

@@ -13,7 +13,7 @@ from run_fixtures import Popen
 from synthetic import write_synthetic_droid
 from tfrecords import in_any_order
 from vjepa2_ac.config import DataConfig, RldsFields
-from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.episode import Episode
 
 SHARD = r"GET /download/.*tfrecord"
@@ -88,7 +88,7 @@ READ_ALL = """
 import sys
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import fetched_data
-from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.rlds import RldsSource
 
 config = DataConfig(path=sys.argv[1], disk_cache={"dir": sys.argv[2], "limit_gb": float(sys.argv[3])})
 for episode in map(int, sys.argv[4]):

@@ -14,8 +14,8 @@ from accidents import mutated
 from synthetic import write_synthetic_droid
 from tfrecords import index_records, read_record
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.data.sources.rlds.tfrecord import write_record
+from vjepa2_ac.data.sources.rlds import RldsSource
+from vjepa2_ac.data.sources.tfrecord import write_record
 from vjepa2_ac.errors import InputError
 
 MUTATIONS = int(os.environ.get("VJEPA2_AC_MUTATIONS", "50"))  # of each kind; more in a longer run

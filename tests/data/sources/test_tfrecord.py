@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tfrecords import decode_example, index_records, read_record
-from vjepa2_ac.data.sources.rlds.tfrecord import (
+from vjepa2_ac.data.sources.tfrecord import (
     NotAnExampleError,
     decode_feature,
     encode_example,

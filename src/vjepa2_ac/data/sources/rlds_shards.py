@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.rlds.tfrecord import Read
+from vjepa2_ac.data.sources.tfrecord import Read
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.storage.structured import read_json_object
 

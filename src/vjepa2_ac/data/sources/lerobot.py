@@ -18,17 +18,20 @@ from vjepa2_ac.data.index import EpisodeTable, StatesSummary, get_or_build, inde
 from vjepa2_ac.data.poses import poses_from
 from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.indexed_source import Found, FramesByStep, IndexedSource, Scanned, table_of
-from vjepa2_ac.data.sources.lerobot.episodes import (
+from vjepa2_ac.data.sources.lerobot_meta import (
     TABLES,
+    DatasetInfo,
     EpisodeRow,
     find_overlaps,
+    list_by_template,
+    missing,
     read_episodes,
+    read_info,
     require_files,
     require_long_videos,
     row_of,
 )
-from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, list_by_template, missing, read_info
-from vjepa2_ac.data.sources.lerobot.parquet import EPISODE, Columns, ParquetRows
+from vjepa2_ac.data.sources.parquet import EPISODE, Columns, ParquetRows
 from vjepa2_ac.data.splits import with_own_splits
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted

@@ -21,8 +21,8 @@ from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, summary_o
 from vjepa2_ac.data.poses import num_rotation_numbers, poses_from, require_selection
 from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.indexed_source import Found, Scanned, require_as_indexed, table_of
-from vjepa2_ac.data.sources.rlds.shards import Shard, open_shard
-from vjepa2_ac.data.sources.rlds.tfrecord import (
+from vjepa2_ac.data.sources.rlds_shards import Shard, open_shard
+from vjepa2_ac.data.sources.tfrecord import (
     HEADER_BYTES,
     Kind,
     NotAnExampleError,

@@ -28,8 +28,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
+from math import prod
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal
 from urllib.parse import quote
 
 import numpy as np
@@ -39,29 +40,28 @@ from safetensors.torch import save
 from torch import Tensor
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.index import EpisodeTable, NotATableError
-from vjepa2_ac.data.selection import StepSelection
-from vjepa2_ac.data.sources.latents.cache_key import FORMAT, CacheKey
-from vjepa2_ac.data.sources.latents.tensor_file import Ranges, TensorFile
 from vjepa2_ac.episode import Episode, StoredLatents
-from vjepa2_ac.errors import InputError, MissingFileError
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
 from vjepa2_ac.storage.block_file import DiskCache, cached_ranges
-from vjepa2_ac.storage.structured import json_object, read_json_object
+from vjepa2_ac.storage.structured import MOST_BYTES, json_object
 
 CacheType = Literal["bf16", "fp32", "int8"]
 
 DTYPES: dict[CacheType, torch.dtype] = {"bf16": torch.bfloat16, "fp32": torch.float32, "int8": torch.int8}
-CACHE, EPISODES, KEPT = "cache.json", "episodes.npz", "kept.npz"
 OPTIONAL = ("commands", "extrinsics", "joint_velocities")
+Ranges = Sequence[tuple[int, int]]  # (start, length) in bytes
 
 _LARGEST = 127  # of int8
 _JPEG_QUALITY = 85
-_MOST_BYTES = 1 << 30  # of a table
-Table = TypeVar("Table", EpisodeTable, StepSelection)
+_HEAD_BYTES = 32 << 10  # of a file, read when it is opened: the header, and with it most small tensors
+_LENGTH_BYTES = 8  # before the header: how long it is
+_TENSOR_TYPES = {
+    "BF16": torch.bfloat16, "F16": torch.float16, "F32": torch.float32, "F64": torch.float64, "BOOL": torch.bool,
+    "U8": torch.uint8, "I8": torch.int8, "I16": torch.int16, "I32": torch.int32, "I64": torch.int64,
+}  # fmt: skip
 _WHOLE, _BROKEN = ".safetensors", ".broken"
 FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
-_ENCODE = "Run `vjepa2-ac encode`, which goes on where it was stopped; or copy the cache again"
 
 
 def pack_latents(latents: Float[Tensor, "*batch tokens dim"], kind: CacheType) -> StoredLatents:
@@ -88,43 +88,6 @@ def unpack_latents(stored: StoredLatents) -> Float[Tensor, "*batch tokens dim"]:
 def bytes_per_frame(tokens: int, dim: int, kind: CacheType) -> int:
     """Return the size of a frame's latents."""
     return tokens * dim * DTYPES[kind].itemsize + (tokens * 4 if kind == "int8" else 0)
-
-
-def read_key(folder: Path | str) -> CacheKey:
-    """Return the key of a cache: what it is.
-
-    Raises:
-        InputError: The folder has none, or one of another format.
-    """
-    where, needed = storage.join(folder, CACHE), f"a folder with the {CACHE} of a latent cache, format {FORMAT}"
-    try:
-        key = read_json_object(where, fix=_ENCODE).get("key")
-    except MissingFileError:
-        is_folder = storage.is_url(folder) or Path(folder).is_dir()
-        found = "no latent cache" if is_folder else f"no such folder, seen from {Path.cwd()}"
-        raise InputError(where=str(folder), found=found, needed=needed, fix=_ENCODE) from None
-    if not isinstance(key, dict) or key.get("format") != FORMAT or not isinstance(key.get("data.camera"), list):
-        raise InputError(where=where, found="another file, or another format", needed=needed, fix=_ENCODE)
-    return CacheKey(key)
-
-
-def read_tables(folder: Path | str, *, has_idle_rule: bool) -> tuple[EpisodeTable, StepSelection | None]:
-    """Read the episodes of a cache and, if it has an idle rule, the ranges that the rule keeps.
-
-    Raises:
-        InputError: One of the files is missing or damaged.
-        UnreachableError: One cannot be read.
-    """
-    table = _table(storage.join(folder, EPISODES), EpisodeTable.from_bytes)
-    return table, _table(storage.join(folder, KEPT), StepSelection.from_bytes) if has_idle_rule else None
-
-
-def _table(path: str, from_bytes: Callable[[bytes], Table]) -> Table:
-    try:
-        with storage.user_can_read(path, fix=_ENCODE):
-            return from_bytes(storage.read_bounded(path, _MOST_BYTES))
-    except NotATableError as error:
-        raise InputError(where=path, found=f"damaged ({error})", fix=_ENCODE) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,3 +324,99 @@ class EpisodeFile:
 
     def _damaged(self, found: str, needed: str = "") -> InputError:
         return InputError(where=self.path, found=found, needed=needed, fix=FIX)
+
+
+# ---- the safetensors format, by ranges ----
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A tensor of the header."""
+
+    dtype: torch.dtype
+    shape: tuple[int, ...]
+    start: int  # in the file
+
+    @classmethod
+    def of(cls, about: Mapping[str, Any], begin: int) -> _Entry:
+        """Return a tensor of a header; `begin`: where the header ends."""
+        start, end = about["data_offsets"]
+        one = cls(_TENSOR_TYPES[about["dtype"]], tuple(about["shape"]), begin + start)
+        if min(start, *one.shape) < 0 or one.end != begin + end:
+            raise ValueError(f"shape {one.shape} in bytes {start} to {end}")
+        return one
+
+    @property
+    def end(self) -> int:
+        """Where it ends in the file."""
+        return self.start + prod(self.shape) * self.dtype.itemsize
+
+    def range_of(self, start: int, stop: int) -> tuple[int, int]:
+        """Return where some of its rows are."""
+        if not 0 <= start <= stop <= self.shape[0]:
+            raise IndexError(f"rows {start} to {stop} of {self.shape[0]}")
+        row = prod(self.shape[1:]) * self.dtype.itemsize
+        return self.start + start * row, (stop - start) * row
+
+
+class TensorFile:
+    """A safetensors file whose header was read; a wrong one is a ValueError, KeyError, TypeError or IndexError.
+
+    Args:
+        read: Returns several pieces of the file, each complete.
+        size: The file's.
+        where: Its name, for messages.
+    """
+
+    def __init__(self, read: Callable[[Ranges], list[bytes]], size: int, where: str) -> None:
+        self._read, self._head = read, b""
+        self._head = self._pieces([(0, min(size, _HEAD_BYTES))])[0]
+        begin = _LENGTH_BYTES + int.from_bytes(self._head[:_LENGTH_BYTES], "little")
+        if not _LENGTH_BYTES < begin <= min(size, MOST_BYTES):
+            raise ValueError("no header")
+        header = json_object(self._pieces([(_LENGTH_BYTES, begin - _LENGTH_BYTES)])[0], where=where)
+        self.metadata: Mapping[str, str] = header.pop("__metadata__", {})
+        self._entries = {name: _Entry.of(about, begin) for name, about in header.items()}
+        if (end := max([begin, *(one.end for one in self._entries.values())])) != size:
+            raise ValueError(f"{size:,} bytes of {end:,}")
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The names of its tensors."""
+        return frozenset(self._entries)
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of a tensor."""
+        return self._entries[name].shape
+
+    def tensor(self, name: str) -> Tensor:
+        """Return a whole tensor."""
+        one = self._entries[name]
+        return _tensor(self._pieces([(one.start, one.end - one.start)]), one, one.shape)
+
+    def rows(self, names: Sequence[str], places: Sequence[int]) -> list[Tensor]:
+        """Return the same rows of several tensors, which are read together."""
+        entries = [self._entries[name] for name in names]
+        pieces = self._pieces([one.range_of(place, place + 1) for one in entries for place in places])
+        count = len(places)
+        return [
+            _tensor(pieces[i * count : (i + 1) * count], one, (count, *one.shape[1:])) for i, one in enumerate(entries)
+        ]
+
+    def slices(self, name: str, bounds: Sequence[tuple[int, int]]) -> list[bytes]:
+        """Return the bytes of rows from the first to before the second number of each pair, read together."""
+        return self._pieces([self._entries[name].range_of(*pair) for pair in bounds])
+
+    def _pieces(self, ranges: Ranges) -> list[bytes]:
+        known, there = len(self._head), dict[tuple[int, int], bytes]()
+        for start, length in ranges:
+            if start + length <= known or not length:
+                there[start, length] = self._head[start : start + length]
+        lacking = [one for one in dict.fromkeys(ranges) if one not in there]
+        there |= zip(lacking, self._read(lacking), strict=True) if lacking else ()
+        return [there[one] for one in ranges]
+
+
+def _tensor(pieces: Sequence[bytes], like: _Entry, shape: tuple[int, ...]) -> Tensor:
+    data = bytearray().join(pieces)  # one that can be written to
+    return torch.frombuffer(data, dtype=like.dtype).reshape(shape) if data else torch.empty(shape, dtype=like.dtype)

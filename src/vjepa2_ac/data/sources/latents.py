@@ -1,0 +1,307 @@
+"""Source of cached latents, which needs no data set; and the key of a cache: everything that determines its latents."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.section import Affects, values_that_affect
+from vjepa2_ac.data.files import fetched_data
+from vjepa2_ac.data.index import EpisodeTable, NotATableError, T
+from vjepa2_ac.data.selection import StepSelection
+from vjepa2_ac.data.sources.indexed_source import IndexedSource, measured_space
+from vjepa2_ac.data.sources.latent_files import FIX, OPTIONAL, LatentFiles
+from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
+from vjepa2_ac.errors import InputError, MissingFileError, counted
+from vjepa2_ac.spaces import vector_states
+from vjepa2_ac.storage.structured import read_json_object
+
+FORMAT = 2  # of the files of a cache
+CACHE, EPISODES, KEPT = "cache.json", "episodes.npz", "kept.npz"  # files, see `latent_files`
+NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: increase it when one of them changes
+
+_OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # the other keys are of clips
+_NOT_OF_ENCODING = ("data", "format")  # how the names of the other parts begin
+_MOST_BYTES = 1 << 30  # of a table
+_ENCODE = "Run `vjepa2-ac encode`, which resumes where it was stopped; or copy the cache again"
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """What determines a frame's latents besides the frame, and their size; made by `encoding.batch.encoding_of`.
+
+    The number of frames per pass of the encoder is not included: it changes only the order of a sum, and on
+    some CPUs nothing (tests/encoding/test_training_cache.py).
+    """
+
+    encoder: str  # WorldModel.encoder_fingerprint
+    image_size: int
+    patch_size: int
+    tokens: int
+    dim: int
+    weights: str  # model.dtype
+    precision: str  # training.precision
+    beyond: Mapping[str, str | int] = field(default_factory=dict)  # WorldModel.encoder_beyond_tensors
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """The corresponding parts of a key."""
+        return {
+            "encoder": self.encoder,
+            "image_size": self.image_size,
+            "patch_size": self.patch_size,
+            "normalisation": NORMALISATION,
+            "model.dtype": self.weights,
+            "training.precision": self.precision,
+            **self.beyond,
+        }
+
+
+@dataclass(frozen=True)
+class CacheKey:
+    """What determines the content of a folder, as {name: JSON value}; with the names of knobs where they exist."""
+
+    parts: Mapping[str, Any]
+
+    @property
+    def digest(self) -> str:
+        """A short hash of it: the name of a cache's folder, also in each of its files."""
+        return hashlib.sha256(json.dumps(dict(self.parts), sort_keys=True).encode()).hexdigest()[:32]
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras of a cache."""
+        return tuple(map(str, self.parts["data.camera"]))
+
+    def differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
+        """Return the differences from the wanted parts, as "data.stride: 8, not 4"; of these names, or of all."""
+        wanted = json.loads(json.dumps(dict(wanted)))  # as a file has them
+        names = sorted(self.parts.keys() | wanted) if names is None else names
+        return [text for name in names for text in _differences(name, self.parts.get(name), wanted.get(name))]
+
+    def differences_of(self, encoding: Encoding) -> list[str]:
+        """Return the differences in how frames became latents."""
+        names = sorted(self.parts.keys() | encoding.parts)
+        return self.differences(encoding.parts, [one for one in names if not one.startswith(_NOT_OF_ENCODING)])
+
+
+def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> CacheKey:
+    """Return the cache key of an open data set, whose stride is a number.
+
+    Args:
+        config: How its clips are made.
+        fingerprint: Of its episodes.
+        encoding: How frames become latents.
+    """
+    return CacheKey({
+        "format": FORMAT,
+        **encoding.parts,
+        **clip_parts(config),
+        "data.cache_dtype": config.cache_dtype,
+        "data.camera": list(config.cameras),
+        "data.pose_frame": config.pose_frame,
+        "data set": {"source": config.source, "episodes": fingerprint, **config.own_values},
+    })  # fmt: skip
+
+
+def clip_parts(config: DataConfig) -> dict[str, Any]:
+    """Return the parts that determine which frames and other data clips need: checked when a cache is used alone."""
+    values = values_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
+    names = values.keys() - _OF_THE_FRAMES - config.own_sections().keys()
+    return {f"data.{name}": values[name] for name in sorted(names)}
+
+
+def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: str) -> None:
+    """Refuse a folder that was begun with another key, or that holds other files; one that is not there passes.
+
+    Args:
+        folder: The folder, or its URL.
+        name: Its JSON file with the key.
+        key: Of what is about to be written there.
+        where: The folder, for messages.
+
+    Raises:
+        InputError: Names what differs.
+        UnreachableError: It cannot be read now.
+    """
+    fix = "Name another folder, or delete this one"
+    others = [other for other in storage.list_names(folder) if other[0] != "."]  # first: another process may begin now
+    try:
+        there = read_json_object(storage.join(folder, name), fix=fix)
+    except MissingFileError:
+        if others:
+            found = f"a folder with other things in it, such as {others[0]}"
+            raise InputError(where=where, found=found, needed="a new or empty one", fix=fix) from None
+        return
+    if differing := CacheKey(there.get("key") or {}).differences(key.parts):
+        found, needed = f"made otherwise: {'; '.join(differing)}", "a new folder, or one made with these settings"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
+
+
+def _differences(name: str, here: Any, there: Any) -> list[str]:
+    if here == there:
+        return []
+    if isinstance(here, dict) and isinstance(there, dict):
+        inner = sorted(here.keys() | there)
+        return [text for key in inner for text in _differences(f"{name}.{key}", here.get(key), there.get(key))]
+    return [f"{name}: {_as_text(here)}, not {_as_text(there)}"]
+
+
+def _as_text(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def read_key(folder: Path | str) -> CacheKey:
+    """Return the key of a cache: what it is.
+
+    Raises:
+        InputError: The folder has none, or one of another format.
+    """
+    where, needed = storage.join(folder, CACHE), f"a folder with the {CACHE} of a latent cache, format {FORMAT}"
+    try:
+        key = read_json_object(where, fix=_ENCODE).get("key")
+    except MissingFileError:
+        is_folder = storage.is_url(folder) or Path(folder).is_dir()
+        found = "no latent cache" if is_folder else f"no such folder, seen from {Path.cwd()}"
+        raise InputError(where=str(folder), found=found, needed=needed, fix=_ENCODE) from None
+    if not isinstance(key, dict) or key.get("format") != FORMAT or not isinstance(key.get("data.camera"), list):
+        raise InputError(where=where, found="another file, or another format", needed=needed, fix=_ENCODE)
+    return CacheKey(key)
+
+
+def read_tables(folder: Path | str, *, has_idle_rule: bool) -> tuple[EpisodeTable, StepSelection | None]:
+    """Read the episodes of a cache and, if it has an idle rule, the ranges that the rule keeps.
+
+    Raises:
+        InputError: One of the files is missing or damaged.
+        UnreachableError: One cannot be read.
+    """
+    table = _table(storage.join(folder, EPISODES), EpisodeTable)
+    return table, _table(storage.join(folder, KEPT), StepSelection) if has_idle_rule else None
+
+
+def _table(path: str, kind: type[T]) -> T:
+    try:
+        with storage.user_can_read(path, fix=_ENCODE):
+            return kind.from_bytes(storage.read_bounded(path, _MOST_BYTES))
+    except NotATableError as error:
+        raise InputError(where=path, found=f"damaged ({error})", fix=_ENCODE) from None
+
+
+@dataclass(frozen=True)
+class _Cache:
+    key: CacheKey
+    files: LatentFiles
+    kept: StepSelection | None
+
+
+class LatentSource(IndexedSource[DataConfig, _Cache]):
+    """The episodes of the data set that a latent cache was made from, in that data set's order.
+
+    An episode that could not be read while encoding is included, and raises an error here, too: so the clips are those
+    of the data set, in their order.
+    """
+
+    @property
+    def key(self) -> CacheKey:
+        """What the cache is."""
+        return self._open()[1].key
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that clips are drawn from: the config's, or all of the cache."""
+        return self.key.cameras if self._config.camera is None else self._config.cameras
+
+    def kept_ranges(self) -> StepSelection | None:
+        """Return the ranges that `data.idle` keeps, from the cache; None: the rule is none.
+
+        Raises:
+            InputError: No cache, or one of other clips than the config's.
+        """
+        return self._open()[1].kept
+
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched
+        """Return one episode; only requested latents are read.
+
+        Raises:
+            InputError: The file is missing or damaged, or the episode could not be read while encoding.
+            UnreachableError: It cannot be read now.
+        """
+        table, opened = self._open()
+        camera = camera or self.cameras[0]
+        record, info = opened.files.open(index, camera), table[index]
+        arrays = {name: record.array(name) for name in OPTIONAL if name in record.names}
+        arrays["states"] = record.array("states")
+        self._require_plausible(arrays, info, f"{record.path}: {info.id}")
+        return Episode(
+            info=info,
+            read_frames=lambda steps: record.pictures(record.places_of(steps)),
+            control_rate_hz=float(table.texts["control_rate_hz"]),
+            metadata=record.metadata,
+            read_latents=lambda steps: record.latents(record.places_of(steps)),
+            frame_steps=record.frame_steps,
+            **arrays,
+        )
+
+    def _require_plausible(self, arrays: Mapping[str, np.ndarray], info: EpisodeInfo, where: str) -> None:
+        """Refuse an episode that no source gives.
+
+        Raises:
+            InputError: It has another number of steps, or numbers that are not finite or that no robot has.
+        """
+        for name, values in arrays.items():
+            width = STATE_DIM if name == "states" and self._config.states == "pose" else np.atleast_2d(values).shape[1]
+            if values.shape != (info.num_steps, width):
+                needed = f"{info.num_steps} x {width}, as the other files of the cache say"
+                raise InputError(where=f"{where}: {name}", found=f"shape {values.shape}", needed=needed, fix=FIX)
+            space = measured_space(self._config, width) if name == "states" else vector_states(width)
+            if name != "joint_velocities":  # only the idle filter reads them, and checks them
+                space.require_plausible(values, f"{where}: {name}", fix=FIX)
+
+    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
+        """Return the config with the names of the cameras.
+
+        Raises:
+            InputError: Some of these episodes have no files: the cache is unfinished, or was made of others.
+            UnreachableError: The folder cannot be listed now.
+        """
+        table, opened = self._open()
+        numbers = np.unique(episodes).tolist()
+        if missing := opened.files.episodes_without_file(numbers, self.cameras):
+            such = f"{len(missing)} of {counted(len(numbers), 'episode')}, such as {table.identity(missing[0])}"
+            fix = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
+            fix += " episodes out (data.outcome, data.exclude)"
+            raise InputError(where=self._config.path, found=f"no latents of {such}", fix=fix)
+        return self._config.model_copy(update={"camera": self.cameras})
+
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - at once
+        folder = storage.folder_at(self._config.path)
+        key = read_key(folder)
+        parts = clip_parts(self._config)
+        differing = key.differences(parts, parts)
+        for camera in () if self._config.camera is None else self._config.cameras:
+            if camera not in key.cameras:
+                differing.append(f"data.camera: {', '.join(key.cameras)}, not {camera}")
+        if differing:  # of other clips than the config's
+            raise another_cache(folder, differing)
+        table, kept = read_tables(folder, has_idle_rule=self._config.idle.rule != "none")
+        cache = fetched_data(self._config.disk_cache) if storage.is_url(folder) else None
+        return table, _Cache(key, LatentFiles(folder, key.digest, cache), kept)
+
+
+def another_cache(folder: Path | str, differing: Sequence[str]) -> InputError:
+    """Return the error of a cache with other settings than those in use."""
+    found = f"a latent cache that was made otherwise: {'; '.join(differing)}"
+    needed = "one that was made with this model and these settings"
+    fix = "Change the settings to those, or encode the data set again"
+    return InputError(where=str(folder), found=found, needed=needed, fix=fix)

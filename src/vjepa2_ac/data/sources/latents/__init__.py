@@ -1,1 +1,0 @@
-"""Latent caches: one safetensors file per episode and camera, and an index."""

@@ -1,0 +1,482 @@
+"""The files in meta of a LeRobot data set: meta/info.json (rate, columns, cameras), and the tables of its episodes."""
+
+from __future__ import annotations
+
+import glob
+import json
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import PurePosixPath
+from typing import Any
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import LeRobotData, LeRobotFields
+from vjepa2_ac.data.files import in_parallel
+from vjepa2_ac.data.index import UNKNOWN, EpisodeTable, hash_of_bytes
+from vjepa2_ac.data.poses import require_selection
+from vjepa2_ac.data.sources.parquet import read_table
+from vjepa2_ac.errors import InputError, MissingFileError, counted, did_you_mean
+from vjepa2_ac.media.video import VideoHeader, is_deep_grey
+from vjepa2_ac.spaces import zero_steps
+from vjepa2_ac.storage import FileInfo
+from vjepa2_ac.storage.block_file import BlockCachedFile
+from vjepa2_ac.storage.structured import json_object, read_json_object
+
+INFO = "meta/info.json"
+VERSIONS = ("v2.1", "v3.0")
+
+_PLACE = re.compile(r"\{(?:(video_key)|(?:chunk_index|file_index|episode_chunk|episode_index)(?::0\dd)?)\}")
+_FIX = "Get meta/info.json again"
+_FIX_VERSION = (
+    "lerobot 0.3.3's convert_dataset_v1_to_v2.py and convert_dataset_v20_to_v21.py make v2.1 of older ones; for newer "
+    "ones update vjepa2-ac"
+)
+_FIX_STORAGE = "`vjepa2-ac data converter lance_to_files` prints a script that writes the files a Lance table is of"
+_WAY_TO_HUB = "Check the name in hf://datasets/owner/name; for a private data set, `hf auth login` or set HF_TOKEN"
+TABLES = {  # templates of the files that list the episodes
+    "v2.1": "meta/episodes.jsonl",
+    "v3.0": "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+}
+FIX_EPISODE = "Copy the data set again, or leave the episode out"
+_MOST_BYTES = 1 << 28  # of meta/episodes.jsonl
+_FIX_TABLES = "Get the files in meta again"
+_FIX_RANGES = (
+    "Correct file_index, from_timestamp and to_timestamp in meta/episodes (they may be wrong for other episodes of the "
+    "file, too), or leave both episodes out"
+)
+_STATISTICS = ("min", "max", "mean", "std")
+_ROUNDING_STEPS = 0.25  # by which the ranges of two episodes in a video may overlap
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One column, or one camera."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...] = ()
+    is_depth: bool = field(default=False, repr=False)  # not in the key of stored indexes
+
+    @property
+    def width(self) -> int:
+        """Its width: numbers per step."""
+        return math.prod(self.shape)
+
+    @property
+    def is_camera(self) -> bool:
+        """Whether it contains frames that show what a camera saw."""
+        return self.dtype in {"video", "image"} and not self.is_depth
+
+    @property
+    def is_numbers(self) -> bool:
+        """Whether it is a column of numbers."""
+        return self.dtype.startswith(("float", "int", "uint", "bool"))
+
+
+@dataclass(frozen=True)
+class DatasetInfo:
+    """The used part of meta/info.json."""
+
+    root: str
+    version: str
+    fps: float
+    episodes: int
+    frames: int | None  # of all episodes; None: not said
+    chunk_episodes: int  # v2.1: episodes per chunk folder
+    data_path: str
+    video_path: str | None
+    features: Mapping[str, Feature]
+    splits: Mapping[str, range] = field(default_factory=dict, repr=False)  # not in the key of stored indexes
+
+    @property
+    def where(self) -> str:
+        """The file."""
+        return storage.join(self.root, INFO)
+
+    def split_of(self, episode: int) -> str | None:
+        """Return the name of the split of an episode, given by its number; None: no split has it."""
+        return next((name for name, episodes in self.splits.items() if episode in episodes), None)
+
+    def require_mapping(self, config: LeRobotData) -> None:
+        """Check that the data set has what `data.lerobot` and `data.camera` name, before anything large is read.
+
+        Raises:
+            InputError: A column or camera is missing (lists the existing ones), or they do not form a state.
+        """
+        fields = config.lerobot
+        columns = [name for name, feature in self.features.items() if feature.is_numbers]
+        wanted = {"state": fields.state, "action": fields.action if config.actions == "recorded" else ()}
+        for knob, names in wanted.items():
+            for name in names:
+                if name not in columns:
+                    raise missing(f"data.lerobot.{knob}", "column of numbers", name, self.where, columns)
+        self._require_state(config)
+        for camera in config.cameras:
+            self.camera_key(fields, camera)
+
+    def camera_key(self, fields: LeRobotFields, camera: str) -> str:
+        """Return the feature with a camera's frames.
+
+        Raises:
+            InputError: The config or the data set has no such camera.
+        """
+        if camera not in fields.cameras:
+            raise missing("data.camera", "camera", camera, "data.lerobot.cameras", fields.cameras)
+        key = fields.cameras[camera]
+        cameras = [name for name, feature in self.features.items() if feature.is_camera]
+        if key not in cameras:
+            raise missing(f"data.lerobot.cameras.{camera}", "camera", key, self.where, cameras)
+        if self.features[key].dtype == "video" and self.video_path is None:
+            raise InputError(where=self.where, found=f"no video_path, and {key} is a video", needed="one", fix=_FIX)
+        return key
+
+    def _require_state(self, config: LeRobotData) -> None:
+        columns = {}
+        for name in config.lerobot.state:
+            feature = self.features[name]
+            described = ", ".join(feature.names) if len(feature.names) == feature.width else feature.width
+            columns[f"{name} [{described}]"] = feature.width
+        require_selection(columns, config.lerobot, "data.lerobot", is_pose=config.states == "pose")
+
+
+def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
+    """Return the error of a missing name, with the existing ones, and a suggestion."""
+    known = list(known)
+    fix = f"{did_you_mean(name, known)}It has: {', '.join(known) or 'none'}"
+    return InputError(where=where, found=f"no {kind} {name} in {place}", needed="one that it has", fix=fix)
+
+
+def read_info(root: str) -> DatasetInfo:
+    """Read meta/info.json.
+
+    Raises:
+        InputError: There is no data set, it is of another version, or the file is damaged.
+        UnreachableError: It cannot be read.
+    """
+    where = storage.join(root, INFO)
+    try:
+        content = read_json_object(where, needed="a description of a data set", fix=_FIX)
+    except MissingFileError:
+        fix = _WAY_TO_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos"
+        found = f"no {INFO} in {root}"
+        raise InputError(where="data.path", found=found, needed="a LeRobot data set", fix=fix) from None
+    if (version := content.get("codebase_version")) not in VERSIONS:
+        found = f"codebase_version {version!r}"
+        raise InputError(where=where, found=found, needed=" or ".join(VERSIONS), fix=_FIX_VERSION)
+    if (stored_as := content.get("storage_format") or "parquet") != "parquet":
+        found = f"storage_format {stored_as!r}"
+        raise InputError(where=where, found=found, needed="Parquet files and MP4 videos", fix=_FIX_STORAGE)
+    try:
+        return _parsed(root, content)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        found = f"not a description of a data set ({error!r})"
+        raise InputError(where=where, found=found, needed="LeRobot's own", fix=_FIX) from None
+
+
+def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
+    video_path = content.get("video_path")
+    fps, episodes, chunk = float(content["fps"]), content["total_episodes"], content.get("chunks_size", 1000)
+    frames = content.get("total_frames")
+    if not 0 < fps <= 1000 or type(episodes) is not int or type(chunk) is not int or episodes < 0 or chunk < 1:
+        raise ValueError(f"fps {fps}, total_episodes {episodes}, chunks_size {chunk}")
+    return DatasetInfo(
+        root=root,
+        version=content["codebase_version"],
+        fps=fps,
+        episodes=episodes,
+        frames=frames if type(frames) is int else None,
+        chunk_episodes=chunk,
+        data_path=_template(content["data_path"]),
+        video_path=None if video_path is None else _template(video_path),
+        features={name: _feature(feature) for name, feature in content["features"].items()},
+        splits=_splits(content.get("splits")),
+    )
+
+
+def _splits(content: object) -> dict[str, range]:
+    """Return the episodes of each split, from {"train": "0:50"}; other notations are ignored."""
+    texts = content if isinstance(content, Mapping) else {}
+    ranges = {str(name): re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)) for name, text in texts.items()}
+    return {name: range(int(part[1]), int(part[2])) for name, part in ranges.items() if part}
+
+
+def _feature(content: Mapping[str, Any]) -> Feature:
+    """Return a feature; a depth map is marked in one of the ways of LeRobot's versions, or by its pixels.
+
+    Source: huggingface/lerobot @ 7427f31, src/lerobot/configs/video.py, is_depth_map.
+    """
+    dtype, shape, names = content["dtype"], tuple(content["shape"]), content.get("names")
+    if not isinstance(dtype, str) or not all(type(size) is int and size > 0 for size in shape):
+        raise TypeError(f"a feature of dtype {dtype!r} and shape {shape!r}")
+    if isinstance(names, dict) and all(type(index) is int for index in names.values()):  # {"x": 0, "y": 1, ...}
+        names = sorted(names, key=names.__getitem__)
+    elif isinstance(names, dict) and len(names) == 1:  # {"motors": ["x", "y", ...]}, as in older ports
+        names = next(iter(names.values()))
+    marks = [one for one in (content.get("info"), content.get("video_info")) if isinstance(one, Mapping)]
+    is_depth = any(
+        one.get("is_depth_map") or one.get("video.is_depth_map") or is_deep_grey(str(one.get("video.pix_fmt")))
+        for one in marks
+    )
+    return Feature(dtype, shape, tuple(map(str, names)) if isinstance(names, list) else (), is_depth)
+
+
+def _template(template: str) -> str:
+    """Return a path template such as `chunk-{chunk_index:03d}`, which must not lead out of the data set."""
+    rest = _PLACE.sub("", template)
+    if not template or template.startswith("/") or ".." in template.split("/") or "{" in rest or "}" in rest:
+        raise ValueError(f"the path template {template!r}")
+    return template
+
+
+def filled(template: str, chunk: int, file: int, key: str = "") -> str:
+    """Return the path, within the data set, of a file: in v3.0 by chunk and file, in v2.1 by chunk and episode."""
+    return template.format(chunk_index=chunk, episode_chunk=chunk, file_index=file, episode_index=file, video_key=key)
+
+
+def list_by_template(root: str, template: str, key: str = "", *, connections: int = 1) -> dict[str, FileInfo]:
+    """Return the files whose paths fit a template, sorted by path within the data set.
+
+    Raises:
+        InputError: One of them is a git-lfs pointer.
+        OSError: A folder cannot be listed.
+    """
+    pattern = _PLACE.sub(lambda place: glob.escape(key) if place[1] else "[0-9]*", template)
+    *folders, name = pattern.split("/")
+    found = [""]
+    for part in folders:
+        names = {folder: storage.list_names(storage.join(root, folder)) if "[" in part else [part] for folder in found}
+        found = [f"{folder}{one}/" for folder in found for one in names[folder] if fnmatchcase(one, part)]
+    listings = in_parallel(lambda folder: storage.list_files(storage.join(root, folder)), found, connections)
+    files = [(folder, file) for folder, inside in zip(found, listings, strict=True) for file in inside]
+    fitting = dict(sorted((f"{folder}{file.name}", file) for folder, file in files if fnmatchcase(file.name, name)))
+    for path, file in fitting.items():
+        storage.require_content(storage.join(root, path), file.size)
+    return fitting
+
+
+# ---- the episodes ----
+
+
+@dataclass(frozen=True)
+class EpisodeRow:
+    """The entry of one episode in the data set's tables."""
+
+    length: int
+    place: Mapping[str, float]  # index; chunk and file of its rows; KEY.chunk, KEY.file and KEY.start_s of each video
+    task: str = ""
+    lengths_s: Mapping[str, float] = field(default_factory=dict)  # of its part of each video, where the table says it
+    success: bool | None = None
+    state_hash: int = UNKNOWN
+
+    @property
+    def index(self) -> int:
+        """Its number."""
+        return int(self.place["index"])
+
+    @property
+    def id(self) -> str:
+        """Its identity: its number, the only name in LeRobot."""
+        return f"episode_{self.index:06d}"
+
+    def data_file(self, info: DatasetInfo) -> str:
+        """Return the path, within the data set, of the file with its rows."""
+        return filled(info.data_path, int(self.place["chunk"]), int(self.place["file"]))
+
+    def video_file(self, info: DatasetInfo, key: str) -> str:
+        """Return the path, within the data set, of the file with its frames."""
+        chunk, file = (int(self.place[f"{key}.{part}"]) for part in ("chunk", "file"))
+        return filled(info.video_path or "", chunk, file, key)
+
+
+def read_episodes(
+    info: DatasetInfo,
+    tables: Sequence[str],
+    videos: Sequence[str],
+    states: Sequence[str],
+    success: str | None,
+    open_file: Callable[[str], str | BlockCachedFile],
+) -> list[EpisodeRow]:
+    """Return every episode, sorted by number.
+
+    Args:
+        info: Of the data set.
+        tables: The files that list the episodes, within the data set.
+        videos: Features whose locations are requested.
+        states: Columns whose statistics are to find episodes with the same states; v2.1 has none.
+        success: Column whose statistics tell the outcome; likewise.
+        open_file: Returns the path or file to open for a path.
+
+    Raises:
+        InputError: The tables are missing, damaged, or do not match the count in meta/info.json.
+        OSError: A remote file cannot be read.
+    """
+    statistics = [f"stats/{name}/{kind}" for name in states for kind in _STATISTICS]
+    outcome = f"stats/{success}/max"
+    own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome, *statistics}
+    prefixes = tuple(f"videos/{key}/" for key in videos)
+    rows = []
+    for table in tables:
+        path = storage.join(info.root, table)
+        if info.version == "v2.1":
+            values = list(_lines(path))
+        else:
+            columns = read_table(open_file(path), path, lambda name: name in own or name.startswith(prefixes))
+            values = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        for number, row in enumerate(values):
+            try:
+                rows.append(_row_of(info, row, videos, row.get(outcome), statistics))
+            except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+                found, needed = f"not an episode ({error!r})", "LeRobot's own tables"
+                raise InputError(where=f"{path}: row {number}", found=found, needed=needed, fix=_FIX_TABLES) from None
+    rows.sort(key=lambda row: row.index)
+    numbers = {row.index for row in rows}
+    if len(numbers) != len(rows) or len(rows) != info.episodes:
+        where = storage.join(info.root, tables[0] if tables else "meta")
+        found = f"{counted(len(rows), 'episode')}, of {len(numbers)} numbers"
+        needed = f"{info.episodes} of as many numbers, says {info.where}"
+        raise InputError(where=where, found=found, needed=needed, fix=_FIX_TABLES)
+    return rows
+
+
+def _lines(path: str) -> Iterator[dict[str, Any]]:
+    """Yield what each line of meta/episodes.jsonl says."""
+    for number, line in enumerate(storage.read_bounded(path, _MOST_BYTES).splitlines(), start=1):
+        if line.strip():
+            where = f"{path}: line {number}"
+            yield json_object(line, where=where, needed="an episode", fix=_FIX_TABLES)
+
+
+def _row_of(
+    info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], outcome: object, statistics: Sequence[str]
+) -> EpisodeRow:
+    index = int(row["episode_index"])
+    if info.version == "v2.1":  # a file for each episode
+        places = ("data", *(f"videos/{key}" for key in videos))
+        row = {**row, **{f"{place}/chunk_index": index // info.chunk_episodes for place in places}}
+        row |= {f"{place}/file_index": index for place in places} | {f"{place}/from_timestamp": 0 for place in places}
+    while isinstance(outcome, list) and outcome:
+        outcome = outcome[0]
+    of_states = [row.get(name) for name in statistics]
+    is_known = bool(of_states) and None not in of_states
+    hashed = json.dumps([row["length"], *of_states], default=str).encode()
+    tasks = row.get("tasks") or ()
+    place: dict[str, float] = {
+        "index": index,
+        "chunk": int(row["data/chunk_index"]),
+        "file": int(row["data/file_index"]),
+    }
+    lengths_s = {}
+    for key in videos:
+        name = f"videos/{key}"
+        start, end = float(row[f"{name}/from_timestamp"]), row.get(f"{name}/to_timestamp")
+        if not math.isfinite(start) or start < 0:
+            raise ValueError(f"{name}/from_timestamp {start}")
+        place |= {f"{key}.{part}": int(row[f"{name}/{part}_index"]) for part in ("chunk", "file")}
+        place[f"{key}.start_s"] = start
+        if end is not None:
+            lengths_s[key] = float(end) - start
+    return EpisodeRow(
+        length=int(row["length"]),
+        place=place,
+        task="; ".join(map(str, tasks)) if isinstance(tasks, list | tuple) else str(tasks),
+        lengths_s=lengths_s,
+        success=bool(outcome) if isinstance(outcome, bool | int | float) else None,
+        state_hash=hash_of_bytes(hashed) if is_known else UNKNOWN,
+    )
+
+
+def require_files(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> None:
+    """Refuse an episode that cannot be used, as far as the data set's tables show.
+
+    Args:
+        info: Of the data set.
+        row: The episode.
+        files: The existing files, within the data set.
+        keys: Features of the cameras that are used.
+
+    Raises:
+        InputError: It has no steps; or its rows or frames are missing, or too few.
+    """
+    if row.length == 0:
+        raise zero_steps(f"{info.root}: {row.id}")
+    rows_in = row.data_file(info)
+    if rows_in not in files:
+        where, needed = f"{storage.join(info.root, rows_in)}: {row.id}", f"the {row.length} rows of the episode"
+        raise InputError(where=where, found="no such file", needed=needed, fix=FIX_EPISODE)
+    for key in keys:
+        if f"{key}.file" not in row.place:
+            continue
+        shown_in = row.video_file(info, key)
+        where, of_rows = f"{storage.join(info.root, shown_in)}: {row.id}", f"for {row.length} rows in {rows_in}"
+        if shown_in not in files:
+            raise InputError(
+                where=where, found=f"no such video, {of_rows}", needed=f"the frames of {key}", fix=FIX_EPISODE
+            )
+        if not row.lengths_s.get(key, math.inf) > (row.length - 0.5) / info.fps:
+            found = f"{row.lengths_s[key]:.3f} s of video, says the data set, {of_rows}"
+            needed = f"{row.length / info.fps:.3f} s"
+            raise InputError(where=where, found=found, needed=needed, fix="Leave the episode out")
+
+
+def require_long_videos(
+    info: DatasetInfo, row: EpisodeRow, keys: Sequence[str], header_of: Callable[[str], VideoHeader]
+) -> None:
+    """Refuse an episode whose video ends before its last step, as far as the header of the video shows.
+
+    Args:
+        info: Of the data set.
+        row: The episode.
+        keys: Features of the cameras that are used.
+        header_of: Returns the header of a video, given by its path.
+
+    Raises:
+        InputError: A video is too short, or cannot be read.
+    """
+    for key in keys:
+        if f"{key}.file" in row.place:
+            path = storage.join(info.root, row.video_file(info, key))
+            header, last_s = header_of(path), row.place[f"{key}.start_s"] + (row.length - 1) / info.fps
+            if header.num_frames < row.length or header.span_s < last_s - 0.5 / info.fps:
+                found = f"{header.num_frames} frames at {header.rate_hz:.4g} a second, up to {header.span_s:.3f} s"
+                needed = f"one for each of {row.length} rows at {info.fps:g} a second, up to {last_s:.3f} s"
+                raise InputError(where=f"{path}: {row.id}", found=found, needed=needed, fix=FIX_EPISODE)
+
+
+def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[str]) -> dict[str, InputError]:
+    """Return an error for each episode that claims seconds of a video that another episode claims, by identity.
+
+    Args:
+        info: Of the data set.
+        rows: All episodes.
+        keys: Features of the cameras that are used.
+    """
+    errors: dict[str, InputError] = {}
+    for key in keys:
+        claims = []
+        for row in rows:
+            if f"{key}.file" in row.place:
+                start_s = row.place[f"{key}.start_s"]
+                end_s = start_s + row.lengths_s.get(key, row.length / info.fps)
+                claims.append((row.video_file(info, key), start_s, end_s, row.id))
+        latest = ("", 0.0, 0.0, "")
+        for claim in sorted(claims):
+            path, start_s, end_s, identity = claim
+            end_s = min(end_s, latest[2])
+            if path == latest[0] and end_s - start_s > _ROUNDING_STEPS / info.fps:
+                seconds = f"{start_s:.6g} to {end_s:.6g} s of {PurePosixPath(path).name}"
+                found, needed = f"{latest[3]} and {identity} claim {seconds}", "seconds of one episode only"
+                error = InputError(where=storage.join(info.root, path), found=found, needed=needed, fix=_FIX_RANGES)
+                errors.setdefault(latest[3], error)
+                errors.setdefault(identity, error)
+            latest = max(latest, claim, key=lambda one: (one[0], one[2]))
+    return errors
+
+
+def row_of(table: EpisodeTable, index: int) -> EpisodeRow:
+    """Return the location of an episode of a table; its task stays in the table."""
+    return EpisodeRow(
+        int(table.num_steps[index]), {name: column[index].item() for name, column in table.locators.items()}
+    )

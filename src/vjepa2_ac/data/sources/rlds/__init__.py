@@ -1,1 +1,0 @@
-"""RLDS data sets: TFRecord shards as TFDS writes them."""
