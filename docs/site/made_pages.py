@@ -212,8 +212,6 @@ def _components_with_options(one: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def _section_of(one: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """Return the section that a key holds, None for a value; of several forms of data the first one."""
-    if _components_with_options(one):
-        return None
     for option in [one, *one.get("anyOf", []), *one.get("allOf", []), *one.get("oneOf", [])]:
         found = _resolved(option, schema)
         if "properties" in found and found["properties"].keys() != {"name", "options"}:  # a component is a value

@@ -41,7 +41,6 @@ lock.take()
 print("held", flush=True)
 sys.stdin.read()
 """
-ASKED = EvaluationOptions(clips=4, probes=ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0))
 
 
 class KilledError(BaseException):
@@ -181,22 +180,6 @@ def at_home(make_config, home: Path):  # type: ignore[no-untyped-def]
     return parse_config({**values, "run_dir": "run"}, where=str(home))
 
 
-def test_a_run_is_measured_and_goes_on_from_anywhere_as_from_its_own_folder(
-    at_home, home, reporter, monkeypatch
-) -> None:
-    train(at_home, reporter)
-    as_written = (home / "run/config.yaml").read_text()
-    here = evaluate_subject("run", ASKED)
-    monkeypatch.chdir(home.parent / "elsewhere")
-    there = evaluate_subject(str(home / "run"), ASKED)
-    elsewhere, nearby = (found.models["adapter"].errors.of("rollout") for found in (there, here))
-    assert (elsewhere == nearby).all()
-    assert there.about.data == str(home / "data")
-    assert load_subject(Path("../home/run")).config.model.base == str(home / "base")
-    train(read_run_config(home / "run"), reporter, check_only=True)
-    assert any("Resuming from" in note for note in reporter.notes)
-    assert (home / "run/config.yaml").read_text() == as_written
-    assert list(Path.cwd().iterdir()) == []
 
 
 def test_only_paths_that_lead_nowhere_are_looked_for_elsewhere(at_home, home, monkeypatch) -> None:

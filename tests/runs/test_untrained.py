@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 
-from decoders import whole_decoder  # noqa: F401 - a fixture
 from run_fixtures import TINY, MakeConfig
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml

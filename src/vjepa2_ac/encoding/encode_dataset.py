@@ -10,7 +10,6 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import timedelta
 from functools import partial
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from vjepa2_ac.distributed import agreed, computing_device, first_only
 from vjepa2_ac.encoding.batch import encoding_of, require_same_encoder
 from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
@@ -189,11 +188,13 @@ def with_latents(
     if (cache := _cache_of(config, dataset, model)) is None:
         return dataset
     if config.data.cache == "auto":
-        make_encoder = partial(EncoderOnDevice.of, config, model, accelerator.device)
         if not check_only:
-            _encode_together(cache, make_encoder, accelerator, reporter)
+            _encode_together(cache, partial(EncoderOnDevice.of, config, model, accelerator.device), accelerator, reporter)
         elif left := cache.missing():
-            reporter.note(_forecast(cache, left, make_encoder(), accelerator.num_processes))
+            cache.require_own()
+            cache.require_space(left)
+            frames = counted(frames_in(left), "frame")
+            reporter.note(f"A run would first encode {frames} of {cache.summary(left)}. The cache is {cache.folder}")
             return dataset
     found = cache.opened()
     reporter.note(f"Latents come from {cache.folder}: the encoder is not needed")
@@ -251,12 +252,3 @@ def require_shared(cache: LatentCache, sees: Callable[[], bool]) -> None:
         time.sleep(_LOOKS_EVERY_S)
 
 
-def _forecast(cache: LatentCache, left: Sequence[FramesToEncode], encoder: EncoderOnDevice, processes: int) -> str:
-    """Return as text what a run would encode first, after a check that there is space for it."""
-    cache.require_own()
-    cache.require_space(left)
-    speed, frames = encoder.frames_per_second() * processes, frames_in(left)
-    return (
-        f"A run would first encode {frames:,} of {cache.summary(left)}. At {speed:.3g} frames/s, measured on one chunk,"
-        f" this takes {timedelta(seconds=round(frames / speed))}. The cache is {cache.folder}"
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -63,16 +62,6 @@ class EncoderOnDevice:
         """Return the latents of normalised frames."""
         with self.autocast():
             return self.world_model.encode(inputs[None], chunk=self.chunk)[0]
-
-    def frames_per_second(self) -> float:
-        """Measure the speed on a chunk of black frames, after a warm-up chunk where a device needs one."""
-        size = self.world_model.image_size
-        black = torch.zeros(self.chunk, 3, size, size, device=self.device)
-        if self.device.type != "cpu":
-            self.latents(black).cpu()
-        started = time.perf_counter()
-        self.latents(black).cpu()
-        return self.chunk / (time.perf_counter() - started)
 
 
 _Frames = UInt8[Tensor, "frames height width 3"]  # cropped
