@@ -9,7 +9,7 @@ import yaml
 from pydantic import BaseModel
 
 from paths import ROOT
-from vjepa2_ac.config import AdapterConfig, CheckpointConfig
+from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.loading import (
     all_keys,
     config_as_yaml,
@@ -48,8 +48,6 @@ def test_an_alpha_that_grows_with_the_rank_under_rslora_is_out_of_line() -> None
         {"kind": "none", "alpha": 128},
     ):
         assert AdapterConfig.model_validate(usual).out_of_line is None
-
-
 
 
 @pytest.mark.parametrize("adapter", [{"modules_to_save": ["state_encoder"]}, {"targets": ["q", "state_encoder"]}])
@@ -116,8 +114,6 @@ def test_another_form_of_data_takes_the_place_of_that_in_the_file_with_its_knobs
     assert ported.data.lerobot.gripper_open == 2
     with pytest.raises(InputError, match=r"data\.lerobot: a section of source lerobot, and this is source rlds"):
         load_config(write(tmp_path, resolved), ["data.lerobot.gripper_open=2"])
-
-
 
 
 def test_every_knob_is_read_somewhere() -> None:

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.config.sources import RotationFormat
 from vjepa2_ac.data.poses import FORMATS, rotation_speeds, smoother_format
 
-MAX_RAD_S = MotionLimits().rotation_rad_s
+MAX_RAD_S = 10.0
 RATES_HZ = (1.0, 5.0, 15.0, 30.0)
 BASES: dict[str, Callable[[np.random.Generator], Rotation]] = {
     "down": lambda rng: Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)) * Rotation.from_euler("x", np.pi),

@@ -54,8 +54,6 @@ def parsed(**training: str) -> Config:
     return parse_config(values(**training), where="test")
 
 
-
-
 def through(door: str, monkeypatch: pytest.MonkeyPatch, folder: Path, **training: str) -> int:
     if door == "simulate" and importlib.util.find_spec("mujoco") is None:
         pytest.skip("MuJoCo (extra sim) is not installed")
@@ -86,8 +84,6 @@ def test_bfloat16_that_is_only_emulated_is_refused(
 )
 def test_what_an_old_gpu_computes_is_not_refused(training: dict[str, str]) -> None:
     assert computing_device(parsed(**training).training).type == training.get("device", "cuda")
-
-
 
 
 def test_slow_bfloat16_on_a_cpu_causes_a_warning_with_a_fix(

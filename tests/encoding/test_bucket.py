@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gcs import Failure, Gcs
+from gcs import Gcs
 from killable import KILLED, Nursery
 from run_fixtures import MakeConfig, SilentReporter, as_yaml, set_up
 from same_run import assert_same_run
@@ -140,8 +140,6 @@ def test_a_cache_is_opened_by_one_listing_and_read_in_ranges_once(bucket: Gcs, f
 
 
 # ---- what can fail -----------------------------------------------------------------------------------------------
-
-
 
 
 @pytest.mark.parametrize(

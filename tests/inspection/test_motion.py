@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from lerobot_sets import STATE, recorded, write_v30
 from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.inspection import motion
 from vjepa2_ac.inspection.coverage import sample_of
@@ -25,7 +24,6 @@ from vjepa2_ac.inspection.motion import (
 )
 
 STEPS, RATE_HZ = 40, 10.0
-LIMITS = MotionLimits()
 Pair = tuple[np.ndarray, np.ndarray]
 
 
@@ -136,7 +134,7 @@ def test_speed_example_is_the_step_between_joined_recordings(tmp_path: Path) -> 
     assert f"step {STEPS - 1} to {STEPS}: " in warnings["speed"]
     states = joined(0)[0]
     stretch = Stretch("e", 7, np.concatenate([states[:40], states[40:]]))
-    text = speed_finding([stretch], RATE_HZ, LIMITS, "1 of 1 episode checked").text
+    text = speed_finding([stretch], RATE_HZ, "1 of 1 episode checked").text
     jump_m = np.linalg.norm(states[40, :3] - states[39, :3])
     assert f"Example: e, step 46 to 47: {RATE_HZ * jump_m:.1f} m/s" in text
 

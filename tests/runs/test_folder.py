@@ -17,8 +17,6 @@ import pytest
 from vjepa2_ac.cli import main
 from vjepa2_ac.config.loading import config_as_dict, config_as_yaml, parse_config
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
-from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.runs.checkpoint import newest_checkpoint
 from vjepa2_ac.runs.folder import (
     RunLock,
@@ -28,7 +26,6 @@ from vjepa2_ac.runs.folder import (
     read_run_config,
     run_id,
 )
-from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training import loop
 from vjepa2_ac.training.loop import train
 
@@ -178,8 +175,6 @@ def at_home(make_config, home: Path):  # type: ignore[no-untyped-def]
     values = config_as_dict(make_config(training__steps=2, data__test_share=0.3))
     values["data"]["path"], values["model"]["base"] = "data", "base"
     return parse_config({**values, "run_dir": "run"}, where=str(home))
-
-
 
 
 def test_only_paths_that_lead_nowhere_are_looked_for_elsewhere(at_home, home, monkeypatch) -> None:

@@ -1,10 +1,8 @@
 """The metrics log: rows are appended, survive a kill, and are not written twice."""
 
 import errno
-import logging
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -139,10 +137,6 @@ def test_what_json_cannot_hold_becomes_null(tmp_path: Path) -> None:
     with MetricsLog(tmp_path, first_step=0) as log:
         log.write("train", 1, {"loss": float("nan")})
     assert next(read_metrics_log(tmp_path / "metrics.jsonl"))["loss"] is None
-
-
-
-
 
 
 def test_a_disk_that_stalls_causes_a_warning(

@@ -83,15 +83,6 @@ class DiskCacheConfig(Section):
     are cached, and none are removed. Indexes do not count."""
 
 
-class MotionLimits(Section):
-    """Speeds between control steps that no arm reaches; `data check` warns where the states are faster."""
-
-    speed_m_s: Positive = 2.5
-    """Speed of the position, in metres per second."""
-    rotation_rad_s: Positive = 10.0
-    """Speed of the rotation, in radians per second."""
-
-
 def source_of(values: Any) -> str:
     """Return the form of the data of a config, or of the values of one: RLDS unless it says another."""
     found = values.get("source", "rlds") if isinstance(values, dict) else getattr(values, "source", "")
@@ -163,8 +154,6 @@ class DataConfig(Section):
     episodes, more than half."""
     exclude: Annotated[tuple[str, ...], Affects.NOTHING] = ()
     """Identities of episodes to leave out, as errors name them."""
-    motion_limits: Annotated[MotionLimits, Affects.NOTHING] = MotionLimits()
-    """Speeds of a pose that no arm reaches: a warning of `data check`, for padding, dropouts and joined recordings."""
     pose_frame: Literal["base", "camera"] = "base"
     """Frame of the poses: the robot's base (the released recipe), or the camera, where its extrinsics are known."""
     crop: Annotated[Literal["released", "square", "letterbox"], Affects.CLIPS | Affects.PLAN] = "released"

@@ -34,7 +34,6 @@ REMOVED: dict[str, RemovedKey] = {
     "decoder.weight_decay": RemovedKey("0.05", (0.05,)),
     "model.encoder_weights": RemovedKey("target_encoder, if the file has it", ("target_encoder",)),
     "model.random_start": RemovedKey("persistence", ("persistence",)),
-    # "training.betas": RemovedKey("(0.9, 0.999)", ([0.9, 0.999],)),
     "data.augment": RemovedKey(
         "off; use data.transforms",
         ({"crop_scale": None, "crop_aspect": [0.75, 1.35], "brightness": 0.0, "contrast": 0.0, "saturation": 0.0},),
@@ -45,6 +44,7 @@ REMOVED: dict[str, RemovedKey] = {
     "data.lerobot.joint_velocity": RemovedKey(
         "action.joint_velocity, if there is one", ("action.joint_velocity", None)
     ),
+    "data.motion_limits": RemovedKey("2.5 m/s and 10 rad/s", ({"speed_m_s": 2.5, "rotation_rad_s": 10.0},)),
     "data.prefetch": RemovedKey("2", (2,)),
     "data.short_episodes": RemovedKey("skip", ("skip",)),
     "training.teacher_forcing_weight": RemovedKey("1", (1.0,)),

@@ -189,7 +189,9 @@ def with_latents(
         return dataset
     if config.data.cache == "auto":
         if not check_only:
-            _encode_together(cache, partial(EncoderOnDevice.of, config, model, accelerator.device), accelerator, reporter)
+            _encode_together(
+                cache, partial(EncoderOnDevice.of, config, model, accelerator.device), accelerator, reporter
+            )
         elif left := cache.missing():
             cache.require_own()
             cache.require_space(left)
@@ -250,5 +252,3 @@ def require_shared(cache: LatentCache, sees: Callable[[], bool]) -> None:
             fix = "Set it to one that all machines of the run share; or run `vjepa2-ac encode` once on every machine"
             raise InputError(where=f"data.cache_dir: {cache.folder}", found=found, fix=fix)
         time.sleep(_LOOKS_EVERY_S)
-
-

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.data.poses import FORMATS, rotation_speeds, smoother_format
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.found import Knob
+from vjepa2_ac.inspection.motion import FASTEST_RAD_S
 from vjepa2_ac.spaces import ANGLE_RAD, REACH_M
 
 Numbers = Float[np.ndarray, "steps _"]
@@ -20,7 +20,6 @@ Samples = Mapping[str, Sequence[Numbers]]  # the numbers of some episodes, by co
 Range = tuple[float, float]  # the least and the greatest value
 
 _NAMES_OF_DROID = ["x", "y", "z", "roll", "pitch", "yaw"]
-_MAX_RAD_S = MotionLimits().rotation_rad_s  # as `data check` assumes
 _MAX_GRIPPER_M, _MAX_SHARE = 0.15, 1.05  # largest values of a gripper's opening in metres, and of a share
 
 _RATE = r"vel|speed|force|torque|effort|accel|wrench|current(?!_?(?:tcp|ee|pose|cart|pos|state))"
@@ -350,7 +349,7 @@ def _rotation_format(rotation: _Numbers, samples: Samples, control_rate_hz: floa
             why += "; rotation vectors in degrees cannot be read"
         return Knob("euler_xyz_degrees", why, is_guess or proposed == "rotation_vector")
     values = [one[abs(one).max(axis=1) <= max(largest, ANGLE_RAD)] for one in values]
-    smoother = smoother_format(rotation_speeds(values, control_rate_hz), proposed, _MAX_RAD_S) if values else None
+    smoother = smoother_format(rotation_speeds(values, control_rate_hz), proposed, FASTEST_RAD_S) if values else None
     if smoother in {None, proposed}:
         return Knob(proposed, why, is_guess)
     why = f"{smoother} moves much more smoothly than {proposed}"

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from vjepa2_ac import storage
-from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.config.sources import PoseFields, RotationFormat
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import MEANS, SPANS
@@ -31,6 +30,7 @@ _FEWEST_SCALED, _SEPARATION, _SCALE, _SAME_SHAPE = 4, 5.0, 1.4, 0.2
 _END_STEPS = 16  # steps at each end of an episode whose frames are read
 _MIN_FROZEN = 3  # single repeated frames come from a camera with a lower rate
 _MOVED_M = 0.01  # an image shows such a motion
+FASTEST_M_S, FASTEST_RAD_S = 2.5, 10.0  # speeds between control steps that no arm reaches
 _FARTHER = 1.5  # a step from or to zeros, relative to the 99th percentile of other steps: not a motion
 _EXCLUDE = "Remove these steps from the data set, or list the episodes in data.exclude"
 
@@ -102,9 +102,9 @@ def scale_finding(dataset: Dataset) -> Finding:
 
 
 def _fast_episodes(dataset: Dataset) -> list[int]:
-    """Return at most 200 episodes in which, by the index, a step exceeds `data.motion_limits`; the fastest first."""
-    limits, members = dataset.config.motion_limits, dataset.episodes
-    excess = (dataset.table.motion[members, :2] / [limits.speed_m_s, limits.rotation_rad_s]).max(axis=1)
+    """Return at most 200 episodes in which, by the index, a step exceeds the speed of any arm; the fastest first."""
+    members = dataset.episodes
+    excess = (dataset.table.motion[members, :2] / [FASTEST_M_S, FASTEST_RAD_S]).max(axis=1)
     order = np.argsort(-excess)[: int((excess * dataset.control_rate_hz > 1).sum())]
     return [int(index) for index in members[order[:_MOST_FAST]]]
 
@@ -120,25 +120,22 @@ def _check_states(dataset: Dataset, sample: Sequence[ReadEpisode]) -> Iterator[F
         for start, end in one.kept
         if end - start > 1
     ]
-    yield speed_finding(stretches, dataset.control_rate_hz, dataset.config.motion_limits, checked + by_index)
+    yield speed_finding(stretches, dataset.control_rate_hz, checked + by_index)
     yield padding_finding(stretches, checked)
 
 
-def speed_finding(
-    stretches: Sequence[Stretch], control_rate_hz: float, motion_limits: MotionLimits, checked: str
-) -> Finding:
+def speed_finding(stretches: Sequence[Stretch], control_rate_hz: float, checked: str) -> Finding:
     """Return whether poses change faster between consecutive control steps than an arm can move.
 
     Args:
         stretches: Steps of some episodes.
         control_rate_hz: Control steps per second.
-        motion_limits: The highest plausible speeds.
         checked: The number of episodes, for the text.
     """
     if not stretches:
         return Finding("skipped", "speed", "needs episodes of two or more steps, found none")
     speeds, turns = control_rate_hz * np.concatenate([step_sizes(one.states) for one in stretches]).T
-    excess = np.maximum(speeds / motion_limits.speed_m_s, turns / motion_limits.rotation_rad_s)
+    excess = np.maximum(speeds / FASTEST_M_S, turns / FASTEST_RAD_S)
     if excess.max() <= 1:
         text = f"at most {speeds.max():.2f} m/s and {turns.max():.2f} rad/s between control steps ({checked})"
         return Finding("ok", "speed", text)
@@ -146,10 +143,10 @@ def speed_finding(
     fast, worst = np.flatnonzero(excess > 1).tolist(), int(excess.argmax())
     name, step = steps[worst]
     episodes = counted(len({steps[one][0] for one in fast}), "episode")
-    limit = f"{motion_limits.speed_m_s:g} m/s or {motion_limits.rotation_rad_s:g} rad/s, which no arm reaches"
+    limit = f"{FASTEST_M_S:g} m/s or {FASTEST_RAD_S:g} rad/s, which no arm reaches"
     text = f"faster than {limit}: {counted(len(fast), 'control step')} in {episodes} ({checked})"
     example = f"{name}, step {step} to {step + 1}: {speeds[worst]:.1f} m/s, {turns[worst]:.1f} rad/s"
-    fix = "Look for padding, lost measurements and joined recordings; data.motion_limits sets the limits"
+    fix = "Look for padding, lost measurements and joined recordings"
     return Finding("warning", "speed", f"{text}. Example: {example}. {fix}")
 
 
@@ -196,7 +193,7 @@ def _check_rotation_format(dataset: Dataset, sample: Sequence[ReadEpisode]) -> I
         states = {index: np.asarray(one.states) for index, one in read_each(dataset, [*states], raw.read)}
     numbers = [one[start:end, POSE.rotation] for index, one in states.items() for start, end in dataset.kept.of(index)]
     speeds = rotation_speeds(numbers, dataset.control_rate_hz)
-    if smoother := smoother_format(speeds, configured, config.motion_limits.rotation_rad_s):
+    if smoother := smoother_format(speeds, configured, FASTEST_RAD_S):
         readings = "; ".join(
             f"read as {name}, the hand turns by {one.median_rad_s:.2f} rad/s (median) and smoothly at"
             f" {one.num_smooth_jumps} of {one.num_jumps} jumps of the numbers"
