@@ -78,7 +78,7 @@ def test_check_with_json_keeps_stdout_empty_where_the_data_cannot_be_read(config
     assert json.loads(capsys.readouterr().out)["errors"] == 1
 
 
-COMMANDS = ["data check", "data index", "data inspect", "data calibrate", "train", "encode", "decoder", "doctor"]
+COMMANDS = ["data check", "data inspect", "data calibrate", "train", "encode", "decoder", "doctor"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -106,17 +106,6 @@ def test_an_unwritable_folder_is_known_before_anything_is_read(config: str, tmp_
     (tmp_path / "file").write_text("")
     assert main(["data", "inspect", config, "--out", str(tmp_path / "file" / "in it")]) == 2
     assert "--out" in capsys.readouterr().err
-
-
-def test_index_says_what_is_kept_and_where_and_builds_it_again(config: str, tmp_path: Path, capsys: Printed) -> None:
-    assert main(["data", "index", config]) == 0
-    assert "8 episodes, 320 steps" in capsys.readouterr().out
-    files = list((tmp_path / "cache" / "index").iterdir())
-    assert len(files) == 1
-    files[0].write_bytes(b"not an index")
-    assert main(["data", "index", config, "--rebuild"]) == 0
-    assert str(files[0]) in capsys.readouterr().out.replace("\n", "")
-    assert files[0].stat().st_size > 100
 
 
 def test_inspect_prints_and_writes_statistics_and_a_figure(config: str, tmp_path: Path, capsys: Printed) -> None:

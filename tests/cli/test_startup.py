@@ -26,7 +26,6 @@ data check nope.yaml
 data check {demo}
 data check {demo} data.path=. --model nope
 data inspect nope.yaml
-data index nope.yaml
 data convert nope.yaml out
 data convert {demo} out
 data convert {demo} data.path=. /proc/nope/out
@@ -48,7 +47,6 @@ serve builtin:sim-tiny --goals nope
 simulate nope
 simulate builtin:sim-tiny --domain Q
 simulate builtin:sim-tiny planning.horizonn=2
-simulate builtin:sim-tiny planning.axes=nope.json
 simulate record /proc/x --episodes 2
 download --url foo --to x.pt
 download x.pt

@@ -171,7 +171,7 @@ def test_of_few_episodes_nothing_is_claimed() -> None:
 def test_what_is_worse_than_persistence_is_no_better_reading() -> None:
     def found(ratio: Estimate) -> VariantResult | None:
         difference = Estimate(-0.2, -0.25, -0.15)
-        plain = VariantResult(AS_THEY_ARE, Estimate(1.3, 1.2, 1.4), 0.4, 0.3, None, clips=64, episodes=12)
+        plain = VariantResult(AS_THEY_ARE, Estimate(1.3, 1.2, 1.4), 0.4, 0.3, clips=64, episodes=12)
         other = replace(plain, name="y negated", ratio=ratio, difference=difference)
         return VariantProbe(plain, (other,)).better
 

@@ -83,11 +83,7 @@ def test_ratios_are_those_computed_by_hand() -> None:
     assert [one.ratio.value for one in found.results.values()] == [
         pytest.approx(4 / 4, abs=1e-3), pytest.approx(0.0, abs=1e-3), pytest.approx(7 / 15, abs=1e-3),
     ]  # fmt: skip
-    assert [one.moved_cm for one in found.results.values()] == [
-        pytest.approx(stride / 10, rel=1e-3) for stride in (4, 8, 15)
-    ]
-    assert found.as_dict()["strides"][0]["seconds_per_step"] == pytest.approx(4 / 15)
-    assert found.as_dict()["runner_up"] == 15
+    assert [one["stride"] for one in found.as_dict()["strides"]] == [4, 8, 15]
     assert found.best.difference is not None
     assert found.best.difference.value == pytest.approx(-7 / 15, abs=1e-3)
 
@@ -152,7 +148,7 @@ def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(mon
 
 def test_the_best_of_several_is_certain_only_by_twice_its_interval() -> None:
     """Both were chosen on these clips: an interval that just leaves 0 out says little."""
-    result = VariantResult("one", Estimate(0.5, 0.4, 0.6), 0.2, 0.4, None, clips=10, episodes=10)
+    result = VariantResult("one", Estimate(0.5, 0.4, 0.6), 0.2, 0.4, clips=10, episodes=10)
     narrow, wide = (replace(result, difference=Estimate(-0.1, -0.1 - half, half - 0.1)) for half in (0.03, 0.08))
     assert narrow.is_certainly_better(needed=10)
     assert not wide.is_certainly_better(needed=10)

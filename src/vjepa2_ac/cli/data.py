@@ -1,11 +1,10 @@
-"""The data commands: check, index, inspect, calibrate, convert and converter."""
+"""The data commands: check, inspect, calibrate, convert and converter."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import json
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,10 +35,6 @@ def _add_commands(commands: cli.Commands) -> None:
     text = "also measure with a model whether frames are shifted, mirrored, reversed or BGR, or the gripper is inverted"
     cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
     cli.add(parser, "--json", "print one JSON object: the findings and their counts", action="store_true")
-
-    parser = cli.command(commands, "index", _index, "my_robot.yaml")
-    cli.add_config(parser, such_as=such_as)
-    cli.add(parser, "--rebuild", "build it again, also where one is kept", action="store_true")
 
     parser = cli.command(commands, "inspect", _inspect, "my_robot.yaml --out inspection")
     cli.add_config(parser, such_as=such_as)
@@ -141,7 +136,7 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
     if probe is not None:
         if not as_json:
             title = "One-step error / persistence of the data in variants"
-            cli.show(variants_table(title, [probe.plain, *probe.results], ["difference"]))
+            cli.show(variants_table(title, [probe.plain, *probe.results]))
         add(Finding("warning" if probe.better else "ok" if probe.is_decided else "skipped", "probe", probe.verdict()))
     if as_json:
         print(json_text(findings_as_dict(findings) | (probe.as_dict() if probe else {})), end="")
@@ -156,25 +151,6 @@ def _probe(config: Config, model: str, *, clips: int, progress: Progress) -> Var
     from vjepa2_ac.inspection.statistics import at_some_stride
 
     return probe_config(config, at_some_stride(open_dataset(config.data)), model=model, clips=clips, progress=progress)
-
-
-def _index(options: argparse.Namespace) -> None:
-    """Build the index of a data set, or show the one that is kept."""
-    config = cli.read_config(options.config, options.overrides).data
-
-    from vjepa2_ac.cli.console.tables import index_lines
-    from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.data.index import cached_file, fingerprint_of
-    from vjepa2_ac.reporter import INDEXING
-
-    with cli.reporter() as reporter:
-        for is_rebuilt in (False, True) if options.rebuild else (False,):
-            started = time.perf_counter()
-            table = open_dataset(config, progress=reporter.task(INDEXING)).table
-            file = cached_file(config.disk_cache, fingerprint_of(table))
-            if options.rebuild and not is_rebuilt:
-                file.unlink(missing_ok=True)
-    cli.show(*index_lines(table, file, time.perf_counter() - started))
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -227,8 +203,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     path = options.out / "calibration.json"
     write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
     title = f"One-step error / persistence on {options.split} episodes, {calibration.frames} frames a clip"
-    columns = ["error", "persistence", "moves by", "clips (episodes)"]
-    table = variants_table(title, list(calibration.results.values()), columns, calibration.best)
+    table = variants_table(title, list(calibration.results.values()), calibration.best)
     reasons = [f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()]
     cli.show(table, *reasons, calibration.verdict(), files=[path])
     return 0

@@ -56,8 +56,9 @@ class VariantProbe:
     def better(self) -> VariantResult | None:
         """The variant that fits best, if it certainly fits better than the unchanged data."""
         certain = [one for one in self.results if one.is_certainly_better(needed=ENOUGH_EPISODES)]
-        better = [one for one in certain if one.gain > _GAIN and one.ratio.high < 1]  # else it only fails less
-        return max(better, key=lambda one: one.gain, default=None)
+        gains = {one: -one.difference.value for one in certain if one.difference and one.ratio.high < 1}
+        better = [one for one, gain in gains.items() if gain > _GAIN]  # with a ratio above 1 it only fails less
+        return max(better, key=lambda one: gains[one], default=None)
 
     @property
     def is_decided(self) -> bool:
@@ -134,12 +135,11 @@ def probe_variants(
     variants = [Variant(AS_THEY_ARE, lambda same: same), *variants_of(dataset.config, shifts)]
     clips = SameClips(dataset, windows, sample.batch_size)
     plain, *measured = measure_variants(model, encode, clips, variants, progress)
-    space = dataset.spaces.action
     results = [
-        result_of(found, one.name, space, beside=plain, repair=one.repair)
+        result_of(found, one.name, reference=plain, repair=one.repair)
         for one, found in zip(variants[1:], measured, strict=True)
     ]
-    return VariantProbe(result_of(plain, AS_THEY_ARE, space), tuple(results))
+    return VariantProbe(result_of(plain, AS_THEY_ARE), tuple(results))
 
 
 def _with_room(

@@ -9,7 +9,7 @@ episodes. Other readings of the data are in `inspection.probe`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -34,7 +34,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.subject import load_subject
-from vjepa2_ac.spaces import ActionSpace
+from vjepa2_ac.storage.structured import plain
 
 Encode = Callable[[Batch], LatentBatch]  # pixels into latents, on the model's device
 
@@ -61,16 +61,10 @@ class VariantResult:
     ratio: Estimate  # of the error to that of copying the frame before
     error: float  # mean over clips
     persistence: float
-    moved_cm: float | None  # median distance of the flange per model step; None: the states are no poses
     clips: int
     episodes: int
     difference: Estimate | None = None  # of the ratio to another variant's on the same clips; below 0: fits better
     repair: str = ""
-
-    @property
-    def gain(self) -> float:
-        """By how much the ratio is below the other variant's."""
-        return 0.0 if self.difference is None else -self.difference.value
 
     def is_certainly_better(self, *, needed: int) -> bool:
         """Return whether the difference is below 0 by twice its interval: the variant was chosen on these clips.
@@ -83,32 +77,22 @@ class VariantResult:
         return self.difference.value + _MARGIN * (self.difference.high - self.difference.value) < 0
 
 
-# By clip (episode, first control step): one-step, teacher-forced L1 of the model and of persistence; the actions.
-VariantErrors = dict[tuple[str, int], tuple[Float[np.ndarray, " 2"], Float[np.ndarray, "steps action_dim"]]]
+# By clip (episode, first control step): the one-step, teacher-forced L1 error of the model and of persistence.
+VariantErrors = dict[tuple[str, int], Float[np.ndarray, " 2"]]
 
 
 def result_of(
-    found: VariantErrors, name: str, space: ActionSpace, *, beside: VariantErrors | None = None, repair: str = ""
+    errors: VariantErrors, name: str, *, reference: VariantErrors | None = None, repair: str = ""
 ) -> VariantResult:
-    """Return what the errors of a variant come to, compared with another one."""
-    ids, moved_cm, difference = [episode for episode, _ in found], None, None
-    of_model, of_nothing = _of_clips(found, found)
-    if space.position is not None:
-        moved_cm = float(np.median(space.shown_size(np.concatenate([actions for _, actions in found.values()]))))
-    if beside is not None:
-        both = [clip for clip in found if clip in beside]
-        names = [episode for episode, _ in both]
-        difference = ratio_difference(_of_clips(found, both), _of_clips(beside, both), names)
-    return VariantResult(
-        name, ratio(of_model, of_nothing, ids), float(of_model.mean()), float(of_nothing.mean()), moved_cm,
-        len(ids), len(set(ids)), difference, repair,
-    )  # fmt: skip
-
-
-def _of_clips(found: VariantErrors, clips: Iterable[tuple[str, int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of the model, and of persistence."""
-    of_model, of_nothing = np.array([found[clip][0] for clip in clips]).T.copy()
-    return of_model, of_nothing
+    """Return the result of a variant from its errors, compared with the reference on their common clips."""
+    ids, difference = [episode for episode, _ in errors], None
+    if reference is not None:
+        common = [clip for clip in errors if clip in reference]
+        one, other = (np.array([kind[clip] for clip in common]).T.copy() for kind in (errors, reference))
+        difference = ratio_difference((one[0], one[1]), (other[0], other[1]), [episode for episode, _ in common])
+    of_model, of_persistence = np.array(list(errors.values())).T.copy()
+    means, counts = (float(of_model.mean()), float(of_persistence.mean())), (len(ids), len(set(ids)))
+    return VariantResult(name, ratio(of_model, of_persistence, ids), *means, *counts, difference, repair)
 
 
 @dataclass(frozen=True)
@@ -165,8 +149,7 @@ def _read(
 def _measured(model: Predictor, latents: LatentBatch) -> VariantErrors:
     found = measured(model, latents, ONE_STEP, (L1,))
     errors = np.stack([found.of("teacher_forced", L1, way).mean(axis=1) for way, _ in ONE_STEP], axis=1)
-    clips = zip(latents.episode_ids, latents.starts, strict=True)
-    return dict(zip(clips, zip(errors, latents.actions.cpu().numpy().astype(np.float64), strict=True), strict=True))
+    return dict(zip(zip(latents.episode_ids, latents.starts, strict=True), errors, strict=True))
 
 
 @dataclass(frozen=True)
@@ -265,25 +248,14 @@ class Calibration:
 
     def as_dict(self) -> dict[str, Any]:
         """Return all metrics as plain values, for `calibration.json`."""
-        names, difference = ("error", "persistence", "moved_cm", "clips", "episodes"), self.best.difference
         return {
             "stride": self.stride,
             "certain": self.is_certain,
             "verdict": self.verdict(),
             "split": self.split,
             "frames": self.frames,
-            "strides": [
-                {
-                    "stride": stride,
-                    "seconds_per_step": stride / self.rate_hz,
-                    **{name: getattr(one, name) for name in names},
-                    "error_over_persistence": one.ratio.as_dict(),
-                }
-                for stride, one in self.results.items()
-            ],
+            "strides": [plain(asdict(one)) | {"stride": stride} for stride, one in self.results.items()],
             "impossible": {str(stride): why for stride, why in self.impossible.items()},
-            "runner_up": _by_ratio(self.results)[1] if len(self.results) > 1 else None,
-            "difference": None if difference is None else difference.as_dict(),
         }
 
 
@@ -366,12 +338,12 @@ def calibrate(
     variants = [Variant(str(stride), partial(_at_stride, views[stride])) for stride in widest_first]
     clips = SameClips(dataset, windows, sample.batch_size)
     found = measure_variants(model, encode, clips, variants, progress)
-    errors, space = dict(zip(widest_first, found, strict=True)), dataset.spaces.action
+    errors = dict(zip(widest_first, found, strict=True))
     names = {stride: f"stride {stride} ({stride / rate:.2f} s)" for stride in possible}
-    results = {stride: result_of(errors[stride], name, space) for stride, name in names.items()}
+    results = {stride: result_of(errors[stride], name) for stride, name in names.items()}
     if len(results) > 1:
         best, second, *_ = _by_ratio(results)
-        results[best] = result_of(errors[best], names[best], space, beside=errors[second])
+        results[best] = result_of(errors[best], names[best], reference=errors[second])
     return Calibration(results, impossible, frames, split, rate)
 
 

@@ -30,10 +30,10 @@ SHARE = Estimate(0.912, 0.888, 0.934)
 
 def variants() -> list[Table]:
     results = [
-        VariantResult(f"{name} or some other thing", SHARE, 0.4321, 0.5432, 12.3, 1024, 128, difference)
+        VariantResult(f"{name} or some other thing", SHARE, 0.4321, 0.5432, 1024, 128, difference)
         for name, difference in (("late", None), ("mirrored", SURE))
     ]
-    return [variants_table("variants", results, ["difference", "error", "moves by", "clips (episodes)"], results[1])]
+    return [variants_table("variants", results, results[1])]
 
 
 def motions() -> list[Table]:

@@ -17,9 +17,6 @@ from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from vjepa2_ac.data.index import EpisodeTable
     from vjepa2_ac.decoding.decoder_folder import DecoderCard
     from vjepa2_ac.goals.make_goals import MadeGoals
     from vjepa2_ac.inspection.findings import Finding
@@ -145,16 +142,6 @@ def print_finding(finding: Finding) -> None:
     console.print(text)
 
 
-def index_lines(table: EpisodeTable, file: Path, seconds: float) -> list[str]:
-    """Return the output of `data index`."""
-    steps = counted(int(table.num_steps.sum()), "step")
-    lines = [f"{counted(len(table), 'episode')}, {steps}; opened in {seconds:.2f} s"]
-    if table.problems:
-        lines.append(f"{counted(len(table.problems), 'broken episode')}; the first: {table.problems[0].where}")
-    size = f"{file.stat().st_size / 1e6:.2f} MB" if file.is_file() else "could not be kept"
-    return [*lines, f"  {file}  {size}"]
-
-
 def motion_table(steps: Sequence[StepSizes]) -> Table:
     """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
     from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED
@@ -170,19 +157,12 @@ def motion_table(steps: Sequence[StepSizes]) -> Table:
     return table
 
 
-def variants_table(
-    title: str, results: Sequence[VariantResult], columns: Sequence[str], best: VariantResult | None = None
-) -> Table:
+def variants_table(title: str, results: Sequence[VariantResult], best: VariantResult | None = None) -> Table:
     """Return the table of `data check --model` and of `data calibrate`: a row for each variant of the same clips."""
-    table = MetricsTable(f"{title} (95 % interval over episodes)", ["variant", "error / persistence", *columns])
+    columns = ["variant", "error / persistence", "difference", "error", "persistence", "clips", "episodes"]
+    table = MetricsTable(f"{title} (95 % interval over episodes)", columns)
     for one in results:
-        moved = "not measured" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
-        cells = {
-            "difference": str(one.difference or "reference"),
-            "error": f"{one.error:.4f}",
-            "persistence": f"{one.persistence:.4f}",
-            "moves by": moved,
-            "clips (episodes)": f"{one.clips} ({one.episodes})",
-        }
-        table.add_row(f"{one.name}{' <' * (one is best)}", str(one.ratio), *(cells[column] for column in columns))
+        difference = "" if one.difference is None else str(one.difference)
+        numbers = (f"{one.error:.4f}", f"{one.persistence:.4f}", f"{one.clips}", f"{one.episodes}")
+        table.add_row(f"{one.name}{' <' * (one is best)}", str(one.ratio), difference, *numbers)
     return table
