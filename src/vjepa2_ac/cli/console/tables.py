@@ -159,10 +159,10 @@ def motion_table(steps: Sequence[StepSizes]) -> Table:
 
 def variants_table(title: str, results: Sequence[VariantResult], best: VariantResult | None = None) -> Table:
     """Return the table of `data check --model` and of `data calibrate`: a row for each variant of the same clips."""
-    columns = ["variant", "error / persistence", "difference", "error", "persistence", "clips", "episodes"]
+    columns = ["variant", "error / persistence", "difference", "error", "persistence", "episodes"]
     table = MetricsTable(f"{title} (95 % interval over episodes)", columns)
     for one in results:
         difference = "" if one.difference is None else str(one.difference)
-        numbers = (f"{one.error:.4f}", f"{one.persistence:.4f}", f"{one.clips}", f"{one.episodes}")
+        numbers = (f"{one.error:.4f}", f"{one.persistence:.4f}", f"{one.episodes}")
         table.add_row(f"{one.name}{' <' * (one is best)}", str(one.ratio), difference, *numbers)
     return table
