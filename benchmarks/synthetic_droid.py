@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vjepa2_ac.media.images import encode_jpeg
-from vjepa2_ac.simulation.droid_writer import CAMERAS, DroidCommands, DroidEpisode, DroidMeasurements
+from vjepa2_ac.simulation.droid_writer import CAMERAS, DroidEpisode
 
 
 def draw_episodes(count: int = 12, steps: int = 290) -> Iterator[DroidEpisode]:
@@ -16,15 +16,17 @@ def draw_episodes(count: int = 12, steps: int = 290) -> Iterator[DroidEpisode]:
     pictures = [encode_jpeg(draw_picture(generator), quality=quality) for quality in range(78, 94) for _ in range(4)]
     sizes = sorted(len(picture) for picture in pictures)
     print(f"JPEGs of {sizes[0] / 1e3:.0f} to {sizes[-1] / 1e3:.0f} KB, {count} episodes of {steps} steps, 3 cameras")
-    pose, gripper, joints = np.zeros((steps, 6)), np.zeros((steps, 1)), np.zeros((steps, 7))
+    widths = {"cartesian": 6, "gripper": 1, "joint": 7}
+    arrays = {"action": np.zeros((steps, 7))}
+    for name, width in widths.items():
+        for feature in (f"action_dict/{name}_position", f"action_dict/{name}_velocity", f"observation/{name}_position"):
+            arrays[feature] = np.zeros((steps, width))
     for number in range(count):
         folder = f"/data/success/episode_{number}"
         yield DroidEpisode(
             file_path=f"{folder}/trajectory.h5",
             recording_folderpath=f"{folder}/recordings",
-            action=joints,
-            action_dict=DroidCommands(pose, pose, gripper, gripper, joints, joints),
-            observation=DroidMeasurements(pose, gripper, joints),
+            arrays=arrays,
             images={
                 camera: [pictures[place] for place in generator.integers(0, len(pictures), steps)] for camera in CAMERAS
             },

@@ -203,9 +203,9 @@ def droid_with_rests(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number in range(16):
         one = synthetic_episode(number, steps=12 + number, size=(36, 64), success=number % 3 != 2)
         still = slice(4 + number % 3, 9 + number // 4)
-        poses = one.observation.cartesian_position
-        poses[still] = poses[still.start]
-        one.observation.gripper_position[still] = one.observation.gripper_position[still.start]
+        for name in ("cartesian", "gripper"):
+            positions = one.arrays[f"observation/{name}_position"]
+            positions[still] = positions[still.start]
         drawn.append(one)
     return write_droid_rlds(tmp_path_factory.mktemp("droid") / "1.0.0", drawn, shards=2)
 

@@ -11,7 +11,6 @@ from vjepa2_ac.spaces import matrices_from_euler
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from vjepa2_ac.simulation.arm import ContactArm, SimulatedArm
-from vjepa2_ac.simulation.rollout import put
 from vjepa2_ac.simulation.tasks import arm_for
 
 
@@ -73,15 +72,6 @@ def test_a_grasped_block_is_lifted_held_and_let_go(arm: ContactArm) -> None:
     assert arm.block[2] < 0.05
 
 
-def test_only_tasks_with_a_block_have_one_and_only_place_has_a_mark_which_has_to_be_put_somewhere() -> None:
+def test_only_tasks_with_a_block_have_one() -> None:
     for task in ("reach", "push", "pick"):
-        other = arm_for(task, DOMAIN_A, size=(18, 32))
-        assert other.mark is None
-        assert (other.block is None) == (task == "reach")
-        with pytest.raises(ValueError, match="mark"):
-            put(other, other.state, None, np.array([0.5, 0.0]))
-    with pytest.raises(ValueError, match="neither a block nor a mark"):
-        put(arm_for("reach", DOMAIN_A), other.state, np.zeros(4))
-    marked = arm_for("place", DOMAIN_A, size=(18, 32))
-    with pytest.raises(ValueError, match=r"give problem\.mark"):
-        put(marked, marked.state, None)
+        assert (arm_for(task, DOMAIN_A, size=(18, 32)).block is None) == (task == "reach")

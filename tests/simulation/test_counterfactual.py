@@ -97,8 +97,6 @@ def test_the_start_is_the_recorded_one_and_no_outcome_depends_on_another(start: 
     assert first.frames.shape == (2, 180, 320, 3)
     np.testing.assert_array_equal(first.frames, again.frames)
     np.testing.assert_array_equal(first.states, again.states)
-    if first.blocks is not None:
-        np.testing.assert_array_equal(first.blocks, again.blocks)
 
 
 def test_other_data_are_refused(recorded, droid: Path) -> None:
@@ -131,9 +129,9 @@ def test_a_recording_that_shows_something_else_is_refused(recorded, tmp_path: Pa
     with pytest.raises(InputError, match=r"control step 4: .*the state differs by up to 0\.001"):
         resimulate(recorded("A"), moved, START)
     values = json.loads((recorded("A") / SIMULATION_FILE).read_text())
-    values |= {"domain": values["domain"] | {"lag_s": 0.2}, "version": "0.0.1"}
+    values["domain"]["lag_s"] = 0.2
     (tmp_path / SIMULATION_FILE).write_text(json.dumps(values))
-    with pytest.raises(InputError, match=r"the state differs.*recorded with vjepa2-ac 0\.0\.1, here"):
+    with pytest.raises(InputError, match=r"the state differs.*simulation\.json names"):
         resimulate(tmp_path, episode, START)
 
 

@@ -9,13 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.media.images import encode_jpeg
-from vjepa2_ac.simulation.droid_writer import (
-    CAMERAS,
-    DroidCommands,
-    DroidEpisode,
-    DroidMeasurements,
-    write_droid_rlds,
-)
+from vjepa2_ac.simulation.droid_writer import CAMERAS, DroidEpisode, write_droid_rlds
 
 
 def synthetic_states(steps: int, *, seed: int = 0) -> Float[np.ndarray, "steps 7"]:
@@ -60,24 +54,30 @@ def synthetic_episode(
     return DroidEpisode(
         file_path=f"{folder}/trajectory.h5",
         recording_folderpath=f"{folder}/recordings/MP4",
-        action=target,
-        action_dict=DroidCommands(
-            cartesian_position=target[:, :6],
-            cartesian_velocity=(target - measured)[:, :6],
-            gripper_position=target[:, 6:],
-            gripper_velocity=(target - measured)[:, 6:],
-            joint_position=joints,
-            joint_velocity=np.gradient(joints, axis=0) if steps > 1 else np.zeros_like(joints),
-        ),
-        observation=DroidMeasurements(
-            cartesian_position=measured[:, :6], gripper_position=measured[:, 6:], joint_position=joints
-        ),
+        arrays={
+            "action": target,
+            "action_dict/cartesian_position": target[:, :6],
+            "action_dict/cartesian_velocity": (target - measured)[:, :6],
+            "action_dict/gripper_position": target[:, 6:],
+            "action_dict/gripper_velocity": (target - measured)[:, 6:],
+            "action_dict/joint_position": joints,
+            "action_dict/joint_velocity": np.gradient(joints, axis=0) if steps > 1 else np.zeros_like(joints),
+            "observation/cartesian_position": measured[:, :6],
+            "observation/gripper_position": measured[:, 6:],
+            "observation/joint_position": joints,
+        },
         images={
             name: [encode_jpeg(draw_frame(state, size=size, camera=camera)) for state in measured]
             for camera, name in enumerate(CAMERAS)
         },
         language_instruction=f"move to place {number}",
     )
+
+
+def measured_states(episode: DroidEpisode) -> Float[np.ndarray, "steps 7"]:
+    """Return the measured poses and closedness of an episode."""
+    measured = [episode.arrays[f"observation/{name}_position"] for name in ("cartesian", "gripper")]
+    return np.concatenate(measured, axis=1)
 
 
 def write_synthetic_droid(

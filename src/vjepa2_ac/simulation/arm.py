@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -79,19 +80,8 @@ class SimulatedArm:
         """Pose of the block; None: there is none."""
         return None
 
-    @property
-    def mark(self) -> Mark | None:
-        """Middle of the mark on the table; None: there is none."""
-        return None
-
     def place(self, block: Block | None, mark: Mark | None) -> None:
-        """Put the block (at a pose at once, at rest) and the mark on the table; None: it stays.
-
-        Raises:
-            ValueError: One is to be put, and there is none.
-        """
-        if block is not None or mark is not None:
-            raise ValueError("neither a block nor a mark can be put: this arm touches nothing")
+        """Put the block (at a pose at once, at rest) and the mark on the table; this arm has neither."""
 
     def set_joints(self, joints: Joints, closedness: float, control_steps: int = 1) -> None:
         """Put the arm at joint angles at once; what circles on the table goes on for so many control steps."""
@@ -119,11 +109,10 @@ class SimulatedArm:
 
     def can_reach(self, state: State) -> bool:
         """Return whether a command to move the flange from here to this pose can be followed."""
-        try:
+        with suppress(OutOfReachError):
             self.joints_for(state)
-        except OutOfReachError:
-            return False
-        return True
+            return True
+        return False
 
     def command(self, target: State, control_steps: int = 1) -> State:
         """Move the flange towards a state for some control steps and return the measured state.
@@ -244,17 +233,8 @@ class ContactArm(SimulatedArm):
         rotation = turn.T @ Rotation.from_quat(place[3:], scalar_first=True).as_matrix()
         return np.append(turn.T @ place[:3], np.arctan2(rotation[1, 0], rotation[0, 0]))
 
-    @property
-    def mark(self) -> Mark | None:
-        """Middle of the mark in the robot base frame, x and y in metres; None: there is none."""
-        return np.asarray(self._data.mocap_pos[0] @ self.domain.base_pose()[:3, :2]) if self._has_mark else None
-
     def place(self, block: Block | None, mark: Mark | None) -> None:
-        """Put the block, upright and at rest, and the mark at once; None: it stays.
-
-        Raises:
-            ValueError: A mark is to be put, and there is none.
-        """
+        """Put the block, upright and at rest, and the mark at once; None: it stays."""
         base = self.domain.base_pose()[:3, :3]
         if block is not None:
             turn = Rotation.from_matrix(base)
@@ -262,8 +242,6 @@ class ContactArm(SimulatedArm):
             self._data.qpos[_BLOCK] = [*turn.apply(block[:3]), *rotation.as_quat(scalar_first=True)]
             self._data.qvel[9:] = 0.0
         if mark is not None:
-            if not self._has_mark:
-                raise ValueError(f"no mark to be put at {mark.tolist()}: this arm has none on its table")
             self._data.mocap_pos[0, :2] = base[:2, :2] @ mark
         self._mujoco.mj_kinematics(self._model, self._data)
 

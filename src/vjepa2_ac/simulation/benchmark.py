@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -100,12 +100,10 @@ class BenchmarkOptions:
         task, domain, steps = self.task, self.world, self.model_steps
         problems = (make_problem(task, domain, self.seed, index) for index in range(self.episodes))
         about = {
-            **{key: value for key, value in asdict(self).items() if key != "films"},
+            **{key: value for key, value in vars(self).items() if key != "films"},
             "domain": domain.name,
             "steps": steps,
             "seconds_per_step": self.stride / CONTROL_RATE_HZ,
-            "success_below_cm": 100 * SUCCESS_M[task],
-            "success_also": ALSO[task],
         }
         return Trials(
             task=task,

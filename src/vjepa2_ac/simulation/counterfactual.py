@@ -42,7 +42,6 @@ class Outcome:
     frames: UInt8[np.ndarray, "time height width 3"]  # through JPEG, as those of the data set
     silhouettes: Bool[np.ndarray, "time height width"]  # which pixels show the arm, or a block
     states: Float[np.ndarray, "time 7"]  # measured
-    blocks: Float[np.ndarray, "time 4"] | None  # x, y, z, rotation about z in the robot base frame; None: no block
     reached: Bool[np.ndarray, " time-1"]  # whether joint angles reach each action's target; else the arm went part way
 
 
@@ -67,19 +66,18 @@ class Resimulation:
         carry_out(arm, self.number, self.spec, until=self.start)
 
         def look() -> tuple[Any, ...]:
-            return arm.image(self.camera), arm.silhouette(self.camera), arm.state, arm.block
+            return arm.image(self.camera), arm.silhouette(self.camera), arm.state
 
         seen, reached = [look()], []
         for action in actions:
             reached.append(send_action(arm, np.asarray(action, dtype=np.float64), stride))
             seen.append(look())
-        images, silhouettes, states, blocks = zip(*seen, strict=True)
+        images, silhouettes, states = zip(*seen, strict=True)
         encoded = [encode_jpeg(image, quality=JPEG_QUALITY) for image in images]
         return Outcome(
             frames=decode_jpegs(encoded, range(len(encoded)), "a simulated frame"),
             silhouettes=np.stack(silhouettes),
             states=np.stack(states),
-            blocks=None if arm.block is None else np.stack(blocks),
             reached=np.array(reached, bool),
         )
 
@@ -112,9 +110,8 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
     off = np.abs(again.under(np.zeros((0, 7)), 1).states[0] - np.asarray(episode.states[start], dtype=np.float64))
     off[3:6] = np.minimum(off[3:6], np.abs(2 * np.pi - off[3:6]))  # -pi and pi are one angle
     if off.max() > _STATE_TOLERANCE:
-        versions = simulation.other_versions
         found = f"simulated again, the state differs by up to {off.max():.2g}"
-        fix = "Record it again with this version" + f"; it was recorded with {versions}" * bool(versions)
+        fix = f"Record it again with these versions of the libraries: {SIMULATION_FILE} names those that recorded it"
         raise InputError(where=f"{where}: control step {start}", found=found, needed="what was recorded", fix=fix)
     return again
 

@@ -29,27 +29,6 @@ _ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "droid"
 
 
 @dataclass(frozen=True)
-class DroidCommands:
-    """The controller's commands at every control step (DROID's `action_dict`)."""
-
-    cartesian_position: Float[np.ndarray, "steps 6"]  # metres, extrinsic xyz Euler angles
-    cartesian_velocity: Float[np.ndarray, "steps 6"]
-    gripper_position: Float[np.ndarray, "steps 1"]  # closedness: 0 open .. 1 closed
-    gripper_velocity: Float[np.ndarray, "steps 1"]
-    joint_position: Float[np.ndarray, "steps 7"]
-    joint_velocity: Float[np.ndarray, "steps 7"]
-
-
-@dataclass(frozen=True)
-class DroidMeasurements:
-    """The robot's measurements at every control step (DROID's `observation`, without images)."""
-
-    cartesian_position: Float[np.ndarray, "steps 6"]  # metres, extrinsic xyz Euler angles
-    gripper_position: Float[np.ndarray, "steps 1"]  # closedness: 0 open .. 1 closed
-    joint_position: Float[np.ndarray, "steps 7"]
-
-
-@dataclass(frozen=True)
 class DroidEpisode:
     """One demonstration as DROID records it.
 
@@ -58,19 +37,9 @@ class DroidEpisode:
 
     file_path: str  # …/success/… or …/failure/…; with the folder it is the episode's identity
     recording_folderpath: str
-    action: Float[np.ndarray, "steps 7"]  # commanded pose and gripper
-    action_dict: DroidCommands
-    observation: DroidMeasurements
+    arrays: Mapping[str, Float[np.ndarray, "steps width"]]  # by feature: `action_dict/joint_position`
     images: Mapping[str, Sequence[bytes]]  # one JPEG per step for each of CAMERAS
     language_instruction: str = ""
-
-    @property
-    def arrays(self) -> dict[str, Float[np.ndarray, "steps width"]]:
-        """Every array, by the name of its feature."""
-        found = {"action": self.action}
-        for group, recorded in (("action_dict", self.action_dict), ("observation", self.observation)):
-            found |= {f"{group}/{name}": array for name, array in vars(recorded).items()}
-        return found
 
 
 def write_droid_rlds(
@@ -144,7 +113,7 @@ def _write_shards(
 
 
 def _features_of(episode: DroidEpisode) -> dict[str, tuple[Kind, Sequence[Any] | np.ndarray]]:
-    steps = len(episode.action)
+    steps = len(episode.arrays["action"])
     first, last = np.eye(1, steps, 0, dtype=int)[0], np.eye(1, steps, steps - 1, dtype=int)[0]
     texts = {"": episode.language_instruction.encode(), "_2": b"", "_3": b""}
     return {

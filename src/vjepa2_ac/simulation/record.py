@@ -26,13 +26,7 @@ from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.process import safe_imports
 from vjepa2_ac.simulation.arm import Look, SimulatedArm
 from vjepa2_ac.simulation.domains import Domain, DomainRanges, load_mujoco, named_domain, sample_domain
-from vjepa2_ac.simulation.droid_writer import (
-    CAMERAS,
-    DroidCommands,
-    DroidEpisode,
-    DroidMeasurements,
-    write_droid_rlds,
-)
+from vjepa2_ac.simulation.droid_writer import CAMERAS, DroidEpisode, write_droid_rlds
 from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
 from vjepa2_ac.simulation.policies import play
 from vjepa2_ac.simulation.tasks import arm_for
@@ -201,29 +195,28 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
     return DroidEpisode(
         file_path=f"{folder}/trajectory.h5",
         recording_folderpath=f"{folder}/recordings/MP4",
-        action=np.concatenate([motion.commanded_poses, motion.commanded_gripper[:, None]], axis=1),
-        action_dict=_commands(motion),
-        observation=DroidMeasurements(
-            cartesian_position=motion.poses, gripper_position=motion.gripper[:, None], joint_position=motion.joints
-        ),
+        arrays=_arrays(motion),
         images={feature: images.get(feature, images[CAMERAS[0]]) for feature in CAMERAS},
         language_instruction=INSTRUCTIONS[spec.task],
     )
 
 
-def _commands(motion: Motion) -> DroidCommands:
-    """Return DROID's `action_dict`; velocities are what the commands ask for, in units per second."""
-    poses = motion.commanded_poses
+def _arrays(motion: Motion) -> dict[str, Float[np.ndarray, "steps width"]]:
+    """Return commands and measurements by DROID's features; velocities are what the commands ask for, per second."""
+    poses, gripper = motion.commanded_poses, motion.commanded_gripper[:, None]
     angles = np.concatenate([poses[:, :3], np.unwrap(poses[:, 3:], axis=0)], axis=1)
-    gripper = motion.commanded_gripper[:, None]
-    return DroidCommands(
-        cartesian_position=poses,
-        cartesian_velocity=_velocity(angles),
-        gripper_position=gripper,
-        gripper_velocity=_velocity(gripper),
-        joint_position=motion.commanded_joints,
-        joint_velocity=_velocity(motion.commanded_joints),
-    )
+    return {
+        "action": np.concatenate([poses, gripper], axis=1),
+        "action_dict/cartesian_position": poses,
+        "action_dict/cartesian_velocity": _velocity(angles),
+        "action_dict/gripper_position": gripper,
+        "action_dict/gripper_velocity": _velocity(gripper),
+        "action_dict/joint_position": motion.commanded_joints,
+        "action_dict/joint_velocity": _velocity(motion.commanded_joints),
+        "observation/cartesian_position": motion.poses,
+        "observation/gripper_position": motion.gripper[:, None],
+        "observation/joint_position": motion.joints,
+    }
 
 
 def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "steps dim"]:
@@ -258,13 +251,6 @@ class RecordedSimulation(RecordingSpec):
         """Return the content of the file: one of its keys `domain` and `ranges` has the world or worlds."""
         values, key = asdict(self), "domain" if isinstance(self.domain, Domain) else "ranges"
         return values | {"domain": None, "ranges": None} | {key: values["domain"]}
-
-    @property
-    def other_versions(self) -> str:
-        """What has another version here than where it was recorded, such as "mujoco 3.5.0, here 3.6.0"."""
-        then = {**self.libraries, _PROGRAM: self.version}
-        here = {name: version(name) for name in (_PROGRAM, *_LIBRARIES)}
-        return "; ".join(f"{name} {then[name]}, here {now}" for name, now in here.items() if then.get(name, now) != now)
 
     def number_of(self, episode_id: str) -> int:
         """Return the number under which an episode was recorded, from its identity.

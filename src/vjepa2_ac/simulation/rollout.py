@@ -253,12 +253,7 @@ def put(arm: SimulatedArm, state: State, block: Block | None, mark: Mark | None 
     """Put arm, block and mark at the start of an episode, and moving objects where they start.
 
     The arm gets there via its rest pose: its redundant joint must not depend on the past.
-
-    Raises:
-        ValueError: There is a mark, and no place for it is given; or a block or a mark is to be put, and there is none.
     """
-    if arm.mark is not None and mark is None:
-        raise ValueError("no place for the mark on the table: give problem.mark")
     arm.reset_clock()
     arm.set_joints(rest_joints(arm.domain), 0.0)
     arm.set_state(state)

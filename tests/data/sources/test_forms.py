@@ -17,7 +17,7 @@ import pytest
 from gcs import Gcs
 from lerobot_sets import STATE, Recorded, write_v21, write_v30
 from recordings import write_raw_droid
-from synthetic import draw_frame, synthetic_episode
+from synthetic import draw_frame, measured_states, synthetic_episode
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import files
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -50,9 +50,8 @@ def forms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_droid_rlds(root / "rlds" / "1.0.0", drawn, shards=2)
     recorded = []
     for number, episode in enumerate(drawn):
-        measured = episode.observation
-        states = np.concatenate([measured.cartesian_position, measured.gripper_position], axis=1).astype(np.float32)
-        velocities = np.asarray(episode.action_dict.joint_velocity, np.float32)
+        states = measured_states(episode).astype(np.float32)
+        velocities = np.asarray(episode.arrays["action_dict/joint_velocity"], np.float32)
         frames = [draw_frame(state, size=SIZE) for state in states]
         recorded.append(
             Recorded(

@@ -150,9 +150,9 @@ def test_an_episode_that_cannot_be_used_is_a_problem_and_no_row(spoiled: Spoil, 
 
 
 def test_where_no_episode_can_be_used_the_first_says_why(tmp_path: Path, droid: Path) -> None:
-    far = dataclasses.replace(synthetic_episode(0).observation, cartesian_position=np.full((40, 6), 7.0))
     drawn = [synthetic_episode(number, steps=40, size=(16, 32)) for number in range(3)]
-    bad = [dataclasses.replace(episode, observation=far) for episode in drawn]
+    far = {"observation/cartesian_position": np.full((40, 6), 7.0)}
+    bad = [dataclasses.replace(episode, arrays={**episode.arrays, **far}) for episode in drawn]
     folder = write_droid_rlds(tmp_path / "some", [drawn[0], *bad[1:]], shards=1)
     table = open_droid(folder).infos()
     assert ([info.id for info in table], len(table.problems)) == ([table.identity(0)], 2)
