@@ -206,7 +206,6 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
     assert "No video: vjepa2-ac evaluate runs/kitchen --decoder FOLDER" in shown
 
 
-@pytest.mark.usefixtures("drawn")
 def test_one_episode_has_no_intervals_and_nothing_is_written_as_nan_even_without_photographs() -> None:
     one = evaluation(episodes=1)
     html = page_of(replace(one, examples=tuple(replace(example, frames=None) for example in one.examples)))

@@ -167,7 +167,7 @@ def test_what_cannot_be_is_one_line(
 
 
 def test_goals_on_the_way_come_from_one_demonstration_of_the_same_problem(model: str, tmp_path: Path) -> None:
-    given = ["simulate", model, "--task", "reach", "--episodes", "2", "--films", "0", *SMALL]
+    given = ["simulate", model, "--task", "reach", "--episodes", "1", "--steps", "4", "--films", "0", *SMALL]
     found = {}
     ways_to_give = {name: ["--sub-goals", name] for name in ("demonstration", "every-step")}
     for name, more in {"single": [], **ways_to_give}.items():
@@ -184,11 +184,11 @@ def test_goals_on_the_way_come_from_one_demonstration_of_the_same_problem(model:
 def test_goals_come_from_the_demonstration_that_looks_like_the_problem(
     model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    record_dataset(tmp_path / "set", RecordingSpec("A", 41, seed=3, task="pick"), episodes=3)
+    record_dataset(tmp_path / "set", RecordingSpec("A", 41, seed=3, task="pick"), episodes=1)
     data = {"path": str(tmp_path / "set"), "frames": 4, "stride": 4, "validation_share": 0.0, "test_share": 0.0}
     config = {"run_dir": str(tmp_path / "run"), "data": data, "model": {"base": model}}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
-    given = ["--task", "pick", "--episodes", "2", "--steps", "2", "--films", "0", "--sub-goals", "alike"]
+    given = ["--task", "pick", "--episodes", "1", "--steps", "1", "--films", "0", "--sub-goals", "alike"]
     where = ["--config", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "out")]
     assert main(["simulate", model, *given, *where, *SMALL]) == 0
     assert metrics(tmp_path / "out")["about"]["sub_goals"] == "alike"
