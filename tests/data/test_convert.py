@@ -201,6 +201,14 @@ def damaged(spoiled: Callable[..., Path]) -> Path:
     return spoiled(spoil)
 
 
+def test_a_broken_episode_stops_the_conversion_and_nothing_is_left(
+    spoiled: Callable[..., Path], tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=r"not a JPEG.*add to data\.exclude"):
+        convert_to_lerobot(config_of(damaged(spoiled), camera=list(CAMERAS)), tmp_path / "out", SILENT)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_broken_episode_is_left_out_where_the_policy_says_so(spoiled: Callable[..., Path], tmp_path: Path) -> None:
     config = config_of(damaged(spoiled), camera=list(CAMERAS), broken_episodes="skip")
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (5, 75)

@@ -287,6 +287,13 @@ def test_the_default_is_to_stop_at_a_clip_that_cannot_be_read() -> None:
         first(broken_set(set(range(300)), broken_episodes="error"), 1)
 
 
+def test_a_validation_of_nothing_but_broken_clips_is_refused() -> None:
+    windows = broken_set({0}, validation_share=0.5).windows("validation")
+    nothing = broken_set(set(windows.episodes.tolist()), validation_share=0.5)
+    with pytest.raises(InputError, match=r"none of the clips can be read; broken episodes: episode \d+"):
+        list(validation_batches(nothing, "validation", clips=1, batch_size=1))
+
+
 def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(spoiled: Callable[..., Path]) -> None:
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][3] = b"GIF89a"

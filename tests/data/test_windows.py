@@ -151,6 +151,18 @@ def test_each_episode_is_in_one_split_and_none_that_has_a_share_is_empty(
         assert found["test"] > 0 or test == 0
 
 
+def test_growing_a_share_moves_episodes_out_of_training_only() -> None:
+    hashes = [number * 2**54 for number in range(1024)]
+    before, after = (
+        {split: in_split(np.array(hashes, np.uint64), settings_of(validation_share=share, test_share=0.05), split)
+         for split in SPLITS}
+        for share in (0.1, 0.2)
+    )  # fmt: skip
+    assert [round(before[split].mean(), 2) for split in SPLITS] == [0.85, 0.1, 0.05]
+    assert np.array_equal(before["test"], after["test"])
+    assert not (before["validation"] & ~after["validation"]).any()
+
+
 def splits_of(source: MemorySource, **knobs: object) -> dict[str, Split]:
     """Return the split of every episode that takes part."""
     dataset = open_in_memory(source, **({"validation_share": 0.02, "test_share": 0.02} | knobs))

@@ -134,10 +134,7 @@ class Dataset:
         groups = None if config.split_by is None else len(np.unique(self.split_hash[taking_part]))
         together = "" if groups is None else f" in {groups} groups (data.split_by)"
         shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
-        three = f"three {'episodes' if groups is None else 'groups'} or more"
-        fix = f"Raise data.{split}_share: above 0, {three} always have one, unless it is broken or in data.exclude"
-        if split == "train":
-            fix = "Lower data.validation_share or data.test_share"
+        fix = "Lower data.validation_share or data.test_share" if split == "train" else f"Raise data.{split}_share"
         if split in held_out_by(self.table, config):
             fix = "Set data.splits: hash, to draw the splits from all episodes"
         found = f"no {split} episodes among {taking_part.sum()}{together} ({shares})"

@@ -85,7 +85,7 @@ def training_loader(
         clips = replace(clips, replayed=_training_clips(replayed, seed), share=Fraction(str(both.share)))
     firsts = first_clips(share, batch_size, start=start_position)
     rows = (list(range(first, first + batch_size)) for first in firsts)
-    micro_batches = _micro_batches(clips, rows, dataset.config.workers, pinned=copies is not None)
+    micro_batches = results_of_workers(clips, rows, dataset.config.workers, pinned=copies is not None)
     return Batches(micro_batches, dataset.broken, copies, replayed.broken if replayed else None)
 
 
@@ -142,7 +142,7 @@ def batches_of(
     rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
     workers = dataset.config.workers if count >= CLIPS_WORTH_WORKERS else 0
     clips = _MicroBatches(dataset, partial(_chosen_clip, dataset, windows))
-    for batch in Batches(_micro_batches(clips, iter(rows), workers), dataset.broken):
+    for batch in Batches(results_of_workers(clips, iter(rows), workers), dataset.broken):
         if batch.starts:
             empty = False
             yield batch
@@ -268,9 +268,3 @@ def prefetch_next(batches: Iterator[Batch]) -> None:
     """Prefetch the next batch if these batches support it: to be called before the host waits for the device."""
     if hasattr(batches, "prefetch_next"):
         batches.prefetch_next()
-
-
-def _micro_batches(
-    clips: _MicroBatches, positions: Iterator[list[int]], workers: int, *, pinned: bool = False
-) -> Generator[Batch | UserError, None, None]:
-    return results_of_workers(clips, positions, workers, pinned=pinned)

@@ -19,6 +19,7 @@ from vjepa2_ac.data.poses import poses_from
 from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.indexed_source import Found, FramesByStep, IndexedSource, Scanned, table_of
 from vjepa2_ac.data.sources.lerobot_meta import (
+    FIX_EPISODE,
     TABLES,
     DatasetInfo,
     EpisodeRow,
@@ -45,7 +46,6 @@ FRAME, TIME = "frame_index", "timestamp"
 _DATA_BYTES = "data_bytes"  # total size of the Parquet files with rows
 _CHECKS = 2  # of episodes while a data set is indexed, and of how frames are chosen: a new number rebuilds all indexes
 
-_FIX = "Copy the file again, or leave the episode out"
 _FIX_VECTORS = "Leave the episode out, or check data.lerobot: state, action"
 
 Content = dict[str, Any]
@@ -265,11 +265,11 @@ def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
     """Check that the rows are those of the episode, complete, in order, at the data set's rate."""
     count = len(rows[EPISODE]) if rows else 0
     if count != length:
-        raise InputError(where=where, found=f"{count} rows", needed=f"{length}, says the data set", fix=_FIX)
+        raise InputError(where=where, found=f"{count} rows", needed=f"{length}, says the data set", fix=FIX_EPISODE)
     order = np.arange(length)
     if FRAME in rows and not np.array_equal(rows[FRAME][:, 0], order):
         found = f"{FRAME} that is not 0 to {length - 1} in order"
-        raise InputError(where=where, found=found, needed="a row for each step", fix=_FIX)
+        raise InputError(where=where, found=found, needed="a row for each step", fix=FIX_EPISODE)
     if TIME in rows and not (wrong := abs(rows[TIME][:, 0] - order / fps)).max() < 0.5 / fps:  # NaN is wrong, too
         step = int(np.argmax(~(wrong < 0.5 / fps)))
         found = f"the {TIME} {rows[TIME][step, 0]:.4g} s"
@@ -282,11 +282,7 @@ def _column(rows: Columns, name: str, info: DatasetInfo, where: str) -> Shaped[n
     if name not in rows:
         raise missing("data.lerobot", "column", name, where, rows)
     column, feature = rows[name], info.features.get(name)
-    found = needed = ""
     if feature is not None and column.shape[1] != feature.width:
-        found, needed = f"{column.shape[1]} numbers a row", f"{feature.width}"
-    elif feature is not None and feature.dtype.startswith("float") and column.dtype.kind != "f":
-        found, needed = f"values of type {column.dtype}", feature.dtype
-    if found:
-        raise InputError(where=f"{where}: {name}", found=found, needed=f"{needed}, says {info.where}", fix=_FIX)
+        found, needed = f"{column.shape[1]} numbers a row", f"{feature.width}, says {info.where}"
+        raise InputError(where=f"{where}: {name}", found=found, needed=needed, fix=FIX_EPISODE)
     return column

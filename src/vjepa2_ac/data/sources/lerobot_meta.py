@@ -113,7 +113,12 @@ class DatasetInfo:
             for name in names:
                 if name not in columns:
                     raise missing(f"data.lerobot.{knob}", "column of numbers", name, self.where, columns)
-        self._require_state(config)
+        columns_of_state = {}
+        for name in fields.state:
+            feature = self.features[name]
+            described = ", ".join(feature.names) if len(feature.names) == feature.width else feature.width
+            columns_of_state[f"{name} [{described}]"] = feature.width
+        require_selection(columns_of_state, fields, "data.lerobot", is_pose=config.states == "pose")
         for camera in config.cameras:
             self.camera_key(fields, camera)
 
@@ -132,14 +137,6 @@ class DatasetInfo:
         if self.features[key].dtype == "video" and self.video_path is None:
             raise InputError(where=self.where, found=f"no video_path, and {key} is a video", needed="one", fix=_FIX)
         return key
-
-    def _require_state(self, config: LeRobotData) -> None:
-        columns = {}
-        for name in config.lerobot.state:
-            feature = self.features[name]
-            described = ", ".join(feature.names) if len(feature.names) == feature.width else feature.width
-            columns[f"{name} [{described}]"] = feature.width
-        require_selection(columns, config.lerobot, "data.lerobot", is_pose=config.states == "pose")
 
 
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:

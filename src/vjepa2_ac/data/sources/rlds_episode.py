@@ -101,8 +101,8 @@ class Record:
             raise InputError(where=str(self._span), found=found, fix=f"{did_you_mean(name, known)}Set data.fields")
         return self.located[name]
 
-    def values(self, name: str, *kinds: Kind, texts: int | None = None) -> Sequence[Any] | np.ndarray:
-        """Return a feature's values; of texts the first so many.
+    def values(self, name: str, *kinds: Kind) -> Sequence[Any] | np.ndarray:
+        """Return a feature's values.
 
         Raises:
             InputError: There is no such feature, it has values of another type or too many, or the file ends within it.
@@ -115,7 +115,7 @@ class Record:
         if len(data) < length:
             raise InputError(where=where, found=f"{len(data)} bytes at {offset}", needed=f"{length} bytes")
         try:
-            found, values = decode_feature(data, texts)
+            found, values = decode_feature(data)
         except NotAnExampleError as error:
             raise InputError(where=where, found=f"not a feature ({error})", needed="an RLDS data set") from None
         if found is not None and found not in kinds:
@@ -142,12 +142,6 @@ def identity_of(record: Record, fields: RldsFields) -> str:
         found = f"empty: {', '.join(fields.identity)}"
         raise InputError(where=record.place, found=found, needed="the identity of the episode", fix=_FIX_IDENTITY)
     return IDENTITY_SEPARATOR.join(parts)
-
-
-def info_of(identity: str, num_steps: int) -> EpisodeInfo:
-    """Return the facts about an episode; its success is known for DROID only, from the path."""
-    success = True if "/success/" in identity else False if "/failure/" in identity else None
-    return EpisodeInfo(id=identity, num_steps=num_steps, success=success)
 
 
 def step_features(config: RldsData) -> tuple[str, ...]:
@@ -185,14 +179,14 @@ def episode_of(record: Record, config: RldsData, info: EpisodeInfo, read_frames:
     """
     require_as_indexed(num_steps_of(record, config), info, where)
     steps, velocity, language = info.num_steps, config.fields.joint_velocity, config.fields.language
-    texts = record.values(language, "bytes_list", texts=1) if language in record.located else None
+    texts = record.values(language, "bytes_list") if language in record.located else None
     return Episode(
         info=info,
         states=states_of(record, config, steps, where),
         read_frames=read_frames,
         control_rate_hz=config.fields.control_rate_hz,
         joint_velocities=_of_every_step(record, velocity, steps, where) if velocity in record.located else None,
-        metadata={} if texts is None else {"language": b"".join(texts).decode(errors="replace")},
+        metadata={} if texts is None else {"language": b"".join(texts[:1]).decode(errors="replace")},
         commands=commands_of(record, config, steps, where),
     )
 
@@ -317,7 +311,9 @@ def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsDa
     except InputError as error:
         return as_problem(error if is_far else _damage_or(error, read, span), name)
     place = dict(zip(_PLACE, (shard, span.number, span.offset, span.length), strict=True))
-    return Scanned(info_of(name, steps), str(span), place, UNREAD if states is None else summary_of(states))
+    success = True if "/success/" in name else False if "/failure/" in name else None  # known for DROID only
+    info = EpisodeInfo(id=name, num_steps=steps, success=success)
+    return Scanned(info, str(span), place, UNREAD if states is None else summary_of(states))
 
 
 def _checked_states(

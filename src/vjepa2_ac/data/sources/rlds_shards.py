@@ -20,7 +20,6 @@ _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 _MOST_NAMES = 5
 _MOST_EPISODES = 100_000  # of a shard; DROID's have some 50
-_MOST_SHARDS = 99_999  # TFDS numbers them with five digits
 _WINDOW_BYTES = 1 << 15  # a read behind a URL costs as much time as so many bytes
 _WINDOWS = 8  # read last: behind the images of one record is the head of the next
 
@@ -52,8 +51,6 @@ def find_shards(folder: str) -> list[Shard]:
     if (form := info.get("fileFormat", "tfrecord")) != "tfrecord":
         raise InputError(where=where, found=f"fileFormat {form}", needed="tfrecord", fix="Convert it with TFDS")
     try:
-        if (num_shards := sum(len(split.get("shardLengths", [])) for split in info["splits"])) > _MOST_SHARDS:
-            raise InputError(where=where, found=f"{num_shards:,} shards", needed=f"{_MOST_SHARDS:,} at most")
         listed = [shard for split in info["splits"] for shard in _listed(split, str(info["name"]))]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         found = f"not a description of a data set ({error!r})"
@@ -61,16 +58,10 @@ def find_shards(folder: str) -> list[Shard]:
     if not listed:
         raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
     names = [name for name, *_ in listed]
-    if len(set(names)) < len(names):
-        needed = "a filepathTemplate that numbers them"
-        raise InputError(where=where, found="shards of one name", needed=needed)
     present = {file.name: file for file in storage.list_files(folder)}
     if missing := [name for name in names if name not in present]:
         found = f"{len(missing)} of {len(names)} shards are missing: {_shorten(missing)}"
-        fix = "Download them"
-        if others := [name for name in present if "tfrecord" in name and name not in names]:
-            found += f". The folder has {_shorten(others)}, which {_INFO} does not list"
-            fix = f"If these are the shards, rename them as {_INFO} lists them, or correct its name and shardLengths"
+        fix = f"Download them, or rename the shards that are there as {_INFO} lists them"
         raise InputError(where=folder, found=found, needed=f"every shard that {_INFO} lists", fix=fix)
     return [
         Shard(storage.join(folder, name), count, present[name].size, present[name].version, split)

@@ -158,12 +158,8 @@ def item_places(read: Read, feature: Place, count: int | None = None) -> list[Pl
     return places
 
 
-def decode_feature(data: bytes, texts: int | None = None) -> tuple[Kind | None, Sequence[Any] | np.ndarray]:
+def decode_feature(data: bytes) -> tuple[Kind | None, Sequence[Any] | np.ndarray]:
     """Return kind and values of one serialised tf.train.Feature: bytes, float32 or integers; None: it has no values.
-
-    Args:
-        data: The feature.
-        texts: How many are wanted, if it has texts; None: all.
 
     Raises:
         NotAnExampleError: The bytes are not a Feature.
@@ -171,7 +167,7 @@ def decode_feature(data: bytes, texts: int | None = None) -> tuple[Kind | None, 
     if not data:
         return None, ()
     if data[0] == _FIRST:
-        places = item_places(lambda offset, length: data[offset : offset + length], (0, len(data)), texts)
+        places = item_places(lambda offset, length: data[offset : offset + length], (0, len(data)))
         return "bytes_list", [data[offset : offset + length] for offset, length in places]
     content = data[_content(data, 0, len(data), _SECOND if data[0] == _SECOND else _THIRD) :]
     packed = content[_content(content, 0, len(content), _FIRST) :] if content else b""
