@@ -23,9 +23,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
+from vjepa2_ac.config.section import Component
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.encoding.batch import encode_batch

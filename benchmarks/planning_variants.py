@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
-from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
+from vjepa2_ac.config.section import Component
 from vjepa2_ac.model.adapter.lora import lora_layers
 from vjepa2_ac.model.checkpoints import to_official
 from vjepa2_ac.model.network.world_model import WorldModel

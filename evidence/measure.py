@@ -17,7 +17,7 @@ from offline import offline_figures
 from prepare import base_model, data_before, data_shifted, encoded, training_episodes
 
 from vjepa2_ac.config import Config, ModelConfig, ValidationConfig
-from vjepa2_ac.config.component import Component
+from vjepa2_ac.config.section import Component
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.evaluation.measure import prediction_errors

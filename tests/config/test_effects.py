@@ -15,9 +15,8 @@ from pydantic import BaseModel
 from copied_sets import WRITERS
 from run_fixtures import TINY
 from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
-from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.loading import changed_keys, config_as_dict, config_as_yaml, parse_config
-from vjepa2_ac.config.section import Affects, Section, mark_of, marks_of, values_that_affect
+from vjepa2_ac.config.section import Affects, Component, Section, mark_of, marks_of, values_that_affect
 from vjepa2_ac.data import idle as idle_ranges
 from vjepa2_ac.data.index import EpisodeInfo, EpisodeTable
 from vjepa2_ac.data.sources.indexed_source import open_source

@@ -7,8 +7,8 @@ from torch._dynamo.utils import counters
 from decisions import STATE
 from tiny_models import tiny_model
 from tracing import tracing
-from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
+from vjepa2_ac.config.section import Component
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network import compilation
 from vjepa2_ac.model.network.world_model import WorldModel

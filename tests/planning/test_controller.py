@@ -6,8 +6,8 @@ import torch
 
 from decisions import STATE, image
 from tiny_models import tiny_model
-from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.section import Component
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel

@@ -11,9 +11,9 @@ from decisions import QUICK, STATE, image
 from run_fixtures import MakeConfig, SilentReporter
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
-from vjepa2_ac.config.component import Component
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
+from vjepa2_ac.config.section import Component
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.planner import Planner

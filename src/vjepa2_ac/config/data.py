@@ -8,10 +8,11 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
-from vjepa2_ac.config.component import Component, ComponentOf
 from vjepa2_ac.config.section import (
     OFF,
     Affects,
+    Component,
+    ComponentOf,
     Count,
     Local,
     NonNegative,

@@ -7,8 +7,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from vjepa2_ac.config.component import Component, ComponentOf
-from vjepa2_ac.config.section import OFF, Local, NonNegative, Positive, PositiveInt, Section, ZeroToOne
+from vjepa2_ac.config.section import (
+    OFF,
+    Component,
+    ComponentOf,
+    Local,
+    NonNegative,
+    Positive,
+    PositiveInt,
+    Section,
+    ZeroToOne,
+)
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.registry import ENERGIES, PLANNERS
 

@@ -1,19 +1,25 @@
-"""Base class of config sections: frozen, strict, every key documented; and what each key affects.
+"""Base class of config sections: frozen, strict, every key documented; what each key affects; and components.
 
 A section has one mark: `Section.affects`, or `Annotated[…, Affects.RUN]` where it is used. A key that differs has its
 own.
+
+A component is given by its name, with options of its own: `planner: icem`, or
+`planner: {name: icem, options: {elites: 20}}`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from enum import Flag, auto
 from functools import cache, reduce
 from operator import or_
 from typing import Annotated, Any, ClassVar, Self, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic_core import core_schema
 
+from vjepa2_ac.registry import Registry
 from vjepa2_ac.storage import places
 
 PositiveInt = Annotated[int, Field(ge=1, le=1_000_000_000)]  # no machine has memory for more of anything
@@ -118,9 +124,9 @@ def values_that_affect(what: Affects, section: BaseModel) -> dict[str, Any]:
 
 
 def _marks(section: type[BaseModel], outer: Affects | None, prefix: str) -> Iterator[tuple[str, Affects]]:
-    for name, field in section.model_fields.items():
-        mark = next((one for one in field.metadata if isinstance(one, Affects)), None)
-        inner = [] if prefix + name == OVERLAY else sections_in(field.annotation)
+    for name, info in section.model_fields.items():
+        mark = next((one for one in info.metadata if isinstance(one, Affects)), None)
+        inner = [] if prefix + name == OVERLAY else sections_in(info.annotation)
         for one in (kind for base in inner for kind in [*getattr(base, "kinds", {}).values()] or [base]):
             marks = (mark, getattr(one, "affects", None), outer)
             yield from _marks(one, next((known for known in marks if known is not None), None), f"{prefix}{name}.")
@@ -136,3 +142,70 @@ def sections_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [section for one in get_args(annotation) for section in sections_in(one)]
+
+
+# ---- components ----
+
+_FORMS = "a name, or {name: NAME, options: {...}}"
+
+
+@dataclass(frozen=True)
+class Component:
+    """The name of a component in its registry, and those of its options that are not the defaults."""
+
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def plain(self) -> str | dict[str, Any]:
+        """Return the component as a config file holds it."""
+        return {"name": self.name, "options": dict(self.options)} if self.options else self.name
+
+
+@dataclass(frozen=True)
+class ComponentOf:
+    """Marks a config key that holds a component, as in `Annotated[Component, ComponentOf(PLANNERS, "cem")]`.
+
+    The options are checked by the `Config` class of the component when the config is read.
+
+    Args:
+        registry: Of the components.
+        usual: The name that is meant where only options are given.
+    """
+
+    registry: Registry
+    usual: str | None = None
+
+    def read(self, value: object) -> Component:
+        """Return the component that a config value means.
+
+        Raises:
+            ValueError: The value has another form, or the registry has no component of this name with these options.
+        """
+        values = value.plain() if isinstance(value, Component) else value
+        values = {"name": values} if isinstance(values, str) else values
+        form = values if isinstance(values, Mapping) else {}
+        name, options = form.get("name", self.usual), form.get("options", {})
+        is_known = bool(form) and form.keys() <= {"name", "options"}
+        if not is_known or not isinstance(name, str) or not isinstance(options, Mapping):
+            raise ValueError(f"{_FORMS} is expected")
+        return Component(name, self.registry.changed_options(self.registry.known(name), options))
+
+    def __get_pydantic_core_schema__(self, _source: Any, _handler: Any) -> core_schema.CoreSchema:
+        """Return the schema by which pydantic reads and writes the key."""
+        plain = core_schema.plain_serializer_function_ser_schema(Component.plain)
+        return core_schema.no_info_plain_validator_function(self.read, serialization=plain)
+
+    def __get_pydantic_json_schema__(self, _schema: Any, _handler: Any) -> dict[str, Any]:
+        """Return the JSON schema: the names, and the options of each component that has some."""
+        names = self.registry.names()
+        with_options = [
+            {
+                "type": "object",
+                "properties": {"name": {"const": name}, "options": section.model_json_schema()},
+                "required": ["options"] if name == self.usual else ["name"],
+                "additionalProperties": False,
+            }
+            for name in names
+            if (section := self.registry.section(name)) is not None
+        ]
+        return {"anyOf": [{"type": "string", **({"enum": names} if names else {})}, *with_options]}

@@ -6,10 +6,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from vjepa2_ac.config.component import Component, ComponentOf
 from vjepa2_ac.config.section import (
     OFF,
     Affects,
+    Component,
+    ComponentOf,
     Count,
     Local,
     LocalOrBuiltin,

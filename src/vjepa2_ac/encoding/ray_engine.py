@@ -9,14 +9,14 @@ import threading
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.distributed import computing_device
-from vjepa2_ac.encoding.encode_dataset import begin_encoding, open_cache, require_shared
+from vjepa2_ac.encoding.encode_dataset import Engine, begin_encoding, open_cache, require_shared
 from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
@@ -30,7 +30,7 @@ _AGAIN = "The same command goes on with what is missing"
 
 
 @contextlib.contextmanager
-def ray_engine(address: str) -> Iterator[RayEngine]:
+def ray_engine(address: str) -> Iterator[Engine]:
     """Connect to a Ray cluster, or start a Ray on this machine, until the context ends.
 
     Args:
@@ -52,7 +52,7 @@ def ray_engine(address: str) -> Iterator[RayEngine]:
         found = f"no Ray cluster that can be used ({error})"
         raise UnreachableError(where=where, found=found, fix="`ray status` on its head node shows it") from None
     try:
-        yield RayEngine(where)
+        yield partial(_encode, where)
     except (ray.exceptions.RayError, ray.data.exceptions.ExecutionTimeoutError) as error:
         raise UnreachableError(where=where, found=f"Ray has given up ({error})", fix=_AGAIN) from error
     finally:
@@ -62,50 +62,46 @@ def ray_engine(address: str) -> Iterator[RayEngine]:
         ray.shutdown()
 
 
-@dataclass(frozen=True)
-class RayEngine:
-    """Encodes on a cluster: an actor on each GPU, or on each CPU core where it has none."""
+def _encode(where: str, config: Config, cache: LatentCache, left: Sequence[FramesToEncode], reporter: Reporter) -> None:
+    """Encode what is left with an actor on each GPU, or on each CPU core where there is none.
 
-    where: str  # for messages
+    An actor that joins late takes part, and one that dies loses nothing.
 
-    def __call__(self, config: Config, cache: LatentCache, left: Sequence[FramesToEncode], reporter: Reporter) -> None:
-        """Encode what is left; an actor that joins late takes part, and one that dies loses nothing.
+    Raises:
+        InputError: As of `encode_share`, from any actor; or there is no GPU and the config requests one; or an actor
+            has other data, or not the folder of the cache.
+    """
+    import ray
 
-        Raises:
-            InputError: As of `encode_share`, from any actor; or there is no GPU and the config asks for one; or an
-                actor sees other data, or not the folder of the cache.
-        """
-        import ray
-
-        devices = ray.cluster_resources()
-        kind = "GPU" if config.training.device != "cpu" and devices.get("GPU") else "CPU"
-        if kind == "CPU" and config.training.device == "cuda":
-            raise InputError(where=f"training.device: cuda, {self.where}", found="a cluster without a GPU")
-        begin_encoding(cache, left, reporter)
-        context, size = ray.data.DataContext.get_current(), max(1, min(_MOST_AT_ONCE, len(left) // _FEWEST_TASKS))
-        context.enable_progress_bars = context.print_on_execution_start = False
-        context.max_consecutive_actor_init_deaths = _MOST_DEATHS
-        logging.getLogger("ray.data").setLevel(logging.ERROR)
-        folder = cache.folder.absolute() if isinstance(cache.folder, Path) else cache.folder
-        tasks = [{"wanted": _Task(left[first : first + size])} for first in range(0, len(left), size)]
-        results = ray.data.from_items(tasks, override_num_blocks=len(tasks)).map(
-            _Actor,
-            fn_constructor_args=(config_as_dict(config), folder, Path.cwd()),
-            compute=ray.data.ActorPoolStrategy(min_size=1, initial_size=max(1, int(devices.get(kind, 1)))),
-            num_cpus=int(kind == "CPU"),
-            num_gpus=int(kind == "GPU"),
-        )
-        progress, done, total = reporter.task("encoding frames", "frames"), 0, frames_in(left)
+    devices = ray.cluster_resources()
+    kind = "GPU" if config.training.device != "cpu" and devices.get("GPU") else "CPU"
+    if kind == "CPU" and config.training.device == "cuda":
+        raise InputError(where=f"training.device: cuda, {where}", found="a cluster without a GPU")
+    begin_encoding(cache, left, reporter)
+    context, size = ray.data.DataContext.get_current(), max(1, min(_MOST_AT_ONCE, len(left) // _FEWEST_TASKS))
+    context.enable_progress_bars = context.print_on_execution_start = False
+    context.max_consecutive_actor_init_deaths = _MOST_DEATHS
+    logging.getLogger("ray.data").setLevel(logging.ERROR)
+    folder = cache.folder.absolute() if isinstance(cache.folder, Path) else cache.folder
+    tasks = [{"wanted": _Task(left[first : first + size])} for first in range(0, len(left), size)]
+    results = ray.data.from_items(tasks, override_num_blocks=len(tasks)).map(
+        _Actor,
+        fn_constructor_args=(config_as_dict(config), folder, Path.cwd()),
+        compute=ray.data.ActorPoolStrategy(min_size=1, initial_size=max(1, int(devices.get(kind, 1)))),
+        num_cpus=int(kind == "CPU"),
+        num_gpus=int(kind == "GPU"),
+    )
+    progress, done, total = reporter.task("encoding frames", "frames"), 0, frames_in(left)
+    progress(done, total)
+    for row in results.iter_rows():
+        result: _Result = row["found"]
+        if result.error is not None:
+            raise result.error
+        for name, reason in result.broken.items():
+            cache.dataset.broken.met(name, reason)
+        done += result.frames
         progress(done, total)
-        for row in results.iter_rows():
-            result: _Result = row["found"]
-            if result.error is not None:
-                raise result.error
-            for name, reason in result.broken.items():
-                cache.dataset.broken.met(name, reason)
-            done += result.frames
-            progress(done, total)
-        require_shared(cache, lambda: not cache.missing())
+    require_shared(cache, lambda: not cache.missing())
 
 
 @dataclass(frozen=True, eq=False)
