@@ -85,7 +85,7 @@ ORDERS: dict[str, list[str]] = {
     "reports": ["metrics_json", "comparison", "figures", "write"],
     "cli": [
         "console",
-        "options next_command",
+        "options",
         "train",
         "data",
         "evaluate explore plan policies closed_loop setup",
@@ -112,7 +112,6 @@ HOMES = {
         "runs/metrics_log.py",
         "training/",
         "encoding/encode_dataset.py",
-        "inspection/stride_choice.py",
         "inspection/variants.py",
     ],
     "av": ["media/"],

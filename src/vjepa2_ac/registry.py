@@ -224,7 +224,7 @@ TRAINING_HOOKS = Registry(
     "hook of training",
     "",  # no entry points
     {
-        "data.stride": "inspection.stride_choice:StrideChoice",
+        "data.stride": "inspection.variants:StrideChoice",
         "validation.decoder": "decoding.imagined_strip:ImaginedStrip",
         "motion": "inspection.motion:warnings_from_index",
         "coverage": "inspection.coverage:coverage_in",

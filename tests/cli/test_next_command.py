@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from vjepa2_ac.cli.evaluate import _next
-from vjepa2_ac.cli.next_command import QUICK_WORDS, option_words, quick_words
-from vjepa2_ac.cli.options import parsed
+from vjepa2_ac.cli.options import QUICK_WORDS, option_words, parsed, quick_words
 from vjepa2_ac.cli.program import _parser
 from vjepa2_ac.config.loading import config_as_yaml, load_config
 from vjepa2_ac.config.planning import PlanningConfig

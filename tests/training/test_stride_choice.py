@@ -25,7 +25,7 @@ def test_a_run_chooses_keeps_and_never_chooses_again(
     assert read_run_config(folder).data.stride == chosen
     assert any("Best: stride" in note for note in reporter.notes)
 
-    monkeypatch.setattr("vjepa2_ac.inspection.stride_choice.calibrate_model", lambda *_: pytest.fail("chosen again"))
+    monkeypatch.setattr("vjepa2_ac.inspection.variants.calibrate_model", lambda *_: pytest.fail("chosen again"))
     more = type(reporter)()
     train(config, more)  # the same config, auto still
     assert not [note for note in more.notes if "Best: stride" in note]

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.cli.console.waiting import Work
-from vjepa2_ac.cli.next_command import option_words
 from vjepa2_ac.errors import InputError, counted, shell_command
 
 if TYPE_CHECKING:
@@ -321,7 +320,7 @@ def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> li
     if verdict.needs or options.sub_goals is not None:  # the verdict names the fix; a server plans without sub-goals
         return []
     if verdict.conclusion == "yes" and (is_evaluated or not command):
-        words = option_words(options, "checkpoint", "config", "goals", "plugin")
+        words = cli.option_words(options, "checkpoint", "config", "goals", "plugin")
         command = shell_command("serve", options.subject, *words, *options.overrides)
     elif command and is_evaluated:
         if any(map(is_of_moved, options.overrides)):  # `data calibrate` needs the base in its place
@@ -334,7 +333,7 @@ def _evaluate_command(options: argparse.Namespace) -> str:
     """Return the command that evaluates what was simulated; empty for what is no run, whose data are not known."""
     from vjepa2_ac.runs.folder import is_of_moved, is_run
 
-    words = [*option_words(options, "checkpoint", "plugin"), *filter(is_of_moved, options.overrides)]
+    words = [*cli.option_words(options, "checkpoint", "plugin"), *filter(is_of_moved, options.overrides)]
     return shell_command("evaluate", options.subject, *words) if is_run(options.subject) else ""
 
 

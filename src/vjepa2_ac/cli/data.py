@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -159,22 +158,21 @@ def _inspect(options: argparse.Namespace) -> None:
     cli.make_folder(options.out)
 
     from vjepa2_ac.cli.console.tables import motion_table
-    from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.sheet import plot_dataset
     from vjepa2_ac.inspection.statistics import RELEASED, at_some_stride, inspect_dataset
-    from vjepa2_ac.reporter import INDEXING
-    from vjepa2_ac.storage import write_atomically
 
     with cli.reporter() as reporter:
-        dataset = at_some_stride(open_dataset(config.data, progress=reporter.task(INDEXING)))
+        dataset = at_some_stride(cli.open_data(config, reporter))
         if config.data.stride == "auto":
             reporter.note(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
         inspection = inspect_dataset(dataset, episodes=options.episodes, progress=reporter.task("reading states"))
         cli.show(*(f"{name:<16}{text}" for name, text in inspection.summary.items()), motion_table(inspection.steps))
         if inspection.has_poses:
             cli.show(f"For comparison: {RELEASED}.")
-        values, sheet = options.out / "inspect.json", options.out / "contact_sheet.png"
-        write_atomically(values, json.dumps(inspection.values, indent=1).encode())
+        values, sheet = (
+            cli.write_json(options.out / "inspect.json", inspection.values),
+            options.out / "contact_sheet.png",
+        )
         image = plot_dataset(inspection, sheet, rows=options.rows, progress=reporter.task("reading frames"))
     cli.show(files=[image, values])
 
@@ -195,13 +193,11 @@ def _calibrate(options: argparse.Namespace) -> int:
     from vjepa2_ac.cli.console.tables import variants_table
     from vjepa2_ac.evaluation.measure import ClipSample
     from vjepa2_ac.inspection.variants import calibrate_config
-    from vjepa2_ac.storage import write_atomically
 
     with cli.reporter() as reporter:
         sample = ClipSample(options.split, options.limit or _CLIPS, options.frames)
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
-    path = options.out / "calibration.json"
-    write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
+    path = cli.write_json(options.out / "calibration.json", calibration.as_dict())
     title = f"One-step error / persistence on {options.split} episodes, {calibration.frames} frames a clip"
     table = variants_table(title, list(calibration.results.values()), calibration.best)
     reasons = [f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()]
@@ -223,13 +219,10 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
     cli.make_folder(options.out)
 
     from vjepa2_ac.inspection.axes import calibrate_axes, plot_axes
-    from vjepa2_ac.storage import write_atomically
-    from vjepa2_ac.storage.structured import json_text
 
     with cli.reporter() as reporter:
         pairs = options.limit or _PAIRS
         fit, content = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
-    write_atomically(options.out / AXES_FILE, json_text(content))
-    files = [options.out / AXES_FILE, plot_axes(fit, options.out / "axes.png")]
+    files = [cli.write_json(options.out / AXES_FILE, content), plot_axes(fit, options.out / "axes.png")]
     cli.show(fit.words(), files=files)
     return int(fit.problem is not None)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.cli.next_command import option_words, quick_words
 from vjepa2_ac.config.model import RANDOM
 from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.process import is_first
@@ -139,10 +138,10 @@ def _next(measured: Evaluated, options: argparse.Namespace) -> list[str]:
         elif summary.plans is None and (simulation := _simulation(about, options)):
             words = simulation
         elif summary.verdicts[2].conclusion == "yes":  # a robot is not recommended without a measured gain
-            words = ["serve", about.subject, *option_words(options, "checkpoint"), *settings]
+            words = ["serve", about.subject, *cli.option_words(options, "checkpoint"), *settings]
         else:
             return []
-    return [f"Next: {shell_command(*words, *option_words(options, 'plugin'))}"]
+    return [f"Next: {shell_command(*words, *cli.option_words(options, 'plugin'))}"]
 
 
 def _simulation(about: About, options: argparse.Namespace) -> list[str]:
@@ -158,9 +157,9 @@ def _simulation(about: About, options: argparse.Namespace) -> list[str]:
         return []
     domain = recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
     config = planning_settings(about.subject, overrides=options.overrides)
-    quick = quick_words(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
+    quick = cli.quick_words(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
     words = ["simulate", about.subject, "--task", recorded.task or "reach", "--domain", domain]
-    return [*words, *option_words(options, "checkpoint"), *options.overrides, *quick]
+    return [*words, *cli.option_words(options, "checkpoint"), *options.overrides, *quick]
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:

@@ -10,6 +10,7 @@ import tempfile
 import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,9 +21,7 @@ from vjepa2_ac.storage.places import BUILTIN
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
-    from vjepa2_ac.data.dataset import Dataset
     from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-    from vjepa2_ac.evaluation.evaluate_run import Models
     from vjepa2_ac.explore.views import Views
     from vjepa2_ac.reporter import Reporter
     from vjepa2_ac.serving.access import Access
@@ -142,8 +141,6 @@ def _views(
     asked = cli.evaluation_options(options, data=data, out=Path())
     config = settle(subject, asked)
 
-    def load(dataset: Dataset, decoder: TrainedDecoder) -> Models:
-        return load_models(subject, config, asked, dataset, decoder)
-
+    load = partial(load_models, subject, config, asked)
     explorer = open_explorer(config, decoder, options.split, load, SimulatedFutures.of, reporter)
     return Views.of(subject, explorer, config)

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.cli.console.progress import ConsoleReporter
     from vjepa2_ac.config import Config
+    from vjepa2_ac.config.planning import PlanningConfig
+    from vjepa2_ac.data.dataset import Dataset
     from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.runs.subject import Subject
@@ -29,6 +31,9 @@ if TYPE_CHECKING:
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 Handler = Callable[[argparse.Namespace], int | None]
 
+QUICK = {"samples": 64, "iterations": 4}  # of `planning`, for a CPU; docs/planning.md says how good this planner is
+QUICK_WORDS = tuple(f"planning.{key}={value}" for key, value in QUICK.items())
+_QUICK_SEQUENCES = 256
 _MOST = 10**9
 _OPTION = re.compile(r"-(?![\d.])")  # but a negative number is a value
 _OVERRIDE = re.compile(r"[a-z_]+(\.\w+)+=")
@@ -303,6 +308,23 @@ def load_planning_session(options: argparse.Namespace) -> Subject:
     return load_to_plan(options.subject, **how)
 
 
+def open_data(config: Config, reporter: ConsoleReporter) -> Dataset:
+    """Open the data set of a config, and show the progress."""
+    from vjepa2_ac.data.dataset import open_dataset
+    from vjepa2_ac.reporter import INDEXING
+
+    return open_dataset(config.data, progress=reporter.task(INDEXING))
+
+
+def write_json(path: Path, values: Any) -> Path:
+    """Write plain values as JSON, atomically; return the file."""
+    from vjepa2_ac.storage import write_atomically
+    from vjepa2_ac.storage.structured import json_text
+
+    write_atomically(path, json_text(values))
+    return path
+
+
 def given_decoder(options: argparse.Namespace) -> TrainedDecoder | None:
     """Load the decoder of `--decoder`, before the model that it is for."""
     from vjepa2_ac.decoding.decoder_folder import load_decoder
@@ -457,3 +479,33 @@ def camera_pose(text: str | None) -> np.ndarray | None:
     extrinsics = as_numbers(text, "--extrinsics")
     EXTRINSICS.require_state(extrinsics, "--extrinsics")
     return extrinsics
+
+
+# ---- commands that a command recommends at its end ----
+
+
+def option_words(options: argparse.Namespace, *names: str) -> list[str]:
+    """Return the words of a command line that give some options their present values.
+
+    Args:
+        options: As their parser returned them.
+        names: The options to include, by their destinations.
+    """
+    words, values = list[str](), vars(options)
+    for action in options.parser._actions:
+        value = values.get(action.dest)
+        if action.dest in names and action.option_strings and value not in (None, action.default):
+            for one in value if isinstance(value, list) else [value]:
+                words += [action.option_strings[-1], str(one)]
+    return words
+
+
+def quick_words(words: Sequence[str], planning: PlanningConfig, *, on_cpu: bool) -> list[str]:
+    """Return the overrides for the quick planner if a search on a CPU would be long; none if `words` set its size."""
+    from vjepa2_ac.config.planning import ELITES
+    from vjepa2_ac.planning.planner import samples_of_iterations
+
+    is_chosen = any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)
+    is_sampled, elites = planning.planner.name != "gradient", planning.planner.options.get("elites", ELITES)
+    is_long = is_sampled and planning.budget_s is None and sum(samples_of_iterations(planning)) > _QUICK_SEQUENCES
+    return [*QUICK_WORDS] if on_cpu and is_long and not is_chosen and elites <= QUICK["samples"] else []

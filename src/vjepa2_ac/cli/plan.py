@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.cli.next_command import QUICK_WORDS, quick_words
 from vjepa2_ac.errors import InputError, counted
 
 if TYPE_CHECKING:
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.planning.goals import SubGoal
 
-_QUICK = " ".join(QUICK_WORDS)
+_QUICK = " ".join(cli.QUICK_WORDS)
 _COLUMNS = 100
 
 
@@ -121,7 +120,7 @@ def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     sequences, steps = counted(sum(samples_of_iterations(config)), "action sequence"), counted(config.horizon, "step")
     text = f"Planning: {sequences} of {steps} in {counted(config.iterations, 'iteration')}"
     text += "" if config.budget_s is None else f", for {config.budget_s:g} s at most"
-    quick = quick_words([], config, on_cpu=on_cpu)
+    quick = cli.quick_words([], config, on_cpu=on_cpu)
     return f"{text}." + f"\nQuick, for a CPU: {_QUICK}" * bool(quick)
 
 

@@ -58,13 +58,9 @@ def _score(options: argparse.Namespace) -> int:
     cli.require_to_plan(options)
 
     from vjepa2_ac.cli.console.progress import MetricsTable
-    from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.data.windows import require_frames
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.policies.score import CHANCE, read_policy_chunks, score_policies
-    from vjepa2_ac.reporter import INDEXING
-    from vjepa2_ac.storage import write_atomically
-    from vjepa2_ac.storage.structured import json_text
 
     policies = [read_policy_chunks(file) for file in options.policies]
     session = cli.load_planning_session(options)
@@ -72,7 +68,7 @@ def _score(options: argparse.Namespace) -> int:
     with cli.reporter() as reporter:
         found = score_policies(
             Controller.of_subject(session, extrinsics=cli.camera_pose(options.extrinsics)),
-            open_dataset(session.config.data, progress=reporter.task(INDEXING)),
+            cli.open_data(session.config, reporter),
             policies,
             form=options.form,
             control_steps=options.control_steps,
@@ -92,8 +88,7 @@ def _score(options: argparse.Namespace) -> int:
     if found.left_out:
         notes.append(f"Left out: {counted(found.left_out, 'frame')} whose episode ends before the goal.")
     about = session.as_dict() | {"policies": [str(file) for file in options.policies], "form": options.form}
-    write_atomically(options.out, json_text(about | found.as_dict()))
-    cli.show(table, *notes, files=[options.out])
+    cli.show(table, *notes, files=[cli.write_json(options.out, about | found.as_dict())])
     return int(found.is_blind)
 
 
@@ -118,25 +113,20 @@ def _monitor(options: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from vjepa2_ac.cli.console.progress import MetricsTable
-    from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.goals.make_goals import number_of_episode
     from vjepa2_ac.policies.monitor import MONITOR, Monitor, calibrate_monitor, watch_episodes
-    from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.figures.planning import MONITOR_IMAGE, most_surprising, plot_watched
-    from vjepa2_ac.storage import write_atomically
-    from vjepa2_ac.storage.structured import json_text
 
     session = cli.load_planning_session(options)
     model, files = session.world_model, []
     with cli.reporter() as reporter:
-        dataset = open_dataset(session.config.data, progress=reporter.task(INDEXING))
-        seen = dataset if data is None else open_dataset(data.data, progress=reporter.task(INDEXING))
+        dataset = cli.open_data(session.config, reporter)
+        seen = dataset if data is None else cli.open_data(data, reporter)
         wanted = [number_of_episode(seen, one) for one in options.episode]
         if options.threshold is None:
             progress = reporter.task("held-out episodes", "episodes")
             monitor = calibrate_monitor(model, dataset, options.false_alarms, progress)
-            write_atomically(folder / MONITOR, json_text(asdict(monitor)))
-            files.append(folder / MONITOR)
+            files.append(cli.write_json(folder / MONITOR, asdict(monitor)))
         else:
             monitor = Monitor.read(
                 options.threshold, model.fingerprints(), tokens=model.num_tokens, where="--threshold"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -39,6 +39,7 @@ from vjepa2_ac.evaluation.measure import (
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
     L1,
+    PERSISTENCE,
     About,
     Clips,
     Evaluation,
@@ -234,11 +235,20 @@ def _examples(
     found = {}
     for batch, frames_of_row in clips.read(list(reasons)):
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
-            predicted = {}
+            true = batch.latents[row].float().cpu()
+            predicted = {PERSISTENCE: true[:1]}
             for contender in contenders:
                 with contender.switched():
                     predicted[contender.name] = prediction(contender.model, batch.clip(row))[0].float().cpu()
-            found[name] = make_example(reasons[name], batch, row, predicted, frames_of_row(row))
+            errors_of = {
+                source: rearrange(
+                    absolute_difference(values, true[1:]).mean(dim=-1),
+                    "horizon (h w) -> horizon h w",
+                    h=math.isqrt(true.shape[1]),
+                ).numpy()
+                for source, values in predicted.items()
+            }
+            found[name] = Example(reasons[name], *name, frames_of_row(row), errors_of)
     return tuple(found[name] for name in reasons if name in found)
 
 
@@ -306,35 +316,3 @@ def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], c
     for why, clip in wanted.items():
         chosen[clip] = f"{chosen[clip]}, {why}" if clip in chosen else why
     return dict(list(chosen.items())[:count])
-
-
-def make_example(
-    why: str,
-    batch: LatentBatch,
-    row: int,
-    predicted: Mapping[str, Float[Tensor, "horizon tokens dim"]],
-    frames: UInt8[np.ndarray, "time height width 3"] | None,
-) -> Example:
-    """Return one clip as an example.
-
-    Args:
-        why: The reason for its choice.
-        batch: The batch that holds it.
-        row: Its row in the batch.
-        predicted: Predictions of each model.
-        frames: Its frames, if there are any.
-    """
-    true = batch.latents[row].float().cpu()
-    grid = math.isqrt(true.shape[1])
-
-    def errors(values: Tensor) -> Float[np.ndarray, "horizon grid grid"]:
-        of_patch = absolute_difference(values, true[1:]).mean(dim=-1)
-        return rearrange(of_patch, "horizon (h w) -> horizon h w", h=grid).numpy()
-
-    return Example(
-        why=why,
-        episode_id=batch.episode_ids[row],
-        start=batch.starts[row],
-        frames=frames,
-        errors={"persistence": errors(true[:1])} | {name: errors(values) for name, values in predicted.items()},
-    )

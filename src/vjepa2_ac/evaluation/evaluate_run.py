@@ -231,6 +231,5 @@ def _about(subject: Subject, config: Config, dataset: Dataset, asked: Evaluation
         seed=config.seed,
         version=__version__,
         time=utc_now(),
-        is_pose=dataset.spaces.action.position is not None,
         is_base=subject.is_base,
     )

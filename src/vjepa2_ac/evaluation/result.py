@@ -80,7 +80,6 @@ class About:
     seed: int
     version: str  # of this package
     time: str  # UTC
-    is_pose: bool = True  # actions are changes of a pose
     is_base: bool = False  # the checkpoint has the weights of the base model
 
 

@@ -22,7 +22,7 @@ from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
-from vjepa2_ac.distributed import make_accelerator
+from vjepa2_ac.distributed import broadcast_object, make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_same_encoder, require_widths
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, EpisodeSource, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError, counted
@@ -367,3 +367,48 @@ def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[
             steps = counted(views[stride].config.clip_steps, "control step")
             reasons[stride] = f"a clip of {steps} fits into 1 episode only"
     return [stride for stride in fitting if stride not in reasons], dict(sorted(reasons.items()))
+
+
+class StrideChoice:
+    """Choose the stride of a run before training, where `data.stride` is auto, among the candidates whose clips fit.
+
+    Args:
+        config: The run.
+
+    Raises:
+        InputError: The run has no base that could choose.
+    """
+
+    def __init__(self, config: Config) -> None:
+        require_learned(config.model)
+        self._config = config
+
+    def __call__(
+        self, world_model: WorldModel, dataset: Dataset, accelerator: Accelerator, reporter: Reporter
+    ) -> Calibration:
+        """Return the calibration of the base, the same in all processes.
+
+        Raises:
+            InputError: No candidate fits, or as `calibrate_model`.
+        """
+        config = self._config
+        reporter.note("data.stride is auto: measuring the model at each candidate stride")
+        fitting, errors = [], []
+        for stride in dataset.config.strides_to_try(dataset.control_rate_hz):
+            view = dataset.with_stride(stride)
+            try:
+                view.windows("train"), view.windows("validation")
+            except InputError as error:
+                errors.append(error)
+                reporter.note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
+            else:
+                fitting.append(stride)
+        if not fitting:
+            raise errors[0]
+        candidates = replace(dataset, config=dataset.config.model_copy(update={"stride_candidates": tuple(fitting)}))
+        sample = ClipSample(clips=config.validation.clips)
+        calibration = calibrate_model(world_model, candidates, config, accelerator, sample)
+        for one in calibration.results.values():
+            reporter.note(f"  {one.name}: error/persistence {one.ratio:.3f}")
+        reporter.note(calibration.verdict())
+        return broadcast_object(accelerator, calibration)
