@@ -28,7 +28,6 @@ def _restored(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for one in (LOSSES, doors.SOURCES):
         for attribute in ("_things", "_origins"):
             monkeypatch.setattr(one, attribute, getattr(one, attribute).copy())
-        monkeypatch.setattr(one, "_distinct", set())
     monkeypatch.setattr(doors, "_registered", doors._registered[:])
     monkeypatch.setattr(doors, "_plugins", set(doors._plugins))
     yield

@@ -41,7 +41,6 @@ class Registry:
         self.kind, self.group = kind, group
         self._things: dict[str, Any] = {name: f"vjepa2_ac.{place}" for name, place in own.items()}
         self._origins: dict[str, str] = {**self._things}  # module:object of what has registered itself
-        self._distinct: set[str] = set()  # names that one package alone has
 
     def register(self, name: str) -> Callable[[_Thing], _Thing]:
         """Return a decorator that adds a function, a class or an object.
@@ -68,14 +67,12 @@ class Registry:
         return list(dict.fromkeys([*self._things, *(one.name for one in installed(self.group))]))
 
     def known(self, name: str) -> str:
-        """Return a name that is registered; installed packages are searched once for each name.
+        """Return a name that is registered.
 
         Raises:
             ValueError: It is not; the message lists the names that are.
             InputError: Several packages have registered it.
         """
-        if name in self._distinct:
-            return name
         if name not in (names := self.names()):
             known = ", ".join(map(repr, names))
             raise ValueError(f"no {self.kind} of this name. {did_you_mean(name, names)}Known are {known}")
@@ -84,7 +81,6 @@ class Registry:
         if len(packages) > 1:
             found = f"registered by {' and by '.join(packages.values())}"
             raise InputError(where=f"{self.kind} {name!r}", found=found, fix="Rename or uninstall all but one")
-        self._distinct.add(name)
         return name
 
     def find(self, name: str) -> Any:

@@ -116,16 +116,10 @@ def decode_images(
         InputError: An image is neither PNG nor JPEG, has more than 8 bits a channel, is too large, or has another size
             than the first.
     """
-    if not any(image.startswith(_PNG) for image in images):
+    if not images[0].startswith(_PNG):
         return decode_jpegs(images, steps, where)
-
-    def decode(image: bytes, step: int) -> UInt8[np.ndarray, "height width 3"]:
-        if image.startswith(_PNG):
-            return decode_image(image, f"{where}: step {step}")
-        (frame,) = decode_jpegs([image], [step], where)
-        return np.asarray(frame)
-
-    return stack_frames(map(decode, images, steps), steps, where)
+    decoded = (decode_image(image, f"{where}: step {step}") for image, step in zip(images, steps, strict=True))
+    return stack_frames(decoded, steps, where)
 
 
 def stack_frames(

@@ -8,7 +8,7 @@ file's display matrix says. A video is written completely or not at all.
 from __future__ import annotations
 
 import re
-from bisect import bisect_left, insort
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -263,21 +263,15 @@ class _Video:
 
         Of two frames equally near it is the earlier one. Times without a frame within the tolerance are left out.
         """
-        nearest: dict[int, int] = {}
-        times: list[int] = []  # of the frames whose packets were read, ascending
-        packets, end = self._packets_before(targets[0]), _START
-        for target in targets:
-            if self._key_frame_before(target) > end > _START:
-                packets, times, end = self._packets_before(target), [], _START
-            while (distance := abs(_nearest(times, target) - target)) and end < target + distance:
-                if (packet := next(packets, None)) is None:
-                    break
-                end = int(packet.dts or 0) + int(packet.duration or 0)  # all frames that follow are shown later
-                if packet.pts is not None and not packet.is_discard:
-                    insort(times, int(packet.pts))
-            if distance <= tolerance:
-                nearest[target] = _nearest(times, target)
-        return nearest
+        times: list[int] = []
+        for packet in self._packets_before(targets[0]):
+            if int(packet.dts or 0) > targets[-1] + tolerance:  # all frames that follow are shown later
+                break
+            if packet.pts is not None and not packet.is_discard:
+                times.append(int(packet.pts))
+        times.sort()
+        nearest = {target: _nearest(times, target) for target in targets}
+        return {target: time for target, time in nearest.items() if abs(time - target) <= tolerance}
 
     def decode(self, times: list[int]) -> dict[int, Frame]:
         """Return the frames that are shown at these ascending times."""

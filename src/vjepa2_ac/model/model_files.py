@@ -6,10 +6,8 @@ Sources: facebookresearch/vjepa2 @ 204698b, src/hub/backbones.py and app/vjepa_2
 
 from __future__ import annotations
 
-import hashlib
 import http.client
 import importlib.resources
-import json
 import math
 import urllib.error
 import urllib.request
@@ -200,26 +198,6 @@ def beyond_tensors(sizes: EncoderSizes, *, heads_are_told: bool) -> dict[str, st
     if heads_are_told and HEADS.get(sizes.width) != sizes.heads:
         found["encoder.heads"] = sizes.heads
     return found
-
-
-def identified(fingerprint: str, beyond: Mapping[str, str | int]) -> str:
-    """Return the fingerprint of an encoder: that of its tensors, with what they do not show.
-
-    Args:
-        fingerprint: Of the tensors.
-        beyond: As `beyond_tensors` gives it; where there is nothing, the fingerprint stays that of the tensors,
-            whatever file they came from.
-    """
-    if not beyond:
-        return fingerprint
-    return hashlib.sha256(json.dumps([fingerprint, dict(beyond)], sort_keys=True).encode()).hexdigest()
-
-
-def described(sizes: EncoderSizes, origin: EncoderOrigin | None) -> str:
-    """Return an encoder in words, for cards."""
-    frame = "" if sizes.family == "v2" else f", each frame as {'a tubelet' if sizes.frame == 'tubelet' else 'an image'}"
-    text = f"V-JEPA {sizes.family[1:]}, {sizes.depth} blocks of {sizes.width}, {sizes.heads} heads{frame}"
-    return text if origin is None else f"{text}; from {origin}"
 
 
 # ---- published checkpoints ----

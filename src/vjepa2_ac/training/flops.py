@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from jaxtyping import Int64
 from torch import nn
 
 from vjepa2_ac.config import Config, ModelSizes
@@ -48,13 +50,13 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
     total = passes.over(frames - 1, keys=range(1, frames), fed_back=False)
     for step in range(2, 1 + config.training.rollout_steps):  # earlier keys and values are cached
         total += passes.over(1, keys=range(step, step + 1), fed_back=True)
-    return ClipFlops(frames * frame_flops(sizes), total.forward, total.backward)
+    return ClipFlops(frames * frame_flops(sizes), *total.tolist())
 
 
 def plan_flops(sizes: ModelSizes, steps: int) -> int:
     """Return the operations of predicting the result of one sequence of actions, without an adapter."""
     passes = _Passes(sizes)
-    return sum(passes.over(1, keys=range(step, step + 1), fed_back=False).forward for step in range(1, 1 + steps))
+    return int(sum(passes.over(1, keys=range(step, step + 1), fed_back=False)[0] for step in range(1, 1 + steps)))
 
 
 def frame_flops(sizes: ModelSizes) -> int:
@@ -66,13 +68,7 @@ def frame_flops(sizes: ModelSizes) -> int:
     return embedding + encoder.depth * (linear + 4 * tokens**2 * width)
 
 
-@dataclass(frozen=True)
-class _Work:
-    forward: int = 0
-    backward: int = 0
-
-    def __add__(self, other: _Work) -> _Work:
-        return _Work(self.forward + other.forward, self.backward + other.backward)
+_Work = Int64[np.ndarray, "2"]  # forward and backward operations
 
 
 class _Passes:
@@ -115,7 +111,7 @@ class _Passes:
                 work += self._linear(name, steps * per_step, into=flowing)
             query, key, value = (flowing or self._changes(name) for name in projections)
             # Forward: scores, values by weights. Backward: of values, of weights, and through them of queries and keys.
-            work += _Work(2 * product, (value + (query or key) + query + key) * product)
+            work += [2 * product, (value + (query or key) + query + key) * product]
             flowing = query or key or value
             for name in (f"{block}.attn.o", f"{block}.mlp.fc1", f"{block}.mlp.fc2"):
                 work += self._linear(name, steps * per_step, into=flowing)
@@ -126,10 +122,10 @@ class _Passes:
         """Return the work of a linear layer with its adapter; `into`: its input needs a gradient."""
         layer = self._layers[name]
         product = 2 * tokens * layer.in_features * layer.out_features
-        work = _Work(product, product * (into + (name in self._whole)))
+        work = np.array([product, product * (into + (name in self._whole))])
         if name in self._ranks:
             first, second = (2 * tokens * self._ranks[name] * side for side in (layer.in_features, layer.out_features))
-            work += _Work(first + second, first * (into + 1) + 2 * second)
+            work += [first + second, first * (into + 1) + 2 * second]
         return work
 
     def _changes(self, name: str) -> bool:

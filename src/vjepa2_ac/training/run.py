@@ -6,12 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
 import torch
 from accelerate import Accelerator
-from jaxtyping import UInt8
 from torch import Tensor, nn
 
 from vjepa2_ac.config import Config
@@ -19,26 +17,11 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader
 from vjepa2_ac.data.streams import copies_for
 from vjepa2_ac.distributed import PRECISIONS
-from vjepa2_ac.episode import Batch, LatentBatch
+from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.training.optim import trained_parameters
-
-
-class ValidationStrip(Protocol):
-    """The hook of `validation.decoder`: it draws what a model predicts of one validation clip."""
-
-    def require_fit(self, world_model: WorldModel, config: Config) -> None:
-        """Refuse a decoder of another encoder or camera."""
-
-    def seen(self, dataset: Dataset, batch: Batch, encoded: LatentBatch) -> None:
-        """Choose a clip among those of a batch of validation clips."""
-
-    def draw(
-        self, world_model: WorldModel, device: torch.device, run: Path, step: int
-    ) -> UInt8[np.ndarray, "height width 3"] | None:
-        """Write the image of a step into the run's folder and return it; None if that fails."""
 
 
 @dataclass
@@ -57,7 +40,7 @@ class Run:
     micro_batches: int  # of an optimizer step, of all processes together
     calibration: Mapping[str, Any] | None = None  # if data.stride was auto and was chosen in this start
     replayed: Dataset | None = None  # the second data set, if there is one
-    strip: ValidationStrip | None = None
+    strip: Any = None  # the hook `validation.decoder`: decoding.imagined_strip.ImaginedStrip
 
     @property
     def folder(self) -> Path:

@@ -17,8 +17,8 @@ from paths import GOLDEN
 from vjepa2_ac.config import EncoderSizes, ModelConfig
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.model.checkpoints import load_base, load_official, to_official
-from vjepa2_ac.model.model_files import beyond_tensors, find_base, identified
-from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
+from vjepa2_ac.model.model_files import beyond_tensors, find_base
+from vjepa2_ac.model.network.world_model import WorldModel
 
 FILES = GOLDEN / "encoders"
 V2, V21 = FILES / "vjepa2_pretrained.pt", FILES / "vjepa2_1_distilled.pt"
@@ -295,9 +295,8 @@ def test_two_encoders_of_the_same_tensors_and_other_latents_are_two() -> None:
     usual = model_of(V21).encoder_fingerprint()
     assert model_of(V21, frame="image").encoder_fingerprint() != usual
     assert model_of(V21, heads=2).encoder_fingerprint() != usual
-    plain = fingerprint(model_of(V21).encoder.state_dict())
     published = EncoderSizes(width=1024, depth=24, heads=16, mlp_ratio=4.0)
-    assert identified(plain, beyond_tensors(published, heads_are_told=True)) == plain, "as of the AC file that holds it"
+    assert not beyond_tensors(published, heads_are_told=True), "as of the AC file that holds it"
     untold = EncoderSizes(width=48, depth=1, heads=3)
     assert not beyond_tensors(untold, heads_are_told=False), "of a model of before"
 

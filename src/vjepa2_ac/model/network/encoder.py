@@ -47,7 +47,12 @@ class Encoder(nn.Module):
             layout = TokenLayout(1, grid, interleaved=True, scaled_to=_GRID_OF_POSITIONS)
             self.vit.level_norms = nn.ModuleList(nn.LayerNorm(width, eps=NORM_EPSILON) for _ in range(_LEVELS - 1))
         self.vit.embeddings.patch_embeddings.proj = patches
-        _share_exact_tables(self.vit, layout)
+        if not hasattr(VJEPA2RopeAttention, "apply_rotary_embeddings"):
+            raise RuntimeError(
+                "this version of transformers rotates queries and keys elsewhere; 5.17 to 5.23 are tested"
+            )
+        for block in self.vit.layer:
+            block.attention = _ExactAttention(self.vit.config, layout)  # the names of the weights stay
         self.vit.layernorm = _PreciseNorm(width, eps=NORM_EPSILON)
         self.requires_grad_(False)
         self.eval()
@@ -70,7 +75,12 @@ class Encoder(nn.Module):
                 f"frames of {frames.shape[-2]} x {frames.shape[-1]} px; this encoder needs {self.image_size} x"
                 f" {self.image_size} px (model.sizes.image_size)"
             )
-        return torch.cat([self._encode(part) for part in torch.split(frames, chunk)])
+        weight, features = next(self.vit.parameters()), list[Tensor]()
+        for part in torch.split(frames.to(weight.dtype), chunk):
+            tubelets = part[:, None].expand(-1, TUBELET, -1, -1, -1)
+            with without_needless_autocast(tubelets, weight):
+                features.append(self.vit(tubelets).last_hidden_state)
+        return torch.cat(features)
 
     def train(self, mode: bool = True) -> Encoder:  # noqa: ARG002  # a frozen encoder has one mode
         """Stay in eval mode, independent of the surrounding model."""
@@ -94,13 +104,6 @@ class Encoder(nn.Module):
         for index, block in enumerate(self.vit.layer):
             for output in (block.attention.proj, block.mlp.fc2):
                 nn.init.trunc_normal_(output.weight, std=output_std(index + 1), generator=generator)
-
-    def _encode(self, frames: Tensor) -> Tensor:
-        weight = next(self.vit.parameters())
-        tubelets = frames.to(weight.dtype)[:, None].expand(-1, TUBELET, -1, -1, -1)
-        with without_needless_autocast(tubelets, weight):
-            features: Tensor = self.vit(tubelets).last_hidden_state
-        return features
 
 
 class _FramePatches(nn.Conv3d):
@@ -149,12 +152,8 @@ class _PatchesByKind(_FramePatches):
     ) -> Float[Tensor, "frames dim 1 rows columns"]:
         """Return the patches of frames: as tubelets of identical frames, or as images."""
         if self.frame == "tubelet":
-            return super().forward(tubelets) + _as_channels(self.video_kind)
-        return self._embedded(tubelets[:, :, 0], self.of_images) + _as_channels(self.image_kind)
-
-
-def _as_channels(vector: Float[Tensor, "1 1 dim"]) -> Float[Tensor, "1 dim 1 1 1"]:
-    return vector.flatten()[None, :, None, None, None]
+            return super().forward(tubelets) + self.video_kind.reshape(1, -1, 1, 1, 1)
+        return self._embedded(tubelets[:, :, 0], self.of_images) + self.image_kind.reshape(1, -1, 1, 1, 1)
 
 
 class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformers has no types
@@ -178,14 +177,6 @@ class _PreciseNorm(nn.LayerNorm):
 
     def forward(self, tokens: Tensor) -> Tensor:
         return layer_norm(tokens.float(), self.normalized_shape, self.weight.float(), self.bias.float(), self.eps)
-
-
-def _share_exact_tables(vit: Any, layout: TokenLayout) -> None:
-    """Replace every layer's attention by one that uses our tables; the names of the weights stay."""
-    if not hasattr(VJEPA2RopeAttention, "apply_rotary_embeddings"):
-        raise RuntimeError("this version of transformers turns queries and keys elsewhere; 5.17 to 5.23 are tested")
-    for block in vit.layer:
-        block.attention = _ExactAttention(vit.config, layout)
 
 
 def _config(sizes: ModelSizes) -> Any:

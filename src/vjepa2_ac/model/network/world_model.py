@@ -25,8 +25,6 @@ from vjepa2_ac.model.model_files import (
     FORMAT,
     EncoderOrigin,
     beyond_tensors,
-    described,
-    identified,
     read_encoder_origin,
     read_sizes,
 )
@@ -223,10 +221,13 @@ class WorldModel(LatentDynamics):
         return rearrange(features, "(batch time) tokens dim -> batch time tokens dim", batch=len(frames))
 
     def encoder_fingerprint(self) -> str:
-        """Return a hash of the encoder: part of the key of cached latents."""
+        """Return a hash of the encoder's tensors and of what they do not show: part of the key of cached latents."""
         if isinstance(self.encoder, AbsentEncoder):
             return self.encoder.fingerprint
-        return identified(fingerprint(self.encoder.state_dict()), self.encoder_beyond_tensors)
+        tensors, beyond = fingerprint(self.encoder.state_dict()), self.encoder_beyond_tensors
+        if not beyond:  # the same for all files with these tensors
+            return tensors
+        return hashlib.sha256(json.dumps([tensors, beyond], sort_keys=True).encode()).hexdigest()
 
     @property
     def encoder_beyond_tensors(self) -> dict[str, str | int]:
@@ -237,7 +238,11 @@ class WorldModel(LatentDynamics):
     @property
     def encoder_in_words(self) -> str:
         """The encoder and where it came from, for cards."""
-        return described(self.sizes.encoder, self.encoder_origin)
+        sizes, frame = self.sizes.encoder, ""
+        if sizes.family != "v2":
+            frame = f", each frame as {'a tubelet' if sizes.frame == 'tubelet' else 'an image'}"
+        origin = f"; from {self.encoder_origin}" if self.encoder_origin else ""
+        return f"V-JEPA {sizes.family[1:]}, {sizes.depth} blocks of {sizes.width}, {sizes.heads} heads{frame}{origin}"
 
     def fingerprints(self) -> Fingerprints:
         """Hash the model, with its adapter separate from its base; for one that was merged, what it was before."""
