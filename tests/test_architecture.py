@@ -55,7 +55,7 @@ ORDERS: dict[str, list[str]] = {
         "about server",
     ],
     "model": [
-        "model_files quiet_imports state_integration distances",
+        "model_files state_integration distances",
         "network",
         "adapter",
         "checkpoints",

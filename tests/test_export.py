@@ -156,14 +156,6 @@ def test_a_trained_weight_that_is_not_finite_is_named(copied, tmp_path: Path, ki
     assert not (tmp_path / "out").exists()
 
 
-def test_plain_peft_loads_what_goes_to_the_hub(trained, base_folder: Path, tmp_path: Path) -> None:
-    run = trained()
-    export_run(run, tmp_path / "hub", "hub")
-    model = WorldModel.from_pretrained(base_folder)
-    model.predictor = peft.PeftModel.from_pretrained(model.predictor, str(tmp_path / "hub"))
-    assert_predicts_as(model, run)
-
-
 def test_the_card_describes_base_data_and_training(
     trained, base_folder: Path, data_folder: Path, tmp_path: Path
 ) -> None:

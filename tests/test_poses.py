@@ -63,16 +63,6 @@ def test_integrating_the_actions_of_a_trajectory_returns_its_states(seed: int, s
         assert_same_pose(pose, expected)
 
 
-@settings(max_examples=30)
-@given(angle=st.floats(-0.2, 0.2), axis=st.sampled_from([3, 5]))
-def test_a_turn_across_pi_is_as_small_as_the_same_turn_elsewhere(angle: float, axis: int) -> None:
-    states = np.zeros((2, 7))
-    states[0, axis] = np.pi - 0.1
-    states[1, axis] = np.angle(np.exp(1j * (states[0, axis] + angle)))
-    assert abs(states).max() <= np.pi
-    np.testing.assert_allclose(actions_from_states(states)[0, axis], angle, atol=1e-9)
-
-
 @pytest.mark.parametrize("library", [np.asarray, torch.from_numpy], ids=["numpy", "torch"])
 def test_euler_angles_are_those_of_scipy(library: Any) -> None:
     angles = np.random.default_rng(0).uniform(-3, 3, (500, 3))
@@ -80,19 +70,6 @@ def test_euler_angles_are_those_of_scipy(library: Any) -> None:
     matrices = matrices_from_euler(library(angles))
     np.testing.assert_allclose(np.asarray(matrices), expected.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(np.asarray(euler_from_matrices(matrices)), expected.as_euler("xyz"), atol=1e-9)
-
-
-def test_moving_robot_and_camera_together_changes_nothing_in_the_cameras_frame() -> None:
-    states, cameras = synthetic_states(10, seed=1), synthetic_states(10, seed=2)[:, :6]
-    shift = np.array([0.1, -0.2, 0.3, 0.4, 0.5, 0.6])
-    turn = matrices_from_euler(shift[3:])
-
-    def move(poses: np.ndarray) -> np.ndarray:
-        position = poses[:, :3] @ turn.T + shift[:3]
-        rotation = euler_from_matrices(turn @ matrices_from_euler(poses[:, 3:6]))
-        return np.concatenate([position, rotation, poses[:, 6:]], axis=1)
-
-    assert_same_pose(states_in_camera_frame(move(states), move(cameras)), states_in_camera_frame(states, cameras))
 
 
 def test_one_state_has_no_action() -> None:

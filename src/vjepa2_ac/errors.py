@@ -2,8 +2,10 @@
 
 import difflib
 import errno
+import gc
 import importlib
 import json
+import logging
 import os
 import re
 import resource
@@ -12,7 +14,8 @@ import shutil
 import stat
 import sys
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
@@ -193,6 +196,27 @@ def require_library(module: str, *, where: str, called: str, extra: str) -> Any:
         return importlib.import_module(module)
     except ImportError:
         raise UnreachableError(where=where, found=f"{called}, is not installed", fix=pip_install(extra)) from None
+
+
+@contextmanager
+def quiet_imports() -> Iterator[None]:
+    """Import transformers and PEFT within this context: some libraries log errors only, and no garbage is collected.
+
+    The messages are about kernels for other devices that cannot be loaded, and about deprecations inside the libraries.
+    The imports create half a million objects that stay, among which a search for garbage takes a third of the time.
+    """
+    loggers = [logging.getLogger(name) for name in ("bitsandbytes", "torchao", "torch.utils._pytree")]
+    levels, collects = [logger.level for logger in loggers], gc.isenabled()
+    gc.disable()
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+        if collects:
+            gc.enable()
 
 
 def _pip() -> str:

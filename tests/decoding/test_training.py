@@ -4,11 +4,8 @@ import math
 import os
 import shutil
 import signal
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -16,19 +13,16 @@ from safetensors.torch import load_file
 from decoders import EncodeSplit
 from killable import KILLED, Nursery
 from run_fixtures import TINY, MakeConfig, SilentReporter, as_yaml
-from vjepa2_ac.cli import main
 from vjepa2_ac.config import DecoderConfig, ModelSizes
-from vjepa2_ac.data.sources.latent_files import LatentFiles
-from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.decoding import training
 from vjepa2_ac.decoding.decoder_folder import CARD, WEIGHTS, load_decoder, read_card
-from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs
+from vjepa2_ac.decoding.frame_pairs import Pairs
 from vjepa2_ac.decoding.network import as_images
 from vjepa2_ac.decoding.training import DecoderSteps, learning_rate_at, train_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import psnr
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.process import EXIT_STATUS, StoppedError
+from vjepa2_ac.process import StoppedError
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 
 FINISHED = {CARD, WEIGHTS, "key.json", "metrics.jsonl", ".lock"}
@@ -54,52 +48,6 @@ def test_it_memorises_four_frames(make_decoder: MakeConfig, encode_split: Encode
     assert psnr(decoder.decode(pairs.latents), as_images(pairs.images)).min() > 30
 
 
-class Shuffled(FramePairs):
-    """Each latent has the image of another frame, always the same one."""
-
-    def read(self, numbers: Sequence[int]) -> Pairs:
-        others = torch.randperm(len(self), generator=torch.Generator().manual_seed(0)).tolist()
-        return replace(super().read(numbers), images=super().read([others[number] for number in numbers]).images)
-
-
-@pytest.fixture
-def _coloured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames whose halves have colours of their own."""
-    read = RldsSource.read
-
-    def reading(source: RldsSource, index: int, *more: object) -> object:
-        def frames(steps: list[int]) -> np.ndarray:
-            colours = [np.random.default_rng([index, step]).integers(0, 256, (1, 2, 3), np.uint8) for step in steps]
-            return np.stack([one.repeat(36, axis=0).repeat(24, axis=1) for one in colours])
-
-        return replace(read(source, index, *more), read_frames=frames)
-
-    monkeypatch.setattr(RldsSource, "read", reading)
-
-
-@pytest.mark.usefixtures("_coloured")
-def test_of_shuffled_pairs_it_learns_the_mean_image_at_best(
-    make_decoder: MakeConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Else held-out figures would come from something that is not in the latents."""
-    knobs = {"frames": 120, "steps": 40, "batch_size": 8}
-
-    def gains(folder: str) -> dict[str, float]:
-        held_out = read_card(train_decoder(make_decoder(folder, knobs, data__validation_share=0.0))).held_out
-        mean = held_out["mean_image"]["psnr_db"]["value"]
-        return {name: held_out[name]["psnr_db"]["value"] - mean for name in ("decoder", "linear")}
-
-    assert min(gains("true").values()) > 3
-    encode = training._encoded
-
-    def shuffled(ready: training.Setup, split: str, *more: object) -> FramePairs:
-        pairs = encode(ready, split, *more)  # type: ignore[arg-type]
-        return Shuffled(pairs.files, pairs.frames, pairs.episode_ids) if split == "train" else pairs
-
-    monkeypatch.setattr(training, "_encoded", shuffled)
-    assert max(gains("shuffled").values()) < 0.3
-
-
 # ---- whatever happens ----------------------------------------------------------------------------------------------
 
 
@@ -121,26 +69,6 @@ def test_a_training_that_was_asked_to_stop_resumes_exactly(
             train_decoder(config)
     assert not (tmp_path / "decoder" / CARD).exists()
     train_decoder(config)
-    assert_same_decoder(whole_decoder, tmp_path / "decoder")
-
-
-@pytest.mark.usefixtures("default_signals")
-def test_a_stop_while_frames_are_encoded_keeps_them_and_has_its_status(
-    make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    write = LatentFiles.write
-
-    def signalled(*values: object, **options: object) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
-        write(*values, **options)  # type: ignore[arg-type]
-
-    config = make_decoder()
-    (tmp_path / "config.yaml").write_text(as_yaml(config))
-    with monkeypatch.context() as patch:
-        patch.setattr(LatentFiles, "write", signalled)
-        assert main(["decoder", str(tmp_path / "config.yaml")]) == EXIT_STATUS
-    assert list((tmp_path / "decoder" / "pairs").rglob("*.safetensors"))
-    assert main(["decoder", str(tmp_path / "config.yaml")]) == 0
     assert_same_decoder(whole_decoder, tmp_path / "decoder")
 
 

@@ -67,17 +67,6 @@ def ms_ssim_of_3(predicted: Tensor, true: Tensor) -> Tensor:
     return ms_ssim(predicted, true, 3)
 
 
-def test_gradients_are_those_of_finite_differences() -> None:
-    predicted, true = pair(1, (48, 48))
-    direction = torch.randn(3, 48, 48, generator=torch.Generator().manual_seed(0))
-    for measure in (psnr, ssim, ms_ssim_of_3):
-        given = predicted.clone().requires_grad_()
-        (gradient,) = torch.autograd.grad(measure(given, true), given)
-        with torch.no_grad():
-            ends = [float(measure(predicted + step * direction, true)) for step in (-1e-3, 1e-3)]
-        assert float((gradient * direction).sum()) == pytest.approx((ends[1] - ends[0]) / 2e-3, rel=2e-2)
-
-
 def test_gradients_are_finite_where_a_factor_is_zero() -> None:
     predicted, true = pair(3, (48, 48))
     given = predicted.clone().requires_grad_()

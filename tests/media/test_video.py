@@ -105,15 +105,6 @@ def test_a_step_has_the_frame_nearest_in_time_whatever_else_is_read(
         np.testing.assert_array_equal(read_frames(path, [steps[first]], where="a", clock=clock), expected[[first]])
 
 
-@pytest.mark.parametrize("b_frames", [0, 3])
-def test_of_two_frames_equally_near_the_earlier_one_is_read(b_frames: int, tmp_path: Path) -> None:
-    path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12, b_frames=b_frames)
-    frames = every_frame(path)
-    for steps in ([0, 1, 2], [1], [2]):
-        read = read_frames(path, steps, where="a", clock=Clock(3.5 / 15, 7.5))
-        np.testing.assert_array_equal(read, frames[[3 + 2 * step for step in steps]])
-
-
 def test_a_frame_half_a_step_away_is_not_the_steps_frame(tmp_path: Path) -> None:
     times = [1024 * frame + 500 * (frame == 20) for frame in range(STEPS)]  # steps of 1024
     path = write_mp4(tmp_path / "a.mp4", FRAMES, times=times)
@@ -187,13 +178,6 @@ def test_a_display_matrix_other_than_a_quarter_turn_is_refused(matrix: tuple[int
     path = with_matrix(write_mp4(tmp_path / "a.mp4", FRAMES), *matrix)
     with pytest.raises(InputError, match="a: a display matrix that is no rotation by 90, 180 or 270 degrees"):
         read_frames(path, [0], where="a")
-
-
-@pytest.mark.parametrize("flags", ["empty_moov+default_base_moof+frag_keyframe", "faststart"])
-def test_any_order_of_the_files_parts_is_read(tmp_path: Path, flags: str) -> None:
-    path = write_mp4(tmp_path / "a.mp4", FRAMES, container={"movflags": flags}, b_frames=2)
-    np.testing.assert_array_equal(read_frames(path, [39, 13], where="a"), every_frame(path)[[39, 13]])
-    assert read_header(path, where="a").num_frames == STEPS
 
 
 def test_only_what_the_asked_frames_need_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

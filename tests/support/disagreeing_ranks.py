@@ -21,7 +21,7 @@ from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.encoding import encode_dataset
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.training import data_sets, loop, outputs, resume, run, validation
+from vjepa2_ac.training import loop, outputs, resume, run, setup, validation
 from vjepa2_ac.training.loop import train
 
 RANK = int(os.environ["RANK"])
@@ -61,7 +61,7 @@ def checkpoint_cannot_be_read() -> None:
 
 def index_cannot_be_made() -> None:
     if RANK == 0:
-        data_sets.open_dataset = mock.Mock(side_effect=InputError(where="data.path", found="no data set"))
+        setup.open_dataset = mock.Mock(side_effect=InputError(where="data.path", found="no data set"))
 
 
 def another_never_comes() -> None:
@@ -99,8 +99,8 @@ def encoding_loses_its_connection() -> None:
 def indexing_takes_longer_than_the_time_out() -> None:
     torch.distributed.init_process_group("gloo", timeout=timedelta(seconds=6))
     if RANK == 0:
-        make = data_sets.open_dataset
-        data_sets.open_dataset = lambda *given, **named: (time.sleep(9), make(*given, **named))[1]
+        make = setup.open_dataset
+        setup.open_dataset = lambda *given, **named: (time.sleep(9), make(*given, **named))[1]
 
 
 def each_meets_another_broken_episode() -> None:

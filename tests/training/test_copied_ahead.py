@@ -3,61 +3,13 @@
 from typing import Any
 
 import pytest
-import torch
 from torch.utils.data import DataLoader
 
 from recording_cuda import RecordingCuda
-from run_fixtures import set_up
 from same_run import assert_same_run
 from vjepa2_ac.data import streams
-from vjepa2_ac.data.loader import Batches, training_loader
 from vjepa2_ac.data.streams import ToDevice
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.run import Run
-from vjepa2_ac.training.step import training_step
-
-COPY = [*["side 1: to pinned memory", "side 1: to device"] * 3]  # frames, states, actions
-USE = ["memory in use by computing"] * 3
-
-
-@pytest.fixture
-def cuda(monkeypatch: pytest.MonkeyPatch) -> RecordingCuda:
-    """A device that records what is enqueued on it, and where the host reads the losses."""
-    cuda = RecordingCuda()
-    backward, tolist = torch.Tensor.backward, torch.Tensor.tolist
-
-    def recorded(tensor: torch.Tensor) -> list[float]:
-        if tensor.shape == (2,):
-            cuda.calls.append("host: waits for the losses")
-        return tolist(tensor)
-
-    monkeypatch.setattr(torch.Tensor, "backward", lambda loss: (cuda.calls.append("backward"), backward(loss))[1])
-    monkeypatch.setattr(torch.Tensor, "tolist", recorded)
-    return cuda
-
-
-def copied(run: Run, cuda: RecordingCuda) -> Batches:
-    """Return the batches of a run, copied to a recording device."""
-    rows = (one for one in training_loader(run.dataset, seed=0, batch_size=2))
-    return Batches(rows, run.dataset.broken, ToDevice(cuda))
-
-
-def micro_batch(event: int) -> list[str]:
-    return [f"computing: waits for event {event}", *USE, "backward"]
-
-
-def test_the_next_batch_is_on_its_way_before_the_host_waits_for_the_losses(make_config, reporter, cuda) -> None:
-    run = set_up(make_config(), reporter)
-    batches = copied(run, cuda)
-    for step in (1, 2):
-        training_step(run, batches, step)
-    event = "side 1: event "
-    assert cuda.calls == [
-        *COPY, event + "1", *micro_batch(1), *COPY, event + "2", *micro_batch(2),
-        *COPY, event + "3", "host: waits for the losses",
-        *micro_batch(3), *COPY, event + "4", *micro_batch(4),
-        *COPY, event + "5", "host: waits for the losses",
-    ]  # fmt: skip
 
 
 @pytest.fixture

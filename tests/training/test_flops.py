@@ -55,9 +55,8 @@ def counted(config: Config, clips: int = 2) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("adapter", ADAPTERS)
-@pytest.mark.parametrize("rollout_steps", [3])
-def test_a_clip_is_what_pytorch_counts(adapter: str, rollout_steps: int) -> None:
-    config = run_config(ADAPTERS[adapter], rollout_steps=rollout_steps)
+def test_a_clip_is_what_pytorch_counts(adapter: str) -> None:
+    config = run_config(ADAPTERS[adapter], rollout_steps=3)
     flops = clip_flops(config, SIZES)
     assert (flops.forward, flops.backward) == counted(config)
 
@@ -86,9 +85,3 @@ def test_a_plan_is_what_pytorch_counts(extrinsics: bool, states: bool) -> None:
     with torch.no_grad(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         model.rollout(latents, actions, actions, camera)
     assert samples * plan_flops(sizes, steps) == counter.get_total_flops()
-
-
-def test_the_papers_decision_has_the_flops_that_were_worked_out_by_hand() -> None:
-    assert 8000 * plan_flops(ModelSizes(), steps=1) == pytest.approx(
-        1.31e15, rel=0.002
-    )  # 1.25 in the weights of blocks

@@ -89,7 +89,7 @@ def test_a_decoder_that_will_not_do_is_told_before_what_is_expensive(
     for check_only in (False, True):
         with pytest.raises(InputError, match=r"validation\.decoder: .*other: the decoder of another encoder"):
             train(make_config(validation__decoder=str(other)), reporter, check_only=check_only)
-    monkeypatch.setattr("vjepa2_ac.training.data_sets.open_dataset", lambda *_, **__: pytest.fail("opens the data"))
+    monkeypatch.setattr("vjepa2_ac.training.setup.open_dataset", lambda *_, **__: pytest.fail("opens the data"))
     with pytest.raises(InputError, match=r"validation\.decoder: nowhere: no decoder\.json"):
         train(make_config(validation__decoder="nowhere"), reporter)
     assert load_decoder(decoder).where == "--decoder"

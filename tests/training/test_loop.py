@@ -16,23 +16,18 @@ from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.runs.folder import read_run_config
-from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training import outputs, validation
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.run import batches_from
 from vjepa2_ac.training.step import training_step
 
 
-@pytest.mark.parametrize("died_at", [3])
-def test_a_run_that_died_and_went_on_equals_the_one_that_did_not(
-    make_config, reporter, tmp_path, whole_run, died_at
-) -> None:
+def test_a_run_that_died_and_went_on_equals_the_one_that_did_not(make_config, reporter, tmp_path, whole_run) -> None:
     config = make_config(run_dir=str(tmp_path / "broken"))
     with pytest.raises(KilledError):
-        train(config, dying_reporter(type(reporter)(), died_at))
+        train(config, dying_reporter(type(reporter)(), 3))
     train(config, reporter)
     assert_same_run(whole_run, tmp_path / "broken")
 
@@ -101,24 +96,6 @@ def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporte
     assert big
     for name, gradient in big.items():
         torch.testing.assert_close(small[name], gradient, rtol=1e-4, atol=1e-7)
-
-
-def test_checkpointing_of_activations_changes_no_gradient(make_config, reporter) -> None:
-    def one_step(checkpointing: bool) -> list[float]:
-        run = set_up(make_config(training__gradient_checkpointing=checkpointing), reporter)
-        figures_of_step = training_step(run, batches_from(run), 1)
-        return [figures_of_step["loss"], figures_of_step["grad_norm"]]
-
-    assert one_step(checkpointing=False) == one_step(checkpointing=True)
-
-
-def test_only_the_adapter_moves(make_config, whole_run) -> None:
-    config = make_config()
-    before = load_base(config.model, seed=config.seed)
-    after = load_subject(whole_run).world_model
-    assert after.encoder_fingerprint() == before.encoder_fingerprint()
-    assert after.predictor_fingerprint() == before.predictor_fingerprint()
-    assert any(value.abs().max() > 0 for key, value in trained_weights(whole_run).items() if "lora_B" in key)
 
 
 def test_training_lowers_the_loss(make_config, reporter) -> None:

@@ -143,14 +143,6 @@ def test_losses_and_gradients_equal_those_of_computing_everything_again(
         assert (one - other).norm() <= 1e-12 * other.norm()  # 2e-14 was measured
 
 
-def test_each_further_prediction_costs_one_step() -> None:
-    model, lengths = trained_model(LORA), list[int]()
-    norm = model.base_predictor.blocks[0].norm1
-    norm.register_forward_hook(lambda _module, _inputs, output: lengths.append(output.shape[1] // 11))
-    prediction_losses(model, clips(), 4)
-    assert lengths == [FRAMES - 1, 1, 1, 1]
-
-
 def test_dropout_draws_the_same_mask_for_teacher_forcing_whatever_follows() -> None:
     model = trained_model(LORA.model_copy(update={"dropout": 0.5}))
     torch.manual_seed(0)

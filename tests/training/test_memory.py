@@ -31,7 +31,7 @@ def bytes_of_moments(**changes: object) -> tuple[int, int]:
         for name, tensor in state.items()
         if isinstance(tensor, torch.Tensor) and name != "step" and not name.startswith("qmap")  # one table for all
     }
-    return estimate_memory(config, sizes).moments, sum(kept.values())
+    return estimate_memory(config, sizes).parts["optimizer state"], sum(kept.values())
 
 
 def test_moments_are_those_of_the_optimizer() -> None:
@@ -62,19 +62,16 @@ def test_a_run_that_fits_needs_no_knob_and_a_large_one_names_them() -> None:
     assert ways_to_fit(config, sizes, 0) is None
 
 
-@pytest.mark.parametrize(("batch", "status", "word"), [(8, 1, "It fits with")])
-def test_doctor_says_whether_it_fits_and_what_of_it_is_estimated(
-    tmp_path, capsys, monkeypatch, batch: int, status: int, word: str
-) -> None:
+def test_doctor_says_whether_it_fits_and_what_of_it_is_estimated(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=64e6))  # of shared memory, as in Docker
     path = tmp_path / "run.yaml"
     path.write_text(json.dumps(USUAL))
-    assert main(["doctor", str(path), f"training.batch_size={batch}"]) == status
+    assert main(["doctor", str(path), "training.batch_size=8"]) == 1
     reported = capsys.readouterr().out
-    assert ("Warning: /dev/shm: 64 MB free" in reported) == (batch == 8)
-    assert word in reported
-    assert reported.startswith("Fits" if status == 0 else "Does not fit"), "the answer comes first"
+    assert "Warning: /dev/shm: 64 MB free" in reported
+    assert "It fits with" in reported
+    assert reported.startswith("Does not fit"), "the answer comes first"
     assert "\nThis machine: not measured; it needs a GPU" in reported
     assert "allowance was not measured" in " ".join(reported.split())
     assert " 0.000 GB" not in reported
@@ -114,8 +111,7 @@ def assert_parameters_are_counted(config: Config, sizes: ModelSizes) -> None:
     assert sorted(counts.trained_tensors) == found
 
 
-@pytest.mark.parametrize("rank", [16])
-def test_parameters_of_the_released_model_are_the_known_ones(rank: int) -> None:
-    counts = count_parameters(run_config({"rank": rank}), ModelSizes())
+def test_parameters_of_the_released_model_are_the_known_ones() -> None:
+    counts = count_parameters(run_config({"rank": 16}), ModelSizes())
     assert counts.encoder == 1_012_173_952
-    assert counts.trained == rank * 442_368
+    assert counts.trained == 16 * 442_368

@@ -17,7 +17,6 @@ from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import extrinsics_for
 from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.training import optim
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import save_checkpoint
 from vjepa2_ac.training.run import Run, batches_from
@@ -78,18 +77,6 @@ def test_a_step_without_a_clip_moves_nothing_and_says_so(make_config, reporter) 
     assert all(torch.equal(old, new) for old, new in zip(before, run.world_model.parameters(), strict=True))
 
 
-def test_bytes_per_clip_are_reported_for_remote_data(make_config, reporter) -> None:
-    run = prepared(make_config, reporter, 2, 2)
-    batches = [
-        replace(batch, bytes_fetched=500)
-        for batch in itertools.islice(training_loader(run.dataset, seed=0, batch_size=2), 2)
-    ]
-    assert "bytes_per_clip" not in training_step(run, iter(batches), 1)
-    data = run.config.data.model_copy(update={"path": "gs://bucket/set"})
-    run.config = run.config.model_copy(update={"data": data})
-    assert training_step(run, iter(batches), 1)["bytes_per_clip"] == 250
-
-
 def test_camera_poses_go_to_the_model_that_wants_them_only(make_config, reporter) -> None:
     run = prepared(make_config, reporter, 2, 1)
     batch = next(training_loader(run.dataset, seed=0, batch_size=2))
@@ -108,13 +95,6 @@ def with_loss_scale(run: Run, scale: float) -> Run:
     return run
 
 
-@pytest.fixture(params=["plain"])
-def adamw(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """AdamW as on a CPU, and as on CUDA: the gradient scaler passes overflows to a fused one."""
-    monkeypatch.setattr(optim, "_are_on_cuda", lambda _: request.param == "fused")
-
-
-@pytest.mark.usefixtures("adamw")
 def test_scaling_losses_by_a_power_of_two_changes_nothing(make_config, reporter) -> None:
     plain, scaled = prepared(make_config, reporter, 2, 2), prepared(make_config, reporter, 2, 2)
     with_loss_scale(scaled, 1024.0)
@@ -128,7 +108,6 @@ def test_scaling_losses_by_a_power_of_two_changes_nothing(make_config, reporter)
     assert all(torch.equal(one, other) for one, other in weights)
 
 
-@pytest.mark.usefixtures("adamw")
 def test_an_overflow_skips_the_step_and_halves_the_loss_scale(make_config, reporter) -> None:
     run = with_loss_scale(prepared(make_config, reporter, 2, 2), 2.0**127)
     batches = training_loader(run.dataset, seed=0, batch_size=2)

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -29,17 +28,6 @@ def test_a_run_chooses_keeps_and_never_chooses_again(
     more = type(reporter)()
     train(config, more)  # the same config, auto still
     assert not [note for note in more.notes if "Best: stride" in note]
-
-
-def test_the_run_equals_one_with_a_given_stride(make_config: Make, reporter: Any, tmp_path: Path) -> None:
-    same: dict[str, Any] = {"data__stride_candidates": [2], "training__steps": 2}
-    chosen = train(make_config(run_dir=str(tmp_path / "a"), data__stride="auto", **same), reporter)
-    reported = train(make_config(run_dir=str(tmp_path / "b"), data__stride=2, **same), reporter)
-    losses = [
-        [json.loads(line).get("loss") for line in (folder / "metrics.jsonl").read_text().splitlines()]
-        for folder in (chosen, reported)
-    ]
-    assert losses[0] == losses[1]
 
 
 def test_only_a_stride_at_which_the_runs_own_clips_fit_is_chosen(make_config: Make, reporter: Any) -> None:

@@ -1,7 +1,6 @@
 """A predictor without states, end to end: trained, resumed, evaluated, exported and planned with."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,7 @@ import torch
 
 from run_fixtures import TINY
 from same_run import metrics
-from vector_sets import write_vectors
-from vjepa2_ac.config import Config, LimitsConfig, ModelConfig, ModelSizes, PlanningConfig
+from vjepa2_ac.config import Config, ModelConfig, ModelSizes, PlanningConfig
 from vjepa2_ac.episode import STATE_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
@@ -40,21 +38,6 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def start_of(kind: str, base: Path) -> dict[str, Any]:
-    """Return the knobs of a run of an adapter on a base, or from scratch."""
-    if kind == "lora":
-        return {"model__base": str(base), "adapter__modules_to_save": ["action_encoder"]}
-    return {"model__base": "random", "model__sizes": SIZES, "adapter__kind": "none"}
-
-
-def with_states(base: Path, width: int) -> WorldModel:
-    """Return a model of the same encoder that takes states of a width."""
-    predictor = {**TINY["predictor"], "state_dim": width}  # type: ignore[dict-item]
-    model = WorldModel.random(ModelSizes.model_validate({**TINY, "predictor": predictor}), seed=4)
-    model.encoder = WorldModel.from_pretrained(base).encoder
-    return model
-
-
 def image(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (36, 64, 3), dtype=np.uint8)
 
@@ -73,9 +56,8 @@ def drive(controller: Controller, state: np.ndarray) -> np.ndarray:
     return np.stack(actions)
 
 
-@pytest.mark.parametrize("kind", ["lora"])
-def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path, kind: str) -> None:
-    folder = train(make_config(**start_of(kind, base)), reporter)
+def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path) -> None:
+    folder = train(make_config(model__base=str(base), adapter__modules_to_save=["action_encoder"]), reporter)
     losses = [row["loss"] for row in metrics(folder) if row["kind"] == "train"]
     assert len(losses) == 6
     assert np.isfinite(losses).all()
@@ -83,7 +65,7 @@ def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_pat
     assert not run.world_model.sizes.predictor.use_states
 
     evaluation = evaluate_subject(str(folder), QUICK)
-    assert list(evaluation.models) == (["base", "adapter"] if kind == "lora" else ["model"])
+    assert list(evaluation.models) == ["base", "adapter"]
 
     assert drive(Controller.of_run(run, SEARCH), STATE).shape == (2, 7)
     merged = export_run(folder, tmp_path / "merged").path
@@ -98,21 +80,3 @@ def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_pat
     drive(Controller.of_subject(planned), STATE)
     with pytest.raises(InputError, match=r"Meta's code has no other.* --to merged"):
         export_run(folder, tmp_path / "official.pt", "official")
-
-
-def test_states_of_any_width_need_no_new_head(
-    make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path
-) -> None:
-    write_vectors(tmp_path / "set", width=11, action_width=7)
-    recorded = {"data__actions": "recorded", "data__join_actions": "sum"}
-    data = {"data__source": "npz", "data__path": str(tmp_path / "set"), "data__states": "vector", **recorded}
-    folder = train(make_config(model__base=str(base), training__steps=2, **data), reporter)
-    assert not any("initialised anew" in note or "state encoder" in note for note in reporter.notes)
-    for width in (11, 7):
-        with_states(base, width).save_pretrained(tmp_path / f"of {width}")
-    asked = replace(QUICK, against=("base", str(tmp_path / "of 11")))
-    assert list(evaluate_subject(str(folder), asked).models) == ["base", "of 11", "adapter"]
-    with pytest.raises(InputError, match=r"states of 11 and actions of 7 numbers\. needed: states of 7"):
-        evaluate_subject(str(folder), replace(QUICK, against=(str(tmp_path / "of 7"),)))
-    planning = SEARCH.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
-    assert drive(Controller.of_run(load_subject(folder), planning), np.zeros(11)).shape == (2, 7)

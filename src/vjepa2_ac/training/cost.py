@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple
 
@@ -50,6 +50,10 @@ _BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
 _SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # of bitsandbytes
 _TUBELET = 2  # frames that the encoder's first layer takes at once
 _LEVELS = 4  # of V-JEPA 2.1, each with a norm
+_CHECKPOINTED = ", checkpointed"
+_STANDING = (  # parts that are allocated all the time
+    "encoder weights", "predictor weights", "trained weights", "optimizer state", "prefetched batch", "CUDA allowance",
+)  # fmt: skip
 _OF_LOSS = {"loss", "rollout_steps"}
 _WITH_EFFECT: Any = {
     "plugins": True, "adapter": True, "model": {"dtype"}, "data": {"frames"}, "validation": {"batch_size"},
@@ -293,60 +297,30 @@ class Parameters:
         return sum(self.trained_tensors)
 
 
-def _part(name: str, about: str) -> Any:
-    return field(metadata={"part": (name, about)})
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class MemoryEstimate:
     """Bytes on the GPU, part by part. `total` is the largest of five moments: they do not occur at once."""
 
     parameters: Parameters
     checkpointing: bool  # as the config requests
-    encoder_weights: int = _part("encoder weights", "frozen, in model.dtype; none where latents are cached")
-    predictor_weights: int = _part("predictor weights", "frozen, in model.dtype; none with full fine-tuning")
-    trained: int = _part("trained weights", "float32")
-    gradients: int = _part("gradients", "float32")
-    moments: int = _part("optimizer state", "two moments of AdamW; 8 bits each with adamw_8bit")
-    arriving: int = _part("prefetched batch", "the next batch, at the model's resolution")
-    latents: int = _part("latents", "of training.batch_size clips, float32")
-    encoding: int = _part("encoder activations", "of model.encode_chunk frames; before the predictor runs")
-    step: StepBytes  # the predictor's
-    validating: int = _part("validation", "clips, keys and values; not during training steps")
-    caching: int = _part("encoding the cache", "the encoder alone, before training")
-
-    @property
-    def parts(self) -> Iterator[tuple[str, int, str]]:
-        """The name of each part, its bytes, and what it is."""
-        for one in fields(self):
-            if "part" in one.metadata:
-                name, about = one.metadata["part"]
-                yield name, getattr(self, one.name), about
-        yield "predictor activations", self.step.stored, "forward, losses, backward; without checkpointing"
-        yield "the same, checkpointed", self.step.checkpointed, "block inputs, and one block recomputed"
-        yield "adapter copies", self.step.casts, "in training.precision"
-        yield "CUDA allowance", ALLOWANCE, "CUDA context, cuBLAS, fragmentation: assumed, not computed"
-
-    @property
-    def standing(self) -> int:
-        """What is allocated all the time."""
-        weights = self.encoder_weights + self.predictor_weights + self.trained
-        return weights + self.moments + self.arriving + ALLOWANCE
+    parts: dict[str, int]  # by name, for people
 
     def total(self, *, checkpointing: bool) -> int:
         """Return the peak with or without gradient checkpointing."""
-        passes = self.step.checkpointed if checkpointing else self.step.stored
-        predicting = self.latents + self.step.casts + passes
-        old_weights = self.trained  # `update_to_weight` needs them on logged steps
-        training = self.gradients + max(self.latents + self.encoding, predicting, old_weights)
-        return max(self.standing + max(training, self.validating), self.caching)
+        parts = self.parts
+        predicting = parts["adapter copies"] + parts[f"predictor activations{_CHECKPOINTED * checkpointing}"]
+        old_weights = parts["trained weights"]  # `update_to_weight` needs them on logged steps
+        computing = parts["latents"] + max(parts["encoder activations"], predicting)
+        training = parts["gradients"] + max(computing, old_weights)
+        standing = sum(parts[name] for name in _STANDING)
+        return max(standing + max(training, parts["validation"]), parts["encoding the cache"])
 
 
 def count_parameters(config: Config, sizes: ModelSizes) -> Parameters:
     """Return how many parameters a model of these sizes has, and how many of them the config trains. No weight is made.
 
     Raises:
-        InputError: A knob of the adapter does not fit the predictor.
+        InputError: A key of the adapter does not fit the predictor.
     """
     every = list(meta_predictor(config, sizes).parameters())
     trained = tuple(one.numel() for one in every if one.requires_grad)
@@ -374,29 +348,32 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
         sizes: Sizes of its model, such as `model.checkpoints.base_sizes` gives.
 
     Raises:
-        InputError: A knob of the adapter does not fit the predictor.
+        InputError: A key of the adapter does not fit the predictor.
     """
     parameters, step = count_parameters(config, sizes), measure_step(config, sizes)
-    number = HALF if config.model.dtype == "bfloat16" else FLOAT32
-    return MemoryEstimate(
-        parameters=parameters,
-        checkpointing=config.training.gradient_checkpointing,
-        encoder_weights=0 if config.data.takes_latents else parameters.encoder * number,
-        predictor_weights=parameters.predictor * number if config.adapter.kind == "lora" else 0,
-        trained=parameters.trained * FLOAT32,
-        gradients=parameters.trained * FLOAT32,
-        moments=sum(_moments(config, elements) for elements in parameters.trained_tensors),
-        arriving=batch_bytes(config, sizes),
-        latents=_latents(config, sizes, config.training.batch_size),
-        encoding=_encoding(config, sizes, config.training.batch_size),
-        step=step,
-        validating=_validating(config, sizes, step),
-        caching=parameters.encoder * number + _caching(config, sizes) if config.data.cache != "off" else 0,
-    )
+    number, trained = HALF if config.model.dtype == "bfloat16" else FLOAT32, parameters.trained * FLOAT32
+    encoder = parameters.encoder * number
+    parts = {
+        "encoder weights": 0 if config.data.takes_latents else encoder,
+        "predictor weights": parameters.predictor * number if config.adapter.kind == "lora" else 0,  # frozen
+        "trained weights": trained,
+        "gradients": trained,
+        "optimizer state": sum(_moments(config, elements) for elements in parameters.trained_tensors),
+        "prefetched batch": batch_bytes(config, sizes),
+        "latents": _latents(config, sizes, config.training.batch_size),
+        "encoder activations": _encoding(config, sizes, config.training.batch_size),  # before the predictor runs
+        "validation": _validating(config, sizes, step),
+        "encoding the cache": 0 if config.data.cache == "off" else encoder + _caching(config, sizes),
+        "predictor activations": step.stored,
+        f"predictor activations{_CHECKPOINTED}": step.checkpointed,
+        "adapter copies": step.casts,
+        "CUDA allowance": ALLOWANCE,
+    }
+    return MemoryEstimate(parameters, config.training.gradient_checkpointing, parts)
 
 
 def ways_to_fit(config: Config, sizes: ModelSizes, available: int) -> list[str] | None:
-    """Return the knobs to change, one after the other, until the run fits; None if all of them do not suffice."""
+    """Return the config keys to change, one after the other, until the run fits; None if all of them do not suffice."""
     turned, total = list[str](), _total(config, sizes)
     for knob, changes in _knobs(config):
         if total <= available:

@@ -116,7 +116,8 @@ class _Passes:
             for name in (f"{block}.attn.o", f"{block}.mlp.fc1", f"{block}.mlp.fc2"):
                 work += self._linear(name, steps * per_step, into=flowing)
                 flowing = flowing or self._changes(name)
-        return work + self._linear("predictor_proj", patches, into=flowing)
+        work += self._linear("predictor_proj", patches, into=flowing)
+        return work
 
     def _linear(self, name: str, tokens: int, *, into: bool) -> _Work:
         """Return the work of a linear layer with its adapter; `into`: its input needs a gradient."""

@@ -153,20 +153,6 @@ def test_a_knob_that_does_not_fit_the_predictor_is_refused(
         add_adapter(model, LORA.model_copy(update=knobs), seed=0)
 
 
-@pytest.mark.parametrize(
-    ("method", "expected"),
-    [
-        ("dora", 4_032 + 2 * (4 * 36 + 72 + 36)),  # a magnitude for each row
-        ("heads", 4_032 + 4 * 2 * (24 + 36) + 2 * (7 * 36 + 36)),  # two projections, two heads with their biases
-        ("patterns", 4_032 + 2 * 2 * (36 + 72) - 2 * 2 * (36 + 36)),
-    ],
-)
-def test_the_report_counts_whatever_is_trained(model: WorldModel, method: str, expected: int) -> None:
-    before = trainable_report(model)
-    add_adapter(model, METHODS[method], seed=0)
-    assert trainable_report(model) == (expected, before.predictor, before.total)
-
-
 @both_types
 @both_kinds
 def test_switched_off_it_is_the_base_and_switched_on_what_it_was(

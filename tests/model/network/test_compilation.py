@@ -1,6 +1,5 @@
 """Compiled blocks: the same results as plain ones, and few compilations, not one per step, layer or length."""
 
-import shutil
 from typing import Any
 
 import pytest
@@ -12,7 +11,6 @@ from tracing import tracing
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network import compilation
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.step import prediction_losses
 
@@ -69,22 +67,3 @@ def test_compiled_steps_are_the_plain_ones_and_nothing_is_compiled_again_after_t
     assert_same(loss_and_gradients(model, batch, compiled=True, rollout=3), expected)
     assert graphs() == 2 * 3
     assert list(model.state_dict()) == names
-
-
-def test_what_a_machine_lacks_to_compile_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("CC", raising=False)
-    monkeypatch.delenv("CXX", raising=False)
-    monkeypatch.setattr(compilation, "has_triton", lambda: True)
-    here = {"gcc", "clang++"}
-    monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}" if name in here else None)
-    assert compilation.missing_for_compilation("cuda") is None
-    assert compilation.missing_for_compilation("cpu") is None
-    monkeypatch.setenv("CXX", "other")
-    assert compilation.missing_for_compilation("cpu") == "no compiler is found (other)"
-    assert compilation.missing_for_compilation("cuda") is None
-    here.clear()
-    assert compilation.missing_for_compilation("cuda") == "no compiler is found (gcc or clang)"
-    here.add("gcc")
-    monkeypatch.setattr(compilation, "has_triton", lambda: False)
-    assert compilation.missing_for_compilation("cuda") == "Triton is not installed"
-    assert compilation.missing_for_compilation("cpu") is not None

@@ -122,17 +122,6 @@ def test_steps_in_parts_give_the_predictions_and_gradients_of_all_at_once(
     assert_same(output_and_gradients(model, in_parts(model, given, parts), given), expected)
 
 
-@pytest.mark.parametrize("adapter", ADAPTERS)
-@pytest.mark.parametrize("checkpointing", [False, True])
-def test_every_kind_of_adapter_lets_gradients_through_the_cache(
-    sizes: ModelSizes, inputs, adapter: str, checkpointing: bool
-) -> None:
-    model, given = adapted(sizes, adapter), arguments(inputs)
-    expected = output_and_gradients(model, model.predict(*given), given)
-    model.set_gradient_checkpointing(checkpointing)
-    assert_same(output_and_gradients(model, in_parts(model, given, (1, 3)), given), expected)
-
-
 def plain_rollout(model: WorldModel, context: Tensor, actions: Tensor, states: Tensor) -> Tensor:
     """Compute everything again for each prediction."""
     latents = context

@@ -88,12 +88,12 @@ def memory_lines(estimate: MemoryEstimate) -> list[str]:
     weights = estimate.parameters
     counts = f"encoder {weights.encoder:,}, predictor {weights.predictor:,}, trained {weights.trained:,}"
     lines = [f"Parameters: {counts}", "Estimated GPU memory, part by part (not all parts are needed at once):"]
-    parts = [part for part in estimate.parts if part[1] >= _LEAST_SHOWN]
-    lines += [f"  {name:<25}{size / _GIGABYTE:8.3f} GB  {about}" for name, size, about in parts]
+    parts = {name: size for name, size in estimate.parts.items() if size >= _LEAST_SHOWN}
+    lines += [f"  {name:<37}{size / _GIGABYTE:8.3f} GB" for name, size in parts.items()]
     for checkpointing, word in ((False, "without"), (True, "with")):
         chosen = "  <- this config" if checkpointing == estimate.checkpointing else ""
         total = estimate.total(checkpointing=checkpointing) / _GIGABYTE
-        lines.append(f"  peak {word + ' checkpointing':<20}{total:8.3f} GB{chosen}")
+        lines.append(f"  peak {word + ' checkpointing':<32}{total:8.3f} GB{chosen}")
     return [*lines, UNTESTED]
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.model import VectorWidth
 from vjepa2_ac.episode import Widths
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, quiet_imports
 from vjepa2_ac.model.adapter.lora import (
     FIX,
     NEEDED,
@@ -27,7 +27,6 @@ from vjepa2_ac.model.adapter.lora import (
     wrap,
 )
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads
-from vjepa2_ac.model.quiet_imports import quiet_imports
 from vjepa2_ac.storage.structured import read_json_object, record_of
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 

@@ -14,10 +14,10 @@ from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.episode import EXTRINSICS_DIM
+from vjepa2_ac.errors import quiet_imports
 from vjepa2_ac.model.network.attention import Attend, AttentionKind, TokenLayout, rotary_tables
 from vjepa2_ac.model.network.blocks import NORM_EPSILON, Block, hidden_width, initialise, normalised
 from vjepa2_ac.model.network.compilation import When
-from vjepa2_ac.model.quiet_imports import quiet_imports
 
 with quiet_imports():
     from transformers import PreTrainedConfig, PreTrainedModel
