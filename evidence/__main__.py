@@ -36,7 +36,6 @@ def main() -> int:
 
 def write(folder: Path) -> None:
     """Write results, tables and plots of all that is measured."""
-    import plots
     import results
     import selection
     import selection_tables
@@ -46,7 +45,7 @@ def write(folder: Path) -> None:
     of_methods = results.read_all(folder / "methods", kept / "methods.json", results.compact, results.name_of)
     results.write_all(kept / "methods.json", of_methods)
     tables.write_tables(of_methods, kept / "methods.md", docs / "evidence.md")
-    plots.draw(of_methods, docs / "evidence.png")
+    tables.draw(of_methods, docs / "evidence.png")
     of_selection = results.read_all(folder / "selection", kept / "selection.json", selection.compact, selection.name_of)
     results.write_all(kept / "selection.json", of_selection)
     selection_tables.write_tables(of_selection, kept / "selection.md", docs / "ranking.png")

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.stats import spearmanr
-from torch import Tensor
 
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.action_use import moves_of, rank_actions
@@ -20,12 +19,14 @@ from vjepa2_ac.spaces import ActionSpace
 MOVES = 32  # clips whose moves are ranked
 
 
+@torch.no_grad()
 def offline_figures(model: WorldModel, space: ActionSpace, held_out: Sequence[LatentBatch]) -> dict[str, float]:
     """Return what is measured on clips of held-out episodes."""
     true, predicted = LatentSums(), LatentSums()
     for batch in held_out:
         true.add(batch.latents[:, 1:], batch.episode_ids)
-        predicted.add(_rollout(model, batch), batch.episode_ids)
+        rolled = model.rollout(batch.latents[:, :1], batch.actions, batch.states[:, :-1])
+        predicted.add(rolled, batch.episode_ids)
     distribution = distribution_of(predicted, true)
     rows = [(batch, row) for batch in held_out for row in range(len(batch.starts))]
     chosen = [rows[place] for place in np.linspace(0, len(rows) - 1, MOVES).astype(int)]
@@ -37,11 +38,6 @@ def offline_figures(model: WorldModel, space: ActionSpace, held_out: Sequence[La
         "spread of latents, distance from 1": abs(distribution.spread[-1].value - 1),
         "latent MMD": distribution.mmd[-1].value,
     }
-
-
-@torch.no_grad()
-def _rollout(model: WorldModel, batch: LatentBatch) -> Tensor:
-    return model.rollout(batch.latents[:, :1], batch.actions, batch.states[:, :-1])
 
 
 def correlations(

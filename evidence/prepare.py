@@ -73,9 +73,8 @@ def prepare_world(folder: Path, task: str, reporter: Reporter = SILENT) -> None:
     """Make what the cells of a world need: demonstrations before and after its change, and a base of those before."""
     for when in ("before", "after"):
         record(folder, task, when)
+        keep_latents(data_of(folder, task, when), BUILTIN)  # all share its encoder
     base = Path(base_model(folder, "one camera", 0, task))
-    keep_latents(data_of(folder, task, "before"), BUILTIN)  # all share its encoder
-    keep_latents(data_of(folder, task, "after"), BUILTIN)
     if not base.exists():
         config = load_config(BASE_CONFIG, [f"run_dir={folder / f'run-{base.name}'}", *OF_A_WORLD])
         start = config.model.with_base(BUILTIN)  # has seen an arm, no such world

@@ -1,4 +1,4 @@
-"""Write the tables of the methods study: all rows into results/methods.md, short tables into docs/evidence.md."""
+"""Write tables and plot of the methods study: all rows into results/methods.md, short tables into docs/evidence.md."""
 
 from __future__ import annotations
 
@@ -30,6 +30,13 @@ OFFLINE = {  # numbers in the short table of correlations
     "Action Score, cm missed": "Action Score of three steps",
     "error over persistence, 3 steps": "error over persistence, 0.8 s ahead",
 }
+COLOURS = {
+    "zero-shot": "#999999",
+    BEST: "#1f77b4",
+    "full": "#2ca02c",
+    "scratch": "#f4a582",
+    "scratch, 3x steps": "#d62728",
+}
 HEAD = (
     "method | demonstrations | error 0.27 / 0.53 / 0.80 s | zero / shuffled actions | reached at the end | distance, cm"
     " | hand arrived | trained | MB | CPU min"
@@ -45,33 +52,17 @@ NOTES = """- *error*: open-loop L1 error over persistence, on held-out episodes 
 
 
 def write_tables(results: Sequence[Figures], path: Path, page: Path) -> None:
-    """Write all rows to a file, and the short tables between their marks in a page.
-
-    Raises:
-        ValueError: The page has no place for them.
-    """
+    """Write all rows to a file, and the short tables between their marks in a page."""
     correlated = correlated_numbers(results)
     parts = (*_rows(results), goal_by_goal(results), f"{NOTES}\n{_made_with(results)}")
     path.write_text("\n\n".join(part for part in parts if part) + "\n")
     texts = {"": summary(results), "trust": summary_of_correlations(correlated), "worlds": summary_of_tasks(results)}
     for part, table in texts.items():
         if table:
-            before, begin, end, after = place_in(page, part)
+            begin, end = (f"<!-- {MARKS[part]}: {word} -->" for word in ("begin", "end"))
+            before, rest = page.read_text().split(begin)
+            _, after = rest.split(end)
             page.write_text(f"{before}{begin}\n{table}\n{end}{after}")
-
-
-def place_in(page: Path, part: str = "") -> tuple[str, str, str, str]:
-    """Return the text before a short table in a page, the marks around it, and the text after it.
-
-    Raises:
-        ValueError: The marks are not there.
-    """
-    marks = [f"<!-- {MARKS[part]}: {end} -->" for end in ("begin", "end")]
-    before, begin, rest = page.read_text().partition(marks[0])
-    _, end, after = rest.partition(marks[1])
-    if not (begin and end):
-        raise ValueError(f"{page} has no {marks[0]} ... {marks[1]}")
-    return before, begin, end, after
 
 
 def summary(results: Sequence[Figures]) -> str:
@@ -237,3 +228,24 @@ def _made_with(results: Sequence[Figures]) -> str:
         for one in results
     )
     return "- Made with " + "; ".join(f"{name} ({count} cells)" for name, count in names.most_common()) + "."
+
+
+def draw(results: Sequence[Figures], path: Path) -> None:
+    """Plot the share of goals reached, a group of bars for each change and base."""
+    from vjepa2_ac.media.figure import new_figure
+
+    figure = new_figure(9.2, 4.6, layout="constrained")
+    axes = figure.subplots()
+    groups, shown = [(shift, base) for shift in SHIFTS for base in BASES], {}
+    for place, (name, colour) in enumerate(COLOURS.items()):
+        for group, (shift, base) in enumerate(groups):
+            if cells := main_cells(results, base, name, shift):
+                share, at = share_reached(cells), group + 0.16 * (place - 2)
+                error = [[share.value - share.low], [share.high - share.value]]
+                shown[name] = axes.bar(at, share.value, 0.15, yerr=error, capsize=2, color=colour)
+    axes.set_xticks(range(len(groups)), [f"{CHANGES[shift]}\nbase of {base}" for shift, base in groups], fontsize=8)
+    axes.set_ylim(0, 1.05)
+    axes.set_ylabel("goals reached: within 5 cm at the end")
+    axes.set_title("Reach after a change of the scene, 20 demonstrations", fontsize=11)
+    axes.legend(shown.values(), shown, fontsize=8, ncols=len(COLOURS), loc="upper center", bbox_to_anchor=(0.5, -0.14))
+    figure.savefig(path, dpi=130)

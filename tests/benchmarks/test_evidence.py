@@ -22,7 +22,7 @@ from vjepa2_ac.simulation.record import RecordingSpec
 pytest.importorskip("mujoco")
 
 MODULES = (
-    "environments", "methods", "prepare", "offline", "results", "measure", "plots", "tables", "selection",
+    "environments", "methods", "prepare", "offline", "results", "measure", "tables", "selection",
     "selection_tables",
 )  # fmt: skip
 
@@ -66,13 +66,6 @@ def test_tables_of_the_page_are_those_of_the_stored_results(evidence: Any, store
     rules = "\n".join(evidence.selection_tables._rules(evidence.selection_tables.by_run(selection)))
     assert rules in (evidence.results.KEPT / "selection.md").read_text()
     assert sum(path.stat().st_size for path in evidence.results.KEPT.glob("*.json")) < 300_000
-
-
-def test_a_page_without_a_place_for_the_table_is_an_error(evidence: Any, tmp_path: Path) -> None:
-    page = tmp_path / "evidence.md"
-    page.write_text("nothing")
-    with pytest.raises(ValueError, match="made by"):
-        evidence.tables.place_in(page)
 
 
 def test_a_new_measurement_replaces_the_stored_one(evidence: Any, tmp_path: Path) -> None:
@@ -159,5 +152,5 @@ def test_runs_of_the_selection_study_differ_and_the_plots_are_drawn(evidence: An
     assert len(runs) == 7
     for run in runs:
         assert (evidence.selection.config_of(run, tmp_path).replay is not None) == (run.cure == "replay")
-    evidence.plots.draw(stored, tmp_path / "plot.png")
+    evidence.tables.draw(stored, tmp_path / "plot.png")
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")

@@ -139,26 +139,6 @@ def test_depth_maps_are_not_offered_as_cameras(tmp_path: Path) -> None:
         look_at(str(folder))
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [(0.0, 1.0, (0.0, 1.0)), (0.0, 0.08, (0.08, 0.0)), (2.0, 99.5, (99.5, 2.0))],
-    ids=["share", "metres", "percent"],
-)
-def test_the_grippers_range_is_read_from_the_statistics(
-    low: float, high: float, expected: tuple[float, float], tmp_path: Path
-) -> None:
-    folder = write_lerobot(tmp_path / "set", range(3))
-    info = json.loads((folder / "meta/info.json").read_text())
-    info["features"]["observation.state"] = {"dtype": "float32", "shape": [7], "names": STATES}
-    for column in ("cartesian_position", "gripper_position"):
-        del info["features"][f"observation.state.{column}"]
-    (folder / "meta/info.json").write_text(json.dumps(info))
-    of_column = {"observation.state": {"min": [0.0] * 6 + [low], "max": [0.0] * 6 + [high]}}
-    (folder / "meta/stats.json").write_text(json.dumps(of_column))
-    knobs = plain(look_at(str(folder)).knobs)["lerobot"]
-    assert (knobs["gripper_open"], knobs["gripper_closed"]) == expected
-
-
 def test_a_set_in_droids_schema_is_droid_if_it_says_so(tmp_path: Path) -> None:
     folder = WRITERS["rlds"](tmp_path / "bridge/1.0.0", range(3))
     for name in ("r2d2_faceblur", "droid_101"):

@@ -44,15 +44,6 @@ def test_numbers_that_have_names_are_chosen_by_them(names: str, rotation: str, s
     assert not pose["state"].is_guess
 
 
-def test_rx_ry_rz_alone_is_a_guess_that_names_both_formats() -> None:
-    names = ("x", "y", "z", "rx", "ry", "rz", "gripper")
-    pose = find_pose({"observation.state": Column(7, names)})
-    assert pose is not None
-    assert (pose["rotation"].value, pose["rotation"].is_guess) == ("rotation_vector", True)
-    assert "euler_xyz" in pose["rotation"].why
-    assert not pose["state"].is_guess
-
-
 @pytest.mark.parametrize(
     ("columns", "rotation", "found"),
     [

@@ -12,7 +12,7 @@ from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.poses import poses_from
 from vjepa2_ac.init.found import Knob, guesses, plain
-from vjepa2_ac.init.poses import Column, Samples, find_pose, gripper_knobs
+from vjepa2_ac.init.poses import Column, find_pose, gripper_knobs
 
 STATE = "observation.state"
 EPISODES = [synthetic_states(80, seed=seed) for seed in range(8)]
@@ -174,18 +174,6 @@ def test_columns_of_two_arms_are_not_mixed() -> None:
     assert "observation.right_ee_pose" in pose["state"].why
 
 
-def test_columns_of_position_rotation_and_fingers_are_joined() -> None:
-    samples: Samples = {
-        "steps/observation/eef_pos": [one[:, :3] for one in EPISODES],
-        "steps/observation/eef_quat": [written(one, "quaternion_xyzw")[:, 3:7] for one in EPISODES],
-        "steps/observation/gripper_position": [one[:, 6:] for one in EPISODES],
-    }
-    pose = find_pose({name: Column(one[0].shape[1]) for name, one in samples.items()}, samples)
-    assert pose is not None
-    assert pose["state"].value == list(samples)
-    assert (pose["rotation"].value, pose["state"].is_guess) == ("quaternion_xyzw", True)
-
-
 @pytest.mark.parametrize(
     ("rotation", "found"), [("quaternion_xyzw", "quaternion_xyzw"), ("rotation_vector", "rotation_vector")]
 )
@@ -209,6 +197,9 @@ def test_eight_numbers_without_names_are_told_apart_by_their_length(rotation: st
         ("gripper", (-1.0, 1.0), (-1.0, 1.0), True),
         ("gripper", (0.0, 85.0), (85.0, 0.0), True),
         ("gripper", None, (0.0, 1.0), True),
+        ("gripper_closed", (0.0, 255.0), (0.0, 255.0), True),
+        ("gripper_open", (-1.0, 1.0), (1.0, -1.0), True),
+        ("gripper_closed", (0.0, 0.1), (0.0, 0.1), True),
     ],
 )
 def test_open_and_closed_follow_from_range_and_name(
@@ -272,18 +263,6 @@ def test_the_pose_of_another_thing_is_not_the_robot(name: str) -> None:
     assert find_pose({f"observation.{name}": Column(6), "observation.gripper": Column(1)}) is None
 
 
-def test_rotation_vectors_in_droids_columns_are_noticed() -> None:
-    samples = {
-        "steps/observation/cartesian_position": [written(one, "rotation_vector")[:, :6] for one in EPISODES],
-        "steps/observation/gripper_position": [one[:, 6:] for one in EPISODES],
-    }
-    pose = find_pose(
-        {"steps/observation/cartesian_position": Column(6), "steps/observation/gripper_position": Column(1)}, samples
-    )
-    assert pose is not None
-    assert (pose["rotation"].value, pose["rotation"].is_guess) == ("rotation_vector", True)
-
-
 def test_columns_of_robosuite_are_read() -> None:
     samples = {
         "observation.robot0_eef_pos": [one[:, :3] for one in EPISODES],
@@ -297,17 +276,3 @@ def test_columns_of_robosuite_are_read() -> None:
     assert pose["state"].value == list(samples)[:3]
     assert pose["select"].value == [0, 1, 2, 3, 4, 5, 6, 7]
     assert pose["gripper_closed"].value == 0.0
-
-
-@pytest.mark.parametrize(
-    ("name", "ranges", "expected"),
-    [
-        ("gripper_closed", (0.0, 255.0), (0.0, 255.0)),
-        ("gripper_open", (-1.0, 1.0), (1.0, -1.0)),
-        ("gripper_closed", (0.0, 0.1), (0.0, 0.1)),
-    ],
-)
-def test_the_name_of_the_gripper_decides_its_direction(
-    name: str, ranges: tuple[float, float], expected: tuple[float, float]
-) -> None:
-    assert tuple(plain(gripper_knobs(name, ranges)).values()) == expected

@@ -22,7 +22,7 @@ from vjepa2_ac.evaluation.imagined import imagined_next
 from vjepa2_ac.media.video import read_header
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.model_setup import load_to_plan
-from vjepa2_ac.simulation.agent import JOINT_FIELDS, Agent, Planning
+from vjepa2_ac.simulation.agent import JOINT_FIELDS, Agent
 from vjepa2_ac.simulation.benchmark import FILM, BenchmarkOptions, film_frames, run_benchmark
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
@@ -196,15 +196,3 @@ def test_goals_come_from_the_demonstration_that_looks_like_the_problem(
     assert re.search(r"Start and goal are [\d.]+ from those of the demonstration most alike", shown)
     assert main(["simulate", model, *given, "--out", str(tmp_path / "there")]) == 2
     assert "needed: a run; or a model with --config" in capsys.readouterr().err
-
-
-def test_a_problem_that_cannot_be_demonstrated_is_told_before_any_is_worked_on(
-    model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Planning, "reset", lambda *_: pytest.fail("a problem was begun"))
-    given = ["simulate", model, "--task", "pick", "--episodes", "2", "--films", "0", "--sub-goals", "demonstration"]
-    assert main([*given, "--out", str(tmp_path), *SMALL[:-1], "planning.limits.xyz=[0.05,0.05,0]"]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: demonstration of problem 0 (pick): the oracle ends ")
-    assert "planning.limits.xyz" in error
-    assert not list(tmp_path.iterdir())

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 import fake_world
 
@@ -59,18 +58,6 @@ def test_a_model_and_those_without_one_act_on_the_problems_that_the_expert_solve
     np.testing.assert_array_equal(moved[:, 0], still[:, 0])
     assert (np.abs(np.diff(moved, axis=1)) > 0.01).any()
     assert {path.name for path in tmp_path.iterdir()} == {CLOSED_LOOP_FILE, "closed_loop.mp4"}
-
-
-def test_goals_come_from_a_recorded_demonstration_alike(model: str, tmp_path: Path) -> None:
-    with OtherWorld(command()) as world:
-        record_world(world, tmp_path / "set", range(4))
-    data = {"source": "npz", "path": str(tmp_path / "set"), "frames": 3, "stride": 1}
-    config = {"run_dir": str(tmp_path / "run"), "data": data, "model": {"base": model}}
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
-    given = ["--world", command(), "--episodes", "2", "--films", "0", "--sub-goals", "alike"]
-    where = ["--config", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "out")]
-    assert main(["simulate", model, *given, *where, *SMALL]) == 0
-    assert json.loads((tmp_path / "out" / CLOSED_LOOP_FILE).read_text())["about"]["sub_goals"] == "alike"
 
 
 def test_a_policy_that_knows_the_goal_reaches_it_in_any_world() -> None:

@@ -355,6 +355,6 @@ def _agent(options: argparse.Namespace) -> Agent:
 def _refuse(options: argparse.Namespace, names: Sequence[str], *, needed: str) -> None:
     """Refuse options that mean nothing to this subject."""
     for name in names:
-        if getattr(options, name) not in (None, []):
-            shown = "overrides" if name == "overrides" else f"--{name.replace('_', '-')}"
+        if getattr(options, name) is not None:
+            shown = f"--{name.replace('_', '-')}"
             raise InputError(where=shown, found=f"simulate {options.subject}", needed=needed)

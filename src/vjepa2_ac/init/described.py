@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,9 +21,9 @@ from vjepa2_ac.data.sources.rlds_shards import Shard, dataset_name, find_shards,
 from vjepa2_ac.data.sources.tfrecord import HEADER_BYTES, Kind, span_at
 from vjepa2_ac.errors import InputError, MissingFileError, UserError, counted
 from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
-from vjepa2_ac.init.poses import Column, Range, Samples, find_pose, measured_columns, vector_state
+from vjepa2_ac.init.poses import Column, Samples, find_pose, measured_columns, vector_state
 from vjepa2_ac.storage.places import SIMULATION_FILE
-from vjepa2_ac.storage.structured import json_object, read_json_object
+from vjepa2_ac.storage.structured import read_json_object
 
 DROID = "gs://gresearch/robotics/droid/1.0.1"
 RANGES = "gs://openpi-assets/droid/droid_sample_ranges_v1_0_1.json"
@@ -85,7 +84,16 @@ def look_at_rlds(path: str) -> FoundData:
     rate = _rate(features, is_bridge=is_bridge)
     has_velocities = _VELOCITIES in features
     texts = [name for name, one in features.items() if one.kind == "text"]
-    columns, texts_of_episode = _columns(features), _identity_features(features)
+    columns = {
+        name: Column(one.width)
+        for name, one in features.items()
+        if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith(_NUMBERS) and one.width > 0
+    }
+    texts_of_episode = [
+        name
+        for name, one in features.items()
+        if name.startswith("episode_metadata/") and (one.kind == "text" or one.dtype.startswith(("int", "uint", "str")))
+    ]
     measured = measured_columns(columns)
     records = _sampled(shards, [*measured, *texts_of_episode])
     pose = _BRIDGE_POSE if is_bridge else find_pose(columns, _samples(records, measured), control_rate_hz=rate.value)
@@ -190,15 +198,6 @@ def _sampled(shards: Sequence[Shard], names: Sequence[str]) -> list[dict[str, tu
     return records
 
 
-def _columns(features: Mapping[str, _Feature]) -> dict[str, Column]:
-    """Return the features that are numbers of the robot at each step."""
-    return {
-        name: Column(one.width)
-        for name, one in features.items()
-        if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith(_NUMBERS) and one.width > 0
-    }
-
-
 def _samples(records: Sequence[Mapping[str, tuple[Any, ...]]], columns: Mapping[str, Column]) -> Samples:
     """Return the numbers of each record, by column; without columns that a record does not have as described."""
     return {
@@ -206,15 +205,6 @@ def _samples(records: Sequence[Mapping[str, tuple[Any, ...]]], columns: Mapping[
         for name, one in columns.items()
         if records and all(record.get(name) and len(record[name]) % one.width == 0 for record in records)
     }
-
-
-def _identity_features(features: Mapping[str, _Feature]) -> list[str]:
-    """Return the texts and integers that describe an episode."""
-    return [
-        name
-        for name, one in features.items()
-        if name.startswith("episode_metadata/") and (one.kind == "text" or one.dtype.startswith(("int", "uint", "str")))
-    ]
 
 
 def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[str]) -> Knob:
@@ -233,8 +223,6 @@ def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[
 
 # ---- LeRobot ----
 
-_STATISTICS = "meta/stats.json"  # without it (v2.1) the sampled episodes give the range
-_MAX_BYTES = 16 << 20
 _OURS = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "subtask_index"})
 _DROID_GRIPPER = "observation.state.gripper_position"
 _OF_DROID = frozenset({"building", "collector_id"})  # columns of its ports to LeRobot
@@ -256,7 +244,7 @@ def look_at_lerobot(path: str) -> FoundData:
         if one.is_numbers and name not in _OURS
     }
     samples = _sampled_rows(info, measured_columns(columns))
-    pose = find_pose(columns, samples, control_rate_hz=info.fps, range_of=partial(_range_of, path))
+    pose = find_pose(columns, samples, control_rate_hz=info.fps)
     if pose and _DROID_GRIPPER in pose["state"].value and info.features.keys() >= _OF_DROID:
         pose |= {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
     success = next((name for name in info.features if "success" in name), None)
@@ -294,14 +282,3 @@ def _sampled_rows(info: DatasetInfo, columns: Mapping[str, Column]) -> Samples:
             for name in columns:
                 read[name].append(rows[name].astype(np.float64))
     return {name: episodes for name, episodes in read.items() if episodes}
-
-
-def _range_of(root: str, column: str, index: int) -> Range | None:
-    """Return the least and the greatest value of a number by the statistics of the data set; None: not known."""
-    where = storage.join(root, _STATISTICS)
-    with suppress(OSError, UserError, KeyError, IndexError, TypeError, ValueError):
-        statistics = json_object(storage.read_bounded(where, _MAX_BYTES), where=where)[column]
-        low, high = float(statistics["min"][index]), float(statistics["max"][index])
-        if math.isfinite(low) and math.isfinite(high):
-            return low, high
-    return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,11 +81,7 @@ class _Number:
 
 
 def find_pose(
-    columns: Mapping[str, Column],
-    samples: Samples | None = None,
-    *,
-    control_rate_hz: float = 10.0,
-    range_of: Callable[[str, int], Range | None] | None = None,
+    columns: Mapping[str, Column], samples: Samples | None = None, *, control_rate_hz: float = 10.0
 ) -> dict[str, Knob] | None:
     """Return the keys of a config section that probably read the measured pose; None: no pose was recognised.
 
@@ -93,7 +89,6 @@ def find_pose(
         columns: All columns of numbers.
         samples: The numbers of some episodes, against which the names are checked; None: not read.
         control_rate_hz: Control steps per second.
-        range_of: Returns the range of a number, by column and index; default: the range of the samples.
     """
     measured, samples = measured_columns(columns), samples or {}
     numbers = [number for name, one in measured.items() for number in _numbers_of(name, one, samples.get(name, ()))]
@@ -104,8 +99,8 @@ def find_pose(
     column, index = chosen[-1].column, chosen[-1].index
     names = measured[column].names
     name = names[index] if index < len(names) else _last_part(column)
-    ranges = (range_of and range_of(column, index)) or _range_in(samples.get(column, ()), index)
-    return {**keys, **gripper_knobs(name, ranges)}
+    values = np.concatenate(_values(chosen[-1:], samples) or [np.zeros((0, 1))])
+    return {**keys, **gripper_knobs(name, (float(values.min()), float(values.max())) if len(values) else None)}
 
 
 def vector_state(columns: Mapping[str, Column], where: str) -> dict[str, Knob]:
@@ -395,10 +390,3 @@ def gripper_knobs(name: str, ranges: Range | None) -> dict[str, Knob]:
             return {"gripper_open": Knob(opened, f"by the name {name}"), "gripper_closed": Knob(closed)}
     why = f"{why}; `data check CONFIG --model RUN_OR_MODEL` tests whether it is inverted"
     return {"gripper_open": Knob(opened, why, is_guess=True), "gripper_closed": Knob(closed, "likewise", is_guess=True)}
-
-
-def _range_in(samples: Sequence[Numbers], index: int) -> Range | None:
-    """Return the least and the greatest sampled value of a number; None: the column was not read."""
-    values = np.concatenate([one[:, index] for one in samples]) if samples else np.zeros(0)
-    values = values[np.isfinite(values)]
-    return (float(values.min()), float(values.max())) if len(values) else None

@@ -319,12 +319,11 @@ def find_trials(
             left_out.append(seed)
         else:
             trial = replace(episode.trial, goal_image=episode.goal_image)
-            if options.sub_goals in {"demonstration", "every-step"}:
-                every = every_key_frame(steps + 1, 1)
-                keys = (
-                    every if options.sub_goals == "every-step" else gripper_key_frames(episode.states, OF_MODEL_STEPS)
-                )
-                trial = replace(trial, goals=goals_of_episode(episode, keys, options.sub_goals))
+            if options.sub_goals == "every-step":
+                trial = replace(trial, goals=goals_of_episode(episode, every_key_frame(steps + 1, 1), "every-step"))
+            elif options.sub_goals == "demonstration":
+                keys = gripper_key_frames(episode.states, OF_MODEL_STEPS)
+                trial = replace(trial, goals=goals_of_episode(episode, keys, "demonstration"))
             trials.append(trial)
             episodes.append(replace(episode, trial=trial, frames=None))
         progress(len(trials), options.episodes)
@@ -334,18 +333,10 @@ def find_trials(
         tried = counted(len(trials) + len(left_out), "problem")
         found = f"the expert solves {len(trials)} of {tried} in {counted(steps, 'model step')}"
         raise world.refused(found, "half of them", "Allow more of them with --steps")
-    values = {
-        **vars(about),
-        "episodes": len(trials),
-        "seeds": [trial.seed for trial in trials],
-        "left_out": left_out,
-        "seed": options.seed,
-        "stride": stride,
-        "steps": steps,
-        "seconds_per_step": stride / about.rate_hz,
-        "sub_goals": options.sub_goals,
-        "goals": options.goals,
-    }
+    chosen = {key: getattr(options, key) for key in ("episodes", "seed", "sub_goals", "goals")}
+    seeds = {"seeds": [trial.seed for trial in trials], "left_out": left_out}
+    length = {"stride": stride, "steps": steps, "seconds_per_step": stride / about.rate_hz}
+    values = {**vars(about), **chosen, **seeds, **length}
     solved = Trials(about.task, about.world, "done", stride / about.rate_hz, tuple(trials), values)
     return solved, ClosedLoopResult(solved, Expert.name, tuple(episodes))
 
