@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rlds_sets import encoded, write_rlds_set
 from synthetic import draw_frame, synthetic_states
-from vjepa2_ac.config import DataConfig, DiskCacheConfig
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.sources.indexed_source import open_source
@@ -135,18 +135,3 @@ def test_formats_of_states_are_proposed_and_read(
         assert np.corrcoef(closed, true)[0, 1] > 0.999
     else:
         require_true(config, tolerance=1e-3)
-
-
-def test_the_same_frames_and_states_are_read_from_a_url(tmp_path: Path) -> None:
-    fsspec = pytest.importorskip("fsspec")
-    folder = write(tmp_path / "set", states=lambda s: {STATE: in_format(s, "rotation_vector")}, names=lambda _: {})
-    memory = fsspec.filesystem("memory")
-    for file in folder.iterdir():
-        memory.pipe(f"/of_others/{file.name}", file.read_bytes())
-    here, _ = proposed(folder)
-    cache = DiskCacheConfig(dir=str(tmp_path / "cache"))
-    there = here.model_copy(update={"path": "memory://of_others", "disk_cache": cache})
-    for number in range(EPISODES):
-        local, remote = open_source(here).read(number), open_source(there).read(number)
-        assert np.array_equal(local.states, remote.states)
-        assert np.array_equal(local.read_frames([0, 3]), remote.read_frames([0, 3]))
