@@ -154,15 +154,10 @@ class BrokenEpisodes:
 
     def __init__(self, config: DataConfig, episodes: int, usable: UInt64[np.ndarray, " usable"] | None = None) -> None:
         self._config, self._episodes, self._usable = config, episodes, usable
-        self._reasons: dict[str, str] = {}
+        self.reasons: dict[str, str] = {}  # of the broken episodes, in the order in which they were found
 
     def __len__(self) -> int:
-        return len(self._reasons)
-
-    @property
-    def reasons(self) -> dict[str, str]:
-        """The broken episodes and their errors, in the order in which they were found."""
-        return dict(self._reasons)
+        return len(self.reasons)
 
     def found(self, problems: Sequence[EpisodeProblem]) -> None:
         """Record the problems found while the data set was opened or indexed.
@@ -189,7 +184,7 @@ class BrokenEpisodes:
         Raises:
             InputError: Now too many are broken.
         """
-        if name not in self._reasons:
+        if name not in self.reasons:
             count = len(self) + 1
             logger.warning("A clip is left out, %d of %d episodes are broken: %s", count, self._episodes, reason)
             self._add({name: reason})
@@ -219,14 +214,15 @@ class BrokenEpisodes:
         return with_exclusion(error, names, is_skippable=is_few and self._config.broken_episodes == "error")
 
     def _add(self, reasons: Mapping[str, str]) -> None:
-        self._reasons |= {name: why for name, why in reasons.items() if name not in self._reasons}
+        new = {name: why for name, why in reasons.items() if name not in self.reasons}
+        self.reasons = {**self.reasons, **new}  # another dict: a checkpoint being written keeps the previous one
         if len(self) <= (allowed := max_broken(self._episodes)):
             return
-        name, reason = next(iter(self._reasons.items()))
+        name, reason = next(iter(self.reasons.items()))
         found = f"{len(self)} of {self._episodes} episodes are broken. The first, {name}: {reason.rstrip('.')}"
         needed, fix = f"at most {allowed} with data.broken_episodes: skip", "Repair or fetch them again"
         error = InputError(where=f"data.path: {self._config.path}", found=found, needed=needed, fix=fix)
-        raise self.refusal(error, tuple(self._reasons))
+        raise self.refusal(error, tuple(self.reasons))
 
 
 def as_error(problem: EpisodeProblem) -> InputError:

@@ -142,8 +142,15 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         metadata = json_object(self._files.read(path, version=version), where=path, needed="the metadata of an episode")
         named = {camera: _named(metadata, camera) for camera in RAW_CAMERAS}
         known = {camera: serial for camera, serial in named.items() if serial}
-        serials = tuple(_serial(known, camera, path) for camera in self._config.cameras)
-        place = _Place(folder, version, known, self._counted(folder, listed, serials))
+        serials, counts = tuple(_serial(known, camera, path) for camera in self._config.cameras), {}
+        for serial in serials:
+            video = self._path(folder, f"{VIDEOS}/{serial}.mp4")
+            if not any(one.name == f"{serial}.mp4" for one in listed.videos):
+                there = ", ".join(one.name for one in listed.videos) or "none"
+                needed = f"the MP4 that {listed.metadata} or data.camera names; there are {there}"
+                raise InputError(where=video, found="no such file", needed=needed, fix=_FIX)
+            counts[serial] = read_header(video, where=video).num_frames
+        place = _Place(folder, version, known, counts)
         states = _states_of(self._numbers(place, serials))
         success = metadata.get("success")
         outcome = success if isinstance(success, bool) else success_of(identity)
@@ -155,18 +162,6 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             labels=_labels(metadata),
             rate_hz=RAW_RATE_HZ,
         )
-
-    def _counted(self, folder: str, listed: EpisodeFolder, serials: tuple[str, ...]) -> dict[str, int]:
-        """Return the number of frames of each camera."""
-        counts = {}
-        for serial in serials:
-            path = self._path(folder, f"{VIDEOS}/{serial}.mp4")
-            if not any(video.name == f"{serial}.mp4" for video in listed.videos):
-                there = ", ".join(video.name for video in listed.videos) or "none"
-                needed = f"the MP4 that {listed.metadata} or data.camera names; there are {there}"
-                raise InputError(where=path, found="no such file", needed=needed, fix=_FIX)
-            counts[serial] = read_header(path, where=path).num_frames
-        return counts
 
     def _numbers(self, place: _Place, serials: tuple[str, ...]) -> Arrays:
         """Return what is known of the steps that are used, with the poses of some cameras and the place of each frame.

@@ -92,41 +92,41 @@ class NpzSource(IndexedSource[DataConfig, None]):
         """
         path, config = self._path(identity), self._config
         with opened_npz(self._files.open(path, version=version), path) as file:
-            arrays, names = _Arrays(file, path), file.names
-            states = arrays.numbers("states", (None, STATE_DIM if config.states == "pose" else None))
+            names = file.names
+            states = file.numbers("states", (None, STATE_DIM if config.states == "pose" else None))
             steps = len(states)
             measured_space(config, states.shape[1]).require_plausible(states, path, fix=FORMAT_HELP)
             for camera in cameras:
-                arrays.require_frames(camera, steps)
-            extrinsics = [arrays.extrinsics(camera, steps) for camera in cameras]
+                file.require_frames(camera, steps)
+            extrinsics = [file.extrinsics(camera, steps) for camera in cameras]
             if config.pose_frame == "camera" and any(one is None for one in extrinsics):
                 found, needed = "no poses of the camera", "extrinsics, or extrinsics_CAMERA for each of data.camera"
                 raise InputError(where=path, found=found, needed=needed, fix="Set data.pose_frame: base")
-            fps_hz = float(arrays.numbers("fps_hz", ()))
+            fps_hz = float(file.numbers("fps_hz", ()))
             if fps_hz <= 0:
-                raise arrays.refused("fps_hz", f"{fps_hz:g}", "control steps per second")
+                raise file.refused("fps_hz", f"{fps_hz:g}", "control steps per second")
             joints = "joint_velocities"
-            language = arrays.text("language") if "language" in names else None
+            language = file.text("language") if "language" in names else None
             episode = Episode(
-                info=EpisodeInfo(identity, steps, bool(arrays.numbers("success", ())) if "success" in names else None),
+                info=EpisodeInfo(identity, steps, bool(file.numbers("success", ())) if "success" in names else None),
                 states=states,
                 read_frames=FramesByStep(steps, path, partial(self._frames, path, version, cameras[0], steps)),
                 control_rate_hz=fps_hz,
                 extrinsics=extrinsics[0],
-                joint_velocities=arrays.numbers(joints, (steps, None)) if joints in names else None,
+                joint_velocities=file.numbers(joints, (steps, None)) if joints in names else None,
                 metadata={} if language is None else {"language": language},
-                commands=arrays.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
+                commands=file.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
             )
             headers = {name: file.header(name) for name in _LABELS if name in names}  # a camera may be called so, too
             is_text = {name: one.shape == () and one.dtype.kind == "U" for name, one in headers.items()}
-            labels = {name: arrays.text(name) for name in headers if is_text[name]}
+            labels = {name: file.text(name) for name in headers if is_text[name]}
             return episode, {"task": language, **labels}
 
     def _frames(
         self, path: str, version: str, camera: str, num_steps: int, steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
         with opened_npz(self._files.open(path, version=version), path) as file:
-            _Arrays(file, path).require_frames(camera, num_steps, count=len(set(steps)))
+            file.require_frames(camera, num_steps, count=len(set(steps)))
             return np.asarray(file.rows(camera, steps))
 
     def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
@@ -171,68 +171,6 @@ def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
         closing(storage.open_to_read(opened) if isinstance(opened, str) else opened) as file,
     ):
         yield NpzFile(file, path)
-
-
-@dataclass(frozen=True)
-class _Arrays:
-    """Reads arrays of known shapes from an untrusted file."""
-
-    file: NpzFile
-    path: str
-
-    def refused(self, name: str, found: str, needed: str) -> InputError:
-        """Return the error of an array."""
-        return InputError(where=f"{self.path}: {name}", found=found, needed=needed, fix=FORMAT_HELP)
-
-    def numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
-        """Return finite numbers of a shape; None stands for any length."""
-        self._require(name, shape, "biuf", "numbers")
-        if (count := prod(self.file.header(name).shape)) > _MOST_NUMBERS:
-            raise self.refused(name, f"{count:,} numbers", f"at most {_MOST_NUMBERS:,} in an episode")
-        values = self.file.array(name).astype(np.float64)
-        if not np.isfinite(values).all():
-            step = np.argwhere(~np.isfinite(values))[0][:1].tolist()
-            raise self.refused(name, f"NaN or infinity{f' at step {step[0]}' if step else ''}", "numbers")
-        return values
-
-    def text(self, name: str) -> str:
-        """Return a text."""
-        self._require(name, (), "U", "one text")
-        if (size := self.file.header(name).nbytes) > _MOST_TEXT_BYTES:
-            raise self.refused(name, f"a text of {size:,} bytes", f"at most {_MOST_TEXT_BYTES:,}")
-        return str(self.file.array(name))
-
-    def extrinsics(self, camera: str, steps: int) -> Float64[np.ndarray, "steps 6"] | None:
-        """Return the poses of a camera, repeated for a fixed one; None if there are none."""
-        for name in (f"extrinsics_{camera}", "extrinsics"):
-            if name in self.file.names:
-                one_pose = len(self.file.header(name).shape) == 1
-                values = self.numbers(name, (EXTRINSICS_DIM,) if one_pose else (steps, EXTRINSICS_DIM))
-                return np.broadcast_to(values, (steps, EXTRINSICS_DIM))
-        return None
-
-    def require_frames(self, camera: str, steps: int, *, count: int = 1) -> None:
-        """Refuse an array that cannot be the frames of a camera, without reading it; `count` are read together."""
-        self._require(camera, (steps, None, None, 3), "u", "frames (steps, height, width, 3)")
-        header = self.file.header(camera)
-        require_bounded(header.shape[1], header.shape[2], f"{self.path}: {camera}", count=count)
-        if header.dtype != np.uint8:
-            raise self.refused(camera, f"frames of {header.dtype}", "uint8, 0 to 255")
-        if header.by_columns:
-            raise self.refused(camera, "frames in Fortran order", "C order, as by numpy.ascontiguousarray")
-
-    def _require(self, name: str, shape: tuple[int | None, ...], kinds: str, meaning: str) -> None:
-        """Refuse an array that is missing, or of another shape or type."""
-        if name not in self.file.names:
-            there = ", ".join(self.file.names)[:200] or "none"
-            raise self.refused(name, "no such array", f"{meaning}; there are {there}")
-        header = self.file.header(name)
-        alike = len(header.shape) == len(shape) and all(
-            b in {a, None} for a, b in zip(header.shape, shape, strict=True)
-        )
-        if not alike or header.dtype.kind not in kinds or (0 in header.shape[1:]):
-            wanted = " x ".join("any" if size is None else str(size) for size in shape) or "a single one"
-            raise self.refused(name, f"shape {header.shape} of {header.dtype}", f"{meaning}: {wanted}")
 
 
 # ---- the .npz format of untrusted files ----
@@ -320,6 +258,60 @@ class NpzFile:
                 file.seek(start + header.start + row * header.row_bytes)
                 found[place] = np.frombuffer(file.read(header.row_bytes), header.dtype).reshape(header.shape[1:])
             return found if (places == np.arange(len(rows))).all() else found[places]
+
+    def refused(self, name: str, found: str, needed: str) -> InputError:
+        """Return the error of an array."""
+        return InputError(where=f"{self._where}: {name}", found=found, needed=needed, fix=FORMAT_HELP)
+
+    def numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
+        """Return finite numbers of a shape; None stands for any length."""
+        self._require(name, shape, "biuf", "numbers")
+        if (count := prod(self.header(name).shape)) > _MOST_NUMBERS:
+            raise self.refused(name, f"{count:,} numbers", f"at most {_MOST_NUMBERS:,} in an episode")
+        values = self.array(name).astype(np.float64)
+        if not np.isfinite(values).all():
+            step = np.argwhere(~np.isfinite(values))[0][:1].tolist()
+            raise self.refused(name, f"NaN or infinity{f' at step {step[0]}' if step else ''}", "numbers")
+        return values
+
+    def text(self, name: str) -> str:
+        """Return a text."""
+        self._require(name, (), "U", "one text")
+        if (size := self.header(name).nbytes) > _MOST_TEXT_BYTES:
+            raise self.refused(name, f"a text of {size:,} bytes", f"at most {_MOST_TEXT_BYTES:,}")
+        return str(self.array(name))
+
+    def extrinsics(self, camera: str, steps: int) -> Float64[np.ndarray, "steps 6"] | None:
+        """Return the poses of a camera, repeated for a fixed one; None if there are none."""
+        for name in (f"extrinsics_{camera}", "extrinsics"):
+            if name in self.names:
+                one_pose = len(self.header(name).shape) == 1
+                values = self.numbers(name, (EXTRINSICS_DIM,) if one_pose else (steps, EXTRINSICS_DIM))
+                return np.broadcast_to(values, (steps, EXTRINSICS_DIM))
+        return None
+
+    def require_frames(self, camera: str, steps: int, *, count: int = 1) -> None:
+        """Refuse an array that cannot be the frames of a camera, without reading it; `count` are read together."""
+        self._require(camera, (steps, None, None, 3), "u", "frames (steps, height, width, 3)")
+        header = self.header(camera)
+        require_bounded(header.shape[1], header.shape[2], f"{self._where}: {camera}", count=count)
+        if header.dtype != np.uint8:
+            raise self.refused(camera, f"frames of {header.dtype}", "uint8, 0 to 255")
+        if header.by_columns:
+            raise self.refused(camera, "frames in Fortran order", "C order, as by numpy.ascontiguousarray")
+
+    def _require(self, name: str, shape: tuple[int | None, ...], kinds: str, meaning: str) -> None:
+        """Refuse an array that is missing, or of another shape or type."""
+        if name not in self.names:
+            there = ", ".join(self.names)[:200] or "none"
+            raise self.refused(name, "no such array", f"{meaning}; there are {there}")
+        header = self.header(name)
+        alike = len(header.shape) == len(shape) and all(
+            b in {a, None} for a, b in zip(header.shape, shape, strict=True)
+        )
+        if not alike or header.dtype.kind not in kinds or (0 in header.shape[1:]):
+            wanted = " x ".join("any" if size is None else str(size) for size in shape) or "a single one"
+            raise self.refused(name, f"shape {header.shape} of {header.dtype}", f"{meaning}: {wanted}")
 
     def _start_of(self, member: zipfile.ZipInfo) -> int:
         """Return where the bytes of an uncompressed member begin in the file."""

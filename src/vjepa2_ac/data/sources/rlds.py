@@ -166,11 +166,9 @@ class RemoteEpisode:
         key = f"{self._key} {' '.join(names)}"
         with storage.user_can_read(self._shard.path, needed=NEEDED):
             data = self._contents.read_or_make(key, lambda: b"".join(storage.read_ranges(self._shard.path, places)))
-        pieces, position = {}, 0
-        for offset, length in places:
-            pieces[offset] = _Piece(offset, data[position : position + length])
-            position += length
-        return Record(lambda offset, length: pieces[offset](offset, length), self._span, located)
+        ends = np.cumsum([length for _, length in places]).tolist()
+        pieces = {place: data[end - place[1] : end] for place, end in zip(places, ends, strict=True)}
+        return Record(lambda *place: pieces[place], self._span, located)
 
     def images(self, name: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str) -> FramesByStep:
         """Return the reader of one camera's images.
