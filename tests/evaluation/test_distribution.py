@@ -90,12 +90,6 @@ def test_the_frechet_distance_equals_the_formula_with_a_matrix_root_also_for_few
     assert frechet_distance(one, one + 2) == pytest.approx(8 * 4)
 
 
-def test_the_frechet_distance_is_biased_upwards_with_few_clips() -> None:
-    rng = np.random.default_rng(0)
-    few, many = (frechet_distance(*rng.standard_normal((2, count, 16))) for count in (20, 2000))
-    assert few > 10 * many > 0
-
-
 # ---- the MMD ---------------------------------------------------------------------------------------------------------
 
 DIM, MMD_EPISODES, MMD_CLIPS = 256, 30, 4

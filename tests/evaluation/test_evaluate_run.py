@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -274,15 +273,3 @@ def test_from_a_cache_the_images_are_those_of_the_frames(config: Config, decoder
     assert of_images[0] is not None
     assert of_images[1] is not None
     assert of_images[0].value == pytest.approx(of_images[1].value, rel=1e-2)
-
-
-@pytest.mark.parametrize(
-    ("changed", "words"),
-    [({"encoder": "another"}, "another encoder"), ({"crop": "square"}, "data.crop square")],
-)
-def test_a_decoder_that_does_not_fit_is_refused(
-    changed: dict[str, str], words: str, config: Config, tmp_path: Path
-) -> None:
-    folder = saved(replace(card_of(config), **changed), tmp_path / "decoder")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=words):
-        evaluate_subject(config.run_dir, EvaluationOptions(clips=5, decoder=folder, probes=NONE))

@@ -331,14 +331,6 @@ def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
     assert plans.statement.endswith(f"of {problems} reach problem{'s' * (problems > 1)}")
 
 
-def test_an_equal_success_rate_is_inconclusive_if_its_interval_is_wide() -> None:
-    shares = {"adapter": share_of(20, 50), "random": share_of(21, 50), "oracle": share_of(50, 50)}
-    where = "in domain B, with key frames"
-    verdict = closed_loop(shares, "adapter", "oracle", 50, "reach", where)
-    assert verdict.conclusion == "inconclusive"
-    assert verdict.statement == f"solves 40 % of 50 reach problems {where}"
-
-
 def test_a_measured_plan_is_not_denied_by_the_use_of_the_actions() -> None:
     summary = summary_of(model("adapter", 0.5))
     assert summary.sentence.endswith("ignores the actions, so the model cannot be used for planning.")

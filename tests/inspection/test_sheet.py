@@ -57,10 +57,3 @@ def test_the_crop_is_shown_unchanged_and_the_rest_is_pale(plotted: Plotted) -> N
     pale = (abs(seen - (149, 98, 101)).max(axis=-1) <= 2).sum()
     assert as_it_is > 10_000
     assert pale / (pale + as_it_is) == pytest.approx(8 / 32, abs=0.03), "24 of 32 columns are seen"
-
-
-def test_episodes_stand_below_one_another_in_their_order(plotted: Plotted) -> None:
-    colours = [(200, 30, 40), (30, 200, 40), (40, 30, 200)]
-    three = plotted(*map(strip, colours))
-    centres = [np.argwhere(abs(three - colour).max(axis=-1) <= 2)[:, 0].mean() for colour in colours]
-    assert centres == sorted(centres)

@@ -20,8 +20,6 @@ from vjepa2_ac.errors import InputError, counted, shell_command
 if TYPE_CHECKING:
     import ssl
 
-    import numpy as np
-
     from vjepa2_ac.evaluation.summary import Summary, Verdict
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
@@ -101,7 +99,7 @@ def _serve(options: argparse.Namespace) -> int:
         found, needed = f"--actions {options.actions}", "--actions pose: RoboArena knows no changes of a pose"
         raise InputError(where="--metadata roboarena", found=found, needed=needed)
     access = cli.access_of(options)
-    extrinsics, tls = cli.camera_pose(options.extrinsics), _tls(options)
+    tls = _tls(options)
     cli.require_goals(options.goals)
     cli.require_to_plan(options)
 
@@ -112,7 +110,7 @@ def _serve(options: argparse.Namespace) -> int:
         cli.require_new_place(options.record)
     goals = None if options.goals is None else read_kept_goals(options.goals)
     how = ServerOptions(access, options.port, tls)
-    ended = serve(lambda: _loaded(options, goals, extrinsics), how, cli.show)
+    ended = serve(lambda: _loaded(options, goals), how, cli.show)
     if not ended:  # a search or a loading that takes longer than anybody waits: nothing of it is to be kept
         sys.stdout.flush()
         sys.stderr.flush()
@@ -144,7 +142,7 @@ def _tls(options: argparse.Namespace) -> ssl.SSLContext | None:
     return context
 
 
-def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np.ndarray | None) -> Served:
+def _loaded(options: argparse.Namespace, goals: KeptGoals | None) -> Served:
     """Load the model, and make a first decision; runs in the planning thread."""
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.planning.controller import Controller
@@ -166,7 +164,7 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np
         dry_run=options.dry_run,
         is_blind=is_blind(ranking_of_run(options.subject, loaded.chosen)),
     )
-    controller = Controller.of_subject(loaded, extrinsics=extrinsics)
+    controller = Controller.of_subject(loaded, extrinsics=options.extrinsics)
     kept = {name: with_shares(one, loaded.config.planning.goals, first=1) for name, one in (goals or {}).items()}
     session = Session(controller, kept, how)
     about = metadata_of(loaded, session)

@@ -81,7 +81,7 @@ def add_imagine(commands: cli.Commands) -> None:
     cli.add(group, "--data CONFIG", "clips of other data; needed for a model", cli.as_local)
     group = parser.add_argument_group("instead of a clip")
     cli.add(group, "--image IMAGE", "what a camera sees: PNG or JPEG; actions by name only", cli.as_local)
-    cli.add(group, "--state NUMBERS", "measured then, as `plan --state`")
+    cli.add(group, "--state NUMBERS", "measured then, as `plan --state`", cli.as_numbers)
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -244,9 +244,8 @@ def _of_image(options: argparse.Namespace) -> Imagination:
     from vjepa2_ac.evaluation.imagined import Seen, imagine_image
     from vjepa2_ac.media.images import read_image
 
-    state, extrinsics = cli.as_numbers(options.state, "--state"), cli.camera_pose(options.extrinsics)
     cli.require_to_plan(options)
-    seen, words = Seen(read_image(options.image), state, extrinsics), options.actions or _NAMED
+    seen, words = Seen(read_image(options.image), options.state, options.extrinsics), options.actions or _NAMED
     session, size_m = cli.load_planning_session(options), options.size / 100
     return imagine_image(session, options.decoder, seen, words, steps=options.steps, size_m=size_m)
 

@@ -169,7 +169,12 @@ def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
     group = parser.add_argument_group("the model")
     add_checkpoint(group)
     add(group, "--config CONFIG", "for a model: the config whose planning, crop and dtype count", as_local)
-    add(group, "--extrinsics NUMBERS", "the camera's x,y,z,roll,pitch,yaw in the base frame, if the model uses it")
+    add(
+        group,
+        "--extrinsics NUMBERS",
+        "the camera's x,y,z,roll,pitch,yaw in the base frame, if the model uses it",
+        _camera_pose,
+    )
 
 
 def add_all(parser: argparse._ActionsContainer) -> None:
@@ -451,22 +456,19 @@ def _numbers(kind: Callable[[str], _Number], fits: Callable[[_Number], bool], me
 count = whole_number(1)  # a number of things
 
 
-def as_numbers(text: str, where: str) -> np.ndarray:
-    """Read the numbers of one word, with commas between them.
-
-    Raises:
-        InputError: A part is none.
-    """
+def _numbers_in(text: str) -> np.ndarray:
     import numpy as np
 
     try:
         return np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError as error:
-        found, needed = f"{text!r} ({error})", "numbers with commas between them, in one word"
-        raise InputError(where=where, found=found, needed=needed) from None
+        raise ValueError(f"is no list of numbers with commas between them ({error})") from None
 
 
-def camera_pose(text: str | None) -> np.ndarray | None:
+as_numbers = _reader(_numbers_in)
+
+
+def _camera_pose(text: str) -> np.ndarray:
     """Read the value of --extrinsics.
 
     Raises:
@@ -474,9 +476,7 @@ def camera_pose(text: str | None) -> np.ndarray | None:
     """
     from vjepa2_ac.spaces import EXTRINSICS
 
-    if text is None:
-        return None
-    extrinsics = as_numbers(text, "--extrinsics")
+    extrinsics = as_numbers(text)
     EXTRINSICS.require_state(extrinsics, "--extrinsics")
     return extrinsics
 

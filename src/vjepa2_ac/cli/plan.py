@@ -27,7 +27,7 @@ def add_plan(commands: cli.Commands) -> None:
     cli.add_planner(parser, such_as=f"such as planning.horizon=2; quick, for a CPU: {_QUICK}")
     cli.add(parser, "--start IMAGE", "what the camera sees now: PNG or JPEG", cli.as_local, required=True)
     text = "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or a vector"
-    cli.add(parser, "--state NUMBERS", text, required=True)
+    cli.add(parser, "--state NUMBERS", text, cli.as_numbers, required=True)
     goals = parser.add_mutually_exclusive_group(required=True)
     cli.add(goals, "--goal IMAGE", "what it is to see; again for goals in a row", cli.as_local, action="append")
     cli.add(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", cli.as_path)
@@ -75,7 +75,7 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.data.sources.indexed_source import measured_space
     from vjepa2_ac.planning.goals import with_shares
 
-    state, extrinsics = cli.as_numbers(options.state, "--state"), cli.camera_pose(options.extrinsics)
+    state = options.state
     cli.require_goals(options.goals)
     config = cli.require_to_plan(options)
     measured_space(config.data, len(state)).require_state(state, "--state")  # how wide, only the model knows
@@ -98,7 +98,7 @@ def _plan(options: argparse.Namespace) -> int:
     request = PlanRequest(start, state, goals, mask)
     with cli.reporter() as reporter:
         reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
-        controller = Controller.of_subject(session, seed=options.seed, extrinsics=extrinsics)
+        controller = Controller.of_subject(session, seed=options.seed, extrinsics=options.extrinsics)
         controller.planner.progress = reporter.task("planning", "action sequences")
         found = decide(controller, request, nodes=options.nodes, reporter=reporter)
     names = options.goal or [str(options.goals or options.goal_from)]

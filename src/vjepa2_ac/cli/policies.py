@@ -67,7 +67,7 @@ def _score(options: argparse.Namespace) -> int:
     require_frames(session.config.data, to="score policies at")
     with cli.reporter() as reporter:
         found = score_policies(
-            Controller.of_subject(session, extrinsics=cli.camera_pose(options.extrinsics)),
+            Controller.of_subject(session, extrinsics=options.extrinsics),
             cli.open_data(session.config, reporter),
             policies,
             form=options.form,

@@ -320,11 +320,6 @@ class Evaluation:
         return self.models[self.trained].errors
 
     @property
-    def base_errors(self) -> PredictionErrors | None:
-        """The errors of the base; None: there is none."""
-        return None if self.base is None else self.models[self.base].errors
-
-    @property
     def horizon(self) -> int:
         """The number of model steps of the longest horizon."""
         return self.about.frames - 1

@@ -207,10 +207,7 @@ def _of_poses(changes: Float[np.ndarray, "pairs 7"], usual: Float[np.ndarray, " 
     metrics = {
         "directions": covered,
         "mean_direction": one_way,
-        "principal_shares": shares.tolist(),
         "length_cm_10_50_90_99": usual_cm,
-        "back_share_xyz": back.tolist(),
-        "forth_share_xyz": forth.tolist(),
         "gripper_share": gripper,
     }
     return Coverage(narrow, moving_steps, usual, lines, metrics, density)

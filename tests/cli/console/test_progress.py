@@ -3,14 +3,12 @@
 import io
 import re
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 from rich.table import Table
 
-import vjepa2_ac
 from evaluation_results import ranking_of
 from vjepa2_ac.cli import main
 from vjepa2_ac.cli.console import progress as console_module
@@ -21,7 +19,6 @@ from vjepa2_ac.evaluation.measure import VALIDATED
 from vjepa2_ac.evaluation.result import PredictionErrors, Validation
 from vjepa2_ac.inspection.findings import Finding
 
-PACKAGE = Path(vjepa2_ac.__file__).parent
 FIGURES = {"loss": 0.51234, "samples_per_second": 1.5, "data_wait_share": 0.1}
 
 
@@ -62,12 +59,6 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
     assert lines == expected, "a line before 5 seconds, then one every 10"
 
 
-def test_a_validation_without_a_ranking_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    written = shown_on(monkeypatch, terminal=False)
-    TrainingConsole().validated(10, Validation(errors(), None))
-    assert "action-ranking error  not measured (needs validation.ranking_clips" in written.getvalue()
-
-
 COMMAND = "vjepa2-ac train my_robot.yaml run_dir=runs/trial training.steps=100 validation.every=50 checkpoint.every=50"
 LINES = {
     "a sentence": "Warning: " + "shuffled actions change the error by 92 % only and " * 4,
@@ -90,16 +81,6 @@ def test_lines_have_at_most_100_columns_and_commands_stay_in_one_piece(name: str
     assert not any(line.lstrip().startswith("% ") for line in lines), "a number keeps its unit"
     if name == "columns":
         assert {len(line) - len(line.lstrip()) for line in lines[1:]} == {26}, "texts are in one column"
-
-
-@pytest.mark.parametrize(("share", "reported"), [(0.2, False), (0.35, True)])
-def test_waiting_for_data_is_shown_where_it_is_much(monkeypatch, share: float, *, reported: bool) -> None:
-    written = shown_on(monkeypatch, terminal=False)
-    reporter = TrainingConsole()
-    reporter.started(0, 1)
-    reporter.stepped(1, {**FIGURES, "data_wait_share": share})
-    assert ("waits for data 35% of the time" in written.getvalue()) == reported
-    assert "left" not in written.getvalue(), "nothing is left"
 
 
 def test_a_terminal_has_one_bar_with_the_same_words(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,9 +147,3 @@ def test_errors_warnings_and_words_on_the_command_line_are_shown_as_they_are(cap
     with pytest.raises(SystemExit, match="2"):
         main(["train", "--no\x1b[31m", "x"])
     assert r"--no\x1b[31m" in capsys.readouterr().err
-
-
-def test_there_is_one_console_and_no_markup_in_the_program() -> None:
-    assert isinstance(console_module.console, console_module.PlainConsole)
-    others = [path for path in PACKAGE.rglob("*.py") if re.search(r"\bConsole\(|from_markup|\[/", path.read_text())]
-    assert others == []
