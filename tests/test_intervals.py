@@ -36,13 +36,6 @@ def test_intervals_cover_the_truth_at_the_stated_rate(episodes: int) -> None:
     assert covered / 400 == pytest.approx(0.95, abs=0.035)
 
 
-def test_drawing_episodes_is_not_drawing_clips() -> None:
-    errors = np.repeat(np.random.default_rng(0).normal(1.0, 0.2, size=8), 50)
-    of_episodes = mean_of(errors, tuple(np.repeat(list("abcdefgh"), 50)))
-    of_clips = mean_of(errors, tuple(map(str, range(400))))
-    assert of_episodes.high - of_episodes.low > 4 * (of_clips.high - of_clips.low)
-
-
 def test_what_makes_an_episode_hard_for_both_does_not_widen_their_difference() -> None:
     rng = np.random.default_rng(0)
     hard = rng.normal(1.0, 0.3, size=20)
@@ -50,17 +43,6 @@ def test_what_makes_an_episode_hard_for_both_does_not_widen_their_difference() -
     apart = ratio_difference((hard - 0.1, ones), (hard, ones), ids)
     assert (apart.low, apart.value, apart.high) == pytest.approx((-0.1, -0.1, -0.1))
     assert ratio(hard, ones, ids).high - ratio(hard, ones, ids).low > 0.2
-
-
-def test_figures_are_those_of_each_column_by_itself() -> None:
-    rng = np.random.default_rng(0)
-    errors, others = rng.uniform(1, 2, size=(2, 12, 3))
-    ids = tuple("aabbccddeeff")
-    together = bootstrapped(lambda sums: sums[0] / sums[1], np.stack([errors, others]), ids)
-    assert [one.value for one in together] == pytest.approx([errors[:, h].sum() / others[:, h].sum() for h in range(3)])
-    for h, one in enumerate(together):
-        alone = ratio(errors[:, h], others[:, h], ids)
-        assert (one.low, one.high) == pytest.approx((alone.low, alone.high))
 
 
 def test_the_level_of_an_interval_is_that_of_few_episodes() -> None:
@@ -90,16 +72,6 @@ def test_the_side_of_an_interval_needs_all_of_it() -> None:
     assert Estimate(1.0, 0.5, 1.5).side(of=1.6) == -1
     assert Estimate(1.0, 0.5, 1.5).side(of=0.4) == 1
     assert Estimate(1.0, math.nan, math.nan).side(of=0.0) == 0
-
-
-def test_the_same_seed_gives_the_same_interval() -> None:
-    columns = np.stack([np.random.default_rng(1).normal(size=20), np.ones(20)])[:, :, None]
-
-    def of(seed: int) -> tuple[Estimate, ...]:
-        return bootstrapped(lambda sums: sums[0] / sums[1], columns, list(map(str, range(20))), seed=seed)
-
-    assert of(3) == of(3)
-    assert of(3) != of(4)
 
 
 def test_weights_of_episodes_give_the_interval_of_their_sums() -> None:

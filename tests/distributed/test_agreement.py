@@ -33,8 +33,6 @@ def test_ranks_whose_errors_differ_in_the_last_digits_lose_patience_together(mak
     ("happens", "found"),
     [
         ("disk_is_full", "No space left on device"),
-        ("run_is_of_another_config", "a run of another config"),
-        ("checkpoint_cannot_be_read", "nowhere"),
         ("index_cannot_be_made", "no data set"),
         ("encoding_loses_its_connection", "gs://data: no answer"),
     ],

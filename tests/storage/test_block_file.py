@@ -251,23 +251,6 @@ def test_a_limit_of_zero_and_no_limit_evict_nothing(tmp_path: Path) -> None:
     assert size_of(tmp_path) == 2100
 
 
-def test_partial_files_of_killed_writers_count_and_are_evicted_like_entries(tmp_path: Path) -> None:
-    cache = DiskCache(tmp_path, 1000)
-    cache.write("a", bytes(96))
-    inner = entries(tmp_path)[0].parent
-    old, fresh = inner / ".x.1234abcd.partial", inner / ".y.1234abcd.partial"
-    for path in (old, fresh):
-        cache._reserve(300)  # as the killed writer did
-        path.write_bytes(bytes(300))
-    os.utime(old, (0, 0))
-    cache.write("b", bytes(296))  # 1000 would fit
-    assert old.exists()
-    cache.write("c", bytes(96))
-    assert not old.exists()
-    assert fresh.exists()
-    assert size_of(tmp_path) == 800
-
-
 WRITE_MANY = """
 import sys
 from concurrent.futures import ThreadPoolExecutor

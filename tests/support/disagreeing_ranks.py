@@ -9,19 +9,17 @@ import sys
 import time
 from dataclasses import replace
 from datetime import timedelta
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import torch
 
-from vjepa2_ac import distributed
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.encoding import encode_dataset
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.training import loop, outputs, resume, run, setup, validation
+from vjepa2_ac.training import loop, resume, run, setup, validation
 from vjepa2_ac.training.loop import train
 
 RANK = int(os.environ["RANK"])
@@ -49,23 +47,9 @@ def disk_is_full() -> None:
         resume.write_checkpoint = mock.Mock(side_effect=full)
 
 
-def run_is_of_another_config() -> None:
-    if RANK == 0:
-        outputs.open_run = mock.Mock(side_effect=InputError(where="run", found="a run of another config"))
-
-
-def checkpoint_cannot_be_read() -> None:
-    if RANK == 0:
-        resume.newest_checkpoint = mock.Mock(return_value=Path("nowhere"))
-
-
 def index_cannot_be_made() -> None:
     if RANK == 0:
         setup.open_dataset = mock.Mock(side_effect=InputError(where="data.path", found="no data set"))
-
-
-def another_never_comes() -> None:
-    distributed._MEETING = timedelta(seconds=3)
 
 
 def one_is_killed_once() -> None:
