@@ -29,7 +29,19 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     out = tmp_path_factory.mktemp("fake_gpu")
     runs = {
         "quick": ["--quick", "--source", "cache", "pixels", "--attention", "dense"],
-        "wide": ["--layers", "2", "--frames", "8", "--batch", "1", "--checkpointing", "off", "on"],
+        "wide": [
+            "--layers",
+            "2",
+            "--encoder-layers",
+            "4",
+            "--frames",
+            "8",
+            "--batch",
+            "1",
+            "--checkpointing",
+            "off",
+            "on",
+        ],
     }
     arguments = [[*words, "--json", str(out / name)] for name, words in runs.items()]
     command = [sys.executable, str(ROOT / "tests/support/fake_gpu_facts.py"), str(FOLDER), json.dumps(arguments)]

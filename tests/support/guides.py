@@ -10,9 +10,10 @@ FEW_STEPS = (
 SHORTER = {  # by the first words of a command
     "train": FEW_STEPS,
     "evaluate": "--clips 4 --ranking-clips 2 --samples 8 --examples 1 --landscapes 1 --nodes 3",
-    "simulate record": "--episodes 10 --steps 33",
+    "simulate record": "--episodes 10 --steps 25",
     "plan": "planning.samples=16 planning.iterations=1",
     "data calibrate": "--limit 8",
+    "simulate": "--steps 2 planning.samples=16 planning.iterations=1",
 }
 
 
