@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,6 @@ from vjepa2_ac import export
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.rows import Row
-from vjepa2_ac.evaluation.summary import Summary, not_measured
 from vjepa2_ac.export import CARD, Exported, export_run
 from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.checkpoints import load_official
@@ -31,27 +28,6 @@ from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import select_checkpoint, write_manifest
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train
-
-ROWS = [
-    Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "base", 0.9, 0.8, 0.95),
-    Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "adapter", 0.7),
-]
-EVALUATED = {
-    "format": 6,
-    "summary": asdict(Summary("somewhere/run, step 2", "8 clips", *(not_measured(name, "evaluate") for name in "abc"))),
-    "trained": "adapter",
-    "base": "base",
-    "about": {
-        "subject": "somewhere/run", "checkpoint": "step 2",
-        "checkpoint_path": "somewhere/run/checkpoints/step-00000002", "data": "data",
-        "cameras": ["exterior"], "split": "test", "frames": 2, "stride": 4, "seconds_per_step": 0.5,
-        "source": "rlds", "seed": 0, "version": "0", "time": "",
-    },
-    "clips": {"count": 8, "episodes": 3, "fingerprint": "0", "named": []},
-    "rows": [{name: None if value != value else value for name, value in asdict(row).items()} for row in ROWS],
-    "by_clip": {"persistence": [], "models": {"base": [], "adapter": []}},
-}  # fmt: skip
-
 
 Trained = Callable[..., Path]
 QUICK = ["--clips=4", "--ranking-clips=2", "--samples=4", "--landscapes=1", "--nodes=3", "--examples=1"]
@@ -199,22 +175,6 @@ def test_the_code_of_the_card_runs(trained, tmp_path: Path) -> None:
     assert isinstance(names["predictor"], peft.PeftModel)
 
 
-def test_the_card_shows_what_was_measured(copied, tmp_path: Path) -> None:
-    run = copied()
-    (run / METRICS_FILE).write_text(json.dumps(EVALUATED))
-    (run / PLOT).write_bytes(b"a picture")
-    export_run(run, tmp_path / "hub", "hub")
-    card = (tmp_path / "hub" / CARD).read_text()
-    assert "run, step 2" not in card
-    assert "not measured" in card
-    assert "| ahead | base | adapter |\n|---|---|---|\n| 0.50 s | 0.900 [0.800, 0.950] | 0.700 |" in card
-    assert "another checkpoint" not in card
-    assert "**Not measured**: the run had no" not in card
-    assert f"]({PLOT})" in card
-    assert (tmp_path / "hub" / PLOT).read_bytes() == b"a picture"
-    assert "somewhere" not in (tmp_path / "hub" / METRICS_FILE).read_text(), "a path of this machine"
-
-
 def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied, tmp_path: Path) -> None:
     run = copied(checkpoint__every=1)
     assert main(["evaluate", str(run), *QUICK]) == 0
@@ -225,6 +185,9 @@ def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied
     assert main(["export", str(run), str(tmp_path / "hub"), "--to", "hub"]) == 0
     card = (tmp_path / "hub" / CARD).read_text()
     assert measured["summary"]["predicts"]["statement"] in " ".join(card.split())
+    assert f"]({PLOT})" in card
+    assert (tmp_path / "hub" / PLOT).read_bytes() == (run / PLOT).read_bytes()
+    assert str(run.parent) not in (tmp_path / "hub" / METRICS_FILE).read_text(), "a path of this machine"
     assert "another checkpoint**: `step-00000001`, not `step-00000002`" in card
 
 

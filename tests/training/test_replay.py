@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -184,14 +183,3 @@ def test_held_out_episodes_that_would_be_replayed_are_named(replaying, reporter,
 
 
 # ---- the run's identity ----
-
-
-def test_a_run_goes_on_with_a_moved_second_set_and_with_no_other(replaying, reporter, tmp_path, second) -> None:
-    folder = train(replaying(training__steps=2), reporter)
-    for name in ("moved", "others"):
-        shutil.copytree(second, tmp_path / name)
-    train(replaying(training__steps=2, replay__data__path=str(tmp_path / "moved")), reporter)
-    assert read_run_config(folder).replay.data.path == str(tmp_path / "moved")
-    next((tmp_path / "others").rglob("*.tfrecord*")).touch()
-    with pytest.raises(InputError, match=r"replay.data.path: .*others: other episodes or files.*moved"):
-        train(replaying(training__steps=2, replay__data__path=str(tmp_path / "others")), reporter)

@@ -10,7 +10,7 @@ import contextlib
 import json
 import math
 import shutil
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -227,8 +227,11 @@ def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Repor
     first = 0
     if saved.is_file():
         state = read_torch(saved)
-        steps.restore(state)
         first = int(state["step"])
+        steps.decoder.load_state_dict(state["decoder"])
+        steps.optimizer.load_state_dict(state["optimizer"])
+        for name, value in steps.average.items():
+            value.copy_(state["average"][name])
     progress = reporter.task("training the decoder", "steps")
     with (
         MetricsLog(ready.folder, first_step=first) as log,
@@ -243,7 +246,8 @@ def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Repor
                 log.write("train", step, metrics)
             if step % every == 0 or is_last or stop.reason is not None:
                 with log.before_a_checkpoint(), user_can_write(saved), atomic_writer(saved) as file:
-                    write_torch({"step": step, **steps.state()}, file)
+                    parts = {"decoder": steps.decoder.state_dict(), "optimizer": steps.optimizer.state_dict()}
+                    write_torch({"step": step, "average": steps.average, **parts}, file)
             if stop.reason is not None and not is_last:
                 raise StoppedError(ready.folder, step, stop.reason)
 
@@ -338,21 +342,7 @@ class DecoderSteps:
             fix = "Lower it, delete the newest checkpoint if it was written by then, and start again"
             raise InputError(where="decoder.learning_rate", found=found, fix=fix)
         self.optimizer.step()
-        self._add_to_average(step)
-        return metrics | {"learning_rate": learning_rate}
-
-    def state(self) -> dict[str, Any]:
-        """Return weights, their average and AdamW's moments, for a checkpoint."""
-        return {"decoder": self.decoder.state_dict(), "average": self.average, "optimizer": self.optimizer.state_dict()}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a checkpoint of the same decoder."""
-        self.decoder.load_state_dict(state["decoder"])
-        self.average = {name: state["average"][name].to(self._device) for name in self.average}
-        self.optimizer.load_state_dict(state["optimizer"])
-
-    @torch.no_grad()
-    def _add_to_average(self, step: int) -> None:
         decay = min(_AVERAGE, 1 - _AVERAGED_SHARE / self._config.decoder.steps, step / (step + _YOUNG))
-        for name, one in self.decoder.state_dict().items():
+        for name, one in self.decoder.state_dict().items():  # detached tensors
             self.average[name].lerp_(one, 1.0 - decay)
+        return metrics | {"learning_rate": learning_rate}

@@ -87,18 +87,22 @@ def decode_jpegs(images: Sequence[bytes], steps: Sequence[int], where: str) -> U
     Raises:
         InputError: An image is not a JPEG, is too large, or differs in size from the first one.
     """
-    height, width = _size_of(images[0], steps[0], where)
-    require_bounded(height, width, f"{where}: step {steps[0]}", count=len(images))
-    frames = np.empty((len(images), height, width, 3), np.uint8)  # decoded in place: half the time of stacking
-    for frame, image, step in zip(frames, images, steps, strict=True):
-        size = _size_of(image, step, where)
-        if size != (height, width):
-            found, needed = f"an image of {size[0]}x{size[1]}", f"{height}x{width} as at step {steps[0]}"
-            raise InputError(where=f"{where}: step {step}", found=found, needed=needed)
+    frames, size = np.empty(0, np.uint8), (0, 0)
+    for place, (image, step) in enumerate(zip(images, steps, strict=True)):
+        at = f"{where}: step {step}"
         try:
-            simplejpeg.decode_jpeg(image, colorspace="RGB", fastdct=True, buffer=frame)
+            height, width, _, _ = simplejpeg.decode_jpeg_header(image)
+            if place == 0:
+                require_bounded(height, width, at, count=len(images))
+                frames, size = np.empty((len(images), height, width, 3), np.uint8), (height, width)
+            if (height, width) != size:
+                needed = f"{size[0]}x{size[1]} as at step {steps[0]}"
+                raise InputError(where=at, found=f"an image of {height}x{width}", needed=needed)
+            # Decoded in place: stacking the images would take as long again.
+            simplejpeg.decode_jpeg(image, colorspace="RGB", fastdct=True, buffer=frames[place])
         except ValueError as error:
-            raise _no_jpeg(image, step, where, error) from None
+            found = f"{len(image)} bytes that are not a JPEG, starting with {bytes(image[:4])!r} ({error})"
+            raise InputError(where=at, found=found, needed="a JPEG or PNG image") from None
     return frames
 
 
@@ -144,19 +148,6 @@ def stack_frames(
             raise InputError(where=at, found=found, needed=f"{needed}, as at step {steps[0]}")
         stacked.append(frame)
     return np.stack(stacked)
-
-
-def _size_of(image: bytes, step: int, where: str) -> tuple[int, int]:
-    try:
-        height, width, _, _ = simplejpeg.decode_jpeg_header(image)
-    except ValueError as error:
-        raise _no_jpeg(image, step, where, error) from None
-    return height, width
-
-
-def _no_jpeg(image: bytes, step: int, where: str, error: ValueError) -> InputError:
-    found = f"{len(image)} bytes that are not a JPEG, starting with {bytes(image[:4])!r} ({error})"
-    return InputError(where=f"{where}: step {step}", found=found, needed="a JPEG or PNG image")
 
 
 def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95) -> bytes:

@@ -13,26 +13,12 @@ from predictor_files import write_predictor_file
 from tiny_models import draw, tiny_model
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model import model_files
 from vjepa2_ac.model.checkpoints import load_base, load_official
 from vjepa2_ac.model.network.world_model import ENCODER, PREDICTOR, WorldModel
 
 
-@pytest.fixture
-def assets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Stand in for the folder of models that come with the package; there is none in it."""
-    monkeypatch.setattr(model_files, "ASSETS", tmp_path / "assets")
-    return tmp_path / "assets"
-
-
 def load_with(base: Path | str, sizes: ModelSizes) -> WorldModel:
     return load_base(ModelConfig(base=str(base), sizes=sizes, dtype="float32"), seed=0)
-
-
-@pytest.mark.usefixtures("assets")
-def test_a_package_without_models_says_how_to_make_one() -> None:
-    with pytest.raises(InputError, match=r"it has none: install it again"):
-        load_with("builtin:sim-tiny", ModelSizes())
 
 
 def test_sizes_that_a_folder_does_not_have_are_refused_by_name(model: WorldModel, tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from vjepa2_ac.model.network import attention
 from vjepa2_ac.model.network.attention import (
     AttentionKind,
     TokenLayout,
-    best_kind,
     block_causal_attention,
     rotary_tables,
     rotate,
@@ -177,15 +176,3 @@ def test_a_step_sees_itself_and_the_past_but_not_the_future(kind: AttentionKind)
     same = (before == after).all(dim=-1).all(dim=1).all(dim=0)
     assert same[: 2 * PER_STEP].all()
     assert not same[2 * PER_STEP :].any()
-
-
-def test_auto_compiles_only_for_long_sequences_with_gradients_on_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
-    cpu, cuda = torch.device("cpu"), torch.device("cuda")
-    monkeypatch.setattr(attention, "has_triton", lambda: True)
-    assert best_kind(cuda, 64, 4, gradients=True) == "flex"
-    assert best_kind(cuda, 64, 3, gradients=True) == "per_step"
-    assert best_kind(cuda, 64, 15, gradients=False) == "per_step"
-    assert best_kind(cuda, 12, 15, gradients=True) == "per_step"
-    assert best_kind(cpu, 64, 15, gradients=True) == "per_step"
-    monkeypatch.setattr(attention, "has_triton", lambda: False)
-    assert best_kind(cuda, 64, 15, gradients=True) == "per_step"

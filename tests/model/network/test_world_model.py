@@ -123,13 +123,6 @@ def test_a_folder_that_claims_absurd_sizes_is_refused_before_anything_is_made(
     assert caught.value.where == f"{tmp_path / 'config.json'}: sizes"
 
 
-def test_each_frame_is_encoded_by_itself(model: WorldModel, inputs) -> None:
-    together = model.encode(inputs.frames)
-    for time in range(4):
-        alone = model.encode(inputs.frames[:, time : time + 1])
-        torch.testing.assert_close(together[:, time : time + 1], alone, rtol=1e-5, atol=1e-5)
-
-
 def test_the_encoder_stays_frozen_and_in_eval_mode_while_the_model_trains(model: WorldModel, inputs) -> None:
     model.train()
     assert model.predictor.training

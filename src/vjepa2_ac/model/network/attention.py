@@ -146,16 +146,11 @@ def block_causal_attention(
         InputError: FlexAttention was compiled for too many sizes; uncompiled it would hold all scores in memory.
     """
     if kind == "auto":
-        steps = query.shape[2] // tokens_per_step
-        kind = best_kind(query.device, query.shape[-1], steps, gradients=torch.is_grad_enabled())
+        is_long = query.shape[-1] >= _FLEX_HEAD_DIM and query.shape[2] // tokens_per_step >= _FLEX_STEPS
+        has_flex = query.device.type == "cuda" and has_triton()
+        kind = "flex" if is_long and has_flex and torch.is_grad_enabled() else "per_step"
     attend = kind if callable(kind) else _IMPLEMENTATIONS[kind]
     return attend(query, key, value, tokens_per_step)
-
-
-def best_kind(device: torch.device, head_dim: int, steps: int, *, gradients: bool) -> AttentionKind:
-    """Return the choice of `auto`: see `block_causal_attention`."""
-    fits_flex = device.type == "cuda" and head_dim >= _FLEX_HEAD_DIM and steps >= _FLEX_STEPS and gradients
-    return "flex" if fits_flex and has_triton() else "per_step"
 
 
 def _dense(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
