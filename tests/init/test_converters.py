@@ -340,8 +340,6 @@ def messages(
     orientations: Mapping[int, tuple[float, ...]] | None = None,
     joints: Sequence[str] = (),
     arm: np.ndarray | None = None,
-    second_finger: float = 1,
-    is_alternating: bool = False,
 ) -> Iterator[tuple[str, str, float, Any]]:
     """Yield topic, type, time in seconds and message; the camera is 20 ms late, so that the newest frame is its own.
 
@@ -351,29 +349,18 @@ def messages(
         orientations: Quaternions of the pose that replace the true ones, by step.
         joints: Names of the joints in /fingers.
         arm: Joints that precede the fingers in /fingers.
-        second_finger: Position of the second finger relative to the first one.
-        is_alternating: Arm and fingers are in messages of their own, the fingers first.
     """
     kinds = TYPES.types
     header = kinds["std_msgs/msg/Header"](stamp=kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id="")
     for step, (state, frame) in enumerate(zip(STATES, FRAMES, strict=True)):
-        time, fingers = step / RATE_HZ, FINGER[step] * np.array([1, second_finger])
+        time, fingers = step / RATE_HZ, np.repeat(FINGER[step], 2)
         quaternion = (orientations or {}).get(step, tuple(Rotation.from_euler("xyz", state[3:6]).as_quat()))
         turned = kinds["geometry_msgs/msg/Quaternion"](*quaternion)
         pose = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](*state[:3]), turned)
         yield "/pose", "geometry_msgs/msg/PoseStamped", time, kinds["geometry_msgs/msg/PoseStamped"](header, pose)
-        parts = [(list(joints), fingers if arm is None else np.r_[arm[step], fingers])]
-        if is_alternating and arm is not None:
-            parts = [(list(joints[-2:]), fingers), (list(joints[:-2]), arm[step])]
-        for delay, (names, numbers) in enumerate(parts):
-            positions = kinds["sensor_msgs/msg/JointState"](header, names, numbers, np.zeros(0), np.zeros(0))
-            yield "/fingers", "sensor_msgs/msg/JointState", time + 0.01 * delay, positions
-        matrix = np.eye(4)
-        has_rotation = np.linalg.norm(quaternion) > 0
-        matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(quaternion).as_matrix() if has_rotation else 0, state[:3]
-        layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
-        numbers = kinds["std_msgs/msg/Float64MultiArray"](layout, matrix.ravel(order="F"))
-        yield "/matrix", "std_msgs/msg/Float64MultiArray", time, numbers
+        numbers = fingers if arm is None else np.r_[arm[step], fingers]
+        positions = kinds["sensor_msgs/msg/JointState"](header, list(joints), numbers, np.zeros(0), np.zeros(0))
+        yield "/fingers", "sensor_msgs/msg/JointState", time, positions
         if step in skip:
             continue
         if encoding == "jpeg":
@@ -421,7 +408,7 @@ def test_a_bag_becomes_an_episode(storage: StoragePlugin, encoding: str, tmp_pat
     [
         ({"encoding": "16UC1"}, CHOSEN, r"images of 16UC1; read are rgb8.*depth is not"),
         ({"skip": range(5, 15)}, CHOSEN, r"/camera: silent for 1\.\d+ s"),
-        ({}, ("--pose", "/tf", *CHOSEN[2:]), "no topic /tf; it has /camera, /fingers, /matrix, /pose"),
+        ({}, ("--pose", "/tf", *CHOSEN[2:]), "no topic /tf; it has /camera, /fingers, /pose"),
         (
             {},
             (*CHOSEN[:4], "--gripper-open", 0.001, "--gripper-closed", 0),

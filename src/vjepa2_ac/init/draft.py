@@ -175,11 +175,10 @@ def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_di
             "keep_best": Knob("ranking", "not by error: it may fall while planning gets worse (docs/training.md)"),
         },
     }
-    config = _config_of(knobs)
-    num_encoded = found.steps or 0 if config.data.takes_latents else 0  # frames that are encoded before the first step
+    config = parse_config(plain(knobs), where="vjepa2-ac init")
     costs: list[str] = []
-    if num_encoded:
-        costs.append(f"Disk: at most {_gigabytes(num_encoded * model.bytes_a_frame)} GB of cached latents.")
+    if found.steps and config.data.takes_latents:
+        costs.append(f"Disk: at most {_gigabytes(found.steps * model.bytes_a_frame)} GB of cached latents.")
     if model.is_tiny:
         return Draft(knobs, config, costs)
     batch, checkpointing, needed = _fit(config, machine)
@@ -190,16 +189,10 @@ def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_di
         "gradient_checkpointing": Knob(checkpointing, "does not fit without" if checkpointing else "fits without"),
     }
     knobs = {**knobs, "training": {**training, **fitted}}
-    config = _config_of(knobs)
-    size = f"{needed / GIGABYTE:.1f} GB; {fits} on {machine.room}"
-    costs = [f"Memory, as `vjepa2-ac doctor` counts: {size}.", *costs]
+    costs.insert(0, f"Memory, as `vjepa2-ac doctor` counts: {needed / GIGABYTE:.1f} GB; {fits} on {machine.room}.")
     if machine.gpu is None:
         costs.append("`vjepa2-ac init` on the machine with the GPU sets batch size and precision.")
-    return Draft(knobs, config, costs)
-
-
-def _config_of(knobs: Knobs) -> Config:
-    return parse_config(plain(knobs), where="vjepa2-ac init")
+    return Draft(knobs, parse_config(plain(knobs), where="vjepa2-ac init"), costs)
 
 
 def _gigabytes(size: float) -> str:

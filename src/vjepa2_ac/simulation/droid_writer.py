@@ -58,15 +58,28 @@ def write_droid_rlds(
     Raises:
         InputError: The folder exists and is not empty, or cannot be written, or there are fewer episodes than shards.
     """
-    folder = Path(folder)
+    folder, described = Path(folder), json.loads((_ASSETS / _FEATURES).read_text())
+    steps = described["featuresDict"]["features"]["steps"]["sequence"]["feature"]["featuresDict"]["features"]
+    cameras = steps["observation"]["featuresDict"]["features"]
+    counts, num_bytes = [0] * shards, 0
     storage.require_new_folder(folder)
-    with storage.folder_writer(folder, _INFO) as partial:
-        counts, num_bytes, sizes = _write_shards(partial, episodes, shards)
+    with storage.folder_writer(folder, _INFO) as partial, ExitStack() as stack:
+        names = [f"{_NAME}-train.tfrecord-{shard:05d}-of-{shards:05d}" for shard in range(shards)]
+        files = [stack.enter_context(storage.atomic_writer(partial / name)) for name in names]
+        for number, episode in enumerate(episodes):
+            for name, jpegs in episode.images.items():
+                height, width = simplejpeg.decode_jpeg_header(jpegs[0])[:2]
+                cameras[name]["image"]["shape"]["dimensions"] = [str(height), str(width), "3"]
+            record = encode_example(_features_of(episode))
+            write_record(files[number % shards], record)
+            counts[number % shards] += 1
+            num_bytes += len(record)
+        stack.close()
         if min(counts) == 0:
             found, needed = counted(sum(counts), "episode"), f"at least one for each of {shards} shards"
             raise InputError(where=str(folder), found=found, needed=needed)
         texts = {
-            _FEATURES: json.dumps(_features_json(sizes), indent=4, sort_keys=True),
+            _FEATURES: json.dumps(described, indent=4, sort_keys=True),
             _INFO: json.dumps(dataset_info(_NAME, "1.0.0", counts, num_bytes), indent=2, sort_keys=True),
         }
         for file, text in {**(notes or {}), **texts}.items():
@@ -83,33 +96,6 @@ def dataset_info(name: str, version: str, counts: Sequence[int], num_bytes: int)
         "shardLengths": [str(count) for count in counts],
     }
     return {"fileFormat": "tfrecord", "moduleName": "__main__", "name": name, "splits": [split], "version": version}
-
-
-def _features_json(sizes: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """Return features.json of DROID's schema, for images of these heights and widths."""
-    described: dict[str, Any] = json.loads((_ASSETS / _FEATURES).read_text())
-    steps = described["featuresDict"]["features"]["steps"]["sequence"]["feature"]["featuresDict"]["features"]
-    cameras = steps["observation"]["featuresDict"]["features"]
-    for camera, (height, width) in sizes.items():
-        cameras[camera]["image"]["shape"]["dimensions"] = [str(height), str(width), "3"]
-    return described
-
-
-def _write_shards(
-    folder: Path, episodes: Iterable[DroidEpisode], shards: int
-) -> tuple[list[int], int, dict[str, tuple[int, int]]]:
-    """Return the number of episodes of each shard, the bytes of all records, and the sizes of the cameras' images."""
-    counts, num_bytes, sizes = [0] * shards, 0, dict[str, tuple[int, int]]()
-    with ExitStack() as stack:
-        names = [f"{_NAME}-train.tfrecord-{shard:05d}-of-{shards:05d}" for shard in range(shards)]
-        files = [stack.enter_context(storage.atomic_writer(folder / name)) for name in names]
-        for number, episode in enumerate(episodes):
-            sizes |= {name: simplejpeg.decode_jpeg_header(jpegs[0])[:2] for name, jpegs in episode.images.items()}
-            record = encode_example(_features_of(episode))
-            write_record(files[number % shards], record)
-            counts[number % shards] += 1
-            num_bytes += len(record)
-    return counts, num_bytes, sizes
 
 
 def _features_of(episode: DroidEpisode) -> dict[str, tuple[Kind, Sequence[Any] | np.ndarray]]:

@@ -7,6 +7,7 @@ of time and size. It imports nothing of this project, so that its pins are its o
 from __future__ import annotations
 
 import base64
+import itertools
 import json
 import os
 import re
@@ -32,6 +33,7 @@ from vjepa2_ac.goals.key_frames import OF_MODEL_STEPS, every_key_frame, gripper_
 from vjepa2_ac.media.video import video_library
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.agent import Agent
+from vjepa2_ac.simulation.arm import State
 from vjepa2_ac.simulation.benchmark import (
     BenchmarkOptions,
     ClosedLoopBenchmark,
@@ -354,39 +356,41 @@ class _DisturbedExpert(Expert):
     """Now and then holds a pose a few centimetres off, then lets the expert go on."""
 
     def __init__(self, world: OtherWorld, seed: int, every: int) -> None:
-        self._rng, self._every, self._step = np.random.default_rng([seed, 0]), every, -every
-        rate_hz = world.about.rate_hz
+        self._rng, self._steps = np.random.default_rng([seed, 0]), itertools.count(0, every)
+        self._every, rate_hz = every, world.about.rate_hz
         self._period, self._length = max(1, round(EVERY_S * rate_hz)), round(OFF_S * rate_hz)
 
     def act(self, observation: Observation) -> Action | None:
-        self._step += self._every
-        if self._step % self._period < self._every:
+        place = next(self._steps) % self._period
+        if place < self._every:
             self._target = observation.state.copy()
             self._target[:3] += OFF_M * self._rng.normal(size=3)
-        if self._step % self._period >= self._length:
-            return None
-        return np.asarray(actions_from_states(np.stack([observation.state, self._target]))[0])
+        return None if place >= self._length else _action_to(self._target, observation)
 
 
 class _Play(Expert):
     """Goes to random places in the box in which the expert moves, and now and then opens or closes the gripper."""
 
     def __init__(self, world: OtherWorld, seed: int, every: int) -> None:
-        self._rng, self._rate_hz, self._every = np.random.default_rng([seed, 1]), world.about.rate_hz, every
+        self._rng, self._steps = np.random.default_rng([seed, 1]), itertools.count(0, every)
+        self._rate_hz, self._until = world.about.rate_hz, 0.0
         expert = steps_of(world, Expert(), Trial(seed, world.about.steps // LOOK, LOOK))
         places = [step.observation.state[:3] for step in expert]
         self._low, self._high = np.min(places, axis=0) - [WIDER_M, WIDER_M, 0.0], np.max(places, axis=0) + WIDER_M
-        self._step, self._until = -every, 0.0
 
     def act(self, observation: Observation) -> Action | None:
-        self._step += self._every
-        if self._step == 0:
+        step = next(self._steps)
+        if step == 0:
             self._target = observation.state.copy()
-        if self._step >= self._until:
-            self._until = self._step + self._rng.uniform(*HELD_S) * self._rate_hz
+        if step >= self._until:
+            self._until = step + self._rng.uniform(*HELD_S) * self._rate_hz
             self._target[:3] = self._rng.uniform(self._low, self._high)
             self._target[6] = self._rng.integers(2) if self._rng.uniform() < GRIPS else self._target[6]
-        return np.asarray(actions_from_states(np.stack([observation.state, self._target]))[0])
+        return _action_to(self._target, observation)
+
+
+def _action_to(target: State, observation: Observation) -> Action:
+    return np.asarray(actions_from_states(np.stack([observation.state, target]))[0])
 
 
 def record_world(
