@@ -4,11 +4,12 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml, parse_config
 from vjepa2_ac.init import draft
-from vjepa2_ac.init.draft import Machine, choose_model, make_draft
+from vjepa2_ac.init.draft import Machine, choose_model, make_draft, this_machine
 from vjepa2_ac.init.found import FoundData, Knob, plain
 from vjepa2_ac.storage.structured import parse_yaml
 
@@ -136,3 +137,21 @@ def test_few_data_get_few_steps_and_larger_shares() -> None:
 def test_vectors_train_fresh_heads() -> None:
     config = of(replace(FOUND, states="vector", idle=None)).config
     assert config.adapter.modules_to_save == ("state_encoder", "action_encoder")
+
+
+@pytest.mark.parametrize(("capability", "precision"), [((7, 5), "fp16"), ((8, 0), "bf16")])
+def test_a_card_has_bf16_from_ampere_on(
+    capability: tuple[int, int], precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card = SimpleNamespace(name="A card", total_memory=16 * 10**9)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _device: capability)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _device: card)
+    assert this_machine().precision == precision
+
+
+def test_a_cpu_computes_in_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert this_machine().precision == "fp32"

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shlex
 from functools import partial
 from pathlib import Path
 
@@ -105,11 +104,6 @@ def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     rows = {line.split("│")[1].strip(): line for line in shown.splitlines() if line.startswith("│")}
     assert list(rows) == ["tiny", "zero action", "random", "oracle"]
     assert "reach in domain B: 2 problems of seed 0, 2 steps of 0.27 s" in shown
-    following = shlex.split(re.search(r"^Next:\s+vjepa2-ac (.*)$", shown, re.M)[1])
-    assert following[:4] == ["simulate", model, "--task", "reach"]
-    kept = {"--domain": "B", "--episodes": "50", "--films": "1", "--out": str(tmp_path)}
-    assert {name: following[following.index(name) + 1] for name in kept} == kept
-    assert following[-len(SMALL) :] == SMALL
     assert "The oracle solves only 0.0 % of these problems, so they cannot be used for" in shown
     reported = metrics(tmp_path)
     assert list(reported["policies"]) == list(rows)

@@ -1,15 +1,19 @@
-"""Demonstrations stay in their box, move as far as specified, and are measured with a lag."""
+"""Demonstrations stay in their box and are measured with a lag; inverse kinematics returns to every pose."""
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from vjepa2_ac.simulation.domains import DOMAIN_A
 from vjepa2_ac.simulation.motion import (
     HIGH,
+    HOME,
     LOW,
     MotionRecipe,
+    OutOfReachError,
     forward_kinematics,
+    inverse_kinematics,
     random_reaching,
     tracking_share,
 )
@@ -46,3 +50,24 @@ def test_a_turned_base_reports_the_same_motion_turned() -> None:
     in_world = forward_kinematics(other.commanded_joints)[:, :3] @ turned.base_pose()[:3, :3].T
     np.testing.assert_allclose(in_world, straight.commanded_poses[:, :3], atol=2e-4)
     assert np.abs(other.poses[:, :3] - straight.poses[:, :3]).max() > 0.05
+
+
+def random_joints(rng: np.random.Generator, spread_rad: float) -> np.ndarray:
+    return rng.uniform(np.maximum(LOW, HOME - spread_rad), np.minimum(HIGH, HOME + spread_rad))
+
+
+def test_inverse_kinematics_returns_to_every_pose_within_the_limits() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(100):
+        pose = forward_kinematics(random_joints(rng, 0.8))
+        joints = inverse_kinematics(pose)
+        assert ((joints >= LOW) & (joints <= HIGH)).all()
+        reached = forward_kinematics(joints)
+        assert np.linalg.norm(reached[:3] - pose[:3]) < 1e-4
+        cosine = (np.trace(matrices_from_euler(reached[3:]) @ matrices_from_euler(pose[3:]).T) - 1) / 2
+        assert np.rad2deg(np.arccos(min(1.0, cosine))) < 0.05
+
+
+def test_a_pose_out_of_reach_is_refused() -> None:
+    with pytest.raises(OutOfReachError, match="no joint angles"):
+        inverse_kinematics(np.array([1.5, 0.0, 0.5, np.pi, 0.0, 0.0]))

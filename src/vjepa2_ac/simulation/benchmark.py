@@ -86,18 +86,13 @@ class BenchmarkOptions:
         """
         return named_domain(self.domain) if isinstance(self.domain, str) else self.domain
 
-    @property
-    def model_steps(self) -> int:
-        """Model steps of an episode."""
-        return self.steps or STEPS[self.task]
-
     def trials(self) -> Trials:
         """Return the trials of the simulated arm.
 
         Raises:
             InputError: There is no domain of this name.
         """
-        task, domain, steps = self.task, self.world, self.model_steps
+        task, domain, steps = self.task, self.world, self.steps or STEPS[self.task]
         problems = (make_problem(task, domain, self.seed, index) for index in range(self.episodes))
         about = {
             **{key: value for key, value in vars(self).items() if key != "films"},

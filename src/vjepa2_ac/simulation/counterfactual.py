@@ -122,16 +122,20 @@ def simulated_outcome(dataset: Dataset, episode: int, start: int) -> Callable[[n
     Raises:
         InputError, UnreachableError: As `resimulate`.
     """
-    config = dataset.config
-    if not (Path(config.path) / SIMULATION_FILE).is_file():
+    if not Path(dataset.config.path, SIMULATION_FILE).is_file():
         return None
-    arm = resimulate(config.path, dataset.source.read(episode, config.cameras[0]), start, config.cameras[0])
+    arm = _of_dataset(dataset, episode, start)
 
     def outcome(actions: np.ndarray) -> tuple[Any, Any]:
-        happens = arm.under(actions, config.model_stride)
+        happens = arm.under(actions, dataset.config.model_stride)
         return happens.frames, happens.silhouettes
 
     return outcome
+
+
+def _of_dataset(dataset: Dataset, episode: int, start: int) -> Resimulation:
+    path, camera = dataset.config.path, dataset.config.cameras[0]
+    return resimulate(path, dataset.source.read(episode, camera), start, camera)
 
 
 class SimulatedFutures:
@@ -180,5 +184,4 @@ class SimulatedFutures:
 
     def _resimulate(self, episode: int, step: int) -> Resimulation:
         self._actions.pop((episode, step), None)
-        camera = self._dataset.config.cameras[0]
-        return resimulate(self._dataset.config.path, self._dataset.source.read(episode, camera), step, camera)
+        return _of_dataset(self._dataset, episode, step)
