@@ -34,7 +34,6 @@ from vjepa2_ac.media.images import decode_images
 from vjepa2_ac.storage.remote import read_neighbours
 
 _CHECKED = b"\xc3"  # not all bits equal, so that a damaged file seldom contains false marks
-_GROUP_STEPS = 32  # images of so many steps are one entry of the cache
 _GAP_BYTES = 1 << 15  # images at most this far apart are fetched by one read
 _CHUNK_BYTES = 1 << 20  # all of a camera's images are fetched in parallel chunks of this size
 
@@ -177,7 +176,7 @@ class RemoteEpisode:
             name: The feature's.
             feature: Its position.
             num_steps: Of the episode.
-            needed: Steps whose images are cached, with those beside them; None: all.
+            needed: Steps whose images are cached; None: all.
             where: File, record, identity and feature, for messages.
         """
         key = f"{self._key} {name}"
@@ -205,30 +204,23 @@ class RemoteEpisode:
     def _fetch_all(
         self, key: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str
     ) -> dict[int, bytes]:
-        """Fetch all of a camera's images; cache their positions, and the groups with needed ones."""
+        """Fetch all of a camera's images; cache their positions, and the needed ones."""
         start, end = feature[0], sum(feature)
         chunks = [(place, min(_CHUNK_BYTES, end - place)) for place in range(start, end, _CHUNK_BYTES)]
         piece = _Piece(start, b"".join(storage.read_ranges(self._shard.path, chunks)))
         places = _places_of(piece, feature, num_steps, where)
         self._places.write(key, (np.array(places) - (start, 0)).astype(np.uint32).tobytes())
-        steps = {step for first, stop in needed or [(0, num_steps)] for step in range(max(0, first), stop)}
-        for group in sorted({step // _GROUP_STEPS for step in steps if step < num_steps}):
-            members = places[group * _GROUP_STEPS : (group + 1) * _GROUP_STEPS]
-            start = members[0][0]
-            self._contents.write(f"{key} {group}", piece(start, sum(members[-1]) - start))
-        return {step: piece(*place) for step, place in enumerate(places)}
+        images = {step: piece(*place) for step, place in enumerate(places)}
+        steps = {step for first, stop in needed or [(0, num_steps)] for step in range(first, stop)}
+        self._contents.write_parts(key, [image if step in steps else b"" for step, image in images.items()])
+        return images
 
     def _some(self, key: str, places: list[Place], steps: Sequence[int]) -> dict[int, bytes]:
-        """Return images whose positions are known: from cached groups, or fetched, neighbours by one read."""
-        found: dict[int, bytes] = {}
-        for group in sorted({step // _GROUP_STEPS for step in steps}):
-            cached = self._contents.read(f"{key} {group}")
-            if cached is not None:
-                piece = _Piece(places[group * _GROUP_STEPS][0], cached)
-                found |= {step: piece(*places[step]) for step in steps if step // _GROUP_STEPS == group}
-        lacking = sorted(set(steps) - found.keys())
-        images = read_neighbours(self._shard.path, [places[step] for step in lacking], _GAP_BYTES)
-        return found | dict(zip(lacking, images, strict=True))
+        """Return images whose positions are known: from the cache, or fetched, neighbours by one read."""
+        images = dict(zip(steps, self._contents.read_parts(key, len(places), steps) or [b""] * len(steps), strict=True))
+        lacking = sorted(step for step, image in images.items() if not image)
+        fetched = read_neighbours(self._shard.path, [places[step] for step in lacking], _GAP_BYTES)
+        return images | dict(zip(lacking, fetched, strict=True))
 
 
 def _places_of(read: Read, feature: Place, num_steps: int, where: str) -> list[Place]:
