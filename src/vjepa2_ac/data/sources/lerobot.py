@@ -8,7 +8,7 @@ from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
@@ -173,8 +173,43 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         return table_of([found[row.id] for row in rows], config, len(rows))
 
     def _content(self, row: EpisodeRow) -> tuple[Content, bool | None]:
-        rows = self._parquet.rows(storage.join(self._info.root, row.data_file(self._info)), row.index)
-        return content_of(rows, row.length, self._info, self._config, self._where(row))
+        """Return the data in the rows of an episode, and whether it succeeded; None: they do not say.
+
+        Raises:
+            InputError: Rows or columns are missing, have another width, or are implausible states.
+        """
+        info, config, where = self._info, self._config, self._where(row)
+        rows = self._parquet.rows(storage.join(info.root, row.data_file(info)), row.index)
+        fields = config.lerobot
+        _require_rows(rows, row.length, info.fps, where)
+
+        def column(name: str) -> Float[np.ndarray, "steps width"]:
+            if name not in rows:
+                raise missing("data.lerobot", "column", name, where, rows)
+            feature, width = info.features.get(name), rows[name].shape[1]
+            if feature is not None and width != feature.width:
+                found, needed = f"{width} numbers a row", f"{feature.width}, says {info.where}"
+                raise InputError(where=f"{where}: {name}", found=found, needed=needed, fix=FIX_EPISODE)
+            return rows[name].astype(np.float64)
+
+        def joined(names: Sequence[str]) -> Float[np.ndarray, "steps width"]:
+            numbers = np.concatenate([column(name) for name in names], axis=1)
+            require_finite(numbers, where, fix=_FIX_VECTORS)
+            return numbers
+
+        def optional(name: str | None) -> Float[np.ndarray, "steps width"] | None:
+            """Return a column that a data set need not have, but then in every file."""
+            return None if name is None or (name not in rows and name not in info.features) else column(name)
+
+        states, success = joined(fields.state), optional(fields.success)
+        if fields.select is not None:
+            states = states[:, list(fields.select)]
+        content = {
+            "states": poses_from(states, fields, where, section="data.lerobot") if config.states == "pose" else states,
+            "commands": joined(fields.action) if config.actions == "recorded" else None,
+            "joint_velocities": None if optional(JOINT_VELOCITY) is None else joined([JOINT_VELOCITY]),
+        }
+        return content, None if success is None else bool(success.any())
 
     def _frames(self, row: EpisodeRow, key: str) -> FramesByStep:
         info = self._info
@@ -222,45 +257,6 @@ def wanted_columns(config: LeRobotData) -> list[str]:
     return [EPISODE, FRAME, TIME, *fields.state, *commands, *optional]
 
 
-def content_of(
-    rows: Columns, length: int, info: DatasetInfo, config: LeRobotData, where: str
-) -> tuple[Content, bool | None]:
-    """Return the data in the rows of an episode, and whether it succeeded; None: they do not say.
-
-    Args:
-        rows: As `ParquetRows.rows` returns them.
-        length: Their expected number.
-        info: The description of the data set's columns.
-        config: Names and conventions of the columns, and the kind of state.
-        where: File and episode, for messages.
-
-    Raises:
-        InputError: Rows or columns are missing, have another width, or are implausible states.
-    """
-    _require_rows(rows, length, info.fps, where)
-    fields = config.lerobot
-
-    def joined(names: Sequence[str]) -> Float[np.ndarray, "steps width"]:
-        numbers = np.concatenate([_column(rows, name, info, where).astype(np.float64) for name in names], axis=1)
-        require_finite(numbers, where, fix=_FIX_VECTORS)
-        return numbers
-
-    def has(name: str | None) -> bool:
-        if name is not None and name in info.features and name not in rows:
-            raise missing("data.lerobot", "column", name, where, rows)
-        return name is not None and name in rows
-
-    states = joined(fields.state)
-    if fields.select is not None:
-        states = states[:, list(fields.select)]
-    content = {
-        "states": poses_from(states, fields, where, section="data.lerobot") if config.states == "pose" else states,
-        "commands": joined(fields.action) if config.actions == "recorded" else None,
-        "joint_velocities": joined([JOINT_VELOCITY]) if has(JOINT_VELOCITY) else None,
-    }
-    return content, bool(rows[str(fields.success)].any()) if has(fields.success) else None
-
-
 def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
     """Check that the rows are those of the episode, complete, in order, at the data set's rate."""
     count = len(rows[EPISODE]) if rows else 0
@@ -276,13 +272,3 @@ def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
         needed = f"{step / fps:.4g} s, at the {fps:g} rows per second that meta/info.json says"
         fix = "Correct fps in meta/info.json, or leave the episode out"
         raise InputError(where=f"{where}: step {step}", found=found, needed=needed, fix=fix)
-
-
-def _column(rows: Columns, name: str, info: DatasetInfo, where: str) -> Shaped[np.ndarray, "steps _"]:
-    if name not in rows:
-        raise missing("data.lerobot", "column", name, where, rows)
-    column, feature = rows[name], info.features.get(name)
-    if feature is not None and column.shape[1] != feature.width:
-        found, needed = f"{column.shape[1]} numbers a row", f"{feature.width}, says {info.where}"
-        raise InputError(where=f"{where}: {name}", found=found, needed=needed, fix=FIX_EPISODE)
-    return column
