@@ -101,7 +101,7 @@ def main(words: Sequence[str] | None = None) -> None:
     ids, errors = [], []
     with torch.no_grad():
         for pixels in validation_batches(open_dataset(config.data), "test", clips=options.clips, batch_size=4):
-            batch = encode_batch(model, pixels, device=device, chunk=config.model.encode_chunk)
+            batch = encode_batch(model, pixels, device=device)
             for row in range(len(batch.starts)):
                 generator = start_of(batch, row, 0).generator(config.seed)
                 place = int(generator.integers(batch.latents.shape[1] - STEPS))

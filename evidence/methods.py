@@ -56,7 +56,7 @@ TRAINING = TrainingConfig(
 PLANNING = PlanningConfig(
     samples=64,
     iterations=4,
-    start_std=0.67,
+    planner={"name": "cem", "options": {"start_std": 0.67}},
     limits=LimitsConfig(xyz=(0.075, 0.075, 0.075), gripper_mode="held"),
 )
 

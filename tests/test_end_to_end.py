@@ -12,8 +12,7 @@ from vjepa2_ac.runs.metrics_log import read_metrics_log
 
 TINY = {
     "image_size": 48,
-    "patch_size": 16,
-    "encoder": {"width": 24, "depth": 1, "heads": 2, "mlp_ratio": 2.0},
+    "encoder": {"width": 24, "depth": 1, "heads": 2},
     "predictor": {"width": 24, "depth": 1, "heads": 2},
 }
 

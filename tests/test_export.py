@@ -14,7 +14,7 @@ import yaml
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from run_fixtures import TINY, SilentReporter, one_thread, tiny_config
+from run_fixtures import TINY_CONFIG, SilentReporter, one_thread, tiny_config
 from vjepa2_ac import export
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
@@ -164,7 +164,7 @@ def test_names_are_no_markup_in_the_card(trained, tmp_path: Path) -> None:
 
 
 def test_the_code_of_the_card_runs(trained, tmp_path: Path) -> None:
-    run = trained(model__sizes=TINY)
+    run = trained(model__sizes=TINY_CONFIG)
     export_run(run, tmp_path / "hub", "hub")
     blocks = re.findall(r"```python\n(.*?)```", (tmp_path / "hub" / CARD).read_text(), flags=re.DOTALL)
     assert len(blocks) == 2

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.config import Config, EncoderConfig, ModelSizes
+from vjepa2_ac.config import Config, EncoderConfig, SizesConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, config_of_model, parse_config
 from vjepa2_ac.data import dataset as datasets
@@ -155,7 +155,7 @@ def load_model(
     adapter: str | Path | None = None,
     device: Device = "auto",
     dtype: WeightType = "auto",
-    sizes: ModelSizes | None = None,
+    sizes: SizesConfig | None = None,
     encoder: str | Path | EncoderConfig | None = None,
 ) -> WorldModel:
     """Load a world model, in eval mode; no weight requires a gradient.
@@ -181,7 +181,7 @@ def load_model(
     has_bfloat16 = place.type == "cuda" and has_bf16(place)
     model_values: dict[str, Any] = {
         "dtype": ("bfloat16" if has_bfloat16 else "float32") if dtype == "auto" else dtype,
-        "sizes": (sizes or ModelSizes()).model_dump(),
+        "sizes": (sizes or SizesConfig()).model_dump(),
         "encoder": encoder.model_dump() if isinstance(encoder, EncoderConfig) else encoder and {"path": str(encoder)},
     }
     config = config_of_model(str(name), where="load_model", **model_values).model

@@ -26,7 +26,7 @@ _PACKAGE = "vjepa2-ac"
 _GPU_IS_FULL = "OutOfMemoryError"  # PyTorch's, which is not imported here
 _LESS_MEMORY = (
     "Set training.gradient_checkpointing=true, or lower training.batch_size (and raise training.accumulation),"
-    " model.encode_chunk, validation.batch_size, planning.energy.samples_at_once or decoder.batch_size"
+    " validation.batch_size, planning.energy.samples_at_once or decoder.batch_size"
 )
 _CLOSED = frozenset({errno.EACCES, errno.EPERM})
 _NO_MORE_FILES = frozenset({errno.EMFILE, errno.ENFILE})

@@ -34,15 +34,12 @@ OTHERS = {
     "data.camera": {"npz": "pixels", "rlds": "wrist_left", "lerobot": "wrist_left", "droid_raw": "right"},
     "data.path": "elsewhere",
     "data.transforms": (Component("noise"),),
-    "data.stride_candidates": (2, 3),
     "planning.budget_s": 1.0,
     "planning.planner": Component("icem"),
     "planning.energy.distance": Component("l2"),
     "training.loss": Component("l2"),
     "tracking.others": {"a tracker": {}},
     "planning.limits.axes": (0.1,),
-    "planning.goals.share": 0.3,
-    "planning.goals.stop_share": 0.3,
     "data.idle.ranges": "ranges.json",
     "data.fields.cameras": {"exterior_1_left": "steps/observation/exterior_image_2_left"},
     "data.lerobot.state": ("observation.state.gripper_position", "observation.state.cartesian_position"),
@@ -53,7 +50,6 @@ OTHERS = {
     },
     "data.lerobot.select": (6, 5, 4, 3, 2, 1, 0),
     "data.fields.select": (6, 5, 4, 3, 2, 1, 0),
-    "data.lerobot.fps": 7.0,
 }  # fmt: skip
 ONLY_REMOTE = {"data.outcome"}  # where reading the episodes costs something
 OF_THE_INDEX = {"camera", "states", "actions", "pose_frame"}

@@ -33,7 +33,7 @@ def test_the_image_is_the_encoder_input_up_to_rounding() -> None:
 def test_pairs_are_what_the_encoder_saw_and_what_it_gave(
     make_config: MakeConfig, encode_split: EncodeSplit, crop: str
 ) -> None:
-    config = make_config(data__crop=crop, data__cache_dtype="fp32", model__encode_chunk=3)
+    config = make_config(data__crop=crop, data__cache_dtype="fp32")
     pairs = encode_split(config, frames=20)
     dataset, model = open_dataset(config.data), load_base(config.model, seed=config.seed)
     numbers = [len(pairs) - 1, 0, 7]

@@ -40,7 +40,7 @@ def needed(config: Config) -> int:
 def test_every_needed_frame_is_encoded_once(
     make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int], reporter: SilentReporter
 ) -> None:
-    config = make_config(model__encode_chunk=7, data__start_every=2)
+    config = make_config(data__start_every=2)
     reported: list[tuple[int, int]] = []
     found = encode(config, tmp_path / "out", lambda *of: reported.append(of), reporter)
     frames = needed(config)

@@ -10,7 +10,7 @@ import yaml
 
 from adapted_run import write_adapted_run
 from latent_sets import encode_for
-from run_fixtures import TINY, MakeConfig, one_thread, tiny_config
+from run_fixtures import TINY_CONFIG, MakeConfig, one_thread, tiny_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
@@ -165,7 +165,7 @@ def test_a_cache_gives_the_figures_of_the_frames_and_frames_of_its_own(
 def test_a_run_without_a_base_is_measured_alone_unless_a_base_is_asked_for(
     make_config: MakeConfig,
 ) -> None:
-    config = make_config(model__base="random", model__sizes=TINY, adapter__kind="none")
+    config = make_config(model__base="random", model__sizes=TINY_CONFIG, adapter__kind="none")
     folder, dataset = write_adapted_run(config), open_dataset(config.data)
     assert [one.role for one in load_models(str(folder), config, asked(), dataset).contenders] == ["trained"]
     with pytest.raises(InputError, match=r"--against base: a model without a base"):

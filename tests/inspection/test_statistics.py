@@ -26,9 +26,10 @@ def straight_on(steps: int) -> np.ndarray:
     return states
 
 
-def test_motion_per_step_is_in_centimetres_and_degrees_at_every_stride() -> None:
+def test_motion_per_step_is_in_centimetres_and_degrees_at_every_stride(monkeypatch: pytest.MonkeyPatch) -> None:
     source = MemorySource([40], states=lambda _: straight_on(40))
-    dataset = dataset_in_memory(source, stride_candidates=(1, 4, 15, 40))
+    monkeypatch.setattr("vjepa2_ac.inspection.statistics.candidate_strides", lambda _: (1, 4, 15, 40))
+    dataset = dataset_in_memory(source)
     *found, too_wide = inspect_dataset(dataset).steps
     for one, stride in zip(found, (1, 4, 15), strict=True):
         assert (one.stride, one.seconds) == (stride, stride / 15)

@@ -9,7 +9,7 @@ import pytest
 from decisions import QUICK, STATE, image
 from paths import ROOT
 from tiny_models import tiny_model
-from vjepa2_ac.config.planning import GoalsConfig, LimitsConfig
+from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -55,14 +55,14 @@ def begun(run: Controller, seen: np.ndarray, goal: int) -> float:
 
 
 def test_a_noisy_image_of_the_goal_ends_it_and_what_is_done_stays_done() -> None:
-    run = controller(goals=GoalsConfig(stop_share=0.5))
-    run.reset(image(100))
+    run, goals = controller(), [SubGoal(image(100), share=0.5)]
+    run.follow(goals)
     assert decided(run, image(0)) == (0, 0, False, False)
     assert not run.act(noisy(100), STATE).any()
     assert (run.decision.why, run.decision.done, run.decision.plan) == ("at the goal", True, None)
     assert "below 50%" in run.decision.progress.changed
     assert not run.act(image(1), STATE).any(), "only a reset begins again"
-    run.reset(image(100))
+    run.follow(goals)
     assert run.act(image(1), STATE).any()
     plain = controller()
     plain.reset(image(100))

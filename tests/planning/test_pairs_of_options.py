@@ -51,7 +51,6 @@ OTHERS: dict[str, Any] = {
     "action_repeat": 2,
     "samples": 6,
     "iterations": 2,
-    "start_std": 0.5,
     "budget_s": 1e-6,
     "prior": "PRIOR",
     "monitor": "MONITOR",
@@ -60,8 +59,6 @@ OTHERS: dict[str, Any] = {
     "compile": "blocks",
     "axes": "AXES",
     "limits.xyz": [0.02, 0.0, 0.03],
-    "limits.ball": "l2",
-    "limits.radius": {"limits.ball": "l1", "limits.radius": 0.02},
     "limits.workspace": [[0.38, -0.02, 0.28], [0.41, 0.02, 0.31]],
     "limits.rotation": 0.1,
     "limits.axes": [0.1],
@@ -70,8 +67,6 @@ OTHERS: dict[str, Any] = {
     "energy.distance": {"energy.distance": {"name": "own energy", "options": {"power": 3.0}}},
     "energy.steps": "sum",
     "energy.samples_at_once": 3,
-    "goals.share": 0.9,
-    "goals.stop_share": 0.9,
 }
 # Other planners with their options, what a caller gives along with a frame, and a planner that needs another option.
 MORE: dict[str, Any] = {
@@ -80,6 +75,7 @@ MORE: dict[str, Any] = {
         for name, option, value in (
             ("cem", "momentum_mean", 0.5),
             ("cem", "try_mean", True),
+            ("cem", "start_std", 0.5),
             ("icem", "noise_exponent", 0.0),
             ("icem", "kept", 1.0),
             ("mppi", "temperature", 1.0),
@@ -95,8 +91,8 @@ MORE: dict[str, Any] = {
 ALONE = {"budget_s", "samples of a policy"}
 # Options that change numbers of a search only: their pairs are tried many at a time.
 NUMBERS = {
-    *("samples", "iterations", "start_std", "energy.distance", "goals.share", "energy.samples_at_once"),
-    *("limits.xyz", "limits.ball", "limits.radius", "limits.rotation", "limits.axes", "limits.gripper"),
+    *("samples", "iterations", "energy.distance", "energy.samples_at_once"),
+    *("limits.xyz", "limits.rotation", "limits.axes", "limits.gripper"),
     *(name for name in MORE if name.startswith(("cem.", "icem.", "mppi."))),
 }
 REFUSED = {

@@ -18,17 +18,11 @@ def pose(horizon: int = 1, action_repeat: int = 1, **limits: object) -> SearchSp
 
 
 @settings(max_examples=50)
-@given(
-    values=st.lists(st.floats(width=32), min_size=7, max_size=7),
-    ball=st.sampled_from(["none", "l1", "l2"]),
-    radius=st.floats(1e-3, 0.1),
-)
-def test_nothing_beyond_the_limits_comes_out(values: list[float], ball: str, radius: float) -> None:
-    found = pose(ball=ball, radius=radius).allowed(torch.tensor([values]))[0].double()
+@given(values=st.lists(st.floats(width=32), min_size=7, max_size=7))
+def test_nothing_beyond_the_limits_comes_out(values: list[float]) -> None:
+    found = pose().allowed(torch.tensor([values]))[0].double()
     assert torch.isfinite(found).all()
     assert (found.abs() <= torch.tensor(LIMITS, dtype=torch.float64)).all()
-    if ball != "none":
-        assert torch.linalg.vector_norm(found[:3], ord=int(ball[1])) <= radius
 
 
 @pytest.mark.parametrize(

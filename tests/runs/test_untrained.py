@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from run_fixtures import TINY, MakeConfig
+from run_fixtures import TINY_CONFIG, MakeConfig
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.episode import Widths
@@ -24,7 +24,7 @@ from vjepa2_ac.runs.folder import CONFIG
 from vjepa2_ac.runs.subject import load_subject
 
 SELECTED = "The selected checkpoint is the base model: fine-tuning did not improve action ranking."
-SCRATCH = {"model__base": "random", "model__sizes": TINY, "adapter__kind": "none"}
+SCRATCH = {"model__base": "random", "model__sizes": TINY_CONFIG, "adapter__kind": "none"}
 FEW = EvaluationOptions(clips=3, probes=ProbeOptions(ranking_clips=0, examples=0))
 
 

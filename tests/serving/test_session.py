@@ -174,7 +174,7 @@ def test_a_dry_run_plans_and_sends_zeros() -> None:
 
 
 BOX = ((0.3, -0.2, 0.1), (0.45, 0.2, 0.5))
-LIMITS = LimitsConfig(xyz=(0.05, 0.04, 0.03), rotation=0.1, ball="l2", radius=0.045, workspace=BOX)
+LIMITS = LimitsConfig(xyz=(0.05, 0.04, 0.03), rotation=0.1, workspace=BOX)
 
 
 class _Liar(Controller):
@@ -231,7 +231,6 @@ def test_whatever_a_controller_plans_the_action_sent_is_within_the_limits(
         assert ((sent[:, 6] >= 0) & (sent[:, 6] <= 1)).all()
         steps = POSE.differences(np.stack([state, sent[-1]]))
     assert (abs(steps) <= LARGEST + 1e-5).all()
-    assert (np.linalg.norm(steps[:, :3], axis=1) <= LIMITS.radius + 1e-5).all()
     targets = state[:3] + np.cumsum(steps[:, :3], axis=0)
     is_inside = (targets >= np.array(BOX[0]) - 1e-5).all() and (targets <= np.array(BOX[1]) + 1e-5).all()
     assert is_inside or not abs(steps[:, :3]).max() > 1e-9
@@ -243,8 +242,7 @@ def test_whatever_a_controller_plans_the_action_sent_is_within_the_limits(
 
 
 WITHIN = np.array([[0.02, 0.01, 0.0, 0.09, 0.0, 0.0, 0.0]] * 2)
-BOXED = LIMITS.model_copy(update={"ball": "none"})
-PLAIN = BOXED.model_copy(update={"workspace": None})
+PLAIN = LIMITS.model_copy(update={"workspace": None})
 
 
 def changed(step: int, axis: int, value: float) -> np.ndarray:
@@ -277,26 +275,20 @@ def test_rounding_of_limits_that_are_searched_in_float32_is_allowed() -> None:
     assert "rotation" in why_not_sent(STATE, changed(0, 3, np.pi + 5e-7), widest, POSE), "a half turn, the other way"
 
 
-def test_a_motion_within_the_limit_of_each_axis_and_outside_the_ball_is_not_sent() -> None:
-    ball = PLAIN.model_copy(update={"ball": "l2"})
-    assert why_not_sent(STATE, changed(0, 0, 0.043), ball, POSE) == ""
-    assert "ball" in why_not_sent(STATE, changed(1, 0, 0.0449), ball, POSE)
-
-
 @pytest.mark.parametrize(("steps", "is_sent"), [((0.02, 0.02), True), ((0.04, 0.04), False), ((0.04, -0.04), True)])
 def test_the_targets_of_all_steps_together_are_in_the_workspace(steps: tuple[float, float], is_sent: bool) -> None:
     changes = np.zeros((2, 7))
     changes[:, 0] = steps
-    assert why_not_sent(STATE, changes, BOXED, POSE) == ("" if is_sent else "out of planning.limits.workspace")
+    assert why_not_sent(STATE, changes, LIMITS, POSE) == ("" if is_sent else "out of planning.limits.workspace")
     assert why_not_sent(STATE, changes, PLAIN, POSE) == ""
 
 
 def test_outside_the_workspace_only_the_position_has_to_stay() -> None:
     outside, turn = np.array([0.5, *STATE[1:]]), np.zeros((2, 7))
     turn[:, 3:] = 0.05
-    assert why_not_sent(outside, turn, BOXED, POSE) == ""
+    assert why_not_sent(outside, turn, LIMITS, POSE) == ""
     turn[0, 0] = -0.01  # not far enough
-    assert "workspace" in why_not_sent(outside, turn, BOXED, POSE)
+    assert "workspace" in why_not_sent(outside, turn, LIMITS, POSE)
 
 
 def test_changes_of_vectors_are_within_the_limits_of_their_axes() -> None:

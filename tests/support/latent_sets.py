@@ -56,7 +56,7 @@ def encode_for(config: Config, world_model: WorldModel, dataset: Dataset) -> Pat
         inputs = pixels_to_input(torch.from_numpy(np.ascontiguousarray(frames))[None], world_model.image_size)
         is_bf16 = config.training.precision == "bf16"
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=is_bf16):
-            return world_model.encode(inputs, chunk=config.model.encode_chunk)[0]
+            return world_model.encode(inputs)[0]
 
     return write_cache(dataset, encoding_of(world_model, config), encode)
 

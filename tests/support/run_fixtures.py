@@ -33,6 +33,11 @@ TINY = {
     "encoder": {"width": 24, "depth": 1, "heads": 2, "mlp_ratio": 2.0},
     "predictor": {"width": 24, "depth": 2, "heads": 2},
 }
+TINY_CONFIG = {  # of a model from scratch
+    "image_size": 32,
+    "encoder": {"width": 24, "depth": 1, "heads": 2},
+    "predictor": TINY["predictor"],
+}
 
 
 @contextmanager

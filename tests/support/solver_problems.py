@@ -8,15 +8,15 @@ from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.planning.planner import Plan, Planner
-from vjepa2_ac.planning.search_space import Ball, SearchSpace
+from vjepa2_ac.planning.search_space import SearchSpace
 
 PLANNERS = ("cem", "icem", "mppi", "gradient")
 
 
-def space(decisions: int = 1, dim: int = 2, reach: float = 1.0, ball: Ball | None = None) -> SearchSpace:
+def space(decisions: int = 1, dim: int = 2, reach: float = 1.0) -> SearchSpace:
     """Return a box around zero."""
     upper = torch.full((decisions, dim), reach)
-    return SearchSpace(-upper, upper, upper, ball=ball)
+    return SearchSpace(-upper, upper, upper)
 
 
 def config(

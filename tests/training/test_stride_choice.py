@@ -14,10 +14,17 @@ from vjepa2_ac.training.loop import train
 Make = Callable[..., Config]
 
 
+@pytest.fixture(autouse=True)
+def candidates(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    strides = [2, 3]
+    monkeypatch.setattr("vjepa2_ac.inspection.variants.candidate_strides", lambda _: strides)
+    return strides
+
+
 def test_a_run_chooses_keeps_and_never_chooses_again(
     make_config: Make, reporter: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = make_config(data__stride="auto", data__stride_candidates=[2, 3], training__steps=2)
+    config = make_config(data__stride="auto", training__steps=2)
     folder = train(config, reporter)
     chosen = json.loads((folder / "calibration.json").read_text())["stride"]
     assert chosen in {2, 3}
@@ -30,15 +37,16 @@ def test_a_run_chooses_keeps_and_never_chooses_again(
     assert not [note for note in more.notes if "Best: stride" in note]
 
 
-def test_only_a_stride_at_which_the_runs_own_clips_fit_is_chosen(make_config: Make, reporter: Any) -> None:
+def test_only_a_stride_at_which_the_runs_own_clips_fit_is_chosen(
+    make_config: Make, reporter: Any, candidates: list[int]
+) -> None:
     # 24 steps hold 12 frames at stride 2 only, though the 8 frames of a calibration at stride 3, too.
-    config = make_config(data__stride="auto", data__stride_candidates=[2, 3], data__frames=12, training__steps=1)
+    config = make_config(data__stride="auto", data__frames=12, training__steps=1)
     assert read_run_config(train(config, reporter)).data.stride == 2
     assert "  stride 3: not possible: no clip of 12 frames fits" in reporter.notes
+    candidates.remove(2)
     with pytest.raises(InputError, match="shorter than a clip"):
-        train(
-            make_config(data__stride="auto", data__stride_candidates=[3], data__frames=12, run_dir="unused"), reporter
-        )
+        train(make_config(data__stride="auto", data__frames=12, run_dir="unused"), reporter)
 
 
 def test_a_model_that_has_learned_nothing_is_not_asked(make_config: Make, reporter: Any) -> None:

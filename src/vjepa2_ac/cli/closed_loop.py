@@ -146,7 +146,7 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None) -> Served:
     """Load the model, and make a first decision; runs in the planning thread."""
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.planning.controller import Controller
-    from vjepa2_ac.planning.goals import with_shares
+    from vjepa2_ac.planning.goals import require_ends
     from vjepa2_ac.policies.score import is_blind, ranking_of_run
     from vjepa2_ac.serving.about import in_words, metadata_of, roboarena_metadata, warm_up
     from vjepa2_ac.serving.recording import Recorder
@@ -165,8 +165,9 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None) -> Served:
         is_blind=is_blind(ranking_of_run(options.subject, loaded.chosen)),
     )
     controller = Controller.of_subject(loaded, extrinsics=options.extrinsics)
-    kept = {name: with_shares(one, loaded.config.planning.goals, first=1) for name, one in (goals or {}).items()}
-    session = Session(controller, kept, how)
+    for kept in (goals or {}).values():
+        require_ends(kept, first=1)
+    session = Session(controller, goals or {}, how)
     about = metadata_of(loaded, session)
     told = about if options.metadata == "full" else roboarena_metadata(session)
     Work.begin("the first decision")

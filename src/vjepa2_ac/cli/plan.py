@@ -73,7 +73,7 @@ def _plan(options: argparse.Namespace) -> int:
     that the plan is worse than the zero action or than the current frame; the first line of the result then says so.
     """
     from vjepa2_ac.data.sources.indexed_source import measured_space
-    from vjepa2_ac.planning.goals import with_shares
+    from vjepa2_ac.planning.goals import require_ends
 
     state = options.state
     cli.require_goals(options.goals)
@@ -81,7 +81,7 @@ def _plan(options: argparse.Namespace) -> int:
     measured_space(config.data, len(state)).require_state(state, "--state")  # how wide, only the model knows
     cli.make_folder(options.out)
     goals = _goals_of(options, config)
-    with_shares(goals, config.planning.goals, first=1)
+    require_ends(goals, first=1)
     start, mask = _images(options, goals[0].image)
 
     from vjepa2_ac.cli.console.tables import plan_table

@@ -1,7 +1,15 @@
 """Config knobs: each is defined once, with type, range, default and meaning. `config.loading` reads them."""
 
 from vjepa2_ac.config.data import DataConfig, DiskCacheConfig, IdleConfig
-from vjepa2_ac.config.model import AdapterConfig, EncoderConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
+from vjepa2_ac.config.model import (
+    AdapterConfig,
+    EncoderConfig,
+    EncoderSizes,
+    ModelConfig,
+    ModelSizes,
+    PredictorSizes,
+    SizesConfig,
+)
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.config.run import Config, ReplayConfig
 from vjepa2_ac.config.section import Section

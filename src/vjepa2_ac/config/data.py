@@ -28,7 +28,6 @@ from vjepa2_ac.registry import SOURCES, TRANSFORMS
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
 Split = Literal["train", "validation", "test"]
-_STRIDES_AT_15_HZ = (4, 8, 15)
 _JOINED = "to sum (deltas), mean (velocities) or last (absolute targets)"
 
 
@@ -127,12 +126,11 @@ class DataConfig(Section):
     """Frames of a clip, one per model step."""
     stride: Annotated[PositiveInt | Literal["auto"], Affects.CLIPS | Affects.PLAN] = 4
     """Control steps per model step. Unsettled for the released weights: 4, 8 and 15 are candidates. auto: before the
-    first step the model chooses among `stride_candidates` by its prediction error over persistence."""
+    first step the model chooses among 4, 8 and 15 at 15 control steps per
+    second, scaled to other rates, by its prediction error over persistence."""
     start_every: PositiveInt = 1
     """Clips start at multiples of this many control steps, counted from the first step of their episode that
     `data.idle` keeps. With the stride's own number, only every stride-th frame is ever needed: a small latent cache."""
-    stride_candidates: Annotated[Annotated[tuple[PositiveInt, ...], Field(min_length=1)] | None, Affects.RUN] = None
-    """Strides that `auto` and `data calibrate` evaluate; null: 4, 8, 15 at 15 control steps per second, or scaled."""
     validation_share: Annotated[Share, Affects.RUN] = 0.05
     """Share of the episodes held out for validation, by a hash of their identity; at least one of three, unless 0."""
     test_share: Annotated[Share, Affects.RUN] = 0.05
@@ -317,12 +315,6 @@ class DataConfig(Section):
         if self.stride == "auto":
             raise ValueError("data.stride is auto: calibrate first")
         return self.stride
-
-    def strides_to_try(self, control_rate_hz: float) -> tuple[int, ...]:
-        """Return the candidate strides at a control rate."""
-        if self.stride_candidates is not None:
-            return self.stride_candidates
-        return tuple(sorted({max(1, round(stride * control_rate_hz / 15)) for stride in _STRIDES_AT_15_HZ}))
 
     def with_stride(self, stride: int) -> DataConfig:
         """Return the config with a calibrated stride."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from vjepa2_ac.config.section import Affects, PositiveInt, Section, Share
 from vjepa2_ac.storage import places
@@ -79,7 +79,7 @@ class PredictorSizes(Section):
 
 
 class ModelSizes(Section):
-    """Sizes of a world model. The defaults are V-JEPA 2-AC ViT-g/16 at 256 px."""
+    """Sizes of a world model, as its file has them. The defaults are V-JEPA 2-AC ViT-g/16 at 256 px."""
 
     image_size: Annotated[int, Field(ge=1, le=8_192)] = 256
     """Height and width of a frame in pixels; a multiple of patch_size."""
@@ -140,6 +140,61 @@ class ModelSizes(Section):
         )
 
 
+class EncoderSizesConfig(Section):
+    """Sizes of a random encoder; of an official `.pt` its heads."""
+
+    width: Width = 1408
+    """Width of a latent."""
+    depth: Depth = 40
+    """Transformer blocks."""
+    heads: Heads = 22
+    """Attention heads; width / heads is the size of a head."""
+
+
+class PredictorSizesConfig(Section):
+    """Sizes of a fresh predictor; of an official `.pt` its heads, and whether the camera pose is an input."""
+
+    width: Width = 1024
+    """Width of a token."""
+    depth: Depth = 24
+    """Transformer blocks."""
+    heads: Heads = 16
+    """Attention heads."""
+    use_extrinsics: bool = False
+    """Whether the camera pose is one more input token per time step."""
+    use_states: bool = True
+    """Whether the state is an input token of each time step. false: the model never sees the states, for a robot whose
+    states are not calibrated; those of the data may then have any width."""
+
+
+class SizesConfig(Section):
+    """Sizes of a world model that a config chooses. The defaults are V-JEPA 2-AC ViT-g/16 at 256 px."""
+
+    image_size: Annotated[int, Field(ge=1, le=8_192)] = 256
+    """Height and width of a frame in pixels; a multiple of 16, the size of a patch."""
+    encoder: EncoderSizesConfig = EncoderSizesConfig()
+    """The frozen encoder."""
+    predictor: PredictorSizesConfig = PredictorSizesConfig()
+    """The predictor."""
+
+    @property
+    def whole(self) -> ModelSizes:
+        """All sizes: MLPs as wide as in the published models; states and actions of a pose until the data say more."""
+        released = EncoderSizes()
+        ratio = released.mlp_ratio if self.encoder.width == released.width else 4.0
+        encoder = EncoderSizes(mlp_ratio=ratio, **self.encoder.model_dump())
+        predictor = PredictorSizes(**self.predictor.model_dump())
+        return ModelSizes(image_size=self.image_size, encoder=encoder, predictor=predictor)
+
+    @model_validator(mode="after")
+    def _fit_together(self) -> SizesConfig:
+        try:
+            _ = self.whole
+        except ValidationError as error:
+            raise ValueError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
+        return self
+
+
 class EncoderConfig(Section):
     """An encoder of its own, under a predictor that does not bring one."""
 
@@ -170,13 +225,11 @@ class ModelConfig(Section):
     encoder: Annotated[EncoderConfig | None, Affects.RUN] = None
     """A pretrained encoder, for `base: random` or a base that holds a predictor alone; null: the base's own. Family,
     width, depth and MLP are the file's."""
-    sizes: Annotated[ModelSizes, Affects.RUN | Affects.PLAN] = ModelSizes()
+    sizes: Annotated[SizesConfig, Affects.RUN | Affects.PLAN] = SizesConfig()
     """The sizes for `base: random`; of an official `.pt` what the file does not contain: the image size, the heads, and
     whether the camera pose is an input. All other sizes are read from the file."""
     dtype: Annotated[Literal["float32", "bfloat16"], Affects.LATENTS | Affects.RUN | Affects.PLAN] = "bfloat16"
     """Type of the frozen weights; trained weights are always float32. Planning computes in it."""
-    encode_chunk: Annotated[PositiveInt, Affects.RUN] = 16
-    """Frames that go through the encoder at once: bounds its memory."""
 
     @property
     def is_random(self) -> bool:
@@ -185,7 +238,7 @@ class ModelConfig(Section):
 
     def with_base(self, name: str) -> ModelConfig:
         """Return the config of another model that is there, with the other settings of this one."""
-        sizes = ModelSizes() if self.is_random else self.sizes
+        sizes = SizesConfig() if self.is_random else self.sizes
         return self.model_copy(update={"base": name, "encoder": None, "sizes": sizes})
 
 

@@ -23,7 +23,6 @@ from vjepa2_ac.registry import ENERGIES, PLANNERS
 
 Place = Annotated[float, Field(ge=-5.0, le=5.0)]  # along an axis of the base frame, in metres; no arm reaches farther
 Corner = tuple[Place, Place, Place]
-Fraction = Annotated[float, Field(gt=0.0, lt=1.0)]
 ELITES = 10  # of the planners cem and icem, unless their option says another number
 Metre = ZeroToOne  # no arm moves farther in a model step: more would be millimetres
 
@@ -34,10 +33,6 @@ class LimitsConfig(Section):
     xyz: Literal["data"] | tuple[Metre, Metre, Metre] = (0.05, 0.05, 0.05)
     """Largest dx, dy, dz in metres, 1 at most; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075. data: what the
     run was taught, the 99th percentile along each axis."""
-    ball: Literal["none", "l1", "l2"] = "none"
-    """Whether (dx, dy, dz) is also limited to a ball: sum of absolute values (l1) or length (l2)."""
-    radius: Positive = 0.05
-    """Of the ball, in metres."""
     workspace: tuple[Corner, Corner] | None = None
     """Corners (lowest and highest x, y, z, in metres) of the box in which every target of the flange lies: an action is
     cut; a robot that is outside by more than one step does not move. Of poses in the base frame."""
@@ -91,17 +86,6 @@ class EnergyConfig(Section):
     """Action sequences that go through the predictor at once: bounds its memory."""
 
 
-class GoalsConfig(Section):
-    """When the next of several goals takes its turn, and when the last one is reached."""
-
-    share: Fraction | None = None
-    """Of all goals but the last, instead of what each says: the next one follows once the energy is below this share of
-    what it was when the goal began, within its bounds on the number of steps. null: each goal's own share, if any."""
-    stop_share: Fraction | None = None
-    """Of the last goal, or the only one, instead of its own: below this share of its first energy it is reached, and
-    nothing is done until the next reset. null: its own share, if any; else it is reached by an equal image only."""
-
-
 class PlanningConfig(Section):
     """One decision: from the current frame to an action."""
 
@@ -116,8 +100,6 @@ class PlanningConfig(Section):
     """Action sequences an iteration; the planner gradient has its option `starts` instead."""
     iterations: PositiveInt = 10
     """Iterations of sampling and fitting."""
-    start_std: Positive = 1.0
-    """Standard deviation of the first samples, as a share of the limits of position and rotation."""
     budget_s: Positive | None = None
     """Seconds of search after which the best plan so far is taken: no iteration begins that would not end by then. The
     first always runs. Encoding the frame is not counted. null: all iterations run."""
@@ -143,8 +125,6 @@ class PlanningConfig(Section):
     """Limits of every action."""
     energy: EnergyConfig = EnergyConfig()
     """Distance of a prediction from the goal."""
-    goals: GoalsConfig = GoalsConfig()
-    """Several goals one after another, and the end of the last one."""
 
     @model_validator(mode="after")
     def _numbers_fit(self) -> PlanningConfig:

@@ -24,6 +24,9 @@ REMOVED: dict[str, RemovedKey] = {
     "planning.limits.gripper_from": RemovedKey("0", (0,)),
     "planning.limits.gripper_rounding": RemovedKey("0.25", (0.25,)),
     "planning.prior_steps": RemovedKey("3", (3,)),
+    "planning.goals": RemovedKey("what each goal says", ({"share": None, "stop_share": None},)),
+    "planning.limits.ball": RemovedKey("none; planning.limits.xyz limits each axis", ("none",)),
+    "planning.limits.radius": RemovedKey("none; planning.limits.xyz limits each axis", (0.05,)),
     "planning.replan": RemovedKey("always", ("always",)),
     "decoder.average": RemovedKey("0.999, less in a short training", (0.999, 0.998, 0.99)),
     "decoder.checkpoint_every": RemovedKey("500, or a third of decoder.steps", (500, 200)),
@@ -33,6 +36,14 @@ REMOVED: dict[str, RemovedKey] = {
     "decoder.warmup_steps": RemovedKey("500, at most a 15th of decoder.steps", (500, 100, 30)),
     "decoder.weight_decay": RemovedKey("0.05", (0.05,)),
     "model.encoder_weights": RemovedKey("target_encoder, if the file has it", ("target_encoder",)),
+    "model.encode_chunk": RemovedKey("16", (16,)),
+    "model.sizes.encoder.family": RemovedKey("v2 of a random encoder, else what the file holds", ("v2",)),
+    "model.sizes.encoder.frame": RemovedKey("tubelet, or model.encoder.frame", ("tubelet",)),
+    "model.sizes.encoder.mlp_ratio": RemovedKey("that of the published width, else 4", (48 / 11, 4.0)),
+    "model.sizes.patch_size": RemovedKey("16 of a random encoder, else what the file holds", (16,)),
+    "model.sizes.predictor.action_dim": RemovedKey("the width of the data's actions", (7,)),
+    "model.sizes.predictor.mlp_ratio": RemovedKey("4", (4.0,)),
+    "model.sizes.predictor.state_dim": RemovedKey("the width of the data's states", (7,)),
     "model.random_start": RemovedKey("persistence", ("persistence",)),
     "data.augment": RemovedKey(
         "off; use data.transforms",
@@ -41,12 +52,14 @@ REMOVED: dict[str, RemovedKey] = {
     "data.check_crc": RemovedKey("once", ("once",)),
     "data.connections": RemovedKey("16", (16,)),
     "data.droid_raw": RemovedKey("drop, at 15 Hz", ({"skip_action": "drop", "control_rate_hz": 15.0},)),
+    "data.lerobot.fps": RemovedKey("what meta/info.json says", (None,)),
     "data.lerobot.joint_velocity": RemovedKey(
         "action.joint_velocity, if there is one", ("action.joint_velocity", None)
     ),
     "data.motion_limits": RemovedKey("2.5 m/s and 10 rad/s", ({"speed_m_s": 2.5, "rotation_rad_s": 10.0},)),
     "data.prefetch": RemovedKey("2", (2,)),
     "data.short_episodes": RemovedKey("skip", ("skip",)),
+    "data.stride_candidates": RemovedKey("4, 8 and 15 at 15 Hz, scaled to other rates", (None,)),
     "training.teacher_forcing_weight": RemovedKey("1", (1.0,)),
     "training.rollout_weight": RemovedKey("1", (1.0,)),
     "training.start_learning_rate": RemovedKey("0", (0.0,)),
@@ -64,6 +77,7 @@ MOVED = {
         for name in ("cem", "icem", "mppi", "gradient")
     },
     "planning.planner_options": "planning.planner: {name: NAME, options: {...}}",
+    "planning.start_std": "planning.planner: {name: NAME, options: {start_std: NUMBER}}",
     "planning.energy.options": "planning.energy.distance: {name: NAME, options: {...}}",
     "training.loss_options": "training.loss: {name: NAME, options: {...}}",
     "training.smooth_l1_beta": "training.loss: {name: smooth_l1, options: {beta: 1.0}}",
@@ -119,13 +133,15 @@ def move_component_options(values: dict[str, Any]) -> None:
         older = {one: section.pop(one, None) for one in _OLDER_OPTIONS[key]}
         if name == "smooth_l1" and "smooth_l1_beta" in older:
             older[name] = {"beta": older["smooth_l1_beta"]}
+        if name in {"cem", "icem", "mppi"} and older.get("start_std") not in (None, 1.0):
+            older[name] = {**(older.get(name) or {}), "start_std": older["start_std"]}
         given = (older.get(name), older.get(f"{key}_options"), older.get("options"), component.get("options"))
         options = {option: one[option] for one in given if isinstance(one, dict) for option in one}
         section[key] = {**component, "options": options} if options else component
 
 
 _OLDER_OPTIONS = {
-    "planner": ("planner_options", "cem", "icem", "mppi", "gradient"),
+    "planner": ("planner_options", "cem", "icem", "mppi", "gradient", "start_std"),
     "distance": ("options",),
     "loss": ("loss_options", "smooth_l1_beta"),
 }

@@ -100,8 +100,6 @@ class LeRobotFields(PoseFields):
     """Camera name -> video feature."""
     success: str | None = "is_episode_successful"
     """Column with the episode's success, used if there is one."""
-    fps: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
-    """Control steps per second; null: what meta/info.json says."""
 
 
 class RldsData(DataConfig):
@@ -154,7 +152,7 @@ class LeRobotData(DataConfig):
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.lerobot:LeRobotSource"
     gripper_fix: ClassVar[str] = "exchange data.lerobot.gripper_open and gripper_closed"
-    constants: ClassVar[dict[str, dict[str, Any]]] = {"lerobot": {"joint_velocity": JOINT_VELOCITY}}
+    constants: ClassVar[dict[str, dict[str, Any]]] = {"lerobot": {"joint_velocity": JOINT_VELOCITY, "fps": None}}
     has_camera_poses: ClassVar[bool] = False
 
     source: Literal["lerobot"] = "lerobot"

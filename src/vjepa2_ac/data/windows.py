@@ -187,6 +187,11 @@ def drawn(id_hash: int, start: int) -> float:
     return (_mix((id_hash + (start + 1) * 0x9E3779B97F4A7C15) & _MASK64) >> 11) / (1 << 53)
 
 
+def candidate_strides(control_rate_hz: float) -> tuple[int, ...]:
+    """Return the strides that a model chooses among: 4, 8 and 15 at 15 control steps per second, scaled."""
+    return tuple(sorted({max(1, round(stride * control_rate_hz / 15)) for stride in (4, 8, 15)}))
+
+
 def require_stride(config: DataConfig, *, to: str, fix: str = "`vjepa2-ac data calibrate CONFIG` finds one") -> int:
     """Return the stride of a config.
 

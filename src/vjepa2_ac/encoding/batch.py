@@ -19,11 +19,14 @@ from vjepa2_ac.data.sources.latents import Encoding, LatentSource, another_cache
 from vjepa2_ac.data.transforms import Crop, pixels_to_input, split_views, view
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.encoder import ENCODE_CHUNK
 from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text
 
 
 @torch.no_grad()
-def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int) -> LatentBatch:
+def encode_batch(
+    world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int = ENCODE_CHUNK
+) -> LatentBatch:
     """Encode the frames of a batch on the device, each independently.
 
     Latents of a batch from a cache are used unchanged: `require_same_encoder` has compared the encoders.
@@ -62,7 +65,7 @@ def encode_frames(
     frames: UInt8[np.ndarray, "time height all 3"],
     crop: Crop,
     *,
-    chunk: int = 16,
+    chunk: int = ENCODE_CHUNK,
     views: int = 1,
 ) -> Float[Tensor, "time tokens dim"]:
     """Return the latents of camera frames, each encoded independently, on the model's device.

@@ -26,6 +26,7 @@ from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
 from vjepa2_ac.distributed import autocast
 from vjepa2_ac.episode import Episode, Progress, StoredLatents, no_progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.encoder import ENCODE_CHUNK
 from vjepa2_ac.model.network.world_model import WorldModel
 
 FRAMES_AT_ONCE = 64  # decoded in one go: a run of a video, and 180 MB of 720p at most
@@ -49,13 +50,13 @@ class EncoderOnDevice:
     world_model: WorldModel
     device: torch.device
     autocast: Callable[[], contextlib.AbstractContextManager[object]]
-    chunk: int  # frames at once
+    chunk: int = ENCODE_CHUNK  # frames at once
 
     @classmethod
     def of(cls, config: Config, model: WorldModel, device: torch.device) -> EncoderOnDevice:
         """Move the encoder of a model, and only the encoder, to a device."""
         model.present_encoder.to(device)
-        return cls(model, device, partial(autocast, config.training, device), config.model.encode_chunk)
+        return cls(model, device, partial(autocast, config.training, device))
 
     @torch.no_grad()
     def latents(self, inputs: Float[Tensor, "time 3 size size"]) -> Float[Tensor, "time tokens dim"]:

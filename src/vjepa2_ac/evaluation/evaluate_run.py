@@ -161,7 +161,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions, *, reporter: Report
             evaluation = evaluate(loaded.contenders, clips, about, probes=asked.probes, reporter=reporter)
             decoded = None
             if decoder is not None:
-                encode = partial(_encoded, world_model, chunk=config.model.encode_chunk)
+                encode = partial(_encoded, world_model)
                 decoder.to(device)
                 decoded = measure_decoded(
                     loaded.contenders, clips, decoder, evaluation.examples, encode=encode, reporter=reporter
@@ -172,11 +172,11 @@ def evaluate_subject(subject: str, asked: EvaluationOptions, *, reporter: Report
 
 
 def _encoded(
-    world_model: WorldModel, images: Float[Tensor, "batch time 3 size size"], *, chunk: int
+    world_model: WorldModel, images: Float[Tensor, "batch time 3 size size"]
 ) -> Float[Tensor, "batch time tokens dim"]:
     """Return the latents of decoded images, rounded to 8 bits as camera images are."""
     pixels = torch.from_numpy(as_pixels(images)).to(images.device)
-    return world_model.encode(pixels_to_input(pixels, world_model.image_size), chunk=chunk)
+    return world_model.encode(pixels_to_input(pixels, world_model.image_size))
 
 
 def _require_places(subject: str, asked: EvaluationOptions) -> None:
@@ -198,7 +198,7 @@ def _clips(
 ) -> RepeatableClips:
     """Return the clips at these windows, with the frames as the encoder sees them; of cached latents, small ones."""
     batch_size = config.validation.batch_size
-    encode = partial(encode_batch, world_model, device=device, chunk=config.model.encode_chunk)
+    encode = partial(encode_batch, world_model, device=device)
     own = own_part(len(windows), batch_size)
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
     some = partial(batches_of, dataset, may_be_none=True)

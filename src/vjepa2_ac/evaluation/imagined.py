@@ -187,7 +187,7 @@ def imagine_clip(
         notes = (f"What really happens under other actions is not known: {error}",)
     rollouts: list[Imagined] = []
     with accelerator.autocast():
-        latents = encode_batch(models.world_model, batch, device=accelerator.device, chunk=config.model.encode_chunk)
+        latents = encode_batch(models.world_model, batch, device=accelerator.device)
         start, states = Start.of(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
         for name, actions in chosen.items():
             for one in models.contenders:

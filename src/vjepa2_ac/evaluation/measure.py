@@ -59,6 +59,7 @@ class ClipSample:
     clips: int = 64  # at most
     frames: int | None = None  # of a clip; None: as the data have them, but 8 at most
     batch_size: int = 8
+    strides: tuple[int, ...] = ()  # of a calibration; empty: `windows.candidate_strides`
 
     def frames_of(self, config: DataConfig) -> int:
         """Return the frames of a clip of these data."""

@@ -211,7 +211,7 @@ def calibrate_axes(
         merge_adapter(world_model)
     world_model.to(accelerator.device).eval()
     starts: list[RolloutStart] = []
-    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
+    encode = partial(encode_batch, world_model, device=accelerator.device)
     with torch.no_grad():
         for batch in validation_batches(dataset, split, clips=pairs, batch_size=config.validation.batch_size):
             latents = encode(batch)

@@ -101,7 +101,7 @@ def probe_config(
     """
     accelerator = make_accelerator(config)
     world_model = load_named(config, dataset, model).to(accelerator.device)
-    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
+    encode = partial(encode_batch, world_model, device=accelerator.device)
     split: Split = "validation"
     try:
         dataset.windows(split)

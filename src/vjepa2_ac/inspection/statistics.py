@@ -14,6 +14,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
+from vjepa2_ac.data.windows import candidate_strides
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.inspection.coverage import (
@@ -81,7 +82,7 @@ class Inspection:
     def steps(self) -> tuple[StepSizes, ...]:
         """The motion per model step at each candidate stride."""
         rate = self.dataset.control_rate_hz
-        return tuple(self._at_stride(stride, rate) for stride in self.dataset.config.strides_to_try(rate))
+        return tuple(self._at_stride(stride, rate) for stride in candidate_strides(rate))
 
     def _at_stride(self, stride: int, control_rate_hz: float) -> StepSizes:
         space = self.dataset.spaces.state
@@ -201,4 +202,4 @@ def at_some_stride(dataset: Dataset) -> Dataset:
     """Return a data set at its stride; if that is auto, at the smallest candidate."""
     if dataset.config.stride != "auto":
         return dataset
-    return dataset.with_stride(min(dataset.config.strides_to_try(dataset.control_rate_hz)))
+    return dataset.with_stride(min(candidate_strides(dataset.control_rate_hz)))

@@ -22,6 +22,7 @@ from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.windows import candidate_strides
 from vjepa2_ac.distributed import broadcast_object, make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_same_encoder, require_widths
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, EpisodeSource, LatentBatch, Progress, StepRanges, no_progress
@@ -305,7 +306,7 @@ def calibrate_model(
         needed, fix = "frames at every candidate stride", "Calibrate on the data set itself, with data.cache: off"
         raise InputError(where=f"data.path: {dataset.config.path}", found=found, needed=needed, fix=fix)
     sample = replace(sample, batch_size=config.validation.batch_size)
-    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
+    encode = partial(encode_batch, world_model, device=accelerator.device)
     with accelerator.autocast(), torch.no_grad():
         return calibrate(world_model, encode, dataset, sample, progress=progress)
 
@@ -321,7 +322,7 @@ def calibrate(
     Args:
         model: The predictor.
         encode: Makes the latents.
-        dataset: The source of clips; its config has the candidates, its own stride does not matter.
+        dataset: The source of clips; its own stride does not matter.
         sample: The clips at each stride.
         progress: Called with (clips done, clips in total).
 
@@ -330,7 +331,7 @@ def calibrate(
     """
     frames, split, rate = sample.frames_of(dataset.config), sample.split, dataset.control_rate_hz
     settings = dataset.config.model_copy(update={"frames": frames})
-    strides = sorted(set(dataset.config.strides_to_try(rate)))
+    strides = sample.strides or candidate_strides(rate)
     views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}
     possible, impossible = _possible(views, split)
     windows = validation_windows(views[possible[-1]], split, clips=sample.clips)
@@ -394,7 +395,7 @@ class StrideChoice:
         config = self._config
         reporter.note("data.stride is auto: measuring the model at each candidate stride")
         fitting, errors = [], []
-        for stride in dataset.config.strides_to_try(dataset.control_rate_hz):
+        for stride in candidate_strides(dataset.control_rate_hz):
             view = dataset.with_stride(stride)
             try:
                 view.windows("train"), view.windows("validation")
@@ -405,9 +406,8 @@ class StrideChoice:
                 fitting.append(stride)
         if not fitting:
             raise errors[0]
-        candidates = replace(dataset, config=dataset.config.model_copy(update={"stride_candidates": tuple(fitting)}))
-        sample = ClipSample(clips=config.validation.clips)
-        calibration = calibrate_model(world_model, candidates, config, accelerator, sample)
+        sample = ClipSample(clips=config.validation.clips, strides=tuple(fitting))
+        calibration = calibrate_model(world_model, dataset, config, accelerator, sample)
         for one in calibration.results.values():
             reporter.note(f"  {one.name}: error/persistence {one.ratio:.3f}")
         reporter.note(calibration.verdict())

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes
+from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, SizesConfig
 from vjepa2_ac.config.loading import flat
 from vjepa2_ac.config.model import Family, FramePath
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError, shell_command
@@ -117,13 +117,13 @@ def read_sizes(folder: Path) -> ModelSizes:
 def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
     """Refuse sizes that were given, and are not those of the model.
 
-    Only those other than the default count as given: a run's own config spells out every default.
+    Only those of a config that differ from the default count as given: a run's own config spells out every default.
 
     Raises:
         InputError: Names what differs.
     """
     actual, wanted, standard = (flat(sizes.model_dump()) for sizes in (found, given, ModelSizes()))
-    wrong = [key for key in actual if wanted[key] not in (actual[key], standard[key])]
+    wrong = [key for key in flat(SizesConfig().model_dump()) if wanted[key] not in (actual[key], standard[key])]
     if wrong:
         said = ", ".join(f"{key} {actual[key]}, and model.sizes says {wanted[key]}" for key in wrong)
         raise InputError(where=where, found=said, fix="Leave them out of model.sizes: the model tells")

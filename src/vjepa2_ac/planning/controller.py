@@ -23,7 +23,7 @@ from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.planning.axes import Axes, require_base_frame
 from vjepa2_ac.planning.cameras import Cameras, Fault
 from vjepa2_ac.planning.energy import ChunkScores, EnergyFunction, Goal, Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
+from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, require_ends, timed
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, until_cancelled
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
@@ -233,7 +233,7 @@ class Controller:
         A goal gives way to the next one after its `at_least` steps at the earliest and its `at_most` at the latest, in
         between as soon as the energy of the current image is below its share of what that was when the goal began.
         There is no way back. The last one is reached by the same rule of energy: then nothing is done until the next
-        reset. `planning.goals` overrides their shares.
+        reset.
 
         Args:
             goals: In order; images of one size.
@@ -249,14 +249,14 @@ class Controller:
         if not goals:
             raise ValueError("no goal")
         self.cameras.require_goals([goal.image for goal in goals])
-        ruled = with_shares(goals, self.config.goals)
+        require_ends(goals)
         searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
         report, latents = until_cancelled(cancelled), []
         for place, goal in enumerate(goals):
             report(place, len(goals))
             latents.append(self.encoded(goal.image))
         weights = self.cameras.weights(mask, goals[0].image)
-        self._goals, self._goal_latents, self._patch_weights = ruled, torch.stack(latents), weights
+        self._goals, self._goal_latents, self._patch_weights = tuple(goals), torch.stack(latents), weights
         self._searched, self.space = searched, searched[None]
         self.cameras.newest, self._progress, self._done, self.decision = (), None, 0, None
 

@@ -114,4 +114,4 @@ def _size_along(axis: int, size_m: float, limits: LimitsConfig | None) -> float:
         return GRIPPER_STEP if axis == GRIPPER else size_m
     if axis == GRIPPER:
         return 0.0 if limits.gripper_mode == "held" else limits.gripper
-    return min(size_m, limits.xyz_m[axis], limits.radius if limits.ball != "none" else np.inf)
+    return min(size_m, limits.xyz_m[axis])

@@ -15,7 +15,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from vjepa2_ac.config.planning import GoalsConfig
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.camera_check import require_contrast
 from vjepa2_ac.media.images import encode_png, read_image, require_image
@@ -77,27 +76,23 @@ def timed(images: Sequence[np.ndarray], durations: Sequence[int]) -> tuple[SubGo
     return (*first, SubGoal(images[-1]))
 
 
-def with_shares(goals: Sequence[SubGoal], config: GoalsConfig, *, first: int = 0) -> tuple[SubGoal, ...]:
-    """Return goals with the shares of `planning.goals` where they are given.
+def require_ends(goals: Sequence[SubGoal], *, first: int = 0) -> None:
+    """Refuse goals of which one would never end, or the last one has a bound.
 
     Args:
         goals: In order.
-        config: Whose shares stand for theirs.
         first: Number of the first goal in messages.
 
     Raises:
-        InputError: One would never end, or the last one has a bound.
+        InputError: Names the goal.
     """
     *before, last = goals
-    ruled = [replace(goal, share=config.share or goal.share) for goal in before]
-    for place, goal in enumerate(ruled, start=first):
+    for place, goal in enumerate(before, start=first):
         if goal.at_most is None and goal.share is None:
-            needed = "at_most or share, or planning.goals.share"
-            raise InputError(where=f"goal {place}", found="a goal that would never end", needed=needed)
+            raise InputError(where=f"goal {place}", found="a goal that would never end", needed="at_most or share")
     if last.at_most is not None:
         found = f"at_most {last.at_most} of the last goal, after which there is none"
         raise InputError(where=f"goal {len(before) + first}", found=found, needed="null: no bound")
-    return (*ruled, replace(last, share=config.stop_share or last.share))
 
 
 @dataclass(frozen=True)

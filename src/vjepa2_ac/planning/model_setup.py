@@ -17,8 +17,6 @@ from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.subject import Subject, load_subject
 
-_POSITION, _ROTATION = slice(0, 3), slice(3, 6)
-
 
 def load_to_plan(
     subject: str, *, checkpoint: str = SELECTED, config: str | Path | None = None, overrides: Sequence[str] = ()

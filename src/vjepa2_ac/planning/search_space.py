@@ -1,9 +1,8 @@
-"""The action space: limits per axis, a norm ball, fixed axes, and rounding of a finished plan."""
+"""The action space: limits per axis, fixed axes, and rounding of a finished plan."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -14,34 +13,21 @@ from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import StateSpace
 
-Way = Float[np.ndarray, " 3"]  # of the flange
-
 GRIPPER = 6  # of a pose
 GRIPPER_ROUNDING = 0.25  # smaller changes of closedness become zero
-_ROUNDING = 4 * torch.finfo(torch.float32).eps  # a norm is rounded more than once
-
-
-@dataclass(frozen=True)
-class Ball:
-    """A ball around no motion, over the first numbers of an action."""
-
-    norm: Literal["l1", "l2"]
-    radius: float
-    axes: int = 3
 
 
 @dataclass(frozen=True)
 class SearchSpace:
     """Limits of each component of each decision; where both limits are equal, it is fixed.
 
-    They are finite, the lower ones not above the upper ones; where there is a ball, they allow zero motion.
+    They are finite, the lower ones not above the upper ones.
     """
 
     lower: Float[Tensor, "decisions dim"]
     upper: Float[Tensor, "decisions dim"]
-    std: Float[Tensor, "decisions dim"]  # of first samples
+    std: Float[Tensor, "decisions dim"]  # of first samples, unless a planner's option says a share of it
     repeat: int = 1  # model steps of a decision
-    ball: Ball | None = None
     gripper: int | None = None  # which number, where one is
     gripper_rounding: float = 0.0  # changes below this are set to zero in a finished plan
 
@@ -71,17 +57,8 @@ class SearchSpace:
         return torch.where(self.lower < self.upper, self.std, 0.0)
 
     def allowed(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch decisions dim"]:
-        """Return each decision, or its projection onto the allowed set; the result is always allowed, even for NaN.
-
-        First to the limits of each axis, then scaled towards zero motion until it is within the ball.
-        """
-        cut = torch.nan_to_num(decisions, nan=0.0).clamp(self.lower, self.upper)
-        if self.ball is None:
-            return cut
-        inner, outer = cut[..., : self.ball.axes], cut[..., self.ball.axes :]
-        length = torch.linalg.vector_norm(inner, ord=1 if self.ball.norm == "l1" else 2, dim=-1, keepdim=True)
-        share = self.ball.radius * (1 - _ROUNDING) / length
-        return torch.cat([torch.where(share < 1, inner * share, inner), outer], dim=-1)
+        """Return each decision, clipped to the limits; the result is always allowed, even for NaN."""
+        return torch.nan_to_num(decisions, nan=0.0).clamp(self.lower, self.upper)
 
     def finished(self, decisions: Float[Tensor, "decisions dim"]) -> Float[Tensor, "decisions dim"]:
         """Return decisions as a robot receives them: allowed, with small changes of the gripper rounded to zero.
@@ -113,7 +90,7 @@ def search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
         needed = f"the largest change of each of the {width} numbers in a model step, or one for all, such as [0.05]"
         raise InputError(where="planning.limits.axes", found=found, needed=needed)
     upper = _towards_zero(list(limits) * (width // len(limits))).repeat(config.horizon // config.action_repeat, 1)
-    return SearchSpace(-upper, upper, config.start_std * upper, config.action_repeat)
+    return SearchSpace(-upper, upper, upper, config.action_repeat)
 
 
 def pose_space(config: PlanningConfig) -> SearchSpace:
@@ -125,14 +102,13 @@ def pose_space(config: PlanningConfig) -> SearchSpace:
     lower = -upper
     if limits.gripper_mode in {"open", "close"}:
         lower[:, GRIPPER] = upper[:, GRIPPER] = 1.0 if limits.gripper_mode == "close" else -1.0
-    std = config.start_std * reach
+    std = reach.clone()
     std[GRIPPER] = 1.0  # beyond the limit of the gripper, as upstream: samples then gather there
     return SearchSpace(
         lower=lower,
         upper=upper,
         std=std.repeat(decisions, 1),
         repeat=config.action_repeat,
-        ball=None if limits.ball == "none" else Ball(limits.ball, limits.radius),
         gripper=GRIPPER,
         gripper_rounding=0.0 if limits.gripper_mode == "free" else GRIPPER_ROUNDING,
     )
@@ -146,7 +122,6 @@ def _towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
 
 
 _NEAR_M = 1e-8  # actions are float32, and no robot measures it
-_HALVINGS = 30
 
 
 @dataclass(frozen=True)
@@ -196,10 +171,11 @@ class Workspace:
             limits: Of an action.
         """
         kept, position = np.array(actions, dtype=np.float64), np.array(state[:3], dtype=np.float64)
+        reach = np.array(limits.xyz_m)
         for action in kept:
             way = np.clip(position + action[:3], self.low, self.high) - position
             if abs(way - action[:3]).max() > _NEAR_M:
-                action[:3] = _within(limits, self.way_back(position), way)
+                action[:3] = np.clip(way, -reach, reach)
             position = position + action[:3]
         return kept
 
@@ -208,20 +184,6 @@ class Workspace:
         return np.asarray(np.clip(position, self.low, self.high) - position)
 
 
-def _within(limits: LimitsConfig, sure: Way, wanted: Way) -> Way:
-    """Return the last way from an allowed one to a wanted one that is allowed, too: limits are convex."""
-    if is_allowed(wanted, limits):
-        return wanted
-    low, high = 0.0, 1.0
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if is_allowed(sure + middle * (wanted - sure), limits) else (low, middle)
-    return np.asarray(sure + low * (wanted - sure))
-
-
-def is_allowed(way: Way, limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
-    """Return whether a motion is within the limits of each axis and of the ball."""
-    if (abs(way) > np.array(limits.xyz_m) + slack_m).any():
-        return False
-    order = 1 if limits.ball == "l1" else 2
-    return limits.ball == "none" or bool(np.linalg.norm(way, ord=order) <= limits.radius + slack_m)
+def is_allowed(way: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
+    """Return whether motions of the flange are within the limits of each axis."""
+    return bool((abs(way) <= np.array(limits.xyz_m) + slack_m).all())

@@ -181,6 +181,5 @@ def _reach(limits: LimitsConfig, taught: Taught, *, poses: bool) -> Sequence[flo
         axes = limits.axes if isinstance(limits.axes, tuple) else taught.changes
         axes = axes * len(taught.changes) if len(axes) == 1 else axes
         return axes if len(axes) == len(taught.changes) else ()
-    ball = math.inf if limits.ball == "none" else limits.radius
     gripper = limits.gripper if limits.gripper_mode in {"rounded", "free"} else 0.0
-    return [*(min(one, ball) for one in limits.xyz_m), *[limits.rotation] * 3, gripper]
+    return [*limits.xyz_m, *[limits.rotation] * 3, gripper]

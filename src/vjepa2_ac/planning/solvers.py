@@ -32,7 +32,7 @@ class PlanStart:
 
     mean: Float[Tensor, "decisions dim"]
     elites: Float[Tensor, "elites decisions dim"]
-    std: Float[Tensor, "decisions dim"] | None = None  # None: `planning.start_std`
+    std: Float[Tensor, "decisions dim"] | None = None  # None: the planner's own
 
     @classmethod
     def of_samples(cls, samples: Float[Tensor, "samples steps dim"], space: SearchSpace) -> PlanStart:
@@ -95,7 +95,7 @@ class Solver:
     ) -> None:
         self._space, self._config, self._generator, self._options = space, config, generator, options
         self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
-        self.std = space.first_std
+        self.std = space.first_std * self._for_gripper(getattr(options, "start_std", 1.0), gripper=1.0)
         if start is not None and start.std is not None:
             self.std = torch.minimum(torch.maximum(start.std, _NARROWEST * self.std), self.std)
         self.begin(start)
@@ -124,6 +124,13 @@ class Solver:
         """Return the current result; None: the best evaluated decisions."""
         return None
 
+    def _for_gripper(self, others: float, *, gripper: float) -> Float[Tensor, " dim"]:
+        """Return one number for each component of an action, another one for the gripper."""
+        numbers = torch.full((self._space.dim,), others)
+        if self._space.gripper is not None:
+            numbers[self._space.gripper] = gripper
+        return numbers
+
     def _around_mean(self, *, try_mean: bool) -> Samples:
         noise = white_noise(self._space, self._config.samples, self._generator)
         noise[: int(try_mean)] = 0.0
@@ -148,6 +155,13 @@ def white_noise(space: SearchSpace, samples: int, generator: Generator) -> Sampl
     return noise
 
 
+class Sampling(Section):
+    """What the planners that draw samples have in common."""
+
+    start_std: Positive = 1.0
+    """Standard deviation of the first samples, as a share of the limits of position and rotation."""
+
+
 class CemSolver(Solver):
     """As upstream: samples are clipped, mean and standard deviation keep a share of their old values.
 
@@ -157,7 +171,7 @@ class CemSolver(Solver):
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, cem.
     """
 
-    class Config(Section):
+    class Config(Sampling):
         """Options of cem: the cross-entropy method; the defaults are upstream's."""
 
         elites: Elites = ELITES
@@ -180,19 +194,13 @@ class CemSolver(Solver):
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Fit the distribution to the elites."""
         options = self._options
-        keep_mean = self._momentum(options.momentum_mean, options.momentum_mean_gripper)
-        keep_std = self._momentum(options.momentum_std, options.momentum_std_gripper)
+        keep_mean = self._for_gripper(options.momentum_mean, gripper=options.momentum_mean_gripper)
+        keep_std = self._for_gripper(options.momentum_std, gripper=options.momentum_std_gripper)
         self._fit(evaluated.best(self.elites).decisions, keep_mean, keep_std)
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
         """Return the mean."""
         return self.mean
-
-    def _momentum(self, others: float, gripper: float) -> Float[Tensor, " dim"]:
-        momentum = torch.full((self._space.dim,), others)
-        if self._space.gripper is not None:
-            momentum[self._space.gripper] = gripper
-        return momentum
 
 
 class IcemSolver(Solver):
@@ -203,7 +211,7 @@ class IcemSolver(Solver):
     Source: Pinneri et al., Sample-efficient Cross-Entropy Method for Real-time Planning, arXiv 2008.06389, algorithm 1.
     """
 
-    class Config(Section):
+    class Config(Sampling):
         """Options of icem: the improved cross-entropy method (arXiv 2008.06389); the defaults are the paper's."""
 
         elites: Elites = ELITES
@@ -277,7 +285,7 @@ class MppiSolver(Solver):
     Source: Williams et al., Information Theoretic MPC for Model-Based Reinforcement Learning, ICRA 2017, algorithm 2.
     """
 
-    class Config(Section):
+    class Config(Sampling):
         """Options of mppi: model predictive path integral control."""
 
         temperature: Positive = 0.1

@@ -152,7 +152,7 @@ def _encoded(batches: Iterator[Batch], model: WorldModel) -> Iterator[LatentBatc
     """Yield clips as latents; batches of which no clip could be read are left out."""
     for batch in batches:
         if len(batch.episode_ids):
-            yield encode_batch(model, batch, device=model.device, chunk=16)
+            yield encode_batch(model, batch, device=model.device)
 
 
 def _pairs(clips: LatentBatch, spaces: Spaces, drawn: torch.Generator) -> _Pairs:

@@ -206,7 +206,7 @@ def demonstrate(trial: Trial, arm: SimulatedArm, limits: LimitsConfig) -> Episod
     if not shown.success:
         where = f"demonstration of problem {trial.seed} ({task})"
         left = f"{100 * shown.distances_m[-1]:.1f} cm from its goal after {counted(steps, 'model step')}"
-        fix = "Allow it longer steps along each axis (planning.limits.xyz, planning.limits.ball), or more of them"
+        fix = "Allow it longer steps along each axis (planning.limits.xyz), or more of them"
         raise InputError(where=where, found=f"the oracle ends {left}", needed="a demonstration that succeeds", fix=fix)
     return shown
 

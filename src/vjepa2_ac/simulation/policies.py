@@ -47,7 +47,7 @@ class RandomActions(ZeroActions):
     """Draws actions uniformly from the allowed ones; the same trial gets the same actions.
 
     Args:
-        limits: The allowed actions: `xyz`, `rotation` and `gripper` of each axis, and the ball.
+        limits: The allowed actions: `xyz`, `rotation` and `gripper` of each axis.
         seed: Of the actions, with that of the trial.
     """
 
@@ -102,7 +102,7 @@ class Expert:
 
 
 def farthest(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
-    """Return the largest size of each component of an action, without the ball; 0 where it is fixed."""
+    """Return the largest size of each component of an action; 0 where it is fixed."""
     gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
     return np.array([*limits.xyz_m, *[limits.rotation] * 3, gripper])
 
@@ -117,9 +117,6 @@ def shortened(way: Float[np.ndarray, " 7"], limits: LimitsConfig) -> Float[np.nd
     for part in (slice(0, 3), slice(3, 6), slice(6, 7)):
         beyond = np.abs(way[part]) / np.where(reach[part] > 0, reach[part], 1.0)
         way[part] *= min(1.0, _ALMOST / max(float(beyond.max()), 1e-12))
-    if limits.ball != "none":
-        length = float(np.linalg.norm(way[:3], ord=1 if limits.ball == "l1" else 2))
-        way[:3] *= min(1.0, _ALMOST * limits.radius / max(length, 1e-12))
     return way
 
 

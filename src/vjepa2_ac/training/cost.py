@@ -34,6 +34,7 @@ from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.network.attention import rotary_tables
+from vjepa2_ac.model.network.encoder import ENCODE_CHUNK
 from vjepa2_ac.model.network.predictor import LatentDynamics, PredictorNetwork, predictor_fields
 from vjepa2_ac.training.step import Objective
 
@@ -396,7 +397,6 @@ def _knobs(config: Config) -> Iterator[tuple[str, dict[str, dict[str, Any]]]]:
     yield "training.batch_size=1 (and as much more accumulation)", {"training": {"batch_size": 1}}
     bf16 = {"model": {"dtype": "bfloat16"}, "training": {"precision": "bf16"}}
     yield "model.dtype=bfloat16 with training.precision=bf16", bf16
-    yield "model.encode_chunk=4", {"model": {"encode_chunk": min(4, config.model.encode_chunk)}}
     if not (config.data.transforms or config.data.takes_latents):
         yield "data.cache=auto", {"data": {"cache": "auto"}}
     fewest = max(8, config.training.rollout_steps + 1)
@@ -438,13 +438,13 @@ def _encoding(config: Config, sizes: ModelSizes, clips: int) -> int:
 def _caching(config: Config, sizes: ModelSizes) -> int:
     """Return the bytes of encoding a cache beside the encoder's weights; a part of an episode waits as input."""
     waiting = FRAMES_AT_ONCE * 3 * sizes.image_size**2 * (FLOAT32 + 1)
-    return ALLOWANCE + waiting + _at_work(config, sizes, config.model.encode_chunk)
+    return ALLOWANCE + waiting + _at_work(config, sizes, ENCODE_CHUNK)
 
 
 def _at_work(config: Config, sizes: ModelSizes, frames: int) -> int:
     width, hidden = sizes.encoder.width, int(sizes.encoder.width * sizes.encoder.mlp_ratio)
     number = FLOAT32 if config.training.precision == "fp32" else HALF
-    tokens = min(config.model.encode_chunk, frames) * sizes.tokens_per_frame
+    tokens = min(ENCODE_CHUNK, frames) * sizes.tokens_per_frame
     attention = width * (4 * number + 5 * FLOAT32)  # residual, query, key, value; normed, and four while rotating
     mlp = width * (2 * number + 2 * FLOAT32) + 2 * hidden * number  # residual and output; normed, cast; around GELU
     pixels = frames * 3 * sizes.image_size**2 * FLOAT32

@@ -140,7 +140,7 @@ def _accumulate(run: Run, batches: Iterator[Batch]) -> tuple[Float[Tensor, 2], l
 def encode(run: Run, batch: Batch) -> LatentBatch:
     """Return the latents of a batch on the run's device, in its precision."""
     with run.accelerator.autocast():
-        return encode_batch(run.world_model, batch, device=run.accelerator.device, chunk=run.config.model.encode_chunk)
+        return encode_batch(run.world_model, batch, device=run.accelerator.device)
 
 
 def micro_step(run: Run, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:

@@ -11,28 +11,27 @@ from safetensors.torch import load_file, save_file
 from paths import GOLDEN
 from predictor_files import write_predictor_file
 from tiny_models import draw, tiny_model
-from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
+from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes, SizesConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints import load_base, load_official
 from vjepa2_ac.model.network.world_model import ENCODER, PREDICTOR, WorldModel
 
 
-def load_with(base: Path | str, sizes: ModelSizes) -> WorldModel:
+def load_with(base: Path | str, sizes: SizesConfig) -> WorldModel:
     return load_base(ModelConfig(base=str(base), sizes=sizes, dtype="float32"), seed=0)
 
 
 def test_sizes_that_a_folder_does_not_have_are_refused_by_name(model: WorldModel, tmp_path: Path) -> None:
     model.save_pretrained(tmp_path / "model")
-    given = ModelSizes(
-        image_size=64, encoder=EncoderSizes(depth=2, heads=4), predictor=PredictorSizes(width=36, heads=3)
-    )
+    sizes = {"image_size": 64, "encoder": {"depth": 2, "heads": 4}, "predictor": {"width": 36, "heads": 3}}
+    given = SizesConfig.model_validate(sizes)
     with pytest.raises(InputError, match=r"image_size 48, and model\.sizes says 64, encoder\.heads 2, and .* 4"):
         load_with(tmp_path / "model", given)
 
 
 def test_a_folder_that_is_no_model_gives_the_command_that_makes_one_of_a_run(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"config\.json: cannot be read: No such.*`vjepa2-ac export RUN FOLDER`"):
-        load_with(tmp_path, ModelSizes())
+        load_with(tmp_path, SizesConfig())
 
 
 @pytest.mark.parametrize("part", [ENCODER, PREDICTOR])
@@ -43,7 +42,7 @@ def test_a_weight_that_is_not_finite_is_named(model: WorldModel, tmp_path: Path,
     weights[name].flatten()[-1] = float("nan")
     save_file(weights, tmp_path / part)
     with pytest.raises(InputError, match=rf"{part}: {name} holds NaN or infinity"):
-        load_with(tmp_path, ModelSizes())
+        load_with(tmp_path, SizesConfig())
 
 
 MODEL = tiny_model(states=False)

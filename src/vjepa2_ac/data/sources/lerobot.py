@@ -87,7 +87,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
 
     @property
     def _control_rate_hz(self) -> float:
-        return self._config.lerobot.fps or self._info.fps
+        return self._info.fps
 
     @cached_property
     def _parquet(self) -> ParquetRows:

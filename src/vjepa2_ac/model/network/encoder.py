@@ -20,6 +20,7 @@ with quiet_imports():
     from transformers import VJEPA2Config
     from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
+ENCODE_CHUNK = 16  # frames that go through the network at once: bounds its memory
 TUBELET = 2  # frames per tubelet: the same one twice
 _GRID_OF_POSITIONS = 16  # V-JEPA 2.1 scales the positions of any grid to those of 256 px
 _LEVELS = 4  # of V-JEPA 2.1, each with a norm of its own; the last one's is the last norm
@@ -59,7 +60,7 @@ class Encoder(nn.Module):
 
     @torch.no_grad()
     def forward(
-        self, frames: Float[Tensor, "frames 3 height width"], chunk: int = 16
+        self, frames: Float[Tensor, "frames 3 height width"], chunk: int = ENCODE_CHUNK
     ) -> Float[Tensor, "frames tokens dim"]:
         """Return the features of normalised frames, not yet layer-normalised without affine, in float32.
 

@@ -29,7 +29,7 @@ from vjepa2_ac.model.model_files import (
     read_sizes,
 )
 from vjepa2_ac.model.network.blocks import initialise
-from vjepa2_ac.model.network.encoder import Encoder
+from vjepa2_ac.model.network.encoder import ENCODE_CHUNK, Encoder
 from vjepa2_ac.model.network.predictor import (
     ActionConditionedPredictor,
     LatentDynamics,
@@ -206,7 +206,7 @@ class WorldModel(LatentDynamics):
 
     @torch.no_grad()
     def encode(
-        self, frames: Float[Tensor, "batch time 3 height width"], chunk: int = 16
+        self, frames: Float[Tensor, "batch time 3 height width"], chunk: int = ENCODE_CHUNK
     ) -> Float[Tensor, "batch time tokens dim"]:
         """Return the latents of normalised frames, each frame encoded independently.
 
