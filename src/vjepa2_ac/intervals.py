@@ -64,9 +64,6 @@ def bootstrapped(
     of_sums: Callable[[np.ndarray], np.ndarray],
     columns: Float[np.ndarray, "columns clips metrics"],
     episode_ids: Sequence[str],
-    *,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
 ) -> tuple[Estimate, ...]:
     """Return an estimate of each metric, which is a function of sums over clips.
 
@@ -74,8 +71,6 @@ def bootstrapped(
         of_sums: Turns sums [columns, ..., metrics] into values [..., metrics].
         columns: The summands. All columns are resampled together, so a comparison of two on the same clips is paired.
         episode_ids: Of each clip.
-        resamples: Number of bootstrap samples, each of as many episodes as there are, with replacement.
-        seed: Of the samples.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         values = of_sums(columns.sum(axis=1))
@@ -84,7 +79,7 @@ def bootstrapped(
         if count < 2:
             return tuple(Estimate(float(value), math.nan, math.nan) for value in values)
         sums = np.einsum("cnf,ne->cef", columns, np.eye(count)[episode_of], optimize=True)
-        drawn = of_sums(np.einsum("re,cef->crf", _draws(count, resamples, seed), sums, optimize=True))
+        drawn = of_sums(np.einsum("re,cef->crf", _draws(count), sums, optimize=True))
     return _estimates(values, drawn, count)
 
 
@@ -102,7 +97,7 @@ def bootstrapped_by_weights(
         values = of_weights(np.ones((1, episodes)))[0]
         if episodes < 2:
             return tuple(Estimate(float(value), math.nan, math.nan) for value in values)
-        return _estimates(values, of_weights(_draws(episodes, RESAMPLES, 0)), episodes)
+        return _estimates(values, of_weights(_draws(episodes)), episodes)
 
 
 def mean_of(values: Float[np.ndarray, " clips"], episode_ids: Sequence[str]) -> Estimate:
@@ -138,11 +133,11 @@ def ratio_difference(
 
 
 @lru_cache(maxsize=4)
-def _draws(episodes: int, resamples: int, seed: int) -> Float[np.ndarray, "resamples episodes"]:
-    """Return how often each episode was drawn."""
-    drawn = np.random.default_rng(seed).integers(episodes, size=(resamples, episodes))
-    places = drawn + episodes * np.arange(resamples)[:, None]
-    return np.bincount(places.ravel(), minlength=resamples * episodes).reshape(resamples, episodes).astype(np.float64)
+def _draws(episodes: int) -> Float[np.ndarray, "resamples episodes"]:
+    """Return how often each episode was drawn, with replacement, in each bootstrap sample."""
+    drawn = np.random.default_rng(0).integers(episodes, size=(RESAMPLES, episodes))
+    places = drawn + episodes * np.arange(RESAMPLES)[:, None]
+    return np.bincount(places.ravel(), minlength=RESAMPLES * episodes).reshape(RESAMPLES, episodes).astype(np.float64)
 
 
 def _estimates(
