@@ -1,4 +1,4 @@
-"""Asynchronous copies do not change a run, and the next batch is copied before the host waits."""
+"""Asynchronous copies to the device do not change a run."""
 
 from typing import Any
 

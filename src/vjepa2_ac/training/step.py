@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.network.predictor import KeyValueCache, LatentDynamics
+from vjepa2_ac.model.network.world_model import seed_of
 from vjepa2_ac.registry import LOSSES
 from vjepa2_ac.storage import is_url
 from vjepa2_ac.training.optim import learning_rate_at
@@ -54,7 +54,8 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     Raises:
         InputError: The loss or a gradient is not finite; names the clips. The weights have not moved.
     """
-    torch.manual_seed(step_seed(run.config.seed, step, run.accelerator.process_index))
+    # The random numbers of a step (dropout) follow from its number: no generator state needs to be saved.
+    torch.manual_seed(seed_of(run.config.seed, step, run.accelerator.process_index))
     learning_rate = learning_rate_at(step, run.config.training)
     for group in run.optimizer.param_groups:
         group["lr"] = learning_rate
@@ -246,12 +247,6 @@ def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> 
     found = f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}"
     fix = f"The weights have not moved. Look at these clips, or lower training.learning_rate{fp16}"
     raise InputError(where="training", found=found, fix=fix)
-
-
-def step_seed(seed: int, step: int, rank: int) -> int:
-    """Return the seed of a step's random numbers (dropout): no generator state needs to be saved."""
-    digest = hashlib.blake2b(f"{seed}/{step}/{rank}".encode(), digest_size=8).digest()
-    return int.from_bytes(digest, "big") >> 1
 
 
 class Update:

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from einops import rearrange
 from jaxtyping import Float
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.episode import Widths
@@ -332,7 +332,7 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
         own, width = getattr(predictor, name), widths.action if name == "action_encoder" else widths.state
         replaced |= {f"{name}.{key}": value.detach().cpu() for key, value in own.state_dict().items()}
         head = nn.Linear(width, own.out_features)
-        initialise(head, _generator(seed, name))
+        initialise(head, torch.Generator().manual_seed(seed_of(seed, name)))
         setattr(predictor, name, head.to(own.weight.device, own.weight.dtype).requires_grad_(False))
         lines.append(f"{_as_text([name])}: {width} numbers instead of the base's {own.in_features}: initialised anew")
     dims = {"action_dim": widths.action}
@@ -359,9 +359,10 @@ def widths_as_text(sizes: ModelSizes) -> str:
     return f"{states} and actions of {own.action_dim} numbers"
 
 
-def _generator(seed: int, name: str) -> Generator:
-    digest = hashlib.blake2b(f"{seed}/{name}".encode(), digest_size=8).digest()
-    return torch.Generator().manual_seed(int.from_bytes(digest, "big") >> 1)
+def seed_of(*parts: object) -> int:
+    """Return a seed that these values determine, such as a seed of the user and a step."""
+    digest = hashlib.blake2b("/".join(map(str, parts)).encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "big") >> 1
 
 
 def _as_text(names: list[str]) -> str:
