@@ -341,8 +341,9 @@ def test_a_measured_plan_is_not_denied_by_the_use_of_the_actions() -> None:
 
 @pytest.mark.parametrize("episodes", [1, 8])
 @pytest.mark.parametrize("with_base", [True, False])
-@pytest.mark.parametrize("level", [0.6, 2.7])
-@pytest.mark.parametrize(("shuffled", "rank", "distance"), [(0.6, 0.02, 1.0), (0.9, 0.7, 12.3), (4.0, 0.1, 123.4)])
+@pytest.mark.parametrize(
+    ("level", "shuffled", "rank", "distance"), [(2.7, 0.6, 0.02, 1.0), (0.6, 0.9, 0.7, 12.3), (0.6, 4.0, 0.1, 123.4)]
+)
 def test_every_summary_fits_a_screen_and_has_whole_sentences(
     episodes: int, with_base: bool, level: float, shuffled: float, rank: float, distance: float
 ) -> None:

@@ -1,4 +1,4 @@
-"""The report page in a real browser: no errors, no requests, no scripts; light and dark, wide and narrow, folded."""
+"""The report page in a real browser: no errors, no requests, no scripts."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from browser import open_page
 from evaluation_results import decoded_strips, evaluation, page_of
 
 pytestmark = pytest.mark.usefixtures("drawn")
-
-# Put into a copy of the page that may run it: the page itself runs nothing.
 
 
 @cache

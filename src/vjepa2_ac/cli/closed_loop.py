@@ -237,6 +237,34 @@ def _record_world(options: argparse.Namespace, target: Path) -> int:
 
 
 def _run_benchmark(options: argparse.Namespace) -> int:
+    _require_benchmark(options)
+
+    from vjepa2_ac.cli.console.tables import benchmark_notes, benchmark_table
+    from vjepa2_ac.evaluation.summary import closed_loop
+    from vjepa2_ac.simulation.benchmark import write_benchmark
+
+    benchmark, folder = _measure(options)
+    verdict = closed_loop(
+        benchmark.shares,
+        model=benchmark.results[0].policy,
+        oracle=benchmark.results[-1].policy,
+        problems=len(benchmark.trials.trials),
+        task=benchmark.trials.task,
+        conditions=benchmark.conditions,
+    )
+    files = write_benchmark(benchmark, folder, asdict(verdict))
+    if options.all:
+        subject = benchmark.agent.subject
+        title = f"{subject.name}: checkpoint {subject.chosen}" if subject.chosen else subject.name
+        cli.show(title, benchmark_table(benchmark), files=files)
+    summary = _summary(benchmark, verdict, options)
+    cli.show(*benchmark_notes(benchmark), str(summary), *_next(summary, verdict, options))
+    cli.show(*(f"Film: {file}" for file in files[1:2]))
+    return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
+
+
+def _require_benchmark(options: argparse.Namespace) -> None:
+    """Refuse options that do not belong together, and a model that cannot plan."""
     from vjepa2_ac.runs.folder import is_run
 
     if options.domain == "random":
@@ -249,12 +277,13 @@ def _run_benchmark(options: argparse.Namespace) -> int:
         raise InputError(where="--sub-goals alike", found=options.subject, needed=needed)
     cli.require_to_plan(options)
 
-    from vjepa2_ac.cli.console.tables import benchmark_notes, benchmark_table
-    from vjepa2_ac.evaluation.summary import closed_loop
-    from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_benchmark, write_benchmark
+
+def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
+    """Let the model and its competitors act; return the benchmark and the folder for its files."""
+    from vjepa2_ac.runs.folder import is_run
+    from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_benchmark
     from vjepa2_ac.simulation.domains import load_mujoco
     from vjepa2_ac.simulation.worlds import OtherWorld, run_world_benchmark
-    from vjepa2_ac.storage import user_can_write
 
     chosen = cli.record_of_options(BenchmarkOptions, options)
     chosen, name = replace(chosen, films=min(chosen.films, chosen.episodes)), f"{chosen.task}-{chosen.domain}"
@@ -263,34 +292,14 @@ def _run_benchmark(options: argparse.Namespace) -> int:
             load_mujoco()
         else:
             env = stack.enter_context(OtherWorld(options.world, options.world_timeout))
-            name = f"{env.about.task} {env.about.world}"
-            name = re.sub(r"\W+", "-", name, flags=re.ASCII).strip("-")[:200]
+            name = re.sub(r"\W+", "-", f"{env.about.task} {env.about.world}", flags=re.ASCII).strip("-")[:200]
         agent, reporter = _agent(options), stack.enter_context(cli.reporter())
         home = Path(options.subject) if is_run(options.subject) else Path()
         folder = options.out or home / "closed_loop" / name
-        with user_can_write(folder):
-            folder.mkdir(parents=True, exist_ok=True)
+        cli.make_folder(folder)
         if options.world is None:
-            benchmark = run_benchmark(agent, chosen, reporter)
-        else:
-            benchmark = run_world_benchmark(agent, env, chosen, reporter)
-        verdict = closed_loop(
-            benchmark.shares,
-            model=benchmark.results[0].policy,
-            oracle=benchmark.results[-1].policy,
-            problems=len(benchmark.trials.trials),
-            task=benchmark.trials.task,
-            conditions=benchmark.conditions,
-        )
-        files = write_benchmark(benchmark, folder, asdict(verdict))
-    if options.all:
-        subject = agent.subject
-        title = f"{subject.name}: checkpoint {subject.chosen}" if subject.chosen else subject.name
-        cli.show(title, benchmark_table(benchmark), files=files)
-    summary = _summary(benchmark, verdict, options)
-    cli.show(*benchmark_notes(benchmark), str(summary), *_next(summary, verdict, options))
-    cli.show(*(f"Film: {file}" for file in files[1:2]))
-    return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
+            return run_benchmark(agent, chosen, reporter), folder
+        return run_world_benchmark(agent, env, chosen, reporter), folder
 
 
 def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse.Namespace) -> Summary:

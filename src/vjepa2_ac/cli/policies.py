@@ -57,7 +57,7 @@ def _score(options: argparse.Namespace) -> int:
     """
     cli.require_to_plan(options)
 
-    from vjepa2_ac.cli.console.progress import MetricsTable
+    from vjepa2_ac.cli.console.tables import scores_table
     from vjepa2_ac.data.windows import require_frames
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.policies.score import CHANCE, read_policy_chunks, score_policies
@@ -74,13 +74,6 @@ def _score(options: argparse.Namespace) -> int:
             control_steps=options.control_steps,
             progress=reporter.task("scoring", "places"),
         )
-    title = (
-        f"Energy relative to the zero action, {counted(found.places, 'frame')} of {counted(found.episodes, 'episode')}"
-    )
-    table = MetricsTable(title, ["policy", "all chunks", "its best", "behind the one before"])
-    for one in found.policies:
-        table.add_row(one.name, str(one.mean), str(one.best), "" if one.behind is None else str(one.behind))
-    table.add_row("demonstrated", str(found.demonstrated), "", "")
     share = f"{found.others_below_true:.0%} of the actions of other places"
     notes = [f"{share} have a lower energy than the true ones (chance {CHANCE:.0%})."]
     if found.is_blind:
@@ -88,7 +81,7 @@ def _score(options: argparse.Namespace) -> int:
     if found.left_out:
         notes.append(f"Left out: {counted(found.left_out, 'frame')} whose episode ends before the goal.")
     about = session.as_dict() | {"policies": [str(file) for file in options.policies], "form": options.form}
-    cli.show(table, *notes, files=[cli.write_json(options.out, about | found.as_dict())])
+    cli.show(scores_table(found), *notes, files=[cli.write_json(options.out, about | found.as_dict())])
     return int(found.is_blind)
 
 
@@ -112,7 +105,7 @@ def _monitor(options: argparse.Namespace) -> int:
 
     from dataclasses import asdict
 
-    from vjepa2_ac.cli.console.progress import MetricsTable
+    from vjepa2_ac.cli.console.tables import watched_table
     from vjepa2_ac.goals.make_goals import number_of_episode
     from vjepa2_ac.policies.monitor import MONITOR, Monitor, calibrate_monitor, watch_episodes
     from vjepa2_ac.reports.figures.planning import MONITOR_IMAGE, most_surprising, plot_watched
@@ -135,20 +128,13 @@ def _monitor(options: argparse.Namespace) -> int:
     of = f"{counted(len(monitor.scores), 'held-out episode')} of up to {counted(monitor.steps, 'model step')}"
     note = f"An alarm is a surprise above {monitor.threshold:.4g}, calibrated on {of}. At most"
     note += f" {monitor.false_alarms:.1%} of undisturbed episodes have an alarm."
-    table = MetricsTable("Surprise, over the threshold", ["episode", "highest", "first alarm at control step"])
-    alarms, most = 0, {one.name: one.scores(monitor.expected).max() for one in watched}
-    for one in watched:
-        first = one.first_alarm(monitor)
-        alarms += first is not None
-        step = "no alarm" if first is None else str(one.steps[first])
-        table.add_row(one.name, f"{most[one.name] / monitor.threshold:.2f}", step)
     if watched:
-        shown, crop = max(watched, key=lambda one: most[one.name]), session.config.data.crop
+        shown = max(watched, key=lambda one: one.scores(monitor.expected).max())
         steps = [int(shown.steps[place]) for place in most_surprising(shown, monitor)]
         frames = seen.source.read(shown.index).read_frames(steps)
-        files.append(plot_watched(shown, frames, monitor, crop, folder / MONITOR_IMAGE))
-    cli.show(*([table] if watched else []), note, files=files)
-    return int(alarms > 0)
+        files.append(plot_watched(shown, frames, monitor, session.config.data.crop, folder / MONITOR_IMAGE))
+    cli.show(*([watched_table(watched, monitor)] if watched else []), note, files=files)
+    return int(any(one.first_alarm(monitor) is not None for one in watched))
 
 
 def _prior(options: argparse.Namespace) -> None:

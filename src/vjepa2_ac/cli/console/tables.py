@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from vjepa2_ac.inspection.statistics import StepSizes
     from vjepa2_ac.inspection.variants import VariantResult
     from vjepa2_ac.planning.decision import PlanResult
+    from vjepa2_ac.policies.monitor import Monitor, WatchedEpisode
+    from vjepa2_ac.policies.score import PolicyScores
     from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
 
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red", "skipped": "cyan"}
@@ -165,4 +167,24 @@ def variants_table(title: str, results: Sequence[VariantResult], best: VariantRe
         difference = "" if one.difference is None else str(one.difference)
         numbers = (f"{one.error:.4f}", f"{one.persistence:.4f}", f"{one.episodes}")
         table.add_row(f"{one.name}{' <' * (one is best)}", str(one.ratio), difference, *numbers)
+    return table
+
+
+def scores_table(scores: PolicyScores) -> Table:
+    """Return a row for each policy, and one for the demonstrated actions."""
+    title = f"Energy relative to the zero action, {counted(scores.places, 'frame')}"
+    columns = ["policy", "all chunks", "its best", "behind the one before"]
+    table = MetricsTable(f"{title} of {counted(scores.episodes, 'episode')}", columns)
+    for one in scores.policies:
+        table.add_row(one.name, str(one.mean), str(one.best), "" if one.behind is None else str(one.behind))
+    table.add_row("demonstrated", str(scores.demonstrated), "", "")
+    return table
+
+
+def watched_table(watched: Sequence[WatchedEpisode], monitor: Monitor) -> Table:
+    """Return a row for each watched episode."""
+    table = MetricsTable("Surprise, over the threshold", ["episode", "highest", "first alarm at control step"])
+    for one in watched:
+        first, highest = one.first_alarm(monitor), one.scores(monitor.expected).max() / monitor.threshold
+        table.add_row(one.name, f"{highest:.2f}", "no alarm" if first is None else str(one.steps[first]))
     return table
