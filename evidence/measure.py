@@ -30,8 +30,7 @@ from vjepa2_ac.policies.train_prior import train_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.subject import load_subject
-from vjepa2_ac.simulation.agent import Planning
-from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_task
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, Planning, run_task
 from vjepa2_ac.simulation.domains import Domain, sample_domain
 from vjepa2_ac.simulation.policies import Oracle, RandomActions, ZeroActions
 from vjepa2_ac.simulation.rollout import Policy

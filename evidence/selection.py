@@ -23,8 +23,7 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.runs.subject import load_subject
-from vjepa2_ac.simulation.agent import Planning
-from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_task
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, Planning, run_task
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
 from vjepa2_ac.simulation.motion import MotionRecipe
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset

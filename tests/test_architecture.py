@@ -99,7 +99,7 @@ ORDERS: dict[str, list[str]] = {
         "tasks",
         "rollout",
         "policies",
-        "agent record",
+        "record",
         "benchmark counterfactual",
         "worlds",
     ],

@@ -33,7 +33,7 @@ from vjepa2_ac.policies.action_prior import ActionPrior, PriorCard, PriorSizes, 
 from vjepa2_ac.policies.monitor import Monitor
 from vjepa2_ac.registry import ENERGIES, PLANNERS
 from vjepa2_ac.runs.subject import Subject
-from vjepa2_ac.simulation.agent import Planning
+from vjepa2_ac.simulation.benchmark import Planning
 from vjepa2_ac.simulation.rollout import Observation, Trial, run
 
 

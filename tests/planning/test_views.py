@@ -20,8 +20,7 @@ from vjepa2_ac.goals.make_goals import recording_of_episode
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.subject import Subject
-from vjepa2_ac.simulation.agent import Agent
-from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_benchmark
+from vjepa2_ac.simulation.benchmark import Agent, BenchmarkOptions, run_benchmark
 from vjepa2_ac.simulation.camera import FRAME_SIZE
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 

@@ -21,8 +21,7 @@ from vjepa2_ac.evaluation.imagined import imagined_next
 from vjepa2_ac.media.video import read_header
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.model_setup import load_to_plan
-from vjepa2_ac.simulation.agent import JOINT_FIELDS, Agent
-from vjepa2_ac.simulation.benchmark import FILM, BenchmarkOptions, film_frames, run_benchmark
+from vjepa2_ac.simulation.benchmark import FILM, JOINT_FIELDS, Agent, BenchmarkOptions, film_frames, run_benchmark
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
 

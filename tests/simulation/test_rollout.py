@@ -14,9 +14,8 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from tiny_models import tiny_model
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.simulation.agent import Planning
 from vjepa2_ac.simulation.arm import SimulatedArm
-from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_task
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, Planning, run_task
 from vjepa2_ac.simulation.motion import HIGH, forward_kinematics
 from vjepa2_ac.simulation.policies import Oracle, RandomActions, ZeroActions, farthest, shortened
 from vjepa2_ac.simulation.rollout import (

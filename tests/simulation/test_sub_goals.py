@@ -11,8 +11,7 @@ from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.simulation.agent import Planning
-from vjepa2_ac.simulation.benchmark import demonstrate, demonstrated_goals
+from vjepa2_ac.simulation.benchmark import Planning, demonstrate, demonstrated_goals
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.rollout import ArmEnvironment, Trial, run
 from vjepa2_ac.simulation.tasks import GRASP_M, HOLDING, TaskName, arm_for, make_problem

@@ -20,8 +20,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.model_setup import load_to_plan
-from vjepa2_ac.simulation.agent import Agent
-from vjepa2_ac.simulation.benchmark import BenchmarkOptions
+from vjepa2_ac.simulation.benchmark import Agent, BenchmarkOptions
 from vjepa2_ac.simulation.policies import ZeroActions
 from vjepa2_ac.simulation.rollout import Image, Observation, Trial, run_trials
 from vjepa2_ac.simulation.worlds import OtherWorld, find_trials, record_world, run_world_benchmark

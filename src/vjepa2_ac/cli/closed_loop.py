@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.evaluation.summary import Summary, Verdict
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
-    from vjepa2_ac.simulation.agent import Agent
-    from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
+    from vjepa2_ac.simulation.benchmark import Agent, ClosedLoopBenchmark
 
 _OF_RECORD = ("cameras", "workers")
 _OF_A_MODEL = ("sub_goals", "goals", "films", "decoder", "checkpoint", "config", "out")
@@ -207,7 +206,6 @@ def _record(options: argparse.Namespace) -> int:
         raise InputError(where="simulate record", found=str(error), needed="a folder of this machine") from None
     if options.world is not None:
         return _record_world(options, target)
-    options.domain = options.domain or "A"
     cli.require_new_place(target)
 
     from vjepa2_ac.simulation.record import RecordingSpec, default_steps, record_dataset
@@ -349,7 +347,7 @@ def _agent(options: argparse.Namespace) -> Agent:
     """Load the model, and the decoder by which videos show predicted frames."""
     from vjepa2_ac.decoding.decoder_folder import SIMULATED
     from vjepa2_ac.evaluation.imagined import imagined_next
-    from vjepa2_ac.simulation.agent import Agent
+    from vjepa2_ac.simulation.benchmark import Agent
 
     decoder, subject = cli.given_decoder(options), cli.load_planning_session(options)
     if decoder is None:

@@ -184,7 +184,11 @@ class RayCamera:
 
     def _see_background(self, data: Any) -> _Background:
         size = (self._width, self._height)
-        rays = _pixel_rays(size, self._half_view) @ self._pose[:3, :3].T
+        across, down = (
+            ((np.arange(count) + 0.5) / count * 2 - 1) * half for count, half in zip(size, self._half_view, strict=True)
+        )  # the middle of each pixel
+        rays = np.stack(np.broadcast_arrays(across[None, :], down[:, None], 1.0), axis=-1).reshape(-1, 3)
+        rays = unit(rays) @ self._pose[:3, :3].T
         view = View(self._pose, rays, self._half_view, size)
         hits = self._caster.cast(data, view.origin, view.rays, STATIC_GROUP)
         distance = np.where(hits.geoms >= 0, hits.distance_m, _FAR_M)
@@ -258,15 +262,6 @@ def _panels(spots: Any) -> Any:
     panel = np.floor(along / 0.6) % 2
     shade = 0.86 + 0.10 * panel + 0.08 * np.clip(spots[:, 2], -0.7, 1.5)
     return np.where(spots[:, 2] < -0.6, 0.5, shade).astype(np.float32)
-
-
-def _pixel_rays(size: tuple[int, int], half_view: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "pixels 3"]:
-    """Return unit rays through the middle of each pixel in the camera's frame, row by row."""
-    across, down = (
-        ((np.arange(count) + 0.5) / count * 2 - 1) * half for count, half in zip(size, half_view, strict=True)
-    )
-    rays = np.stack(np.broadcast_arrays(across[None, :], down[:, None], 1.0), axis=-1).reshape(-1, 3)
-    return unit(rays)
 
 
 def _as_bytes(colour: Any) -> UInt8[np.ndarray, "pixels 3"]:

@@ -58,7 +58,7 @@ _MOTION, _WORLD, _SUCCESS = range(3)  # random streams of an episode
 class RecordingSpec:
     """What an episode of a simulated data set is."""
 
-    domain: str | Domain | DomainRanges  # or its name; ranges, or `random`: another world in every episode
+    domain: str | Domain | DomainRanges = "A"  # or its name; ranges, or `random`: another world in every episode
     steps: Annotated[int, Field(ge=2, le=1_000_000)] = 41  # control steps (15 per second); see `default_steps`
     seed: Annotated[int, Field(ge=0)] = 0  # determines motion, outcome and worlds
     cameras: Literal[1, 2, 3] = 1  # so many have an image of their own, those that stand still first

@@ -34,9 +34,6 @@ place: as push, since the block lies on the table, too; its middle is on the mar
 not all: `TaskProblem.succeeded`.
 """
 
-ALSO: dict[TaskName, str] = {"reach": "", "push": "", "pick": "", "place": "released on the table"}
-"""What success requires beside the distance, as text; "": nothing."""
-
 STEPS: dict[TaskName, int] = {"reach": 8, "push": 8, "pick": 12, "place": 18}
 """Default number of model steps of an episode; place: the paper's 4 + 10 + 4 of pick-and-place."""
 

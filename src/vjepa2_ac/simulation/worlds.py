@@ -32,9 +32,9 @@ from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.goals.key_frames import OF_MODEL_STEPS, every_key_frame, gripper_key_frames
 from vjepa2_ac.media.video import video_library
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.simulation.agent import Agent
 from vjepa2_ac.simulation.arm import State
 from vjepa2_ac.simulation.benchmark import (
+    Agent,
     BenchmarkOptions,
     ClosedLoopBenchmark,
     goals_of_episode,
