@@ -20,11 +20,11 @@ from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.sources import RAW_CAMERAS, RAW_RATE_HZ
 from vjepa2_ac.data.files import CONNECTIONS, DEEPEST, in_parallel, list_folder
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key, key_of, summary_of
-from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Scanned, require_as_indexed
+from vjepa2_ac.data.sources.indexed_source import IndexedSource, Scanned, frames_by_step, require_as_indexed
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted, require_library
 from vjepa2_ac.media.video import frame_times, read_frames, read_header
-from vjepa2_ac.spaces import POSE, zero_steps
+from vjepa2_ac.spaces import POSE, require_finite
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import json_object
 
@@ -86,7 +86,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         return Episode(
             info=info,
             states=states,
-            read_frames=FramesByStep(info.num_steps, video, frames),
+            read_frames=frames_by_step(info.num_steps, video, frames),
             control_rate_hz=RAW_RATE_HZ,
             extrinsics=numbers.get(serial),
             joint_velocities=numbers.get("velocities"),
@@ -219,8 +219,6 @@ def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[st
         wrong = f"{len(data)} bytes that cannot be read as HDF5 ({str(error)[:200]})"
         raise InputError(where=where, found=wrong, needed="an undamaged trajectory.h5", fix=_FIX) from None
     steps = len(found["pose"])
-    if steps == 0:
-        raise zero_steps(where)
     for name, values in found.items():
         if len(values) != steps:
             raise InputError(where=f"{where}: {name}", found=f"{len(values)} of {counted(steps, 'step')}", fix=_FIX)
@@ -235,9 +233,7 @@ def _array(data: Any, width: int, where: str) -> Float[np.ndarray, "steps width"
         found, needed = f"shape {shape} of kind {kind!r}", f"{width} numbers for each step"
         raise InputError(where=where, found=found, needed=needed, fix=_FIX)
     values = np.asarray(data[()], dtype=np.float64).reshape(-1, width)
-    if not np.isfinite(values).all():
-        step = int((~np.isfinite(values)).any(axis=1).argmax())
-        raise InputError(where=where, found=f"{values[step]} at step {step}", needed="finite numbers", fix=_FIX)
+    require_finite(values, where, fix=_FIX)
     return values
 
 

@@ -18,7 +18,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import EpisodeFiles, connections_to, in_parallel
 from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, StatesSummary, labels_of, nul_error
 from vjepa2_ac.data.selection import as_error, as_problem
-from vjepa2_ac.episode import EpisodeInfo, EpisodeSource, Progress, Widths, no_progress
+from vjepa2_ac.episode import EpisodeInfo, EpisodeSource, FrameReader, Progress, Widths, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import CAMERA_POSE, POSE, POSE_CHANGE, Spaces, StateSpace, vector_states
 
@@ -182,25 +182,21 @@ class IndexedSource(ABC, Generic[Config, More]):
         """Open the data set: read its index from the cache, or scan it."""
 
 
-@dataclass(frozen=True)
-class FramesByStep:
-    """Reads the frames of one camera of an episode; see `episode.FrameReader`."""
+def frames_by_step(num_steps: int, where: str, decode: FrameReader) -> FrameReader:
+    """Return the reader of the frames of one camera of an episode.
 
-    num_steps: int
-    where: str  # file and episode, for messages
-    decode: Callable[[Sequence[int]], UInt8[np.ndarray, "time height width 3"]]  # of steps within the episode
+    Args:
+        num_steps: Of the episode.
+        where: File and episode, for messages.
+        decode: Returns the RGB frames at steps within the episode, in their order.
+    """
 
-    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB frames at these control steps, in this order.
+    def read(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
+        if not steps or min(steps) < 0 or max(steps) >= num_steps:
+            raise ValueError(f"{where}: steps {list(steps)} of {num_steps}")
+        return decode(steps)
 
-        Raises:
-            InputError: A frame is missing, damaged or of another size, or its file has changed.
-            OSError: A file behind a URL cannot be read.
-            ValueError: No steps, or a step outside the episode.
-        """
-        if not steps or min(steps) < 0 or max(steps) >= self.num_steps:
-            raise ValueError(f"{self.where}: steps {list(steps)} of {self.num_steps}")
-        return self.decode(steps)
+    return read
 
 
 def require_as_indexed(found: int, info: EpisodeInfo, where: str) -> None:

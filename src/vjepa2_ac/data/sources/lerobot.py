@@ -17,7 +17,7 @@ from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.index import EpisodeTable, StatesSummary, get_or_build, index_key, summary_of
 from vjepa2_ac.data.poses import poses_from
 from vjepa2_ac.data.selection import as_problem
-from vjepa2_ac.data.sources.indexed_source import Found, FramesByStep, IndexedSource, Scanned, table_of
+from vjepa2_ac.data.sources.indexed_source import Found, IndexedSource, Scanned, frames_by_step, table_of
 from vjepa2_ac.data.sources.lerobot_meta import (
     FIX_EPISODE,
     TABLES,
@@ -34,7 +34,7 @@ from vjepa2_ac.data.sources.lerobot_meta import (
 )
 from vjepa2_ac.data.sources.parquet import EPISODE, Columns, ParquetRows
 from vjepa2_ac.data.splits import with_own_splits
-from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
+from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_image, stack_frames
 from vjepa2_ac.media.video import Clock, read_frames, read_header, video_library
@@ -211,16 +211,16 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         }
         return content, None if success is None else bool(success.any())
 
-    def _frames(self, row: EpisodeRow, key: str) -> FramesByStep:
+    def _frames(self, row: EpisodeRow, key: str) -> FrameReader:
         info = self._info
         if info.features[key].dtype == "image":
             path = storage.join(info.root, row.data_file(info))
             read_all = cache(partial(self._parquet.images, path, key, row.index))
             read = partial(self._stored_frames, row, key, read_all)
-            return FramesByStep(row.length, f"{self._where(row)}: {key}", read)
+            return frames_by_step(row.length, f"{self._where(row)}: {key}", read)
         path, start_s = storage.join(info.root, row.video_file(info, key)), row.place[f"{key}.start_s"]
         clock, where = Clock(start_s=start_s, rate_hz=info.fps, source=info.where), f"{path}: {row.id}"
-        return FramesByStep(
+        return frames_by_step(
             row.length, where, lambda steps: read_frames(self._open_file(path), steps, where=where, clock=clock)
         )
 

@@ -41,9 +41,9 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import CONNECTIONS, walk
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key, summary_of
 from vjepa2_ac.data.sources.indexed_source import (
-    FramesByStep,
     IndexedSource,
     Scanned,
+    frames_by_step,
     measured_space,
     require_as_indexed,
 )
@@ -110,7 +110,7 @@ class NpzSource(IndexedSource[DataConfig, None]):
             episode = Episode(
                 info=EpisodeInfo(identity, steps, bool(file.numbers("success", ())) if "success" in names else None),
                 states=states,
-                read_frames=FramesByStep(steps, path, partial(self._frames, path, version, cameras[0], steps)),
+                read_frames=frames_by_step(steps, path, partial(self._frames, path, version, cameras[0], steps)),
                 control_rate_hz=fps_hz,
                 extrinsics=extrinsics[0],
                 joint_velocities=file.numbers(joints, (steps, None)) if joints in names else None,

@@ -23,12 +23,12 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig, RldsData
 from vjepa2_ac.data.files import fetched_data, open_cache
 from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build, index_key
-from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource
+from vjepa2_ac.data.sources.indexed_source import IndexedSource, frames_by_step
 from vjepa2_ac.data.sources.rlds_episode import STEP_FLAG, Record, build_index, episode_of, position_of, step_features
 from vjepa2_ac.data.sources.rlds_shards import NEEDED, Shard, find_shards, open_shard
 from vjepa2_ac.data.sources.tfrecord import NotAnExampleError, Place, Read, RecordSpan, item_places, require_intact
 from vjepa2_ac.data.splits import with_own_splits
-from vjepa2_ac.episode import Episode, Progress, StepRanges
+from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_images
 from vjepa2_ac.storage.remote import read_neighbours
@@ -117,7 +117,7 @@ def _mark(file: Path, number: int) -> None:
             os.close(handle)
 
 
-def images_here(shard: Shard, feature: Place, num_steps: int, where: str) -> FramesByStep:
+def images_here(shard: Shard, feature: Place, num_steps: int, where: str) -> FrameReader:
     """Return the reader of the images in a local shard; `where`: file, record, identity and feature, for messages."""
 
     def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
@@ -125,7 +125,7 @@ def images_here(shard: Shard, feature: Place, num_steps: int, where: str) -> Fra
             places = _places_of(read, feature, num_steps, where)
             return decode_images([read(*places[step]) for step in steps], steps, where)
 
-    return FramesByStep(num_steps, where, decode)
+    return frames_by_step(num_steps, where, decode)
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class RemoteEpisode:
         pieces = {place: data[end - place[1] : end] for place, end in zip(places, ends, strict=True)}
         return Record(lambda *place: pieces[place], self._span, located)
 
-    def images(self, name: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str) -> FramesByStep:
+    def images(self, name: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str) -> FrameReader:
         """Return the reader of one camera's images.
 
         Args:
@@ -191,7 +191,7 @@ class RemoteEpisode:
                     images = self._some(key, list(map(tuple, places.tolist())), steps)
             return decode_images([images[step] for step in steps], steps, where)
 
-        return FramesByStep(num_steps, where, decode)
+        return frames_by_step(num_steps, where, decode)
 
     def _located(self) -> dict[str, Place]:
         def locate() -> bytes:
