@@ -28,11 +28,6 @@ def test_the_page_names_all_scripts() -> None:
     assert all(f"python examples/{path.name}" in page for path in EXAMPLES)
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_is_short(path: Path) -> None:
-    assert len(path.read_text().splitlines()) < (150 if path.stem == "train_loop" else 70)
-
-
 def test_a_first_look_at_data_records_them_and_draws_a_sheet(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

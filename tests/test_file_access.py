@@ -202,11 +202,6 @@ def other_modes(root: Path, umask: int) -> dict[str, str]:
     return {str(path.relative_to(root)): oct(mode) for path, mode in modes.items() if mode != 0o666 & ~umask}
 
 
-def test_the_mode_of_every_written_file_of_weights_follows_the_umask(tmp_path: Path, umask: int) -> None:
-    write_all(tmp_path)
-    assert not other_modes(tmp_path, umask)
-
-
 def test_the_mode_of_every_file_of_a_run_its_exports_and_its_latents_follows_the_umask(
     tmp_path: Path, make_config: MakeConfig, umask: int
 ) -> None:

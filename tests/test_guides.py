@@ -13,11 +13,6 @@ from vjepa2_ac.config.loading import load_config
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def test_a_command_is_whole_and_has_no_comment() -> None:
-    page = "```sh\n# first\nvjepa2-ac train a \\\n    b=1   # why\n\nmake demo    # so\n```\n"
-    assert commands_of(page) == ["vjepa2-ac train a b=1", "make demo"]
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_the_program_accepts_every_command_of_a_guide(page, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)

@@ -1,12 +1,10 @@
 """The habits of the project: one version, pins, notices, hooks, workflows and links that say what is there."""
 
 import re
-import subprocess
 import tomllib
 from pathlib import Path
 from typing import Any
 
-import nbformat
 import pytest
 import yaml
 
@@ -66,14 +64,6 @@ def test_everything_that_is_ported_stands_in_the_notice() -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_nothing_is_vendored() -> None:
-    """NOTICE says so: all code is in our package, and the package holds no library of others."""
-    assert not [path for path in (ROOT / "src").rglob("*") if re.search(r"vendor|third.party|extern$", path.name)]
-    kinds = {path.suffix for path in (ROOT / "src").rglob("*") if path.is_file() and "__pycache__" not in path.parts}
-    kinds -= {part.suffix for folder in (ROOT / "src").glob("*.egg-info") for part in folder.iterdir()}
-    assert kinds <= {".py", ".typed", "", ".jinja", ".html", ".js", ".css", ".json", ".yaml", ".safetensors", ".xml"}
-
-
 # Pages, forms, workflows, hooks.
 
 
@@ -84,40 +74,9 @@ def test_every_target_that_is_named_is_there() -> None:
         assert {word for line in lines for word in line.split()} <= TARGETS, page.name
 
 
-def test_contributing_is_short_and_leads_to_each_recipe() -> None:
-    page = (ROOT / "CONTRIBUTING.md").read_text()
-    assert len(page.splitlines()) <= 90
-    extending = re.findall(r"^## (An? .+)$", (ROOT / "docs/extending.md").read_text(), flags=re.MULTILINE)
-    assert len(extending) == 9
-    assert all(f"docs/extending.md#{title.lower().replace(' ', '-')}" in page for title in extending)
-
-
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
 def test_a_workflow_may_only_read_and_pins_its_actions(path: Path) -> None:
     text = path.read_text()
     if path.name in {"ci.yml", "weekly.yml"}:
         assert loaded(path)["permissions"] == {"contents": "read"}
     assert all(re.fullmatch(r"[\w-]+/[\w-]+@v\d+", used) for used in re.findall(r"uses: (\S+)", text))
-
-
-def test_hooks_are_the_tools_of_make_lint() -> None:
-    """From the environment that `make` creates: their versions are those of constraints.txt."""
-    repositories = loaded(ROOT / ".pre-commit-config.yaml")["repos"]
-    assert [one["repo"] for one in repositories] == ["local"]
-    hooks = {hook["entry"].split()[0] for hook in repositories[0]["hooks"]}
-    recipe = re.search(r"^lint:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
-    assert recipe
-    assert hooks == {f".venv/bin/{tool}" for tool in re.findall(r"\$\(BIN\)/(\w+)", recipe[1])}
-
-
-def test_make_help_lists_at_most_twelve_targets() -> None:
-    done = subprocess.run(["make", "-s", "help"], cwd=ROOT, capture_output=True, text=True, check=True)
-    listed = re.findall(r"^make (\S+) - ", done.stdout, flags=re.MULTILINE)
-    assert set(listed) - {"worlds/%"} == TARGETS
-    assert len(listed) <= 12
-
-
-def test_notebooks_have_no_outputs() -> None:
-    for path in (ROOT / "examples").glob("*.ipynb"):
-        cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
-        assert not [cell for cell in cells if cell.outputs or cell.execution_count is not None], path

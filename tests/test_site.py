@@ -65,8 +65,3 @@ def test_every_key_is_on_its_page_with_its_range() -> None:
 )
 def test_links_lead_to_pages(text: str, expected: str) -> None:
     assert on_site(text, "README.md", "index.md") == expected
-
-
-def test_links_of_pages_further_down() -> None:
-    assert on_site("[a](../README.md)", "docs/data.md", "data.md") == "[a](index.md)"
-    assert on_site("[a](docs/data.md)", "CONTRIBUTING.md", "made/contributing.md") == "[a](../data.md)"

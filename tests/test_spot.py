@@ -67,19 +67,6 @@ def test_torchrun_and_train_take_what_the_file_starts_and_the_mirror_has_time(wh
         assert (options.node_rank, launch.nproc_per_node, options.master_addr) == (1, 4, "10.0.0.1")
 
 
-def test_pods_find_each_other_and_have_shared_memory() -> None:
-    service, job, pod = of_kubernetes()
-    words = words_in_a_pod()
-    name, port = service["metadata"]["name"], service["spec"]["ports"][0]["port"]
-    assert f"--rdzv-endpoint=vjepa2-ac-0.{name}:{port}" in words
-    assert (pod["subdomain"], service["spec"]["clusterIP"]) == (name, "None")
-    assert f"--nnodes={job['completions']}" in words
-    assert job["completions"] == job["parallelism"]
-    mounts = {mount["mountPath"]: mount["name"] for mount in pod["containers"][0]["volumeMounts"]}
-    volumes = {volume["name"]: volume["emptyDir"] for volume in pod["volumes"]}
-    assert volumes[mounts["/dev/shm"]]["medium"] == "Memory"  # noqa: S108 - the volume's place
-
-
 def test_kubernetes_takes_the_file_and_no_misspelt_key(tmp_path: Path) -> None:
     words = ["--no-deps", "--target", str(tmp_path), "kubernetes-validate==1.37.0", "importlib_resources==7.1.0"]
     install(sys.executable, *words)

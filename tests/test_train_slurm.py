@@ -82,9 +82,3 @@ def test_an_array_without_a_grid_or_a_line_trains_nothing(
     assert status
     assert calls == []
     assert said in capfd.readouterr().err
-
-
-def test_a_last_line_without_its_end_is_a_line(tmp_path: Path) -> None:
-    (tmp_path / "sweep.txt").write_text("seed=1\nseed=2")
-    _, calls = submit(tmp_path, run_ends_with=0, SLURM_ARRAY_TASK_ID="2", GRID="sweep.txt")
-    assert calls[-1].endswith("train my.yaml seed=1 seed=2 run_dir=sweep/2")

@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -86,60 +86,7 @@ def test_ways_take_turns_and_a_ratio_is_of_neighbours(timing: Any) -> None:
     assert (base.median_s, base.least_s) == (8.0, 2.0)
 
 
-def test_a_way_that_fails_takes_no_more_turns_and_what_it_left_is_cleared(timing: Any) -> None:
-    calls: list[str] = []
-
-    def fails() -> None:
-        calls.append("f")
-        if calls.count("f") == 2:
-            raise ValueError("enough")
-
-    *_, seen = timing.rounds({"f": fails, "o": lambda: calls.append("o")}, options(), lambda: calls.append("!"))
-    assert "".join(calls) == "fof!oo"
-    assert seen["f"].figures() == {
-        "problem": "failed: ValueError: enough", "s": None, "min_s": None, "repeats": 0, "alloc_retries": 0,
-    }  # fmt: skip
-    assert timing.ratio(seen["f"], seen["o"]) is None
-    assert len(seen["o"].seconds) == 2
-
-
-def test_a_time_in_which_the_allocator_gave_memory_back_does_not_count(
-    timing: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    retries = [0]
-    fake_cuda(monkeypatch, memory_stats=lambda: {"num_alloc_retries": retries[0]})
-
-    def grows_once(at: int) -> Callable[[], None]:
-        left = [at]
-
-        def step() -> None:
-            left[0] -= 1
-            retries[0] += not left[0]
-
-        return step
-
-    ways = {"warming up": grows_once(1), "timed": grows_once(3), "never": grows_once(-1)}
-    *_, seen = timing.rounds(ways, options(device="cuda"), list)
-    assert [turns.retries for turns in seen.values()] == [0, 1, 0]
-    assert "the allocator gave memory back 1 times" in seen["timed"].problem
-    assert seen["timed"].figures()["s"] is None
-    assert timing.ratio(seen["never"], seen["timed"]) is None
-    assert timing.ratio(seen["never"], seen["warming up"]) > 0
-
-
 # ---- memory ----
-
-
-def fake_cuda(monkeypatch: pytest.MonkeyPatch, **more: Any) -> list[str]:
-    """Stand in for what benchmarks ask of CUDA; return the list of what was asked."""
-    called: list[str] = []
-    answers: dict[str, Any] = {
-        "synchronize": lambda: None,
-        "empty_cache": lambda: called.append("empty"),
-    }
-    for name, answer in {**answers, **more}.items():
-        monkeypatch.setattr(torch.cuda, name, answer)
-    return called
 
 
 @pytest.mark.parametrize(

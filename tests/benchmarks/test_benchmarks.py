@@ -70,17 +70,6 @@ def test_all_rows_of_a_training_step_come_from_one_command_and_what_runs_out_of_
     assert first["compiled_after"] == 0
 
 
-def test_the_batch_that_was_found_is_a_row_and_is_timed(
-    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(train_step.QUICK, "batch", ["largest"])  # on a CPU: 2
-    file = tmp_path / "steps.json"
-    train_step.main(["--quick", "--no-memory", "--official", str(tmp_path), "--json", str(file)])
-    assert re.search(r"^ +4 +2 +no +cache +auto +is the largest batch", capsys.readouterr().out, re.MULTILINE)
-    found = [(row["measured"], row["batch"]) for row in json.loads(file.read_text())["rows"]]
-    assert found == [("largest batch", 2), ("time", 2), ("time", 2)]
-
-
 def test_no_ratio_is_printed_to_a_predictor_that_computes_something_else(
     train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,7 +3,6 @@
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -15,7 +14,6 @@ import pytest
 
 from paths import ROOT
 from vjepa2_ac.config import ValidationConfig
-from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.policies.train_prior import PriorOptions, train_prior
 from vjepa2_ac.simulation.record import RecordingSpec
 
@@ -135,16 +133,6 @@ def test_a_cell_is_trained_and_measured(small: Any, method: str) -> None:
     if method == "zero-shot":
         ends = {name: one["ends_cm"][0] for name, one in compact["baselines"].items()}
         assert ends["oracle"] < 1 < ends["zero action"]
-
-
-def test_seeds_train_on_other_demonstrations_of_the_same_number(small: Any) -> None:
-    drawn = []
-    cell = small.methods.Cell("look", "many cameras", "full", 4, 0)
-    for seed in (0, 1):
-        windows = open_dataset(small.measure.config_of(replace(cell, seed=seed), small.folder).data).windows("train")
-        drawn.append({windows[place][0] for place in range(len(windows))})
-        assert len(drawn[-1]) == 4
-    assert drawn[0] != drawn[1]
 
 
 def test_runs_of_the_selection_study_differ_and_the_plots_are_drawn(evidence: Any, stored: Any, tmp_path: Path) -> None:

@@ -42,12 +42,6 @@ def test_a_part_that_fails_is_named(tmp_path: Any) -> None:
     assert done.stderr.strip() == "failed or out of time: chunk"
 
 
-def test_a_part_that_takes_too_long_is_ended(on_gpu: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(on_gpu, "PARTS", [on_gpu.Part("chunk", "encoders", "", 0)])
-    with pytest.raises(SystemExit, match="out of time: chunk"):
-        on_gpu.main(["--quick", "--out", str(tmp_path)])
-
-
 def test_commands_of_the_notes_can_be_given(monkeypatch: pytest.MonkeyPatch) -> None:
     commands = re.findall(r"python (benchmarks/\w+\.py[^`]*)`", SECTION)
     assert len(commands) > 1

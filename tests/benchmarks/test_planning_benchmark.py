@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from benches import ELSEWHERE, imported
 
@@ -85,22 +84,3 @@ def test_no_ratio_is_printed_to_a_notebook_that_plans_otherwise(
     printed = capsys.readouterr().out
     assert re.search(r"official: actions differ by .*: NO RATIO", printed)
     assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/2", "ours/4+adapter"]
-
-
-def test_a_decision_is_counted_and_timed_in_the_type_and_towards_the_goal_that_were_asked_for(
-    planning: Any, tmp_path: Path
-) -> None:
-    decisions = sys.modules["planning_variants"]
-    options = planning.parse(["--quick", "--official", str(tmp_path)])
-    bench = decisions.Bench(options, "bfloat16")
-    for horizon in (1, 2):
-        cost = decisions.WorldModelCost(bench.model, bench._scene, bench._goal(horizon), decisions.EnergyConfig())
-        with torch.no_grad():
-            assert float(cost(torch.tensor(decisions.WANTED).expand(1, horizon, -1))) < 1e-5
-            assert float(cost(torch.zeros(1, horizon, 7))) > 1e-3
-    assert bench.model.predictor.dtype == torch.float32  # until all were compared
-    plan = bench.decision(decisions.Way.ours(2), 2)()
-    assert bench.model.predictor.dtype == torch.bfloat16
-    assert len(plan.actions) == 2
-    assert plan.evaluations == bench.sequences
-    assert bench.flops(2) == bench.sequences * decisions.plan_flops(bench.sizes, 2)
