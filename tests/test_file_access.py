@@ -13,8 +13,8 @@ from safetensors.torch import load_file, save_file
 
 from accidents import without_permission
 from random_decoder import write_decoder
-from run_fixtures import TINY, MakeConfig
-from vjepa2_ac.config import AdapterConfig, DiskCacheConfig, EncoderConfig, ModelConfig, ModelSizes
+from run_fixtures import TINY, TINY_CONFIG, MakeConfig
+from vjepa2_ac.config import AdapterConfig, DiskCacheConfig, EncoderConfig, ModelConfig, ModelSizes, SizesConfig
 from vjepa2_ac.data.index import EpisodeTable, get_or_build
 from vjepa2_ac.data.sources.latent_files import LatentFiles
 from vjepa2_ac.data.sources.latents import EPISODES, read_tables
@@ -148,7 +148,8 @@ def test_an_encoder_of_whole_numbers_is_refused_by_name(files: Path) -> None:
     weights = load_file(path)
     name = sorted(weights)[0]
     save_file({**weights, name: weights[name].long()}, path)
-    config = ModelConfig(base="random", sizes=SIZES, encoder=EncoderConfig(path=str(files / "model")), dtype="float32")
+    sizes, encoder = SizesConfig.model_validate(TINY_CONFIG), EncoderConfig(path=str(files / "model"))
+    config = ModelConfig(base="random", sizes=sizes, encoder=encoder, dtype="float32")
     with pytest.raises(InputError, match=rf"{re.escape(name)} is torch\.int64"):
         load_base(config, seed=0)
 
