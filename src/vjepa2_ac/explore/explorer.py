@@ -238,20 +238,17 @@ class Explorer:
         if not place.actions:
             return self.moment(place.episode, place.start).latents, KeyValueCache()
         (before, cache), states = self._end(teller, place.before), self.states(place)
-        given = states[-1] if self.spaces.action.follows == "target" else self._feasible(place, states[-2])
+        given = states[-1]
+        if self.spaces.action.follows != "target":
+            given = np.array(place.actions[-1])
+            if self.recorded(place) is None:  # its gripper changes as far as it can
+                given = feasible_actions(states[-2], given[None], self.spaces.state)[0]
         cache, camera = cache.copy(), self.camera(place)
         action, state = (torch.as_tensor(one, dtype=torch.float32, device=self.device) for one in (given, states[-2]))
         seen = before[None, None], action[None, None], state[None, None]
         with self.autocast(), self.contenders[teller].switched():
             predicted = self.model(teller).predict(*seen, None if camera is None else camera[None, None], cache)
         return predicted[0, 0].float(), cache
-
-    def _feasible(self, place: Place, state: np.ndarray) -> np.ndarray:
-        """Return the last action, from a state, its gripper as far as it can change unless that was recorded."""
-        action = np.array(place.actions[-1:])
-        if self.recorded(place) is None:
-            action = feasible_actions(state, action, self.spaces.state)
-        return np.asarray(action[0])
 
     def model(self, teller: int) -> WorldModel:
         """Return what imagines; it counts within `contenders[teller].switched()`."""

@@ -16,7 +16,7 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.episode import Progress, short_names
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.explore.explorer import Explorer, Moment, Pixels, Place, goal_moment, relative_spread, token_errors
+from vjepa2_ac.explore.explorer import Explorer, Pixels, Place, goal_moment, relative_spread, token_errors
 from vjepa2_ac.explore.messages import MOST_STEPS, Image, PageRequest, packed, shown_units
 from vjepa2_ac.explore.search import Search
 from vjepa2_ac.media.film import error_colours
@@ -137,15 +137,13 @@ class Views:
         return [*moves, {"id": "still", "label": "still", "axis": None, "sign": 0}]
 
     @cached_property
-    def _recorded_states(self) -> list[Float[np.ndarray, "steps dim"]]:
-        read, first = self.explorer.dataset.source.read, self.explorer.episodes[:_SEARCHED]
-        return [np.asarray(read(episode).states, dtype=np.float64) for episode in first]
-
-    @cached_property
     def _recorded_changes(self) -> list[Float[np.ndarray, "steps dim"]]:
-        """The changes of the state in each model step of each of these episodes."""
-        space, stride = self.explorer.spaces.state, self.explorer.stride
-        return [space.differences(states[::stride]) for states in self._recorded_states]
+        """The changes of the state in each model step of some episodes."""
+        explorer, found = self.explorer, []
+        for episode in explorer.episodes[:_SEARCHED]:
+            states = np.asarray(explorer.dataset.source.read(episode).states, dtype=np.float64)
+            found.append(explorer.spaces.state.differences(states[:: explorer.stride]))
+        return found
 
     @property
     def _usual_changes(self) -> Float[np.ndarray, " dim"]:
@@ -187,8 +185,9 @@ class Views:
         explorer, start = self.explorer, self.explorer.moment(place.episode, place.start)
         goal = None if request.goal is None else goal_moment(explorer, request.goal)
         outcome, states = explorer.truth(place, cancelled), explorer.states(place)
+        known = None if outcome is None else "simulated" if outcome.is_simulated else "recorded"
         images = [Image("given", start.pixels, f"the given frame, recorded at control step {place.start}")]
-        images += [] if outcome is None else [Image("truth", outcome.pixels, _true_alt(outcome))]
+        images += [] if outcome is None else [Image("truth", outcome.pixels, f"what really happens, {known}")]
         images += [] if goal is None else [Image("goal", goal.pixels, "the goal frame")]
         tellers = []
         for number, contender in enumerate(explorer.contenders):
@@ -212,7 +211,7 @@ class Views:
             "next_recorded": explorer.recorded_next(place),
             "state": states[-1],
             "path": None if position is None else states[:, position],
-            "truth": None if outcome is None else "simulated" if outcome.is_simulated else "recorded",
+            "truth": known,
             "truth_state": None if outcome is None else outcome.state,
             "note": "" if outcome is None or outcome.reached else "The arm cannot go so far: it went as far as it can.",
             "tellers": tellers,
@@ -255,7 +254,3 @@ class Views:
         ]  # fmt: skip
         now = self.search.energy(self.explorer.imagined(teller, place), goal)
         return packed("energy", request.seq, {"maps": shown, "now": now}, ())
-
-
-def _true_alt(outcome: Moment) -> str:
-    return f"what really happens, {'simulated' if outcome.is_simulated else 'recorded'}"

@@ -205,15 +205,12 @@ def make_goals(recording: Recording, options: KeyFrameOptions) -> MadeGoals:
     Raises:
         InputError: The demonstration has no poses, and the options need them.
     """
-    keys = _keys(recording, options)
-    first, *images = recording.read([0, *(key.frame for key in keys)])
-    return MadeGoals(recording, options, keys, sub_goals_of(images, keys, options, recording.states), first)
-
-
-def _keys(recording: Recording, options: KeyFrameOptions) -> tuple[KeyFrame, ...]:
     if options.by == "every":
-        return every_key_frame(recording.frames, options.every or 1)
-    if recording.states is None:
+        keys = every_key_frame(recording.frames, options.every or 1)
+    elif recording.states is None:
         found, needed = f"{recording.name}: no measured poses", "an episode with poses and gripper"
         raise InputError(where="goals", found=found, needed=needed, fix="Take every n-th frame: --every N")
-    return gripper_key_frames(recording.states, StillRule(apart=options.apart))
+    else:
+        keys = gripper_key_frames(recording.states, StillRule(apart=options.apart))
+    first, *images = recording.read([0, *(key.frame for key in keys)])
+    return MadeGoals(recording, options, keys, sub_goals_of(images, keys, options, recording.states), first)

@@ -343,8 +343,11 @@ class Controller:
         if not self._goals:
             raise ValueError("no goal: call reset first")
         require_image(frame, where="frame", like=self._goals[0].image)
-        state = self._known(np.asarray(state, dtype=np.float64))
-        self.spaces.state.require_state(state, "state")
+        state, space = np.asarray(state, dtype=np.float64), self.spaces.state
+        is_needed = self._model.sizes.predictor.use_states or self.spaces.action.follows != "change"
+        if not is_needed and not space.is_pose and state.shape != (len(space),):
+            state = np.zeros(len(space))  # the model takes no states, so a vector may have any width
+        space.require_state(state, "state")
         return state
 
     def _faulty(self, state: np.ndarray, why: Fault) -> Decision:
@@ -352,12 +355,6 @@ class Controller:
         progress = self._progress or GoalProgress(0, 0, math.nan)
         places, command = (progress.place,) * self.space.steps, self._command(state, np.zeros(len(state)))
         return Decision(command, why, math.nan, places, replace(progress, changed=""), done=progress.done)
-
-    def _known(self, state: np.ndarray) -> np.ndarray:
-        """Return the state; zeros for a vector of another width than an action's, if the model takes no states."""
-        is_needed = self._model.sizes.predictor.use_states or self.spaces.action.follows != "change"
-        width = len(self.spaces.state)
-        return state if is_needed or self.spaces.state.is_pose or state.shape == (width,) else np.zeros(width)
 
     def encoded(self, image: UInt8[np.ndarray, "height width 3"]) -> Latents:
         """Return the latents of an image on the model's device; those of several views follow one another.
@@ -457,14 +454,10 @@ class Controller:
         """Return what a search finds, inside the workspace if there is one; the energy is of what is sent."""
         generator, box = torch.Generator().manual_seed(self.seed + self._done), self._workspace
         space = self.space if box is None else box.narrowed(self.space, state)
-        return self._inside(state, self.planner.plan(cost, generator, start, cancelled, space), cost)
-
-    def _inside(self, state: np.ndarray, plan: Plan, cost: WorldModelCost) -> Plan:
-        """Return a plan whose targets are in the workspace, if there is one."""
-        if self._workspace is None or plan.stopped == "no finite energy":
+        plan = self.planner.plan(cost, generator, start, cancelled, space)
+        if box is None or plan.stopped == "no finite energy":
             return plan
-        actions = plan.actions.double().numpy()
-        kept = torch.from_numpy(self._workspace.kept(state, actions, self.config.limits)).to(plan.actions)
+        kept = torch.from_numpy(box.kept(state, plan.actions.double().numpy(), self.config.limits)).to(plan.actions)
         if torch.equal(kept, plan.actions):
             return plan
         with torch.no_grad():

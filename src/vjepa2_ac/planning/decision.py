@@ -17,7 +17,6 @@ from vjepa2_ac.errors import counted
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.energy import SAME_ENERGY, EnergySlice, energy_slices
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.planning.planner import Cost, Plan
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
@@ -104,8 +103,10 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0, rep
     if plan is not None and decision.cost is not None:
         with torch.no_grad():
             still = float(decision.cost(torch.zeros_like(plan.actions)[None])[0])
-        if decision.why != "no finite energy":
-            slices = _slices(controller, plan, decision.cost, nodes, reporter)
+        axes = controller.shown_axes
+        if decision.why != "no finite energy" and nodes >= 3 and len(axes) >= 2:
+            task = reporter.task("energy maps", "action sequences")
+            slices = energy_slices(decision.cost, plan.actions, space, axes, nodes=nodes, progress=task)
     times.append(time.perf_counter())
     return PlanResult(
         question=question,
@@ -119,14 +120,6 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0, rep
     )
 
 
-def _slices(controller: Controller, plan: Plan, cost: Cost, nodes: int, reporter: Reporter) -> tuple[EnergySlice, ...]:
-    axes = controller.shown_axes
-    if nodes < 3 or len(axes) < 2:
-        return ()
-    task = reporter.task("energy maps", "action sequences")
-    return energy_slices(cost, plan.actions, controller.space, axes, nodes=nodes, progress=task)
-
-
 PLAN_FILE = "plan.json"
 FORMAT = 1  # goes up when a reader of the file would have to change
 
@@ -134,24 +127,22 @@ _AT_LIMIT = 0.98  # share of a limit from which an action is said to be at it
 
 
 def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
-    """Write a decision as JSON; the file is written atomically.
+    """Write a decision as JSON; the file is written atomically, and numbers that are not finite are null.
 
     Args:
         answer: The decision.
         about: The model and the sources of the images, as plain values.
         path: The file.
     """
-    write_atomically(path, json_text(plan_as_dict(answer, about)))
-    return path
-
-
-def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of the file; numbers that are not finite are null."""
     decision, question, controller = answer.decision, answer.question, answer.controller
     plan, progress, names = decision.plan, decision.progress, answer.state_space.change_names
     rules = ("name", "at_least", "at_most", "share", "gripper")
     recorded = ("samples", "finite", "lowest", "mean", "std", "seconds")
     energy = {"now": decision.energy_now, "began": progress.began, "doing_nothing": answer.doing_nothing}
+    slices = []
+    for one in answer.slices:
+        across, up = (names[axis] for axis in one.axes)
+        slices.append({"across": across, "up": up, across: one.across, up: one.up, "energy": one.energy})
     found = {
         "format": FORMAT,
         "in_words": summarize(answer),
@@ -176,14 +167,11 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
             {name: getattr(one, name) for name in recorded} | {"elites_mean": one.elite_energy}
             for one in (() if plan is None else plan.iterations)
         ],
-        "slices": [_slice(one, names[one.axes[0]], names[one.axes[1]]) for one in answer.slices],
+        "slices": slices,
         "seconds": {**answer.seconds, "search": 0.0 if plan is None else plan.seconds},
     }
-    return {name: plain(value) for name, value in found.items()}
-
-
-def _slice(one: EnergySlice, across: str, up: str) -> dict[str, Any]:
-    return {"across": across, "up": up, across: one.across, up: one.up, "energy": one.energy}
+    write_atomically(path, json_text({name: plain(value) for name, value in found.items()}))
+    return path
 
 
 def summarize(answer: PlanResult) -> str:

@@ -12,7 +12,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from types import SimpleNamespace
+from typing import Any, Literal, Protocol
 
 import torch
 from einops import reduce
@@ -34,20 +35,16 @@ class SearchCancelledError(Exception):
     """A search was ended from outside before it was done; there is no plan."""
 
 
-@runtime_checkable
 class Cost(Protocol):
-    """A planner's only view of a model: the cost of action sequences. Lower is better; NaN is not allowed."""
+    """A planner's only view of a model: the cost of action sequences. Lower is better; NaN is not allowed.
+
+    One that evaluates in parts may have an attribute `progress`, which it calls after each part with the action
+    sequences so far, and all of the call.
+    """
 
     def __call__(self, actions: Float[Tensor, "samples steps dim"]) -> Float[Tensor, " samples"]:
         """Return the energy of each action sequence; for `gradient`, as a differentiable function of it."""
         ...
-
-
-@runtime_checkable
-class ReportingCost(Cost, Protocol):
-    """A cost that evaluates in parts, and says how far it is."""
-
-    progress: Progress  # called after each part with the action sequences so far, and all of the call
 
 
 def until_cancelled(cancelled: Cancelled, progress: Progress = no_progress) -> Progress:
@@ -77,14 +74,12 @@ def reporting(cost: Cost, progress: Progress, *, done: int, share: int, total: i
         if part < of:  # the last part is done when its energies are there
             progress(done + share * part // of, total)
 
-    if isinstance(cost, ReportingCost):
-        before, cost.progress = cost.progress, evaluated
-        try:
-            yield
-        finally:
-            cost.progress = before
-    else:
+    parts: Any = cost if hasattr(cost, "progress") else SimpleNamespace(progress=no_progress)
+    before, parts.progress = parts.progress, evaluated
+    try:
         yield
+    finally:
+        parts.progress = before
     progress(done + share, total)
 
 
@@ -209,7 +204,10 @@ class Planner:
         shares = _samples_of(search, config)
         total = sum(shares)
         self.progress(0, total)
-        while len(record) < len(shares) and self._has_time(began, record):
+        while len(record) < len(shares):
+            longest = max((one.seconds for one in record), default=0.0)
+            if record and config.budget_s is not None and self.clock() - began + longest > config.budget_s:
+                break
             if cancelled():
                 raise SearchCancelledError
             done, share = sum(shares[: len(record)]), shares[len(record)]
@@ -232,12 +230,6 @@ class Planner:
             evaluations=sum(one.samples for one in record) + evaluated,
             seconds=self.clock() - began,
         )
-
-    def _has_time(self, began: float, record: list[Iteration]) -> bool:
-        """Return whether an iteration as long as the longest so far would end within the budget."""
-        if self.config.budget_s is None or not record:
-            return True
-        return self.clock() - began + max(one.seconds for one in record) <= self.config.budget_s
 
     def _iterate(self, search: Solver, cost: Cost, space: SearchSpace) -> Iteration:
         began = self.clock()

@@ -79,10 +79,7 @@ def train_prior(
     device = computing_device(config.training)
     data, frames = config.data, open_dataset(config.data, progress=reporter.task(INDEXING))
     reporter.task(LOADING)
-    model, spaces = (
-        load_base(config.model, seed=config.seed).to(device),
-        frames.spaces,
-    )  # of it the encoder alone counts
+    model, spaces = load_base(config.model, seed=config.seed).to(device), frames.spaces  # its encoder alone counts
     if spaces.action.follows == "unknown":
         found = "commands of which nobody knows what they do to the state"
         raise InputError(where="data.actions: recorded", found=found, needed="actions that a planner can search among")
@@ -113,7 +110,10 @@ def _trained(
         first = [_pairs(one, spaces, drawn) for one in itertools.islice(_encoded(batches, model), _FIRST)]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            prior = ActionPrior(_sizes(model, dataset)).to(model.device)
+            grid, widths = model.image_size // model.sizes.patch_size, dataset.spaces.widths
+            ahead = dataset.config.frames - 1
+            sizes = PriorSizes(grid, model.latent_dim, widths.state, widths.action, ahead)
+            prior = ActionPrior(sizes).to(model.device)
         prior.scale.copy_(torch.cat([one.changes for one in first]).std(dim=0).clamp(min=1e-6))
         optimizer = torch.optim.AdamW(prior.parameters(), lr=options.learning_rate, weight_decay=0.01)
         pairs = (_pairs(one, spaces, drawn) for one in _encoded(batches, model))
@@ -141,11 +141,6 @@ def prior_loss(mean: Tensor, deviation: Tensor, changes: Tensor) -> Tensor:
     """
     off = (mean - changes).abs()
     return (off + off.detach() / deviation + deviation.log()).mean()
-
-
-def _sizes(model: WorldModel, dataset: Dataset) -> PriorSizes:
-    grid, widths = model.image_size // model.sizes.patch_size, dataset.spaces.widths
-    return PriorSizes(grid, model.latent_dim, widths.state, widths.action, dataset.config.frames - 1)
 
 
 def _encoded(batches: Iterator[Batch], model: WorldModel) -> Iterator[LatentBatch]:

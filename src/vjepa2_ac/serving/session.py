@@ -141,7 +141,8 @@ class Session:
 
     def _answered(self, request: Request, began: float, is_gone: Callable[[], bool]) -> dict[str, Any]:
         if request.begins or not self._has_begun or request.episode not in (None, self._episode):
-            self._forget(request.episode or self._episode)
+            self._episode, self._has_begun, self._goal, self._notes = request.episode or self._episode, True, None, []
+            self.counts.episodes += 1
         until = began + self.options.deadline_s
         try:
             return self._carried_out(request, began, lambda: is_gone() or self._clock() > until)
@@ -257,10 +258,6 @@ class Session:
         if self.controller.spaces.action.follows == "target":
             return np.asarray(state + np.cumsum(changes, axis=0))
         return changes
-
-    def _forget(self, episode: str | None) -> None:
-        self._episode, self._has_begun, self._goal, self._notes = episode, True, None, []
-        self.counts.episodes += 1
 
     def _set(self, goal: GivenGoal, cancelled: Cancelled) -> None:
         if goal.name is not None and goal.name not in self.goals:
