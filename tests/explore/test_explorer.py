@@ -6,7 +6,7 @@ import torch
 
 from vjepa2_ac.decoding.imagine import Start, rolled_out
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.explore.explorer import Explorer, Place, relative_spread, token_errors
+from vjepa2_ac.explore.explorer import Explorer, Place
 from vjepa2_ac.explore.messages import MOST_STEPS
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.simulation.counterfactual import resimulate
@@ -112,10 +112,3 @@ def test_a_target_out_of_reach_is_said(live: Views) -> None:
 def test_what_is_no_place_is_refused(recorded: Views, place: Place, says: str) -> None:
     with pytest.raises(InputError, match=says):
         recorded.explorer.require(place)
-
-
-def test_error_and_spread_of_a_frame_itself() -> None:
-    latents = torch.randn(9, 4, generator=torch.Generator().manual_seed(0))
-    assert not token_errors(latents, latents).any()
-    assert relative_spread(latents, latents) == 1.0
-    assert relative_spread(latents * 0.5, latents) == pytest.approx(0.25)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from einops import reduce
@@ -35,6 +35,7 @@ class SearchCancelledError(Exception):
     """A search was ended from outside before it was done; there is no plan."""
 
 
+@runtime_checkable
 class Cost(Protocol):
     """A planner's only view of a model: the cost of action sequences. Lower is better; NaN is not allowed.
 
