@@ -259,7 +259,7 @@ class EpisodeFile:
         self.path = path
         with self._reading():
             self._file = TensorFile(read, size, path)
-            about, self.names = self._file.metadata, self._file.names
+            about, self.names = self._file.metadata, self._file.entries.keys()
             self.metadata = {name: str(text) for name, text in json_object(about["metadata"], where=path).items()}
         if about.get("key") != key:
             raise self._damaged("a file of another cache", "a file that was made with this one's cache.json")
@@ -307,7 +307,7 @@ class EpisodeFile:
             InputError: One is damaged.
         """
         with self._reading():
-            if len(self._file.shape("pictures")) > 1:
+            if len(self._file.entries["pictures"].shape) > 1:
                 return np.asarray(self._file.rows(["pictures"], places)[0].numpy())
             ends = [0, *self._file.tensor("picture_ends").tolist()]
             jpegs = self._file.slices("pictures", [(ends[place], ends[place + 1]) for place in places])
@@ -376,27 +376,18 @@ class TensorFile:
             raise ValueError("no header")
         header = json_object(self._pieces([(_LENGTH_BYTES, begin - _LENGTH_BYTES)])[0], where=where)
         self.metadata: Mapping[str, str] = header.pop("__metadata__", {})
-        self._entries = {name: _Entry.of(about, begin) for name, about in header.items()}
-        if (end := max([begin, *(one.end for one in self._entries.values())])) != size:
+        self.entries = {name: _Entry.of(about, begin) for name, about in header.items()}
+        if (end := max([begin, *(one.end for one in self.entries.values())])) != size:
             raise ValueError(f"{size:,} bytes of {end:,}")
-
-    @property
-    def names(self) -> frozenset[str]:
-        """The names of its tensors."""
-        return frozenset(self._entries)
-
-    def shape(self, name: str) -> tuple[int, ...]:
-        """Return the shape of a tensor."""
-        return self._entries[name].shape
 
     def tensor(self, name: str) -> Tensor:
         """Return a whole tensor."""
-        one = self._entries[name]
+        one = self.entries[name]
         return _tensor(self._pieces([(one.start, one.end - one.start)]), one, one.shape)
 
     def rows(self, names: Sequence[str], places: Sequence[int]) -> list[Tensor]:
         """Return the same rows of several tensors, which are read together."""
-        entries = [self._entries[name] for name in names]
+        entries = [self.entries[name] for name in names]
         pieces = self._pieces([one.range_of(place, place + 1) for one in entries for place in places])
         count = len(places)
         return [
@@ -405,7 +396,7 @@ class TensorFile:
 
     def slices(self, name: str, bounds: Sequence[tuple[int, int]]) -> list[bytes]:
         """Return the bytes of rows from the first to before the second number of each pair, read together."""
-        return self._pieces([self._entries[name].range_of(*pair) for pair in bounds])
+        return self._pieces([self.entries[name].range_of(*pair) for pair in bounds])
 
     def _pieces(self, ranges: Ranges) -> list[bytes]:
         known, there = len(self._head), dict[tuple[int, int], bytes]()
