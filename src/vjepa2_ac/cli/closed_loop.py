@@ -243,7 +243,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
 
     benchmark, folder = _measure(options)
     verdict = closed_loop(
-        benchmark.shares,
+        {result.policy: result.success_rate for result in benchmark.results},
         model=benchmark.results[0].policy,
         oracle=benchmark.results[-1].policy,
         problems=len(benchmark.trials.trials),

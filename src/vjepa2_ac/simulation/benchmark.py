@@ -28,7 +28,6 @@ from vjepa2_ac.goals.key_frames import (
     with_frames_between,
 )
 from vjepa2_ac.goals.nearest import goals_alike
-from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.media.film import below_each_other, side_by_side
 from vjepa2_ac.media.video import video_library, write_video
 from vjepa2_ac.planning.controller import Controller, Decision
@@ -146,11 +145,6 @@ class Agent:
         """The planning settings, which the references share."""
         return self.subject.config.planning
 
-    @property
-    def stride(self) -> int:
-        """Control steps of a model step."""
-        return self.subject.config.data.model_stride
-
     def policy(self, arm: SimulatedArm | None) -> Planning:
         """Return the policy for an arm; None: for a third-party environment, whose camera's pose is not known.
 
@@ -258,11 +252,6 @@ class ClosedLoopBenchmark:
     results: tuple[ClosedLoopResult, ...]
 
     @property
-    def shares(self) -> dict[str, Estimate]:
-        """Success rates by policy, the model's first, the expert's last."""
-        return {result.policy: result.success_rate for result in self.results}
-
-    @property
     def conditions(self) -> str:
         """Where, and with which sub-goals the model acts, as text."""
         about = self.trials.about
@@ -285,7 +274,7 @@ def run_benchmark(agent: Agent, options: BenchmarkOptions, reporter: Reporter = 
     """
     if options.films:
         video_library()
-    options, limits = replace(options, stride=agent.stride), agent.planning.limits
+    options, limits = replace(options, stride=agent.subject.config.data.model_stride), agent.planning.limits
     arm = arm_for(options.task, options.world, views=agent.planning.views)
     environment, model, trials = ArmEnvironment(arm), agent.policy(arm), options.trials()
     if options.sub_goals in {"demonstration", "every-step"}:

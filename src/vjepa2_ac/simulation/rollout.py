@@ -230,14 +230,21 @@ class ArmEnvironment:
         return observation, info | {"goal_image": goal_image}
 
     def step(self, action: Action | None) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Carry out an action: of 7 numbers the change of the pose, of 8 that of the joints.
+        """Carry out an action: of 7 numbers the change of the pose, of 8 that of the joints, within their limits.
 
         Raises:
             ValueError: There is no action.
         """
         if action is None:
             raise ValueError("the simulated arm has no expert: use the policy Oracle")
-        is_reachable = (send_action if len(action) == 7 else _send_joints)(self.arm, action, self._stride)
+        if len(action) == 7:
+            is_reachable = send_action(self.arm, action, self._stride)
+        else:
+            target = self.arm.joints + action[:-1]
+            joints = np.clip(target, LOW, HIGH)
+            closedness = float(np.clip(self.arm.closedness + action[-1], 0.0, 1.0))
+            self.arm.command_joints(joints, closedness, self._stride)
+            is_reachable = bool(np.array_equal(target, joints))
         observation, info = self._observe()
         return observation, -info["distance_m"], info["success"], False, info | {"is_reachable": is_reachable}
 
@@ -290,14 +297,6 @@ def states_along(state: State, action: State) -> list[State]:
     """Return equally spaced states on the straight line of an action, the nearest first."""
     shares = np.arange(1, _PARTS + 1)[:, None] / _PARTS
     return list(apply_action(np.tile(state, (_PARTS, 1)), shares * action))
-
-
-def _send_joints(arm: SimulatedArm, action: Float[np.ndarray, " 8"], stride: int) -> bool:
-    """Command the joints after an action, within their limits; return whether it was within them."""
-    target = arm.joints + action[:-1]
-    reachable = np.clip(target, LOW, HIGH)
-    arm.command_joints(reachable, float(np.clip(arm.closedness + action[-1], 0.0, 1.0)), stride)
-    return bool(np.array_equal(target, reachable))
 
 
 # ---- all trials ----
