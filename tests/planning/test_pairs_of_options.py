@@ -230,7 +230,8 @@ def tried(scene: Scene, *names: str) -> None:
         return
     scene.imagined.add(read)
     session = Subject("tiny", config, scene.model)
-    film = imagine_image(session, "decoder", imagined.Seen(world.images[0], STATE), ["back"], steps=1)
+    asked = imagined.ImagineOptions("decoder", ("back",), steps=1)
+    film = imagine_image(session, asked, imagined.Seen(world.images[0], STATE))
     assert film.rollouts[0].frames.shape[1:] == film.first.shape == film.decoded_first.shape
 
 

@@ -15,7 +15,7 @@ from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.imagined import Seen, imagine_image, imagined_next
+from vjepa2_ac.evaluation.imagined import ImagineOptions, Seen, imagine_image, imagined_next
 from vjepa2_ac.goals.make_goals import recording_of_episode
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
@@ -106,7 +106,7 @@ def test_an_image_of_two_views_is_imagined_view_by_view(tmp_path: Path) -> None:
     def film(pixels: np.ndarray, views: int) -> np.ndarray:
         config = parse_config(values | {"planning": {"views": views}}, where="test")
         session = Subject("tiny", config, model)
-        found = imagine_image(session, decoder, Seen(pixels, STATE), ["up"], steps=2)
+        found = imagine_image(session, ImagineOptions(decoder, ("up",), steps=2), Seen(pixels, STATE))
         return np.concatenate([found.first[None], found.decoded_first[None], found.rollouts[0].frames])
 
     both = film(np.hstack(images), 2)

@@ -241,13 +241,14 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
 
 
 def _of_image(options: argparse.Namespace) -> Imagination:
-    from vjepa2_ac.evaluation.imagined import Seen, imagine_image
+    from vjepa2_ac.evaluation.imagined import ImagineOptions, Seen, imagine_image
     from vjepa2_ac.media.images import read_image
 
     cli.require_to_plan(options)
-    seen, words = Seen(read_image(options.image), options.state, options.extrinsics), options.actions or _NAMED
-    session, size_m = cli.load_planning_session(options), options.size / 100
-    return imagine_image(session, options.decoder, seen, words, steps=options.steps, size_m=size_m)
+    seen = Seen(read_image(options.image), options.state, options.extrinsics)
+    named = {"actions": options.actions or _NAMED, "size_m": options.size / 100}
+    asked = cli.record_of_options(ImagineOptions, options, **named)
+    return imagine_image(cli.load_planning_session(options), asked, seen)
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -52,37 +52,40 @@ class Seen:
     extrinsics: Float[np.ndarray, " 6"] | None = None  # where the model uses it
 
 
-def imagine_image(
-    session: Subject,
-    decoder_name: str,
-    seen: Seen,
-    actions: Sequence[str],
-    *,
-    steps: int,
-    size_m: float = STEP_M,
-) -> Imagination:
+@dataclass(frozen=True)
+class ImagineOptions:
+    """What is to be imagined."""
+
+    decoder: str
+    actions: tuple[str, ...] = (TRUE, "none", "up", "left", "close")  # names, `true`, or files
+    steps: int = 7  # model steps
+    size_m: float = STEP_M  # of a named action, in each step, if the limits allow it
+    episode: str | None = None  # None: the held-out clip with the most motion
+    start: int | None = None  # first control step; None: likewise
+    evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, split
+
+
+def imagine_image(session: Subject, asked: ImagineOptions, seen: Seen) -> Imagination:
     """Imagine what follows from an image under actions by name, or from files; `planning.views` as a planner sees them.
 
     Args:
         session: The model, and the config whose crop and limits count.
-        decoder_name: As `load_decoder` takes.
+        asked: Decoder, actions (names of directions, or files), steps and size.
         seen: The start.
-        actions: Names of directions, or files; see `planning.counterfactual`.
-        steps: Model steps.
-        size_m: Length of a named action in each step, if the limits allow it.
 
     Raises:
         InputError: Decoder, state or actions cannot be used.
     """
     require_one_process()
-    _require_some(actions)
+    _require_some(asked.actions)
     model, config = session.world_model, session.config
-    decoder = load_decoder(decoder_name)
+    decoder = load_decoder(asked.decoder)
     warnings = decoder.require_fit(model, config.data, subject=session.name)
     decoder.to(model.device)
     space = measured_space(config.data, len(seen.state))
     _require_directions(space, where="--state")
-    chosen = {name: _actions_by_name(name, steps, size_m, config.planning.limits) for name in actions}
+    limits = config.planning.limits
+    chosen = {name: _actions_by_name(name, asked.steps, asked.size_m, limits) for name in asked.actions}
     camera = None if seen.extrinsics is None else torch.as_tensor(seen.extrinsics, dtype=torch.float32).to(model.device)
     views = config.planning.views
     latents = encode_frames(model, seen.image[None], config.data.crop, views=views)
@@ -131,19 +134,6 @@ def _actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig)
         return read_actions(word, steps=steps)
     needed = f"true (of a recorded clip), {', '.join(ACTION_NAMES)}, or a file"
     raise InputError(where=f"--actions {word}", found="no such actions", needed=needed)
-
-
-@dataclass(frozen=True)
-class ImagineOptions:
-    """What is to be imagined."""
-
-    decoder: str
-    actions: tuple[str, ...] = (TRUE, "none", "up", "left", "close")  # names, `true`, or files
-    steps: int = 7  # model steps
-    size_m: float = STEP_M  # of a named action, in each step, if the limits allow it
-    episode: str | None = None  # None: the held-out clip with the most motion
-    start: int | None = None  # first control step; None: likewise
-    evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, split
 
 
 def imagine_clip(
