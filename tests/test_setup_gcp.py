@@ -120,12 +120,8 @@ def test_what_fails_is_named(machine: Machine) -> None:
     ("options", "words"),
     [
         (["--buckets", "a"], "unknown option: --buckets"),
-        (["word"], "unknown option: word"),
         (["--bucket"], "--bucket needs a value"),
-        (["--bucket", "--project", "p"], "--bucket needs a value"),
-        (["--project", ""], "--project needs a value"),
         (["--bucket", "my-checkpoints"], "belong together"),
-        (["--project", "my-project", "--region", "EU"], "belong together"),
         (["--bucket", "gs://my", *BUCKET[2:]], "without gs://"),
         (["--bucket", "My_Bucket", *BUCKET[2:]], "small letters"),
         ([*BUCKET[:2], "--project", "My Project", *BUCKET[4:]], "the project's identifier"),
