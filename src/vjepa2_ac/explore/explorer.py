@@ -25,7 +25,6 @@ from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import Models
 from vjepa2_ac.explore.messages import MOST_STEPS, GoalFrame
-from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.network.predictor import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
@@ -263,11 +262,6 @@ class Explorer:
     def decoded(self, latents: Float[Tensor, "tokens dim"]) -> Pixels:
         """Return latents as an image for people."""
         return np.asarray(shown(self.decoder.decoder, latents[None])[0])
-
-
-def token_errors(imagined: Float[Tensor, "tokens dim"], true: Float[Tensor, "tokens dim"]) -> Float[Tensor, " tokens"]:
-    """Return the error of each patch: the mean absolute difference of its latent."""
-    return absolute_difference(imagined, true).mean(dim=-1)
 
 
 def relative_spread(latents: Float[Tensor, "tokens dim"], like: Float[Tensor, "tokens dim"]) -> float:

@@ -16,10 +16,11 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.episode import Progress, short_names
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.explore.explorer import Explorer, Pixels, Place, goal_moment, relative_spread, token_errors
+from vjepa2_ac.explore.explorer import Explorer, Pixels, Place, goal_moment, relative_spread
 from vjepa2_ac.explore.messages import MOST_STEPS, Image, PageRequest, packed, shown_units
 from vjepa2_ac.explore.search import Search
 from vjepa2_ac.media.film import error_colours
+from vjepa2_ac.planning.energy import mean_difference
 from vjepa2_ac.planning.planner import Cancelled
 
 _QUICK = {"samples": 64, "iterations": 4}  # of a plan: docs/planning.md says how good it is
@@ -193,7 +194,7 @@ class Views:
         for number, contender in enumerate(explorer.contenders):
             latents, name = explorer.imagined(number, place), contender.name
             images.append(Image(f"imagined-{name}", explorer.decoded(latents), f"what {name} imagines"))
-            errors = None if outcome is None or not place.actions else token_errors(latents, outcome.latents)
+            errors = None if outcome is None or not place.actions else mean_difference(latents, outcome.latents)
             if errors is not None:
                 images.append(Image(f"error-{name}", self._error_map(errors), f"where {name} is wrong"))
             tellers.append({
@@ -215,7 +216,7 @@ class Views:
             "truth_state": None if outcome is None else outcome.state,
             "note": "" if outcome is None or outcome.reached else "The arm cannot go so far: it went as far as it can.",
             "tellers": tellers,
-            "copying": None if outcome is None else float(token_errors(start.latents, outcome.latents).mean()),
+            "copying": None if outcome is None else float(mean_difference(start.latents, outcome.latents).mean()),
         }
         return packed("look", request.seq, told, images)
 

@@ -19,10 +19,10 @@ from vjepa2_ac.data.windows import require_frames, require_stride
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.network.world_model import Fingerprints, WorldModel
 from vjepa2_ac.planning.cameras import Cameras
 from vjepa2_ac.planning.controller import Surprise
+from vjepa2_ac.planning.energy import mean_difference
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
 MONITOR = "monitor.json"
@@ -30,13 +30,6 @@ _FIX = "Make it with `vjepa2-ac monitor RUN`"
 Number = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 MOST_EPISODES = 200  # that a threshold is of
 _AT_ONCE = 16
-
-
-def error_by_patch(
-    predicted: Float[Tensor, "*batch tokens dim"], seen: Float[Tensor, "*batch tokens dim"]
-) -> Float[Tensor, "*batch tokens"]:
-    """Return the mean absolute difference of each patch."""
-    return absolute_difference(predicted, seen).mean(dim=-1)
 
 
 def surprise_of(
@@ -61,7 +54,7 @@ class Monitor:
 
     def compare(self, predicted: Float[Tensor, "tokens dim"], seen: Float[Tensor, "tokens dim"]) -> Surprise:
         """Return the difference between a predicted frame and the frame."""
-        errors = error_by_patch(predicted, seen).float().cpu()
+        errors = mean_difference(predicted, seen).float().cpu()
         score = float(surprise_of(errors, torch.tensor(self.expected)))
         return Surprise(score, errors, not score <= self.threshold)  # NaN is an alarm, too
 
@@ -160,7 +153,7 @@ def watch_episodes(
             seen = encode_batch(model, batch, device=model.device, chunk=_AT_ONCE)
             camera = None if seen.extrinsics is None else seen.extrinsics[:, :1]
             predicted = model.predict(seen.latents[:, :1], seen.actions, seen.states[:, :1], camera)
-            errors.append(error_by_patch(predicted[:, 0].float(), seen.latents[:, 1]).cpu())
+            errors.append(mean_difference(predicted[:, 0].float(), seen.latents[:, 1]).cpu())
         if errors:
             found = torch.cat(errors)
             yield WatchedEpisode(
