@@ -164,6 +164,14 @@ def test_the_best_stays_besides_the_newest_until_there_is_a_better_one(tmp_path:
     assert names(tmp_path) == [checkpoint_name(50), checkpoint_name(60)]
 
 
+def test_best_checkpoint_that_was_deleted_is_forgotten(tmp_path: Path) -> None:
+    best = write_checkpoint(tmp_path, RunState(10).measured(0.5), write_weights, keep=2)
+    newest = write_checkpoint(tmp_path, RunState(20, best_step=10, best_error=0.5), write_weights, keep=2)
+    assert read_state(newest) == RunState(20, best_step=10, best_error=0.5)
+    shutil.rmtree(best)
+    assert read_state(newest) == RunState(20)
+
+
 def manifest_of(files: dict[str, str]) -> str:
     return json.dumps({"files": files})
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.config.model import RANDOM
-from vjepa2_ac.errors import InputError, UserError, shell_command
+from vjepa2_ac.errors import InputError, UserError, counted, shell_command
 from vjepa2_ac.process import is_first
 
 _NAMED = ("none", "up", "left", "close")  # actions from an image, whose true ones are not known
@@ -17,7 +19,7 @@ _NAMED = ("none", "up", "left", "close")  # actions from an image, whose true on
 if TYPE_CHECKING:
     from vjepa2_ac.decoding.imagine import Imagination
     from vjepa2_ac.evaluation.request import EvaluationOptions
-    from vjepa2_ac.evaluation.result import About
+    from vjepa2_ac.evaluation.result import About, Evaluation
     from vjepa2_ac.reporter import Reporter
     from vjepa2_ac.reports.write import Evaluated
 
@@ -116,19 +118,25 @@ def _evaluate(options: argparse.Namespace) -> None:
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
             tables = row_tables(rows_of(evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
-        cli.show(str(measured.summary), *_next(measured, options))
+        cli.show(str(measured.summary), *_next(measured, options, reporter.seconds))
         film = "" if evaluation.decoded is None else "film and "
         cli.show(f"Report with {film}all tables: {measured.report}")
     leave_processes()
 
 
-def _next(measured: Evaluated, options: argparse.Namespace) -> list[str]:
-    """Return the command that follows from the summary, as lines."""
+def _next(measured: Evaluated, options: argparse.Namespace, seconds: Mapping[str, float]) -> list[str]:
+    """Return the command that follows from the summary, as lines.
+
+    Args:
+        measured: The evaluation.
+        options: Those of the command.
+        seconds: The duration of each task of the evaluation, by its title.
+    """
     from vjepa2_ac.runs.folder import is_of_moved
 
     about, summary, settings = measured.evaluation.about, measured.summary, options.overrides
     config = options.data or f"{about.subject}/config.yaml"
-    words = ["data", "check", config]
+    words, cost = ["data", "check", config], ""
     if not about.checkpoint:
         is_other = cli.read_config(config).model.base not in {RANDOM, about.subject}
         words = ["train", config, *[f"model.base={about.subject}"] * is_other]
@@ -136,12 +144,13 @@ def _next(measured: Evaluated, options: argparse.Namespace) -> list[str]:
         if about.is_base or "no" in {verdict.conclusion for verdict in summary.verdicts[:3]}:
             words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
         elif summary.plans is None and (simulation := _simulation(about, options)):
-            words = simulation
+            words, cost = simulation, _simulation_cost(measured.evaluation, simulation, seconds)
         elif summary.verdicts[2].conclusion == "yes":  # a robot is not recommended without a measured gain
             words = ["serve", about.subject, *cli.option_words(options, "checkpoint"), *settings]
         else:
             return []
-    return [f"Next: {shell_command(*words, *cli.option_words(options, 'plugin'))}"]
+    command = f"Next: {shell_command(*words, *cli.option_words(options, 'plugin'))}"
+    return [command, f"  ({cost})"] if cost else [command]
 
 
 def _simulation(about: About, options: argparse.Namespace) -> list[str]:
@@ -160,6 +169,28 @@ def _simulation(about: About, options: argparse.Namespace) -> list[str]:
     quick = cli.quick_words(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
     words = ["simulate", about.subject, "--task", recorded.task or "reach", "--domain", domain]
     return [*words, *cli.option_words(options, "checkpoint"), *options.overrides, *quick]
+
+
+def _simulation_cost(evaluation: Evaluation, words: Sequence[str], seconds: Mapping[str, float]) -> str:
+    """Return how long a simulation takes on this machine, from the duration of the action ranking."""
+    from vjepa2_ac.planning.planner import samples_of_iterations
+    from vjepa2_ac.planning.settings import planning_settings
+    from vjepa2_ac.reporter import duration
+    from vjepa2_ac.simulation.benchmark import BenchmarkOptions
+    from vjepa2_ac.simulation.tasks import STEPS
+
+    ranking = evaluation.models[evaluation.trained].ranking
+    overrides = [word for word in words if "=" in word]
+    planning = planning_settings(evaluation.about.subject, overrides=overrides).planning
+    decisions = BenchmarkOptions.episodes * STEPS[words[words.index("--task") + 1]]
+    sequences = sum(samples_of_iterations(planning))
+    about = f"{counted(decisions, 'decision')} of {counted(sequences, 'action sequence')} each"
+    ranked_s = seconds.get(f"action ranking, {evaluation.trained}")
+    if ranking is None or ranked_s is None:
+        return f"its time was not measured: {about}"
+    prediction_s = ranked_s * int(os.environ.get("WORLD_SIZE", "1")) / (len(ranking.ranks) * (1 + 2 * ranking.samples))
+    hours = decisions * sequences * planning.horizon * prediction_s / 3600
+    return f"{duration(hours)} here: {about}"
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:

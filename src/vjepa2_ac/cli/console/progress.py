@@ -179,7 +179,9 @@ class ConsoleReporter(Reporter):
     """Shows messages, and one task after another as a bar; at the end of its `with` block the terminal is restored."""
 
     def __init__(self) -> None:
-        self._bar = ProgressBar("")
+        self._bar, self._began = ProgressBar(""), time.monotonic()
+        self.seconds: dict[str, float] = {}
+        """Duration of each finished task, by its title."""
 
     def note(self, text: str) -> None:
         """Print a message."""
@@ -187,8 +189,8 @@ class ConsoleReporter(Reporter):
 
     def task(self, title: str, unit: str = "") -> ProgressBar:
         """Begin another task; return its bar."""
-        self._bar.close()
-        self._bar = ProgressBar(title, unit)
+        self._end()
+        self._bar, self._began = ProgressBar(title, unit), time.monotonic()
         Work.begin(title)
         return self._bar
 
@@ -198,4 +200,8 @@ class ConsoleReporter(Reporter):
 
     def __exit__(self, *_: object) -> None:
         """Restore the terminal."""
+        self._end()
+
+    def _end(self) -> None:
         self._bar.close()
+        self.seconds[self._bar.title] = time.monotonic() - self._began
