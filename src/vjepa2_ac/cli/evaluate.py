@@ -182,7 +182,7 @@ def _simulation_cost(evaluation: Evaluation, words: Sequence[str], seconds: Mapp
     ranking = evaluation.models[evaluation.trained].ranking
     overrides = [word for word in words if "=" in word]
     planning = planning_settings(evaluation.about.subject, overrides=overrides).planning
-    decisions = BenchmarkOptions.episodes * dict[str, int](STEPS)[words[words.index("--task") + 1]]
+    decisions = BenchmarkOptions.episodes * next(steps for task, steps in STEPS.items() if task in words)
     sequences = sum(samples_of_iterations(planning))
     about = f"{counted(decisions, 'decision')} of {counted(sequences, 'action sequence')} each"
     ranked_s = seconds.get(f"action ranking, {evaluation.trained}")
