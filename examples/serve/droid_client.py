@@ -1,7 +1,8 @@
 """A robot of the DROID platform (`RobotEnv` of github.com/droid-dataset/droid), planned for by a server.
 
     vjepa2-ac serve RUN --actions pose --goals goals --host ADDRESS --key-file key \
-        planning.limits.xyz=[0.05,0.05,0.05] planning.limits.workspace=[[0.3,-0.4,0.1],[0.7,0.4,0.6]]
+        planning.limits.xyz=[0.075,0.075,0.075] planning.limits.l1=0.075 \
+        planning.limits.workspace=[[0.3,-0.4,0.1],[0.7,0.4,0.6]]
     python droid_client.py CAMERA SERVER KEY cup      # beside: pip install openpi-client typing_extensions
 
 CAMERA is the name of an image in `env.get_observation()["image"]`: the left image of an exterior camera. Its images and

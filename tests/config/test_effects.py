@@ -35,6 +35,7 @@ OTHERS = {
     "data.path": "elsewhere",
     "data.transforms": (Component("noise"),),
     "planning.budget_s": 1.0,
+    "planning.limits.l1": 0.1,
     "planning.planner": Component("icem"),
     "planning.energy.distance": Component("l2"),
     "training.loss": Component("l2"),
@@ -272,7 +273,7 @@ def test_planning_takes_the_values_that_affect_a_decision_and_names_them() -> No
 
 
 def test_a_mark_of_a_section_holds_for_its_knobs_and_a_value_has_that_of_its_knob() -> None:
-    assert mark_of("tracking.project", Config) == Affects.NOTHING
+    assert mark_of("tracking.wandb", Config) == Affects.NOTHING
     assert mark_of("data.fields.cameras.left", Config) == mark_of("data.fields.cameras", Config) == Affects.CLIPS
     assert mark_of("replay.data.frames", Config) == mark_of("replay.data", Config) == Affects.RUN
     assert mark_of("replay.data.path", Config) == Affects.NOTHING

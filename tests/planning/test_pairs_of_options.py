@@ -59,6 +59,7 @@ OTHERS: dict[str, Any] = {
     "compile": "blocks",
     "axes": "AXES",
     "limits.xyz": [0.02, 0.0, 0.03],
+    "limits.l1": 0.03,
     "limits.workspace": [[0.38, -0.02, 0.28], [0.41, 0.02, 0.31]],
     "limits.rotation": 0.1,
     "limits.axes": [0.1],

@@ -18,11 +18,21 @@ def pose(horizon: int = 1, action_repeat: int = 1, **limits: object) -> SearchSp
 
 
 @settings(max_examples=50)
-@given(values=st.lists(st.floats(width=32), min_size=7, max_size=7))
-def test_nothing_beyond_the_limits_comes_out(values: list[float]) -> None:
-    found = pose().allowed(torch.tensor([values]))[0].double()
-    assert torch.isfinite(found).all()
-    assert (found.abs() <= torch.tensor(LIMITS, dtype=torch.float64)).all()
+@given(
+    values=st.lists(st.floats(width=32), min_size=7, max_size=7),
+    l1=st.none() | st.floats(1e-3, 0.1),
+)
+def test_allowed_actions_are_within_all_limits(values: list[float], l1: float | None) -> None:
+    allowed = pose(l1=l1).allowed(torch.tensor([values]))[0].double()
+    assert torch.isfinite(allowed).all()
+    assert (allowed.abs() <= torch.tensor(LIMITS, dtype=torch.float64)).all()
+    assert l1 is None or allowed[:3].abs().sum() <= l1
+
+
+def test_actions_within_the_limits_are_unchanged_and_longer_ones_keep_their_direction() -> None:
+    inside = torch.tensor([[0.01, -0.02, 0.0, 0.1, -0.1, 0.19, -0.7]])
+    assert torch.equal(pose(l1=0.031).allowed(inside), inside)
+    torch.testing.assert_close(pose(l1=0.015).allowed(inside)[0, :3], torch.tensor([0.005, -0.01, 0.0]))
 
 
 @pytest.mark.parametrize(

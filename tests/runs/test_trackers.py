@@ -21,8 +21,9 @@ def _own_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No tracker writes into the user's home, reports home, or knows the user's account."""
     for name in ("HOME", "WANDB_CACHE_DIR", "WANDB_CONFIG_DIR", "WANDB_DATA_DIR", "TRACKIO_DIR"):
         monkeypatch.setenv(name, str(tmp_path / "home"))
-    for name in ("WANDB_API_KEY", "WANDB_DIR", "WANDB_MODE", "WANDB_PROJECT", "WANDB_RUN_ID"):
+    for name in ("WANDB_API_KEY", "WANDB_DIR", "WANDB_MODE", "WANDB_RUN_ID"):
         monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("WANDB_PROJECT", "arms")
     monkeypatch.setenv("WANDB_ERROR_REPORTING", "false")
     monkeypatch.setenv("WANDB_SILENT", "true")
 
@@ -141,7 +142,7 @@ def test_a_run_without_tensorboard_prints_how_to_install_it(
 
 def test_weights_and_biases_goes_on_in_the_same_run_without_a_network(tmp_path: Path) -> None:
     pytest.importorskip("wandb")
-    config = run_config(tmp_path, wandb="offline", project="arms")
+    config = run_config(tmp_path, wandb="offline")
     for first_step in (0, 1):
         trackers = open_trackers(config, tmp_path, run_id="abc123", first_step=first_step)
         trackers.log("train", first_step + 1, {"loss": 0.25})
@@ -162,7 +163,7 @@ def test_a_tracker_is_asked_to_resume_the_run_by_its_id(tmp_path: Path, monkeypa
         module.init = lambda _library=library, **given: asked.setdefault(_library, given) and kept  # type: ignore[attr-defined]
         module.Settings = types.SimpleNamespace  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, library, module)
-    config = run_config(tmp_path, wandb="online", trackio=True, project="arms")
+    config = run_config(tmp_path, wandb="online", trackio=True)
     trackers = open_trackers(config, tmp_path, run_id="abc123", first_step=0)
     trackers.log("train", 3, {"loss": 0.5})
     trackers.close()
@@ -176,7 +177,7 @@ def test_a_tracker_is_asked_to_resume_the_run_by_its_id(tmp_path: Path, monkeypa
 
 def test_trackio_goes_on_in_the_same_run(tmp_path: Path) -> None:
     trackio = pytest.importorskip("trackio")
-    config = run_config(tmp_path, trackio=True, project="arms")
+    config = run_config(tmp_path, trackio=True)
     for first_step in (0, 1):
         trackers = open_trackers(config, tmp_path, run_id="abc123", first_step=first_step)
         trackers.log("train", first_step + 1, {"loss": 0.25})

@@ -33,6 +33,9 @@ class LimitsConfig(Section):
     xyz: Literal["data"] | tuple[Metre, Metre, Metre] = (0.05, 0.05, 0.05)
     """Largest dx, dy, dz in metres, 1 at most; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075. data: what the
     run was taught, the 99th percentile along each axis."""
+    l1: Positive | None = None
+    """Largest sum of the absolute dx, dy and dz in metres; longer motions are scaled down. The paper's planner has
+    0.075 and no other limit of the position. null: none."""
     workspace: tuple[Corner, Corner] | None = None
     """Corners (lowest and highest x, y, z, in metres) of the box in which every target of the flange lies: an action is
     cut; a robot that is outside by more than one step does not move. Of poses in the base frame."""

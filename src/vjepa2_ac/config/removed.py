@@ -25,8 +25,8 @@ REMOVED: dict[str, RemovedKey] = {
     "planning.limits.gripper_rounding": RemovedKey("0.25", (0.25,)),
     "planning.prior_steps": RemovedKey("3", (3,)),
     "planning.goals": RemovedKey("what each goal says", ({"share": None, "stop_share": None},)),
-    "planning.limits.ball": RemovedKey("none; planning.limits.xyz limits each axis", ("none",)),
-    "planning.limits.radius": RemovedKey("none; planning.limits.xyz limits each axis", (0.05,)),
+    "planning.limits.ball": RemovedKey("none; set planning.limits.l1", ("none",)),
+    "planning.limits.radius": RemovedKey("none; set planning.limits.l1", (0.05,)),
     "planning.replan": RemovedKey("always", ("always",)),
     "decoder.average": RemovedKey("0.999, less in a short training", (0.999, 0.998, 0.99)),
     "decoder.checkpoint_every": RemovedKey("500, or a third of decoder.steps", (500, 200)),
@@ -66,9 +66,10 @@ REMOVED: dict[str, RemovedKey] = {
     "training.final_learning_rate": RemovedKey("0", (0.0,)),
     "training.betas": RemovedKey("(0.9, 0.999)", ([0.9, 0.999],)),
     "validation.ranking_reach_cm": RemovedKey("7.5", (7.5,)),
+    "tracking.project": RemovedKey("vjepa2-ac, or the environment variable WANDB_PROJECT", ("vjepa2-ac",)),
     "checkpoint.every_minutes": RemovedKey("15", (15.0,)),
 }
-"""RemovedKey keys and sections, by their dotted key. A row for a key of `data` also holds below `replay`."""
+"""Removed keys and sections, by their dotted key. A row for a key of `data` also holds below `replay`."""
 
 
 MOVED = {

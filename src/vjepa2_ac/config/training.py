@@ -140,8 +140,6 @@ class TrackingConfig(Section):
     """Weights & Biases, extra wandb. offline: files in RUN/wandb, which `wandb sync` sends later."""
     trackio: bool = False
     """trackio, extra trackio: stored where trackio stores its runs (TRACKIO_DIR), shown by `trackio show`."""
-    project: Annotated[str, Field(min_length=1)] = "vjepa2-ac"
-    """Name of the project there; the run in it has the same id wherever it is resumed."""
     others: Annotated[dict[str, dict[str, Any]], TRACKERS.things_in_schema] = {}
     """Trackers of your own (docs/extending.md), by name, each with its options: {} where it has none."""
 

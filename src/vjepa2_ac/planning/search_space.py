@@ -1,4 +1,4 @@
-"""The action space: limits per axis, fixed axes, and rounding of a finished plan."""
+"""The action space: limits per axis and of the L1 norm, fixed axes, and rounding of a finished plan."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ from vjepa2_ac.spaces import StateSpace
 
 GRIPPER = 6  # of a pose
 GRIPPER_ROUNDING = 0.25  # smaller changes of closedness become zero
+_ROUNDING = 4 * torch.finfo(torch.float32).eps  # a norm is rounded more than once
 
 
 @dataclass(frozen=True)
 class SearchSpace:
     """Limits of each component of each decision; where both limits are equal, it is fixed.
 
-    They are finite, the lower ones not above the upper ones.
+    They are finite, the lower ones not above the upper ones; with `l1`, they allow zero motion.
     """
 
     lower: Float[Tensor, "decisions dim"]
     upper: Float[Tensor, "decisions dim"]
     std: Float[Tensor, "decisions dim"]  # of first samples, unless a planner's option says a share of it
     repeat: int = 1  # model steps of a decision
+    l1: float | None = None  # the largest sum of the absolute dx, dy and dz
     gripper: int | None = None  # which number, where one is
     gripper_rounding: float = 0.0  # changes below this are set to zero in a finished plan
 
@@ -57,8 +59,16 @@ class SearchSpace:
         return torch.where(self.lower < self.upper, self.std, 0.0)
 
     def allowed(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch decisions dim"]:
-        """Return each decision, clipped to the limits; the result is always allowed, even for NaN."""
-        return torch.nan_to_num(decisions, nan=0.0).clamp(self.lower, self.upper)
+        """Return each decision, clipped to the limits; the result is always allowed, even for NaN.
+
+        Where dx, dy and dz exceed the limit of the L1 norm, they are scaled towards zero motion.
+        """
+        clipped = torch.nan_to_num(decisions, nan=0.0).clamp(self.lower, self.upper)
+        if self.l1 is None:
+            return clipped
+        length = clipped[..., :3].abs().sum(dim=-1, keepdim=True)
+        share = (self.l1 * (1 - _ROUNDING) / length).clamp(max=1.0)
+        return torch.cat([clipped[..., :3] * share, clipped[..., 3:]], dim=-1)
 
     def finished(self, decisions: Float[Tensor, "decisions dim"]) -> Float[Tensor, "decisions dim"]:
         """Return decisions as a robot receives them: allowed, with small changes of the gripper rounded to zero.
@@ -109,6 +119,7 @@ def pose_space(config: PlanningConfig) -> SearchSpace:
         upper=upper,
         std=std.repeat(decisions, 1),
         repeat=config.action_repeat,
+        l1=limits.l1,
         gripper=GRIPPER,
         gripper_rounding=0.0 if limits.gripper_mode == "free" else GRIPPER_ROUNDING,
     )
@@ -175,7 +186,8 @@ class Workspace:
         for action in kept:
             way = np.clip(position + action[:3], self.low, self.high) - position
             if abs(way - action[:3]).max() > _NEAR_M:
-                action[:3] = np.clip(way, -reach, reach)
+                way = np.clip(way, -reach, reach)
+                action[:3] = way * min(1.0, (limits.l1 or np.inf) / max(abs(way).sum(), _NEAR_M))
             position = position + action[:3]
         return kept
 
@@ -185,5 +197,6 @@ class Workspace:
 
 
 def is_allowed(way: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
-    """Return whether motions of the flange are within the limits of each axis."""
-    return bool((abs(way) <= np.array(limits.xyz_m) + slack_m).all())
+    """Return whether motions of the flange are within the limits of each axis and of the L1 norm."""
+    longest = np.inf if limits.l1 is None else limits.l1
+    return bool((abs(way) <= np.array(limits.xyz_m) + slack_m).all() and (abs(way).sum(-1) <= longest + slack_m).all())

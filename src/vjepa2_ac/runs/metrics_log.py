@@ -262,6 +262,11 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
     return Trackers(openings)
 
 
+def _project() -> str:
+    """Return the project of Weights & Biases and of trackio."""
+    return os.environ.get("WANDB_PROJECT", "vjepa2-ac")
+
+
 def _tensorboard(folder: Path, first_step: int) -> Any:
     from accelerate.tracking import TensorBoardTracker
 
@@ -277,7 +282,7 @@ def _wandb(config: Config, folder: Path, run_id: str) -> Any:
 
     # Output is not captured: it would contain the console's progress bar. Times are bounded.
     return WandBTracker(
-        config.tracking.project,
+        _project(),
         id=run_id,
         name=folder.resolve().name,
         resume="allow",
@@ -299,7 +304,7 @@ def _trackio(config: Config, run_id: str) -> Any:
             self.log({name: trackio.Image(images[0]) for name, images in values.items()}, step=step)
 
     plain = config_as_flat_dict(config)
-    return WithImages(config.tracking.project, name=run_id, resume="allow", config=plain, embed=False)
+    return WithImages(_project(), name=run_id, resume="allow", config=plain, embed=False)
 
 
 def _numbers(metrics: Mapping[str, Any]) -> dict[str, float]:

@@ -336,7 +336,7 @@ def why_not_sent(
         largest = np.array(limits.axes if isinstance(limits.axes, tuple) else (0.0,))
         return "more than planning.limits.axes" if (abs(changes) > largest + _ROUNDING).any() else ""
     if not is_allowed(changes[:, :3], limits, _ROUNDING):
-        return "more than planning.limits.xyz"
+        return "more than planning.limits.xyz or l1"
     if (abs(changes[:, 3:6]) > min(limits.rotation + _ROUNDING, math.pi)).any():
         return "more than planning.limits.rotation"
     if abs(changes[:, 6]).max() > 1.0:  # open and close are changes of 1, whatever the limit

@@ -1,0 +1,62 @@
+"""What users type and write is listed in one file: a command, an option or a config section is added on purpose.
+
+After a wanted change: `python tests/test_surface.py > tests/golden/surface.txt`, and a line in CHANGELOG.md.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+
+import vjepa2_ac
+from paths import ROOT
+from vjepa2_ac.cli.program import _parser
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.data import DataConfig
+from vjepa2_ac.config.loading import all_keys
+from vjepa2_ac.registry import REGISTRIES
+
+MOST_KEYS = 150
+
+
+def surface() -> str:
+    """Return the public names, extension points, config sections, commands and options, as text."""
+    parts = {
+        "Public names of vjepa2_ac": sorted(vjepa2_ac.__all__),
+        "Extension points (entry points and plug-ins), with the names of this package": [
+            f"{registry.group}: {', '.join(sorted(registry.names()))}".rstrip(": ") for registry in REGISTRIES
+        ],
+        "Top-level config keys": list(Config.model_fields),
+        "Commands": list(commands(_parser(), "vjepa2-ac")),
+    }
+    return "\n\n".join("\n".join([title, *(f"  {line}" for line in lines)]) for title, lines in parts.items()) + "\n"
+
+
+def commands(parser: argparse.ArgumentParser, name: str) -> Iterator[str]:
+    """Yield a line for each command: its arguments, then its options."""
+    inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    words = [action.metavar or action.dest for action in parser._actions if not action.option_strings]
+    options = sorted(action.option_strings[-1] for action in parser._actions if action.option_strings)
+    if not inner:
+        yield " ".join([name, *(str(word) for word in words), *(one for one in options if one != "--help")])
+    for action in inner:
+        for command, one in action.choices.items():
+            yield from commands(one, f"{name} {command}")
+
+
+def leaf_keys() -> set[str]:
+    """Return all config keys that hold a value; those of `replay.data` are those of `data`."""
+    keys = {key for key in all_keys() if not key.startswith("replay.data.")}
+    return {key for key in keys if not any(other.startswith(f"{key}.") for other in keys)}
+
+
+def test_commands_options_names_and_sections_are_those_on_record() -> None:
+    assert surface() == (ROOT / "tests/golden/surface.txt").read_text()
+
+
+def test_config_has_few_keys() -> None:
+    assert len(leaf_keys()) <= MOST_KEYS
+    assert "npz" in DataConfig.kinds
+
+
+if __name__ == "__main__":
+    sys.stdout.write(surface())
