@@ -13,6 +13,7 @@ from environments import TASKS
 
 from vjepa2_ac.config import AdapterConfig, TrainingConfig
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
+from vjepa2_ac.config.section import Component
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges
 
 Base = Literal["one camera", "many cameras", "none"]
@@ -56,7 +57,7 @@ TRAINING = TrainingConfig(
 PLANNING = PlanningConfig(
     samples=64,
     iterations=4,
-    planner={"name": "cem", "options": {"start_std": 0.67}},
+    planner=Component("cem", {"start_std": 0.67}),
     limits=LimitsConfig(xyz=(0.075, 0.075, 0.075), gripper_mode="held"),
 )
 
