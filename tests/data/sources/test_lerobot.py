@@ -468,4 +468,7 @@ def test_a_set_that_lerobot_wrote_gives_the_values_that_lerobot_reads(shared: Pa
             episode = source.read(number)
             np.testing.assert_array_equal(episode.states, truth[f"state.{number}"])
             frames = episode.read_frames(range(info.num_steps))[:, ::24, ::32].astype(int)
-            assert abs(frames - truth[f"front.{number}"]).mean() < 3, "the videos are lossy"
+            true = truth[f"front.{number}"].astype(int)
+            difference = abs(frames - true).mean()  # the videos are lossy
+            assert difference < 6
+            assert difference < min(abs(frames[1:] - true[:-1]).mean(), abs(frames[:-1] - true[1:]).mean()) / 1.2
