@@ -81,6 +81,66 @@ def test_options_of_an_older_run_move_to_their_components() -> None:
         parse_config(older, where="mine.yaml")
 
 
+@pytest.mark.parametrize(
+    ("limits", "l1", "warnings"),
+    [
+        ({"ball": "none", "radius": 0.08}, None, []),
+        ({"ball": "l1", "radius": 0.075}, 0.075, []),
+        (
+            {"ball": "l2", "radius": 0.06},
+            0.06,
+            ["run/config.yaml: planning.limits.ball was l2; this version uses the stricter planning.limits.l1: 0.06"],
+        ),
+    ],
+)
+def test_norm_ball_of_an_older_run_becomes_a_limit_that_is_not_looser(
+    limits: dict[str, object], l1: float | None, warnings: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    older = {**VALUES, "planning": {"limits": limits}}
+    config = parse_config(older, where="run/config.yaml", here=False)
+    assert config.planning.limits.l1 == l1
+    assert [record.getMessage() for record in caplog.records] == warnings
+    with pytest.raises(InputError, match=r"planning.limits.ball: moved in 0.2, to planning.limits.l1: METRES"):
+        parse_config(older, where="mine.yaml")
+
+
+def test_start_std_of_an_older_run_moves_to_the_planner_or_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    cem, gradient = (
+        parse_config({**VALUES, "planning": {"planner": name, "start_std": 0.5}}, where="run/config.yaml", here=False)
+        for name in ("cem", "gradient")
+    )
+    assert cem.planning.planner.options == {"start_std": 0.5}
+    assert gradient.planning.planner.options == {}
+    assert [record.getMessage() for record in caplog.records] == [
+        "run/config.yaml: planning.start_std was 0.5; the planner gradient has no such option, and uses 1"
+    ]
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"planning": {"planner": {"name": ["cem"]}}},
+        {"planning": {"planner": "cem", "cem": 3, "start_std": 0.5, "limits": 3}},
+        {"training": {"schedule": "linear", "steps": "100"}},
+        {"data": {**VALUES["data"], "fields": {"gripper": ["closedness"]}}},
+    ],
+)
+def test_values_of_another_type_in_the_config_of_an_older_run_are_an_error(values: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=r"run/config\.yaml"):
+        parse_config({**VALUES, **values}, where="run/config.yaml", here=False)
+
+
+@pytest.mark.parametrize(
+    ("training", "decay_steps"),
+    [({}, 99_000), ({"steps": 200}, 180), ({"steps": 200, "warmup_steps": 50}, 150)],
+)
+def test_linear_schedule_without_steps_decays_from_the_warm_up_to_the_last_step(
+    training: dict[str, int], decay_steps: int
+) -> None:
+    config = parse_config({**VALUES, "training": {"schedule": "linear", **training}}, where="mine.yaml")
+    assert (config.training.schedule, config.training.decay_steps) == ("warmup_stable_decay", decay_steps)
+
+
 def test_options_of_a_component_are_given_by_its_name_or_by_overrides() -> None:
     config = parse_config(VALUES, ["planning.planner=icem", "planning.planner.options.elites=20"], where="mine.yaml")
     assert config_as_dict(config)["planning"]["planner"] == {"name": "icem", "options": {"elites": 20}}

@@ -35,6 +35,15 @@ def test_actions_within_the_limits_are_unchanged_and_longer_ones_keep_their_dire
     torch.testing.assert_close(pose(l1=0.015).allowed(inside)[0, :3], torch.tensor([0.005, -0.01, 0.0]))
 
 
+@pytest.mark.parametrize("l1", [1e-50, 0.075])
+def test_no_motion_is_allowed_under_any_limit_of_the_norm_and_has_a_finite_gradient(l1: float) -> None:
+    motion = torch.zeros(2, 3, 7, requires_grad=True)
+    allowed = pose(horizon=3, l1=l1).allowed(motion)
+    allowed.sum().backward()
+    assert torch.equal(allowed, torch.zeros(2, 3, 7))
+    assert torch.isfinite(motion.grad).all()
+
+
 @pytest.mark.parametrize(
     ("mode", "given", "expected"),
     [

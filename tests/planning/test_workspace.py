@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -21,8 +21,8 @@ CORNERS = ((0.3, -0.2, 0.1), (0.6, 0.2, 0.5))
 SLACK = 2e-8  # metres
 
 
-def limits_of() -> LimitsConfig:
-    return LimitsConfig(workspace=CORNERS, xyz=(0.05, 0.05, 0.03))
+def limits_of(l1: float | None = None) -> LimitsConfig:
+    return LimitsConfig(workspace=CORNERS, xyz=(0.05, 0.05, 0.03), l1=l1)
 
 
 def box() -> Workspace:
@@ -36,9 +36,10 @@ def position(*numbers: float) -> np.ndarray:
 NEAR = st.tuples(st.floats(0.27, 0.63), st.floats(-0.23, 0.23), st.floats(0.08, 0.52))
 
 
-@given(NEAR, arrays(np.float64, (3, 7), elements=st.floats(-1, 1)))
-def test_every_target_is_inside_and_every_action_allowed(where, wild) -> None:
-    limits, state = limits_of(), position(*where)
+@given(NEAR, arrays(np.float64, (3, 7), elements=st.floats(-1, 1)), st.none() | st.floats(0.02, 0.1))
+@example((0.27, 0.0, 0.3), np.array([[-1.0, 1, 0, 0, 0, 0, 0]] * 3), 0.05)  # outside, and moving along the wall
+def test_every_target_is_inside_and_every_action_allowed(where, wild, l1) -> None:
+    limits, state = limits_of(l1), position(*where)
     space = pose_space(PlanningConfig(limits=limits, horizon=3))
     actions = space.allowed(torch.from_numpy(wild).float()).double().numpy()
     if not is_allowed(box().way_back(state[:3]), limits):
@@ -47,7 +48,7 @@ def test_every_target_is_inside_and_every_action_allowed(where, wild) -> None:
     targets = state[:3] + np.cumsum(kept[:, :3], axis=0)
     assert (targets >= np.array(CORNERS[0]) - SLACK).all()
     assert (targets <= np.array(CORNERS[1]) + SLACK).all()
-    assert (abs(kept[:, :3]) <= np.array(limits.xyz_m) + SLACK).all()
+    assert is_allowed(kept[:, :3], limits, SLACK)
     np.testing.assert_array_equal(kept[:, 3:], actions[:, 3:])
 
 

@@ -193,6 +193,17 @@ def test_what_is_seen_there_and_cannot_be_fetched_is_not_done_again_from_the_sta
     assert f"what is on this machine, after step 10, though {checkpoint_name(20)} is there" in caplog.text
 
 
+def test_a_run_without_a_complete_checkpoint_there_that_cannot_be_fetched_is_not_started_again(
+    bucket: Gcs, config: Config
+) -> None:
+    run_there(bucket, config, 20)
+    RemoteCheckpoints(PLACE).remove(checkpoint_name(20))
+    bucket.put(f"bucket/run/checkpoints/{checkpoint_name(20)}/state.json", b'{"run_id": "mine", "step": 20}')
+    bucket.fail_next(503, times=99, match="/download/.*config.yaml")
+    with pytest.raises(UnreachableError, match=r"config\.yaml"):
+        open_remote(config, SILENT)
+
+
 @pytest.mark.parametrize(
     ("match", "failure"), [("POST /upload/", 403), ("DELETE", 403), ("prefix=", 403), ("POST /upload/", 401)]
 )

@@ -18,9 +18,10 @@ from pydantic import ValidationError
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import source_of
 from vjepa2_ac.config.model import RANDOM
-from vjepa2_ac.config.removed import drop_removed_keys, move_component_options, why_removed
+from vjepa2_ac.config.removed import drop_removed_keys, move_component_options, move_norm_limit, why_removed
 from vjepa2_ac.config.run import ReplayConfig, with_complete_replay
 from vjepa2_ac.config.section import key_of_data, marks_of
+from vjepa2_ac.config.training import TrainingConfig, usual_warmup
 from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.registry import SOURCES, UNKNOWN_OPTION, import_plugins
 from vjepa2_ac.storage import read_bounded
@@ -122,7 +123,8 @@ def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, wh
         _replace_keys_of_model(given["model"])
     if not here:
         drop_removed_keys(given, where)
-        move_component_options(given)
+        move_norm_limit(given, where)
+        move_component_options(given, where)
     try:
         given = with_plugins(given, where=where, here=here)
         return Config.model_validate_json(_as_json(with_complete_replay(given), where))
@@ -262,15 +264,23 @@ def _replace_older_keys(values: dict[str, Any]) -> None:
     """Replace, in configs of older runs, the key gripper of `data.fields` and two schedules by what means the same."""
     for section, inner in values.items():
         if section == "training" and isinstance(inner, dict) and inner.get("schedule") in ("constant", "linear"):
-            falls = inner["schedule"] == "linear"
-            inner |= {
-                "schedule": "warmup_stable_decay",
-                "decay_steps": inner.get("steps", 0) - inner.get("warmup_steps", 0) if falls else 0,
-            }
-        if section == "fields" and isinstance(inner, dict) and inner.get("gripper") in _OLDER_GRIPPERS:
-            inner.update(_OLDER_GRIPPERS[inner.pop("gripper")])
+            decay_steps = _steps_after_warmup(inner) if inner["schedule"] == "linear" else 0
+            inner |= {"schedule": "warmup_stable_decay", "decay_steps": decay_steps}
+        gripper = inner.get("gripper") if section == "fields" and isinstance(inner, dict) else None
+        if isinstance(gripper, str) and gripper in _OLDER_GRIPPERS:
+            del inner["gripper"]
+            inner.update(_OLDER_GRIPPERS[gripper])
         elif isinstance(inner, dict):
             _replace_older_keys(inner)
+
+
+def _steps_after_warmup(training: Mapping[str, Any]) -> int:
+    """Return the steps after the warm-up; 0 for values of another type, which the check of the config refuses."""
+    steps = training.get("steps", TrainingConfig.model_fields["steps"].default)
+    warmup_steps = training.get("warmup_steps")
+    if not isinstance(steps, int) or not isinstance(warmup_steps, int | None):
+        return 0
+    return max(0, steps - (usual_warmup({"steps": steps}) if warmup_steps is None else warmup_steps))
 
 
 # ---- plug-ins: modules that are imported before a config is checked; what they register may be named in it ----

@@ -25,8 +25,6 @@ REMOVED: dict[str, RemovedKey] = {
     "planning.limits.gripper_rounding": RemovedKey("0.25", (0.25,)),
     "planning.prior_steps": RemovedKey("3", (3,)),
     "planning.goals": RemovedKey("what each goal says", ({"share": None, "stop_share": None},)),
-    "planning.limits.ball": RemovedKey("none; set planning.limits.l1", ("none",)),
-    "planning.limits.radius": RemovedKey("none; set planning.limits.l1", (0.05,)),
     "planning.replan": RemovedKey("always", ("always",)),
     "decoder.average": RemovedKey("0.999, less in a short training", (0.999, 0.998, 0.99)),
     "decoder.checkpoint_every": RemovedKey("500, or a third of decoder.steps", (500, 200)),
@@ -79,11 +77,13 @@ MOVED = {
     },
     "planning.planner_options": "planning.planner: {name: NAME, options: {...}}",
     "planning.start_std": "planning.planner: {name: NAME, options: {start_std: NUMBER}}",
+    "planning.limits.ball": "planning.limits.l1: METRES, the limit of the L1 norm",
+    "planning.limits.radius": "planning.limits.l1: METRES, the limit of the L1 norm",
     "planning.energy.options": "planning.energy.distance: {name: NAME, options: {...}}",
     "training.loss_options": "training.loss: {name: NAME, options: {...}}",
     "training.smooth_l1_beta": "training.loss: {name: smooth_l1, options: {beta: 1.0}}",
 }
-"""Keys and sections whose values are options of a component today."""
+"""Keys and sections whose values are at another key today; of most, options of a component."""
 
 
 def why_removed(key: str) -> str | None:
@@ -115,8 +115,38 @@ def drop_removed_keys(values: dict[str, Any], where: str) -> None:
                 logger.warning("%s: %s was %s; this version always uses %s", where, path, value, removed.always)
 
 
-def move_component_options(values: dict[str, Any]) -> None:
-    """Move the options of planner, energy and loss in the config of an older run to their component, in place."""
+def move_norm_limit(values: dict[str, Any], where: str) -> None:
+    """Replace the norm ball of the limits in the config of an older run by a limit of the L1 norm, in place.
+
+    The L1 norm of a motion is at least its length. So the limit that replaces a ball of the L2 norm is never looser,
+    and is reported as a warning.
+
+    Args:
+        values: The plain values of the config.
+        where: The file, for the warning.
+    """
+    planning = values.get("planning")
+    limits = planning.get("limits") if isinstance(planning, dict) else None
+    if not isinstance(limits, dict):
+        return
+    ball, radius = limits.pop("ball", "none"), limits.pop("radius", 0.05)
+    if ball == "none":
+        return
+    limits.setdefault("l1", radius)
+    if ball != "l1":
+        text = "%s: planning.limits.ball was %s; this version uses the stricter planning.limits.l1: %s"
+        logger.warning(text, where, ball, limits["l1"])
+
+
+def move_component_options(values: dict[str, Any], where: str) -> None:
+    """Move the options of planner, energy and loss in the config of an older run to their component, in place.
+
+    `planning.start_std` of a planner without this option is reported as a warning.
+
+    Args:
+        values: The plain values of the config.
+        where: The file, for the warning.
+    """
     places = (
         (("planning",), "planner", "cem"),
         (("planning", "energy"), "distance", "l1"),
@@ -131,11 +161,18 @@ def move_component_options(values: dict[str, Any]) -> None:
         if not isinstance(component, dict):
             continue  # an error, which the check of the config names
         name = component.get("name", usual)
+        if not isinstance(name, str):
+            continue  # likewise
         older = {one: section.pop(one, None) for one in _OLDER_OPTIONS[key]}
         if name == "smooth_l1" and "smooth_l1_beta" in older:
             older[name] = {"beta": older["smooth_l1_beta"]}
-        if name in {"cem", "icem", "mppi"} and older.get("start_std") not in (None, 1.0):
-            older[name] = {**(older.get(name) or {}), "start_std": older["start_std"]}
+        if (start_std := older.get("start_std")) not in (None, 1.0):
+            if name in {"cem", "icem", "mppi"}:
+                of_planner = older.get(name)
+                older[name] = {**(of_planner if isinstance(of_planner, dict) else {}), "start_std": start_std}
+            elif name != "prior":  # which draws no samples
+                text = "%s: planning.start_std was %s; the planner %s has no such option, and uses 1"
+                logger.warning(text, where, start_std, name)
         given = (older.get(name), older.get(f"{key}_options"), older.get("options"), component.get("options"))
         options = {option: one[option] for one in given if isinstance(one, dict) for option in one}
         section[key] = {**component, "options": options} if options else component

@@ -1,4 +1,4 @@
-"""Training knobs: optimisation, validation, checkpoints and logging; and those of the decoder's training."""
+"""Config keys of training, validation, checkpoints and logging, and of the training of the decoder."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from vjepa2_ac.registry import LOSSES, TRACKERS
 DecoderSize = Literal["tiny", "small", "medium"]
 
 
-def _usual_warmup(values: dict[str, Any]) -> int:
+def usual_warmup(values: dict[str, Any]) -> int:
+    """Return the default of `training.warmup_steps` for these values of `training`."""
     return min(1_000, int(values.get("steps", 0)) // 10)
 
 
@@ -50,7 +51,7 @@ class TrainingConfig(Section):
     schedule: Literal["cosine", "warmup_stable_decay"] = "cosine"
     """Both begin with a linear warm-up from 0. cosine: then half a cosine to 0. warmup_stable_decay: then constant, and
     a linear decay to 0 in the last decay_steps."""
-    warmup_steps: Count = Field(default_factory=_usual_warmup)
+    warmup_steps: Count = Field(default_factory=usual_warmup)
     """Optimizer steps of the linear warm-up; unless given 1,000, or a tenth of the steps where that is less."""
     decay_steps: Count = 0
     """Optimizer steps of the final decay, warmup_stable_decay only; 0: the rate stays constant to the end."""

@@ -67,6 +67,7 @@ class SearchSpace:
         if self.l1 is None:
             return clipped
         length = clipped[..., :3].abs().sum(dim=-1, keepdim=True)
+        length = length.clamp(min=torch.finfo(length.dtype).tiny)  # without a motion its share would be infinite
         share = (self.l1 * (1 - _ROUNDING) / length).clamp(max=1.0)
         return torch.cat([clipped[..., :3] * share, clipped[..., 3:]], dim=-1)
 
@@ -186,14 +187,33 @@ class Workspace:
         for action in kept:
             way = np.clip(position + action[:3], self.low, self.high) - position
             if abs(way - action[:3]).max() > _NEAR_M:
-                way = np.clip(way, -reach, reach)
-                action[:3] = way * min(1.0, (limits.l1 or np.inf) / max(abs(way).sum(), _NEAR_M))
+                action[:3] = _shortened(np.clip(way, -reach, reach), self.way_back(position), limits.l1)
             position = position + action[:3]
         return kept
 
     def way_back(self, position: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Return the shortest way inside; zeros from there."""
         return np.asarray(np.clip(position, self.low, self.high) - position)
+
+
+def _shortened(
+    way: Float[np.ndarray, " 3"], way_back: Float[np.ndarray, " 3"], l1: float | None
+) -> Float[np.ndarray, " 3"]:
+    """Return a motion whose L1 norm is within its limit, and that still ends inside the workspace.
+
+    Only the part beyond the shortest way inside is scaled: both parts have the same direction along each axis, so that
+    their L1 norms add up.
+
+    Args:
+        way: From a position to one inside.
+        way_back: From the same position, the shortest way inside, which is within the limit.
+        l1: The limit; None: there is none.
+    """
+    if l1 is None:
+        return way
+    beyond = way - way_back
+    room, length = l1 - abs(way_back).sum(), abs(beyond).sum()
+    return way_back + beyond * min(1.0, max(room, 0.0) / max(length, _NEAR_M))
 
 
 def is_allowed(way: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:

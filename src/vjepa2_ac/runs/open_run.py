@@ -107,8 +107,8 @@ def open_remote(
 
     A small file is written there and removed again. Fetched are the newest checkpoint there whose every file matches
     its manifest, the best one, and the run's small files; damaged ones are named and skipped, and removed there once a
-    complete one is here. A place that cannot be reached is a warning, unless a newer checkpoint is known to be there
-    and this machine has none.
+    complete one is here. A place that cannot be reached is a warning, unless this machine has no checkpoint and the
+    place is known to have some, complete or not.
 
     Args:
         config: The run.
@@ -136,6 +136,7 @@ def open_remote(
         newest = newest_checkpoint(run_dir / CHECKPOINTS)
         state = None if newest is None else written_state(newest)
     remote, newer = RemoteCheckpoints(place), list[str]()
+    owner: str | None = None
     try:
         with quietly():
             storage.try_writing(place)
@@ -156,7 +157,7 @@ def open_remote(
         fix = f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out"
         raise InputError(where=REMOTE_KEY, found=f"{error.where}: {error.found}", fix=fix) from error
     except UnreachableError as error:
-        if newer and state is None:
+        if state is None and (newer or owner is not None):  # a run is there: a new one could not be mirrored there
             raise
         stand = f"after step {state.step}" if state else "without a checkpoint"
         there = f", though {newer[0]} is there" if newer else ""

@@ -63,7 +63,7 @@ class RunOutputs:
         self.metrics_log: MetricsLog | None = None
         self._mirror: Mirror | None = None
         self._stopped_by = 0  # number of a signal
-        self._saved_s, self._saved_step = time.monotonic(), 0
+        self._saved_s, self._saved_step = 0.0, 0  # of the last checkpoint: `begin` sets both
 
         def open_folder() -> OpenRun:
             require_installed(config.tracking)
@@ -100,7 +100,7 @@ class RunOutputs:
 
     def begin(self, run: Run) -> None:
         """Open the metrics log, the trackers and the mirror, and listen to signals."""
-        self._run, self._saved_step = run, run.state.step
+        self._run, self._saved_step, self._saved_s = run, run.state.step, time.monotonic()
         agreed(run.accelerator, self._begin)
         self._stop = self._closing.enter_context(stop_on_signals())
 
