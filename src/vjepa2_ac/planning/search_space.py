@@ -213,7 +213,7 @@ def _shortened(
         return way
     beyond = way - way_back
     room, length = l1 - abs(way_back).sum(), abs(beyond).sum()
-    return way_back + beyond * min(1.0, max(room, 0.0) / max(length, _NEAR_M))
+    return np.asarray(way_back + beyond * min(1.0, max(room, 0.0) / max(length, _NEAR_M)))
 
 
 def is_allowed(way: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
