@@ -2,9 +2,9 @@
 
     python examples/train_loop.py [DATA] [STEPS]
 
-Without DATA, a folder of DROID's RLDS form, a few episodes of a simulated arm are recorded first. The loop is the one
-of `vjepa2-ac train` without its config, processes, checkpoints and signals: `tests/training/test_train_loop.py` holds
-both equal, bit for bit on a CPU.
+DATA is a folder in the RLDS format of DROID. Without DATA the script first records a few episodes of a simulated arm.
+The loop is that of `vjepa2-ac train` without config, processes, checkpoints and signals.
+`tests/training/test_train_loop.py` checks that both give the same weights, bit for bit on a CPU.
 """
 
 import math
@@ -49,7 +49,7 @@ def train(data: str, steps: int) -> tuple[WorldModel, list[float]]:
     dataset = open_dataset(data, frames=FRAMES, stride=STRIDE, validation_share=0.2, test_share=0.3, workers=0)
     clips = training_loader(dataset, seed=SEED, batch_size=BATCH)
 
-    # The model: a frozen encoder, and a predictor of the next frame's latents, of which only an adapter is trained.
+    # The model: a frozen encoder, and a predictor of the next frame's latents, of which only the adapter is trained.
     model = load_model(BASE, device="cpu", dtype="float32")
     add_lora(model)
     print("Before training:", validate(model, dataset))
@@ -79,8 +79,8 @@ def add_lora(model: WorldModel) -> None:
     """Put a LoRA adapter on the linear layers of the predictor's blocks.
 
     The second matrix of each adapter is zero, so a fresh adapter does not change the predictions. `LoraLinear` is
-    PEFT's layer with fewer passes over the tokens; the first matrices are drawn from a generator of their own, so that
-    the numbers do not depend on PEFT's version.
+    PEFT's layer with fewer passes over the tokens. The first matrices are drawn from a separate generator, so that the
+    values do not depend on the version of PEFT.
     """
     config = LoraConfig(r=RANK, lora_alpha=ALPHA, target_modules=TARGETS, lora_dropout=0.0, use_rslora=True)
     config._register_custom_module({nn.Linear: LoraLinear})
@@ -94,9 +94,9 @@ def add_lora(model: WorldModel) -> None:
 def two_losses(model: WorldModel, batch: LatentBatch) -> tuple[Tensor, Tensor]:
     """Return the losses of teacher forcing and of a short rollout: mean absolute differences of latents.
 
-    Teacher forcing predicts each frame from the true frames before it. The rollout starts at the first frame, and each
-    further prediction is made from the predictions before it. The first step of both is the same: the rollout reuses
-    its keys and values.
+    Teacher forcing predicts each frame from the true frames before it. The rollout starts at the first frame, and makes
+    each further prediction from the predictions before it. Both have the same first step, so the rollout reuses the
+    keys and values of this step.
     """
     states, cache = batch.states[:, :-1], KeyValueCache()
     forced = model.predict(batch.latents[:, :-1], batch.actions, states, cache=cache, keep=1)
@@ -118,14 +118,14 @@ def learning_rate_at(step: int, steps: int) -> float:
 def validate(model: WorldModel, dataset: Dataset) -> str:
     """Measure the one-step error on held-out episodes, relative to persistence: copying the last frame."""
     model.eval()
-    of_model = of_persistence = 0.0
+    model_error = persistence_error = 0.0
     for clips in read_clips(dataset, "validation", clips=16):
         batch = encode(model, clips)
         predicted = model.predict(batch.latents[:, :-1], batch.actions, batch.states[:, :-1])
-        of_model += (predicted - batch.latents[:, 1:]).abs().mean().item()
-        of_persistence += (batch.latents[:, :-1] - batch.latents[:, 1:]).abs().mean().item()
+        model_error += (predicted - batch.latents[:, 1:]).abs().mean().item()
+        persistence_error += (batch.latents[:, :-1] - batch.latents[:, 1:]).abs().mean().item()
     model.train()
-    return f"one-step error / persistence {of_model / of_persistence:.3f} (below 1 is better)"
+    return f"one-step error / persistence {model_error / persistence_error:.3f} (below 1 is better)"
 
 
 if __name__ == "__main__":

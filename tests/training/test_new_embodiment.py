@@ -54,10 +54,10 @@ def test_from_recordings_to_a_model_of_its_own(
 ) -> None:
     config = make_robot(widths, adapter__kind=kind, training__steps=2, validation__every=2)
     folder = train(config, reporter)
-    fresh = [note for note in reporter.notes if "initialised anew" in note]
+    fresh = [note for note in reporter.notes if "newly initialised" in note]
     assert len(fresh) == sum(width != 7 for width in widths)
     if widths.state != 7:
-        assert f"state encoder: {widths.state} numbers instead of the base's 7: initialised anew" in fresh
+        assert f"state encoder: {widths.state} numbers instead of the base's 7: newly initialised" in fresh
     assert any("Base compared with persistence: skipped" in note for note in reporter.notes)
     run = load_subject(folder)
     assert widths_of_model(run.world_model.sizes) == widths

@@ -215,7 +215,7 @@ def _download(options: argparse.Namespace) -> None:
     cli.show(published_summary(known, url))
     with cli.reporter() as reporter:
         download(url, path, known=known, reporter=reporter)
-    cli.show(f"It is in {path}. In a config:  {known.knob}: {literal(path)}")
+    cli.show(f"It is in {path}. In a config:  {known.config_key}: {literal(path)}")
 
 
 def _doctor(options: argparse.Namespace) -> int:

@@ -1,7 +1,8 @@
 """The world model that a config starts from, and the formats of checkpoints that it can be read from.
 
-Meta's `.pt` of either family, a transformers folder, the same from the Hub, and a folder of this project all end in one
-record for an encoder, `FoundEncoder`; a network is filled from it alone. Every tensor is matched or refused.
+Meta's `.pt` of either family, a transformers folder, the same from the Hub, and a folder of this project are all
+described by one record for an encoder, `FoundEncoder`, from which a network is filled. Every tensor is matched or
+refused.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ from vjepa2_ac.storage.transfer import from_hub
 logger = logging.getLogger(__name__)
 
 ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
-"""Where an encoder can be in a file. The first that is there is taken: an average of weights, which Meta's own use is
-of; `encoder` is the one that was trained by gradient."""
+"""Keys of an encoder in a file. The first key in the file is used: Meta uses an average of weights; `encoder` has the
+weights that were trained by gradient."""
 FIX = "`vjepa2-ac download --list` shows those that are published; the Hub has facebook/vjepa2-vitl-fpc64-256"
 
 Part = Literal["encoder", "encoder 2.1", "predictor"]
@@ -178,7 +179,7 @@ def _of_meta(file: MetaFile, encoder: FoundEncoder | None, given: ModelSizes, dt
     found = encoder or encoder_in_file(file, None, given.encoder.frame, given.encoder.heads)
     predictor = file.tensors("predictor")
     if "mask_tokens" in {name.partition(".")[0] for name in predictor} and "action_encoder.weight" not in predictor:
-        said = "a checkpoint of pretraining: its predictor fills in masked patches, and knows no actions"
+        said = "a checkpoint of pretraining: its predictor fills in masked patches, and takes no actions"
         fix = "Its encoder can be used: set model.encoder.path to this file, and model.base: random for a fresh"
         fix += " predictor (configs/scratch_vitb.yaml)"
         raise InputError(where=f"model.base: {file.path}", found=said, fix=fix)
@@ -199,7 +200,7 @@ def _of_meta(file: MetaFile, encoder: FoundEncoder | None, given: ModelSizes, dt
         logger.warning("%s: a predictor without states and without an encoder. %s", file.path, _NON_COMMERCIAL)
     logger.warning(
         "%s does not say which encoder its predictor was trained on: on any other than %s it predicts noise. The first"
-        " validation shows it (its error beside that of persistence).",
+        " validation shows it (its error compared with that of persistence).",
         file.path,
         encoder.origin,
     )
@@ -225,7 +226,7 @@ def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: FoundEncode
         depth = depth_of(predictor, "predictor_blocks")
     except KeyError as missing:
         raise file.lacks(f"tensor {missing}", part="predictor") from None
-    told = {
+    fields = {
         "image_size": given.image_size,
         "patch_size": encoder.patch_size,
         "encoder": encoder.sizes.model_dump(),
@@ -239,7 +240,7 @@ def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: FoundEncode
         },
     }
     fix = "Set image size and heads in model.sizes: the tensors cannot tell"
-    found = record_of(ModelSizes, told, where=str(file.path), needed="sizes that go with model.sizes", fix=fix)
+    found = record_of(ModelSizes, fields, where=str(file.path), needed="sizes that go with model.sizes", fix=fix)
     check_sizes(found, given, where=str(file.path))
     return found
 
@@ -254,11 +255,11 @@ class FoundEncoder:
     where: str  # for messages
     sizes: EncoderSizes
     patch_size: int
-    image_size: int | None  # that it was trained at last, if somebody says so
+    image_size: int | None  # of the last training, if it is known
     origin: EncoderOrigin
     weights: Callable[[], Mapping[str, Tensor]]  # mapped, by the file's names
     rename: Rename
-    is_cut: bool = False  # after a block before the last: the weights of the last norm are not its own
+    is_cut: bool = False  # without its last blocks: then the last norm has no trained weights
 
     def up_to(self, layer: int) -> FoundEncoder:
         """Return the same encoder without the blocks after a layer.
@@ -311,7 +312,7 @@ def sizes_with(found: FoundEncoder, given: ModelSizes) -> ModelSizes:
     check_sizes(sizes, given, where=found.where)
     if found.image_size not in {None, given.image_size}:
         logger.warning(
-            "%s was trained at %d px, and frames are encoded at %d px (image_size): other positions than it knows",
+            "%s was trained at %d px, and frames are encoded at %d px (image_size), at untrained positions",
             found.origin, found.image_size, given.image_size,
         )  # fmt: skip
     return sizes
@@ -341,7 +342,7 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
         heads: The attention heads of an encoder that is not as wide as a published one.
 
     Raises:
-        InputError: There is no such key, what is there is no encoder, or nobody knows the heads.
+        InputError: There is no such key, what is there is no encoder, or the number of heads is not known.
     """
     there = [name for name in ENCODER_KEYS if name in file.parts]
     if key is None and there:
@@ -381,8 +382,8 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
     )
 
 
-class _Told(BaseModel):
-    """What the config.json of a V-JEPA 2 model of transformers says; only what this project computes is taken."""
+class _TransformersConfig(BaseModel):
+    """The fields of the config.json of a V-JEPA 2 model of transformers, with the values that are supported."""
 
     model_type: Literal["vjepa2"]
     hidden_size: Width
@@ -419,8 +420,8 @@ def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> FoundEncode
 
 
 def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, name: str) -> FoundEncoder:
-    """Return the encoder of a plain or a classification model; its masked predictor and its head are left alone."""
-    told = record_of(_Told, card, where=str(folder / CONFIG), needed=ENCODER_NEEDED, fix=FIX)
+    """Return the encoder of a plain or a classification model; the masked predictor and the head are not read."""
+    fields = record_of(_TransformersConfig, card, where=str(folder / CONFIG), needed=ENCODER_NEEDED, fix=FIX)
     tensors = _mapped(sorted(folder.glob("*.safetensors")))
     prefix = next((one for one in _PREFIXES_ON_THE_HUB if any(tensor.startswith(one) for tensor in tensors)), None)
     if prefix is None:
@@ -429,14 +430,14 @@ def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, na
     return FoundEncoder(
         where=str(folder),
         sizes=EncoderSizes(
-            width=told.hidden_size,
-            depth=told.num_hidden_layers,
-            heads=told.num_attention_heads,
-            mlp_ratio=told.mlp_ratio,
+            width=fields.hidden_size,
+            depth=fields.num_hidden_layers,
+            heads=fields.num_attention_heads,
+            mlp_ratio=fields.mlp_ratio,
             frame=frame,
         ),
-        patch_size=told.patch_size,
-        image_size=told.crop_size,
+        patch_size=fields.patch_size,
+        image_size=fields.crop_size,
         origin=EncoderOrigin(name),
         weights=lambda: {one: value for one, value in tensors.items() if one.startswith(prefix)},
         rename=lambda ours: (prefix + ours.removeprefix("vit."), None),
@@ -561,7 +562,7 @@ def depth_of(names: Mapping[str, object], blocks: str) -> int:
 
 
 def _problem_of(path: Path, error: Exception) -> tuple[str, str]:
-    """Return what a file is that torch did not load (its beginning shows a web page, for example), and the fix."""
+    """Return a description of a file that torch could not load, with its first bytes, and the fix."""
     refused = re.search(r"GLOBAL ([\w.]+)", str(error))
     if refused:
         found = f"a pickle that would call {refused[1]}: it was refused, since loading it could run foreign code"

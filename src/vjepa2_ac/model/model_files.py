@@ -1,4 +1,4 @@
-"""Files of models: where they are, what is known of them without reading a weight, and the download of published ones.
+"""Files of models: their paths, their sizes without reading a weight, and the download of published files.
 
 PyTorch is not imported. A download resumes where it stopped, is checked, then renamed.
 Sources: facebookresearch/vjepa2 @ 204698b, src/hub/backbones.py and app/vjepa_2_1/models; the models' cards on the Hub.
@@ -59,10 +59,10 @@ def find_encoder_path(name: str) -> Path | None:
 
 
 def require_model(config: ModelConfig) -> None:
-    """Refuse a model or an encoder of this machine that is not there.
+    """Refuse a config whose model or encoder does not exist on this machine.
 
     Raises:
-        InputError: It is not.
+        InputError: It does not exist.
     """
     if not config.is_random:
         find_base(config.base)
@@ -122,22 +122,22 @@ def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
     Raises:
         InputError: Names what differs.
     """
-    actual, wanted, standard = (flat(sizes.model_dump()) for sizes in (found, given, ModelSizes()))
-    wrong = [key for key in flat(SizesConfig().model_dump()) if wanted[key] not in (actual[key], standard[key])]
+    actual, configured, default = (flat(sizes.model_dump()) for sizes in (found, given, ModelSizes()))
+    wrong = [key for key in flat(SizesConfig().model_dump()) if configured[key] not in (actual[key], default[key])]
     if wrong:
-        said = ", ".join(f"{key} {actual[key]}, and model.sizes says {wanted[key]}" for key in wrong)
-        raise InputError(where=where, found=said, fix="Leave them out of model.sizes: the model tells")
+        said = ", ".join(f"{key} {actual[key]}, and model.sizes says {configured[key]}" for key in wrong)
+        raise InputError(where=where, found=said, fix="Leave them out of model.sizes: the model file has them")
 
 
 def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
-    """Return where the encoder of a model in a folder came from; None: nobody knows, or it belongs to the model.
+    """Return the origin of the encoder of a model in a folder; None: not known, or it belongs to the model.
 
     Raises:
-        InputError: The folder says it in a way that nobody understands.
+        InputError: The record of the origin is damaged.
     """
-    told = read_json_object(folder / CONFIG, needed=NEEDED_MODEL).get("encoder_origin")
+    origin = read_json_object(folder / CONFIG, needed=NEEDED_MODEL).get("encoder_origin")
     where, needed = f"{folder / CONFIG}: encoder_origin", "file, key and licence of an encoder"
-    return None if told is None else record_of(EncoderOrigin, told, where=where, needed=needed)
+    return None if origin is None else record_of(EncoderOrigin, origin, where=where, needed=needed)
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ class Published:
 
     @property
     def holds(self) -> str:
-        """What it is."""
+        """The kind of model in the file."""
         return "world model" if self.name == OFFICIAL else "encoder"
 
     @property
@@ -233,22 +233,22 @@ class Published:
 
     @property
     def url(self) -> str:
-        """Its address."""
+        """The URL of the file."""
         return _URL + self.remote
 
     @property
     def file(self) -> str:
-        """The name under which it is stored: it tells ViT-g from ViT-G on a disk that is blind to case."""
+        """The local file name, which differs for ViT-g and ViT-G on a case-insensitive disk, too."""
         return f"{self.name}.pt"
 
     @property
     def size(self) -> str:
-        """Its size, for people."""
+        """The size of the file, as text."""
         return f"about {self.gigabytes:g} GB" if self.bytes is None else f"{self.bytes:,} bytes"
 
     @property
-    def knob(self) -> str:
-        """The knob of a config that takes the file."""
+    def config_key(self) -> str:
+        """The config key that takes the file."""
         return "model.base" if self.name == OFFICIAL else "model.encoder.path"
 
 
@@ -300,15 +300,15 @@ def download(
     reporter: Reporter = SILENT,
     policy: RetryPolicy = _POLICY,
 ) -> Path:
-    """Fetch a file to `path`; a part that an earlier call left beside it is gone on with.
+    """Fetch a file to `path`; a partial file of an earlier call is resumed.
 
     Args:
         url: What to fetch.
-        path: Where the whole file goes; it appears there only when it is whole. One that is there is kept, if it can
-            be the file.
-        known: The published checkpoint that it has to be, whose size is checked; None: any file.
-        reporter: Is told how far it is, in megabytes.
-        policy: How often in a row the line may break without a byte having come, and the waits.
+        path: The path of the complete file, which exists only after the download has finished. An existing file is
+            kept if its size fits.
+        known: The published checkpoint, whose size is checked; None: any file.
+        reporter: Receives the progress in megabytes.
+        policy: The number of attempts in a row without a new byte, and the waits between them.
 
     Raises:
         InputError: The server does not say how large the file is, or sends another size than the published file can
@@ -336,19 +336,19 @@ def download(
         raise
     except UnreachableError as error:
         found = f"{error.found}; {_size(part)} bytes are in {part}"
-        fix = "Check the network and start again: it goes on where it stopped"
+        fix = "Check the network and start again: the download resumes where it stopped"
         raise UnreachableError(where=url, found=found, fix=fix) from None
     return part.replace(path)
 
 
 def _fetch(url: str, part: Path, known: Published | None, reporter: Reporter, timeout_s: float) -> None:
-    """Bring the rest of a file."""
+    """Download the rest of a file."""
     start = _size(part)
     try:
         request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user's
         answer = urllib.request.urlopen(request, timeout=timeout_s)  # noqa: S310  # the user's
     except http.client.InvalidURL as error:
-        raise ValueError(error) from None  # it does not pass
+        raise ValueError(error) from None  # another attempt cannot succeed
     except urllib.error.HTTPError as error:
         if error.code != 416:
             raise

@@ -47,7 +47,7 @@ Listing = Mapping[str, Mapping[str, int]]
 
 
 class LostPlaceError(InputError):
-    """The place is another run's, or a later start's of the same run."""
+    """The place belongs to another run, or to a later start of the same run."""
 
 
 class _CancelledError(Exception):
@@ -87,11 +87,11 @@ class RemoteCheckpoints:
         """Return the run of all checkpoints in a listing, also of incomplete ones; None if it is not known.
 
         Args:
-            listing: Of this place.
+            listing: The listing of this place.
             run_id: The expected run; None: any.
 
         Raises:
-            LostPlaceError: One is of another run.
+            LostPlaceError: A checkpoint is of another run.
         """
         for name in sorted(listing, reverse=True):
             try:
@@ -112,7 +112,7 @@ class RemoteCheckpoints:
 
         Args:
             checkpoint: Its folder; the name stays the same.
-            files: Those that are there already.
+            files: The files that are there already.
             before_each: Called before each file; an exception ends the upload.
         """
         name, manifest = checkpoint.name, (checkpoint / MANIFEST).read_bytes()
@@ -256,7 +256,7 @@ class Mirror:
             shutil.rmtree(self._folder / HELD, ignore_errors=True)
 
     def _continue_pass(self) -> None:
-        """Cancel the pass if the run has ended, or is ending and has a newer checkpoint."""
+        """Cancel the pass if the mirror has ended, or is finishing and there is a newer checkpoint."""
         if self._has_ended or (self._is_ending and self._newest_here() != self._aim):
             raise _CancelledError
 
@@ -267,7 +267,7 @@ class Mirror:
         kept are removed after.
 
         Raises:
-            LostPlaceError: The place is another run's, or another machine has resumed this run, and uses it.
+            LostPlaceError: The place belongs to another run, or another machine has resumed this run and uses it.
             UnreachableError: It cannot be reached.
             OSError: The run's folder cannot be read, or written for the links.
         """

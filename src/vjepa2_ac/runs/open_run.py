@@ -45,7 +45,7 @@ class OpenRun:
 
         Args:
             config: The run; its stride is a number.
-            state: Where it begins.
+            state: The state that the run starts from.
 
         Raises:
             InputError: Another process trains in the folder, or has done so since it was inspected; or as
@@ -61,7 +61,7 @@ class OpenRun:
         open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
 
     def mirror(self, run_id: str) -> Mirror | None:
-        """Return what keeps `checkpoint.remote` up to date."""
+        """Return the mirror that keeps `checkpoint.remote` up to date; None: there is no remote."""
         place = self.config.checkpoint.remote
         return None if place is None else Mirror(place, self.config, run_id)
 
@@ -105,24 +105,25 @@ def open_remote(
 ) -> Config:
     """Test `checkpoint.remote` if it is set, fetch a newer checkpoint from there, and return the config to use.
 
-    A small file is written there and removed again. Fetched are the newest checkpoint there whose every file matches
-    its manifest, the best one, and the run's small files; damaged ones are named and skipped, and removed there once a
-    complete one is here. A place that cannot be reached is a warning, unless this machine has no checkpoint and the
-    place is known to have some, complete or not.
+    The test writes a small file there and removes it again. This fetches the newest checkpoint whose files all
+    match its manifest, the best checkpoint, and the run's small files. Damaged checkpoints are reported and
+    skipped, and removed there after a complete one was fetched. A place that cannot be reached is a warning, unless
+    this machine has no checkpoint and the place is known to have some, complete or not.
 
     Args:
         config: The run.
         reporter: Receives messages for the user.
-        lock: Taken before the first file is fetched.
-        allow_config_change: The run there may have another config.
+        lock: The lock to take before the first file is fetched.
+        allow_config_change: The config of the run there may differ.
         into: The folder to fetch into, new or empty, if not the run's own: for a trial, which removes nothing there.
 
     Returns:
         The config, whose run_dir has the run to resume.
 
     Raises:
-        InputError: It can never be written, it has another run's checkpoints or another config, its checkpoints are
-            damaged or cannot be fetched and this machine has none to resume from, or another process has the lock.
+        InputError: This user may not write there; the checkpoints there are of another run, or have another config;
+            they are damaged and this machine has none to resume from; or another process has the lock.
+        UnreachableError: A checkpoint there cannot be fetched, and this machine has none to resume from.
     """
     if config.checkpoint.remote is None:
         return config
@@ -147,7 +148,7 @@ def open_remote(
         newer = [name for name in complete(listing) if state is None or step_number(name) > state.step]
         if not newer and (state is not None or owner is None):
             return config
-        # Without a complete checkpoint there, a machine was killed during its first upload or before.
+        # If an owner but no complete checkpoint is there, a machine was killed during its first upload.
         target = config if into is None else config.model_copy(update={"run_dir": str(into)})
         _require_this_config(target, place, allow_config_change=allow_config_change)
         if lock is not None:
@@ -172,7 +173,7 @@ def open_remote(
 
 
 def _require_this_config(config: Config, place: str, *, allow_config_change: bool) -> None:
-    """Check that the run there is the requested one, as for a local folder."""
+    """Refuse a run at the place whose config differs, as for a local folder."""
     with tempfile.TemporaryDirectory() as folder:
         with suppress(FileNotFoundError):
             storage.download(storage.join(place, CONFIG), Path(folder, CONFIG))

@@ -1,4 +1,4 @@
-"""A run or a model, opened: its world model, and what the selection of a checkpoint says about the training."""
+"""Open a run or a model: load its world model, and report which checkpoint was selected and why."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ BASE_MODEL = "base model"
 
 @dataclass(frozen=True)
 class Subject:
-    """A run or a model that is open: its world model in eval mode, its config, and where the weights come from."""
+    """An open run or model: its world model in eval mode, its config, and the source of its weights."""
 
     name: str  # the folder of the run, or the model, as given
     config: Config
-    world_model: WorldModel  # for planning on its device and with the adapter merged, else neither
-    checkpoint: Path | None = None  # its folder. None: a model
+    world_model: WorldModel  # `load_to_plan` moves it to its device and merges the adapter; `load_subject` does neither
+    checkpoint: Path | None = None  # the folder of the checkpoint; None: a model
     chosen: str = ""  # the checkpoint as text; "" for a model
     is_base: bool = False  # the checkpoint has the weights of the base model
     note: str = ""  # a sentence about a checkpoint of step 0; "" for a trained one

@@ -69,15 +69,15 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
 
 
 def _optimize(run: Run, outputs: RunOutputs, reporter: Reporter) -> None:
-    """Do the steps that are left."""
+    """Run the remaining steps."""
     reporter.started(run.state.step, run.config.training.steps)
     throughput = Throughput.of(run.config, run.world_model.sizes, run.accelerator)
     with contextlib.closing(batches_from(run)) as batches:
         timed = TimedBatches(batches, run.accelerator.device)
-        while outputs.goes_on:
+        while outputs.has_next_step:
             step, started, waited_s = run.state.step + 1, time.perf_counter(), timed.waited_s
             try:
-                metrics = training_step(run, timed, step, measure_update=outputs.logs(step))
+                metrics = training_step(run, timed, step, measure_update=outputs.is_logged(step))
             except UnreachableError:
                 if not outputs.stops_without_data():
                     raise

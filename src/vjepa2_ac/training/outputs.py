@@ -35,7 +35,7 @@ SAVE_EVERY_S = 15 * 60.0  # in addition to checkpoint.every
 
 
 class RunOutputs:
-    """What the training loop calls after each step. Only the first process writes; all take part in decisions.
+    """What the training loop calls after each step. Only the first process writes; all processes decide together.
 
     Args:
         config: The run.
@@ -76,7 +76,7 @@ class RunOutputs:
         self.has_ended = bool(broadcast_object(accelerator, has_ended))
 
     def _finish_ended(self) -> bool:
-        """Return whether the run has ended already; then write its config, and send what `checkpoint.remote` lacks."""
+        """Return whether the run ended in an earlier start; if so, write the config and finish the mirror."""
         newest = newest_checkpoint(Path(self.config.run_dir, CHECKPOINTS))
         if newest is None or not asks_nothing_new(self.config) or not is_done(self.config, state := read_state(newest)):
             return False
@@ -99,7 +99,7 @@ class RunOutputs:
             self._reporter.note(rate)
 
     def begin(self, run: Run) -> None:
-        """Open the metrics log, the trackers and the mirror, and listen to signals."""
+        """Open the metrics log, the trackers and the mirror, and handle signals."""
         self._run, self._saved_step, self._saved_s = run, run.state.step, time.monotonic()
         agreed(run.accelerator, self._begin)
         self._stop = self._closing.enter_context(stop_on_signals())
@@ -121,11 +121,11 @@ class RunOutputs:
             self._mirror = self._closing.enter_context(mirror)
 
     @property
-    def goes_on(self) -> bool:
+    def has_next_step(self) -> bool:
         """Whether another step follows."""
         return not (self._stopped_by or is_done(self._run.config, self._run.state))
 
-    def logs(self, step: int) -> bool:
+    def is_logged(self, step: int) -> bool:
         """Return whether a step is written into the metrics log."""
         training = self._run.config.training
         return step % training.log_every == 0 or step == training.steps
@@ -134,13 +134,13 @@ class RunOutputs:
         """Show and log the metrics of the current step."""
         step = self._run.state.step
         self._reporter.stepped(step, metrics)
-        if self.metrics_log is not None and self.logs(step):
+        if self.metrics_log is not None and self.is_logged(step):
             self.metrics_log.write("train", step, metrics)
 
     def save_if_due(self, *, is_best: bool) -> None:
-        """Save a checkpoint where one is due or a signal came, in which all processes agree, and feed the mirror.
+        """Save a checkpoint if it is due or a signal was received, and start an upload if the mirror is due.
 
-        The signal is read once: one that comes later takes effect at the next step.
+        All processes agree on it. The signal is read once: a later signal takes effect at the next step.
         """
         run, step = self._run, self._run.state.step
         is_due = step % run.config.checkpoint.every == 0 or time.monotonic() - self._saved_s >= SAVE_EVERY_S
@@ -163,7 +163,7 @@ class RunOutputs:
         self._saved_s, self._saved_step = time.monotonic(), self._run.state.step
 
     def stops_without_data(self) -> bool:
-        """Return whether a signal has come while the data of a step do not; then save what is not saved."""
+        """Return whether to stop: data cannot be reached and a signal was received. Then save unsaved steps first."""
         if not self._stop.number or self._run.accelerator.num_processes > 1:
             return False
         self._stopped_by = self._stop.number
@@ -182,11 +182,11 @@ class RunOutputs:
         if has_ended and run.state.step < run.config.training.steps:
             self._reporter.note(_why_ended(run.config, run.state))
 
-        def send_the_rest() -> None:
+        def finish_mirror() -> None:
             if self._mirror is not None:
                 self._mirror.finish(lambda: not has_ended or bool(self._stop.number))
 
-        agreed(run.accelerator, send_the_rest)  # all wait: the launcher ends all processes once one has ended
+        agreed(run.accelerator, finish_mirror)  # all wait: the launcher ends all processes when the first exits
         if not has_ended:
             raise StoppedError(run.folder, run.state.step, signal.Signals(self._stopped_by).name)
 

@@ -39,10 +39,10 @@ from vjepa2_ac.training.run import Run
 
 
 def save_checkpoint(run: Run, folder: Path) -> None:
-    """Write the state of the run into its folder (see `runs.checkpoint`): all processes call, the first writes.
+    """Write the state of the run into its folder (see `runs.checkpoint`). All processes call this; the first writes.
 
     Raises:
-        InputError: It cannot be written; in the first process only.
+        InputError: The checkpoint cannot be written; raised in the first process only.
     """
 
     def write(inner: Path) -> None:
@@ -66,7 +66,7 @@ def save_checkpoint(run: Run, folder: Path) -> None:
 
 
 def restore(run: Run, reporter: Reporter) -> Run:
-    """Bring a run to its newest checkpoint, in every process.
+    """Restore the newest checkpoint of a run, in every process.
 
     Raises:
         InputError: The processes have different bases, or the checkpoint is not of this run.
@@ -87,7 +87,7 @@ def restore(run: Run, reporter: Reporter) -> Run:
 
 
 def _state_of_all(run: Run, reporter: Reporter) -> RunState:
-    """Restore weights and moments in every process: the first one reads them, and sends them to the others."""
+    """Restore weights and moments in every process: the first process reads them and sends them to the others."""
     accelerator, world_model = run.accelerator, run.world_model
     encoder = world_model.adaptation.encoder if world_model.adaptation else ""
     require_same(accelerator, encoder, what="model.base", fix="Give every machine the same checkpoint")
@@ -116,7 +116,7 @@ def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any]
 
 
 def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
-    """Return what determines the measurements of a validation, by readable names."""
+    """Return the settings and clips that determine the metrics of a validation, by readable names."""
     settings = {key: json.dumps(value) for key, value in flat(values_that_affect(Affects.MEASURED, config)).items()}
     windows = validation_windows(dataset, "validation", clips=config.validation.clips)
     clips = [(dataset.table.identity(episode), int(start)) for episode, start in windows]
@@ -124,10 +124,10 @@ def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
 
 
 def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> RunState:
-    """Return the state to resume from: a best validation by other measurements is dropped, with a message.
+    """Return the state to resume from; a best validation that was measured differently is dropped, with a message.
 
-    Only errors of the same clips, time span and latents are compared. What a state does not record, or records beyond
-    what matters now, is accepted.
+    Errors are comparable only for the same clips, time span and latents. Settings that only one of the two records has
+    are ignored.
     """
     before = state.measured_on or {}
     differing = sorted(key for key in before.keys() & now if before[key] != now[key])
@@ -144,9 +144,9 @@ def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> 
 def micro_batches_of(config: Config, state: RunState, processes: int, reporter: Reporter) -> int:
     """Return the number of micro-batches of a step, of all processes.
 
-    It is the config's, at the first start and if batch_size * accumulation was changed on purpose; else the number that
-    keeps the clips per step, on any number of processes and after any number of restarts. Where processes do not divide
-    it some have one more than others.
+    At the first start, or if batch_size * accumulation was changed, the config determines it. Otherwise it keeps the
+    number of clips per step, for any number of processes and restarts. If it is not a multiple of the number of
+    processes, some processes have one micro-batch more than others.
 
     Raises:
         InputError: There are more processes than micro-batches.

@@ -61,11 +61,11 @@ def set_up(
         config: The run.
         reporter: Receives messages, and the progress of indexing and encoding.
         accelerator: The result of `make_accelerator` for this config; None: it is created here.
-        check_only: Encode nothing, and report how much that would be.
+        check_only: Encode nothing, and report the amount of data to encode.
         allow_config_change: The run in the folder may have begun with other data sets.
 
     Raises:
-        InputError: Something cannot be used.
+        InputError: A part of the run cannot be used; says which.
     """
     accelerator = accelerator or make_accelerator(config)
     if config.training.compile == "blocks":
@@ -73,7 +73,7 @@ def set_up(
     choose_stride = TRAINING_HOOKS.find("data.stride")(config) if config.data.stride == "auto" else None
     strip = TRAINING_HOOKS.find("validation.decoder")(config) if config.validation.decoder is not None else None
 
-    # The other processes of a machine find the index of the first one, however long that takes.
+    # The other processes of a machine wait for the first process, and then read the index that it has written.
     dataset, *others = first_of_machine(accelerator, lambda: open_data_sets(config, reporter))
     for warning in TRAINING_HOOKS.find("motion")(dataset):
         reporter.note(f"Warning: {warning.text}.")
@@ -129,7 +129,7 @@ def _require_shared_memory(config: Config, clip: Batch, sizes: ModelSizes, accel
 
 
 def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
-    """Put heads of the data's widths and an adapter on a base, and let it compute as `training` says."""
+    """Fit the heads to the data, add an adapter, and apply the options of `training` for the computation."""
     _fit_heads(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed)
     reporter.note(str(trainable_report(world_model)))
@@ -146,7 +146,7 @@ def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, r
 
 
 def _check_heads(config: Config, dataset: Dataset) -> None:
-    """Refuse, before the model is loaded, data of other widths than the base's if no layer would learn them.
+    """Refuse, before the model is loaded, data whose widths differ from the base's if no layer is trained on them.
 
     Raises:
         InputError: A new head would not be trained; or the stride is to be chosen by the base, which cannot predict
@@ -161,7 +161,7 @@ def _check_heads(config: Config, dataset: Dataset) -> None:
 
 
 def _fit_heads(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
-    """Give a base new input heads if the data's states or actions have other widths, and report them."""
+    """Replace the input heads of a base that do not fit the widths of the data, and report the new heads."""
     heads = heads_to_replace(world_model.sizes, dataset.widths)
     for line in fit_heads(world_model, dataset.widths, config.seed):
         reporter.note(line)
@@ -182,7 +182,7 @@ def open_data_sets(config: Config, reporter: Reporter) -> list[Dataset]:
     """Open the data set of a run, and that of `replay` where there is one.
 
     Raises:
-        InputError: One cannot be opened; or the second one's spaces or the time of its steps are others.
+        InputError: A data set cannot be opened; or both differ in their spaces, or in the duration of a model step.
     """
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     if splits := describe_splits(dataset.table, config.data):
@@ -218,15 +218,17 @@ def _open_replay(replay: ReplayConfig, dataset: Dataset, reporter: Reporter) -> 
 
 
 def first_clip(dataset: Dataset, split: Split = "train") -> Batch:
-    """Return a clip of a split, the first that can be read."""
+    """Return the first clip of a split that can be read."""
     return next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1))
 
 
 def require_fitting_clips(first: Dataset, others: Sequence[Dataset]) -> None:
-    """Refuse a second data set whose clips cannot be in one batch with those of the first; latents to come may.
+    """Refuse a second data set whose clips cannot be in one batch with those of the first.
+
+    Data sets that are still to be encoded are accepted.
 
     Raises:
-        InputError: They are of other pictures, or latents of another type; says how they differ.
+        InputError: Frames differ in size, or latents in type; says how they differ.
     """
     for replayed in others:
         if any(one.config.takes_latents and not one.config.is_cache for one in (first, replayed)):
@@ -239,12 +241,12 @@ def require_fitting_clips(first: Dataset, others: Sequence[Dataset]) -> None:
 
 
 def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
-    """Refuse to go on with other data sets than those that the run in its folder began with.
+    """Refuse to resume a run with other data sets than it was started with.
 
-    At the place where it began the data may have changed, which is reported; elsewhere they must be the same.
+    A data set at the same path may have changed, which is reported. A data set at another path must be the same.
 
     Raises:
-        InputError: They are others.
+        InputError: A data set at another path differs.
     """
     folder = Path(config.run_dir)
     if not (folder / CONFIG).is_file() or (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is None:
@@ -259,10 +261,10 @@ def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
 
 
 def require_same_base(config: Config, model: WorldModel) -> None:
-    """Refuse a base at another path than the run's if it is not the one that the run was trained on.
+    """Refuse a base at another path than before if it is not the base that the run was trained on.
 
     Raises:
-        InputError: It is another one.
+        InputError: The base is another one.
     """
     folder = Path(config.run_dir)
     is_moved = (folder / CONFIG).is_file() and read_run_config(folder).model != config.model

@@ -26,7 +26,7 @@ from vjepa2_ac.storage import is_url
 from vjepa2_ac.training.optim import learning_rate_at
 from vjepa2_ac.training.run import Run
 
-Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, element by element
+Distance = Callable[[Tensor, Tensor], Tensor]  # (predicted latents, true latents) -> the loss of each element
 
 SMALLEST_LOSS_SCALE = 1.0  # fp16: if gradients still overflow, they are not finite for another reason
 
@@ -38,21 +38,21 @@ class Gradients:
     forced_loss: float  # mean over the clips; NaN where there is none
     rollout_loss: float
     norm: float  # before clipping; not finite after an overflow in fp16, which the loss scale handles
-    clips: int  # that were read
+    clips: int  # number of clips that could be read
     bytes_fetched: int
 
 
 def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_update: bool = False) -> dict[str, float]:
-    """Do one optimizer step: accumulate gradients over micro-batches and processes, clip, update.
+    """Run one optimizer step: accumulate gradients over micro-batches and processes, clip them, update the weights.
 
     Args:
         run: The run.
-        batches: Source of its micro-batches.
-        step: From 1.
-        measure_update: Also return how far the weights have moved, which needs a copy of them.
+        batches: Source of micro-batches.
+        step: Number of the step, from 1.
+        measure_update: Also return the size of the update, which needs a copy of the weights.
 
     Raises:
-        InputError: The loss or a gradient is not finite; names the clips. The weights have not moved.
+        InputError: The loss or a gradient is not finite; names the clips. The weights are unchanged.
     """
     # The random numbers of a step (dropout) follow from its number: no generator state needs to be saved.
     torch.manual_seed(seed_of(run.config.seed, step, run.accelerator.process_index))
@@ -61,8 +61,8 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
         group["lr"] = learning_rate
     computed = gradients(run, batches, more=step < run.config.training.steps)
     update = Update(run.trained) if measure_update else None
-    if computed.clips:  # without a clip there are no gradients, and nothing moves
-        run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
+    if computed.clips:  # without a clip there are no gradients, and the weights stay unchanged
+        run.scaler.step(run.optimizer)  # skips the update after an overflow in fp16
         run.scaler.update()
     run.optimizer.zero_grad(set_to_none=True)
     metrics = {
@@ -84,19 +84,19 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
 
 
 def gradients(run: Run, batches: Iterator[Batch], *, more: bool = False) -> Gradients:
-    """Accumulate and clip the gradients of the next micro-batches of all processes; the weights do not move.
+    """Accumulate and clip the gradients of the next micro-batches of all processes; the weights are unchanged.
 
-    Loss and gradient are means over the clips of the step. Where clips are left out (`data.broken_episodes`: skip) they
-    are means over those that are left: each counts as much as the others, whatever micro-batch it is in.
+    Loss and gradient are means over the clips of the step. If clips are skipped (`data.broken_episodes`: skip),
+    they are means over the remaining clips, which all have the same weight, whatever micro-batch a clip is in.
 
     Args:
         run: The run.
-        batches: Source of its micro-batches.
+        batches: Source of micro-batches.
         more: Whether another step follows, whose first micro-batch is fetched while the device is computing.
 
     Raises:
         InputError: A loss or gradient is not finite; names the clips of this process. Or a clip of any process cannot
-            be read, or too many episodes of all processes are broken: in all processes.
+            be read, or all processes together have too many broken episodes; then all processes raise an error.
     """
     if not run.world_model.training:  # after a validation
         run.world_model.train()
@@ -145,7 +145,7 @@ def encode(run: Run, batch: Batch) -> LatentBatch:
 
 
 def micro_step(run: Run, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:
-    """Return (teacher forcing, rollout), each a mean over these clips; add the gradient of their sum over `parts`."""
+    """Return (teacher forcing, rollout), each a mean over these clips; add the gradient of their sum / `parts`."""
     with run.accelerator.autocast():
         forced, rollout = run.objective(latents)
     run.scaler.scale((forced + rollout) / parts).backward()  # type: ignore[no-untyped-call]  # torch
@@ -153,7 +153,7 @@ def micro_step(run: Run, latents: LatentBatch, parts: float) -> Float[Tensor, 2]
 
 
 class Objective:
-    """The loss of a world model on latents: `prediction_losses` by the config."""
+    """The loss of a world model on latents: `prediction_losses` with the settings of `training`."""
 
     def __init__(self, world_model: LatentDynamics, training: TrainingConfig) -> None:
         self.world_model, self.rollout_steps = world_model, training.rollout_steps
@@ -169,11 +169,11 @@ def prediction_losses(
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Return (teacher forcing, rollout) of one batch, each a mean over all elements.
 
-    Teacher forcing predicts frames 2..T from the true frames 1..T-1. The rollout starts at frame 1; its first
-    prediction is the teacher-forced one, each further one is made from the predictions before it. States and actions
-    are the true ones throughout. The rollout reuses the keys and values that teacher forcing computed for the first
-    step. Loss and gradient equal those of recomputing everything. With dropout both parts share the masks of the first
-    step, which changes the expectation of neither.
+    Teacher forcing predicts frames 2..T from the true frames 1..T-1. The rollout starts at frame 1: the first
+    prediction is that of teacher forcing, and each further prediction is made from the predictions before it. States
+    and actions are always the true ones. The rollout reuses the keys and values that teacher forcing computed for the
+    first step. Loss and gradient equal those of recomputing everything. With dropout both parts share the masks of the
+    first step, which changes the expectation of neither.
 
     Raises:
         ValueError: A rollout longer than the clip.
@@ -216,7 +216,7 @@ class SmoothL1:
 
 
 def _finish_gradients(run: Run, factor: float) -> float:
-    """Turn the scaled sums of all processes into the gradient of the mean, clip it, and return its norm before."""
+    """Turn the scaled sums of all processes into the gradient of the mean, clip it; return the norm before clipping."""
     all_reduce_gradients(run.accelerator, run.trained)
     run.scaler.unscale_(run.optimizer)
     if factor != 1:
@@ -228,10 +228,10 @@ def _finish_gradients(run: Run, factor: float) -> float:
 
 
 def _share_broken_episodes(run: Run) -> None:
-    """Let each process count the broken episodes of all of them: the allowed share is that of the run.
+    """Share the broken episodes among all processes: the allowed share is that of the whole run.
 
     Raises:
-        InputError: There are too many; in all processes.
+        InputError: There are too many broken episodes; raised in all processes.
     """
     for dataset in run.datasets:
         for reasons in all_gather_object(run.accelerator, dataset.broken.reasons):
@@ -250,10 +250,10 @@ def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> 
 
 
 class Update:
-    """Measures how far an optimizer step moves the weights. Keeps a copy of them until it is read.
+    """The size of an optimizer step's update. Holds a copy of the weights until the size is read.
 
     Args:
-        parameters: Those of the optimizer, before the step.
+        parameters: The parameters of the optimizer, before the step.
     """
 
     def __init__(self, parameters: Iterable[Tensor]) -> None:
@@ -261,7 +261,7 @@ class Update:
         self._before = [parameter.detach().clone() for parameter in self._parameters]
 
     def to_weight(self) -> float:
-        """Return the norm of the update over that of the weights before it, of all tensors together; read it once."""
+        """Return the norm of the update / the norm of the weights before, over all tensors together; call it once."""
         weight = float(torch.nn.utils.get_total_norm(self._before))
         for before, parameter in zip(self._before, self._parameters, strict=True):
             before -= parameter.detach()  # in the copy's own memory

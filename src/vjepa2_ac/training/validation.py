@@ -25,7 +25,7 @@ from vjepa2_ac.training.step import encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
 RANK = "action_ranking_error"  # checkpoint.keep_best ranking
-USED = 0.02  # share of error that wrong actions cost a model that uses them, at least
+USED = 0.02  # a model that uses its actions has an error at least this share higher with shuffled actions
 RANKING_REACH_CM = 7.5  # half the width of the box of other actions: as far as plans should move in a model step
 _AT_ONCE = 64  # samples per batch: as many tokens as the clips of a small micro-batch
 _BASE_NOT_CHECKED = (
@@ -47,7 +47,7 @@ def validate_if_due(run: Run, metrics_log: MetricsLog | None, reporter: Reporter
 
 
 def unused_actions(found: Validation) -> str:
-    """Return that a model hardly uses the actions, as text; empty: it does."""
+    """Return a warning if the model hardly uses the actions; an empty string if it does use them."""
     cost = cost_of_actions(found.errors, "shuffled").value
     if cost >= USED:
         return ""
@@ -75,7 +75,7 @@ def record(run: Run, found: Validation, metrics_log: MetricsLog | None) -> bool:
 
 
 def is_done(config: Config, state: RunState) -> bool:
-    """Return whether training ends: all steps are done, or there were too many validations without a better one."""
+    """Return whether training ends: all steps are done, or `training.patience` validations brought no better one."""
     training = config.training
     if state.step >= training.steps:
         return True
@@ -85,7 +85,7 @@ def is_done(config: Config, state: RunState) -> bool:
 
 
 def validation_metrics(found: Validation) -> dict[str, Any]:
-    """Return what a validation writes into the metrics log."""
+    """Return the metrics of a validation for the metrics log."""
     errors, by_horizon = found.errors, over_persistence(found.errors, "rollout")
     metrics: dict[str, Any] = {
         "error_over_persistence": one_step_over_persistence(errors).value,
@@ -104,9 +104,9 @@ def validation_metrics(found: Validation) -> dict[str, Any]:
 def validate(run: Run, reporter: Reporter) -> Validation:
     """Measure the held-out clips, and rank the true actions of moves in some of them.
 
-    In the ranking other clips, in a fixed order, replace those that cannot be read. The processes share the clips, and
-    what the first one computes from all results counts: processes that disagree in the last digits about the best would
-    not end together.
+    For the ranking, clips that cannot be read are replaced by other clips, in a fixed order. The processes share the
+    clips. The first process computes the result, and all others receive it: results that differ in the last digits
+    could otherwise let processes stop at different steps.
     """
     run.world_model.eval()
     with run.accelerator.autocast(), sharing(run.accelerator):
@@ -156,10 +156,10 @@ def _encoded(
 def validate_base(run: Run, reporter: Reporter) -> Validation | None:
     """Measure a run before its first step, and refuse a base that is no better than copying the last frame.
 
-    None is returned of a run that goes on.
+    Returns None for a run that resumes.
 
     Raises:
-        InputError: It is not, and `training.allow_weak_base` is off.
+        InputError: The base is not better, and `training.allow_weak_base` is off.
     """
     if run.state.step:
         return None

@@ -287,7 +287,7 @@ def test_a_transformers_folder_that_says_something_else_is_refused(
 
 
 def test_pretrainings_masked_predictor_is_not_taken_for_one_of_actions() -> None:
-    with pytest.raises(InputError, match=r"knows no actions.*set model\.encoder\.path to this file"):
+    with pytest.raises(InputError, match=r"takes no actions.*set model\.encoder\.path to this file"):
         load_base(ModelConfig(base=str(V21)), seed=0)
 
 

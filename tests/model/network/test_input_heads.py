@@ -67,7 +67,7 @@ def test_only_heads_that_do_not_fit_are_replaced_and_each_is_told(widths: Widths
         "action encoder": (widths.action, "action_encoder"),
     }
     told = [
-        f"{words}: {width} numbers instead of the base's 7: initialised anew"
+        f"{words}: {width} numbers instead of the base's 7: newly initialised"
         for words, (width, _) in expected.items()
         if width != 7
     ]

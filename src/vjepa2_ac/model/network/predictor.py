@@ -1,4 +1,4 @@
-"""The action-conditioned predictor: layers, pass, cache, its form in transformers; predict a step, roll out many."""
+"""The action-conditioned predictor: layers, forward pass, key-value cache, transformers model, and rollout."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class PredictorNetwork(nn.Module):
     config: Any  # the fields of `predictor_fields`
     attention: AttentionKind | Attend
     gradient_checkpointing: bool  # the name transformers switches
-    has_dropout: bool  # in its blocks: then recomputed blocks draw the same masks
+    has_dropout: bool  # whether blocks have dropout: recomputed blocks must then draw the same masks
 
     def add_layers(self, config: Any) -> None:
         """Make the layers of these sizes, uninitialised, and set the switches to their defaults."""
@@ -113,8 +113,8 @@ class PredictorNetwork(nn.Module):
             actions: The action of each.
             states: The state of each; not used, and of any width, where the model has no states.
             extrinsics: The camera of each, where the model uses it.
-            cache: The steps come after those in the cache, and see them; then they are added to it.
-            keep: How many of the steps are added, from the first; None: all.
+            cache: The steps come after those in the cache and attend to them; then they are added to it.
+            keep: Number of steps to add to the cache, from the first; None: all.
 
         Raises:
             ValueError: Extrinsics are missing or unexpected.
@@ -151,7 +151,7 @@ class PredictorNetwork(nn.Module):
     def _through_blocks(
         self, tokens: Tensor, layout: TokenLayout, cache: KeyValueCache | None, keep: int | None
     ) -> Tensor:
-        """Return the tokens after all blocks, which see the cache; new keys and values are added to it."""
+        """Return the tokens after all blocks, which attend to the cache; new keys and values are added to it."""
         tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
         how = (tables, layout.tokens_per_step, self.attention)
         steps = layout.steps if keep is None else min(keep, layout.steps)
@@ -183,7 +183,7 @@ class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers h
 
 
 class ActionConditionedPredictor(PredictorNetwork, PreTrainedModel):  # type: ignore[misc]  # transformers has no types
-    """The predictor in the form that transformers stores and loads; its pass is the network's."""
+    """The predictor as a transformers model, which can be stored and loaded; the forward pass is inherited."""
 
     config_class = PredictorConfig
     base_model_prefix = "predictor"
@@ -204,9 +204,9 @@ class ActionConditionedPredictor(PredictorNetwork, PreTrainedModel):  # type: ig
     def start_at_persistence(self, generator: Generator) -> None:
         """Initialise a predictor close to copying: it reads latents through a rotation, and writes through its inverse.
 
-        These two layers are the network's only path from input to output; a tiny one that starts at random
-        spends most of its training on learning to copy. Close where the predictor is at least as wide as a latent; a
-        narrower one passes on a random part of it (`ModelSizes.too_narrow_to_copy`).
+        These two layers are the network's only path from input to output. With random initialisation a tiny predictor
+        spends most of its training on learning to copy. A predictor narrower than a latent passes on only a random part
+        of it (`ModelSizes.too_narrow_to_copy`).
         """
         shape = self.predictor_embed.weight.shape
         drawn = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)

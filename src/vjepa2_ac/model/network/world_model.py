@@ -1,6 +1,6 @@
-"""The world model: encoder and predictor together: encode, predict, roll out, save and load.
+"""The world model, an encoder and a predictor: encode, predict, roll out, save and load.
 
-And input heads for robots with other states or actions than the base: new encoders, which must be trained.
+`fit_heads` adds input heads for robots whose states or actions differ from the base's; these heads must be trained.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Fingerprints(NamedTuple):
 
 @dataclass(frozen=True)
 class FreshHeads:
-    """Fresh heads of the predictor (`fit_heads`): encoders for states or actions of other widths than the base's."""
+    """New input heads of the predictor (`fit_heads`), for states or actions whose widths differ from the base's."""
 
     replaced: dict[str, Tensor]  # the base's own, by their names in the predictor
     seed: int  # of the new ones
@@ -200,7 +200,7 @@ class WorldModel(LatentDynamics):
         raise ValueError("the encoder was set aside: latents come from a cache")
 
     def set_encoder_aside(self) -> None:
-        """Remove the encoder's weights permanently: latents come from a cache. Its fingerprint stays known."""
+        """Remove the encoder's weights permanently: latents come from a cache. The fingerprint is kept."""
         if isinstance(self.encoder, Encoder):
             self.encoder = AbsentEncoder(self.encoder_fingerprint())
 
@@ -231,9 +231,9 @@ class WorldModel(LatentDynamics):
 
     @property
     def encoder_beyond_tensors(self) -> dict[str, str | int]:
-        """What its latents depend on and its tensors do not show: family, frame path and heads, where they matter."""
-        told = self.encoder_origin is not None and self.encoder_origin.heads_are_told
-        return beyond_tensors(self.sizes.encoder, heads_are_told=told)
+        """The properties that latents depend on and tensors do not show: family, frame path and heads."""
+        origin = self.encoder_origin
+        return beyond_tensors(self.sizes.encoder, heads_are_told=origin is not None and origin.heads_are_told)
 
     @property
     def encoder_in_words(self) -> str:
@@ -334,7 +334,7 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
         head = nn.Linear(width, own.out_features)
         initialise(head, torch.Generator().manual_seed(seed_of(seed, name)))
         setattr(predictor, name, head.to(own.weight.device, own.weight.dtype).requires_grad_(False))
-        lines.append(f"{_as_text([name])}: {width} numbers instead of the base's {own.in_features}: initialised anew")
+        lines.append(f"{_as_text([name])}: {width} numbers instead of the base's {own.in_features}: newly initialised")
     dims = {"action_dim": widths.action}
     dims |= {"state_dim": widths.state} if model.sizes.predictor.use_states else {}
     predictor.config.update(dims)
