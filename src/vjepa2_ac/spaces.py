@@ -1,7 +1,7 @@
-"""State and action spaces: what the numbers of a robot are, which of them are plausible, and how states change.
+"""State and action spaces: the meaning of the numbers of a robot, their plausible ranges, and how states change.
 
-A pose has a position, a rotation and a gripper (legend: `vjepa2_ac.episode`). Of a vector only the width is known: a
-robot's joints, two arms, a mobile base. Whoever needs a part asks for it: `space.position` is None where there is none.
+A pose has a position, a rotation and a gripper (conventions: `vjepa2_ac.episode`). Of a vector only the width is known:
+a robot's joints, two arms, a mobile base. `space.position` is None for a space without a position.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray
     """Return the action from each state to the next.
 
     Translation and gripper subtract; rotation is R[t+1] @ R[t].T as extrinsic xyz Euler angles, so an action acts on
-    the left. Legend of states and actions: `vjepa2_ac.episode`.
+    the left. Conventions of states and actions: `vjepa2_ac.episode`.
 
     Raises:
         ValueError: Fewer than two states.
@@ -211,7 +211,7 @@ class StateSpace(Space):
         fix: str = "",
         conversions: Mapping[str, str] = CONVERSIONS,
     ) -> None:
-        """Refuse states that no robot has: not finite; of poses, no metres, radians or closedness.
+        """Refuse implausible states: numbers that are not finite, and poses not in metres, radians and closedness.
 
         Args:
             states: One for each control step.
@@ -220,8 +220,8 @@ class StateSpace(Space):
             conversions: By the name of a unit that the numbers may look like, how to convert from it.
 
         Raises:
-            InputError: There are none; or names the first implausible one, its numbers, and the units that the states
-                look like.
+            InputError: There are no states; or names the first implausible state, its numbers, and the units that the
+                states seem to have.
         """
         if len(states) == 0:
             raise zero_steps(where)
@@ -238,7 +238,7 @@ class StateSpace(Space):
                 raise InputError(where=place, found=found, needed=needed, fix=". ".join(filter(None, [*looks, fix])))
 
     def require_state(self, numbers: np.ndarray, where: str) -> None:
-        """Refuse an array that is no state, or one that no robot has.
+        """Refuse an array that is not a state, or an implausible state.
 
         Raises:
             InputError: Says what was found.
@@ -250,7 +250,7 @@ class StateSpace(Space):
         self.require_plausible(numbers[None], where)
 
     def _checks(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[np.ndarray, str]]:
-        """Return, for each rule: the steps at which it is broken, and what is needed."""
+        """Return, for each rule, a mask of the steps that break it, and what is needed."""
         checks = [(~np.isfinite(states).all(axis=1), "finite numbers")]
         if self.position is not None:
             far = abs(states[:, self.position]).max(axis=1) > REACH_M
@@ -284,7 +284,7 @@ class StateSpace(Space):
 class ActionSpace(Space):
     """The numbers of an action, and how the next state follows from it."""
 
-    follows: Follows = "change"  # the state changes by it, becomes it, or nobody knows
+    follows: Follows = "change"  # change: added to the state. target: becomes the state. unknown: neither is known
 
 
 def zero_steps(where: str) -> InputError:

@@ -122,7 +122,7 @@ def test_a_run_of_vectors_plans_within_what_it_was_taught(make_config, reporter)
         with pytest.raises(InputError, match=complaint):
             load_to_plan(str(folder))
     (folder / "changes.json").unlink()
-    with pytest.raises(InputError, match=r"planning\.limits\.axes: data, of a model that does not.*of the 8 numbers"):
+    with pytest.raises(InputError, match=r"planning\.limits\.axes: data, for a model without.*of the 8 numbers"):
         Controller.of_subject(load_to_plan(str(folder)))
 
 

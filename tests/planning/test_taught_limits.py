@@ -70,7 +70,7 @@ def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config
 def test_a_run_without_it_plans_as_before_and_its_limits_cannot_be_those_of_the_data(make_config, base_folder) -> None:
     folder = write_adapted_run(make_config(planning=PLANNING))
     assert load_to_plan(str(folder)).warnings == ()
-    error = r"planning\.limits\.xyz: data, of a model or an older run.*such as planning\.limits\.xyz=\[0\.05.*inspect"
+    error = r"planning\.limits\.xyz: data, for a model or an older run.*such as planning\.limits\.xyz=\[0\.05.*inspect"
     for subject in (folder, base_folder):
         with pytest.raises(InputError, match=error):
             planning_settings(str(subject), overrides=["planning.limits.xyz=data"])

@@ -31,19 +31,20 @@ class LimitsConfig(Section):
     """Limits of every action, independent of the model. All per model step; `action_repeat` repeats it."""
 
     xyz: Literal["data"] | tuple[Metre, Metre, Metre] = (0.05, 0.05, 0.05)
-    """Largest dx, dy, dz in metres, 1 at most; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075. data: what the
-    run was taught, the 99th percentile along each axis."""
+    """Largest dx, dy, dz in metres, 1 at most; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075. data: the 99th
+    percentile of the motions in the training data, along each axis."""
     l1: Positive | None = None
     """Largest sum of the absolute dx, dy and dz in metres; longer motions are scaled down. The paper's planner has
     0.075 and no other limit of the position. null: none."""
     workspace: tuple[Corner, Corner] | None = None
-    """Corners (lowest and highest x, y, z, in metres) of the box in which every target of the flange lies: an action is
-    cut; a robot that is outside by more than one step does not move. Of poses in the base frame."""
+    """Corners (lowest and highest x, y, z, in metres) of a box for the flange; null: none. Actions are shortened so
+    that every target is inside. A robot that is outside by more than one step does not move. Only for poses in the base
+    frame."""
     rotation: Annotated[float, Field(ge=0.0, le=math.pi)] = 0.0
-    """Largest turn about each axis, in radians; 0: the rotation is held, as upstream does."""
+    """Largest rotation about each axis, in radians; 0: the rotation is fixed, as upstream."""
     axes: Literal["data"] | Annotated[tuple[NonNegative, ...], Field(min_length=1)] = "data"
-    """Of vectors only: the largest change of each number, in its own unit; one number stands for all. data: what the
-    run was taught, the 99th percentile of each number's change."""
+    """Only for vectors: the largest change of each number, in the unit of the number; a single value holds for all
+    numbers. data: the 99th percentile of each number's change in the training data."""
     gripper: ZeroToOne = 0.75
     """Largest change of the gripper's closedness."""
     gripper_mode: Literal["rounded", "free", "held", "open", "close"] = "rounded"
@@ -55,11 +56,11 @@ class LimitsConfig(Section):
         """The largest dx, dy, dz in metres.
 
         Raises:
-            InputError: They are those of the data, and no run has said which.
+            InputError: They are those of the data, and no run has recorded them.
         """
         if isinstance(self.xyz, tuple):
             return self.xyz
-        found = "data, of a model or an older run, which does not say what it was taught"
+        found = "data, for a model or an older run without a record of the motions in its training data"
         needed = "the largest dx, dy, dz in metres, such as planning.limits.xyz=[0.05,0.05,0.05]"
         fix = "`vjepa2-ac data inspect CONFIG` shows how far 99 % of the steps in your data go (line `axes`)"
         raise InputError(where="planning.limits.xyz", found=found, needed=needed, fix=fix)
@@ -81,10 +82,10 @@ class EnergyConfig(Section):
     """Distance of a prediction from the goal."""
 
     distance: Annotated[Component, ComponentOf(ENERGIES, "l1")] = Component("l1")
-    """Of predicted and goal latents. l1: mean absolute difference (upstream). l2: mean square. cosine: 1 - cosine of a
-    token. Or an energy of your own (docs/extending.md)."""
+    """Distance of predicted and goal latents. l1: mean absolute difference (upstream). l2: mean squared difference.
+    cosine: 1 - cosine similarity of each token. Or an energy of your own (docs/extending.md)."""
     steps: Literal["last", "sum"] = "last"
-    """last: of the plan's last step (upstream). sum: over all its steps."""
+    """last: the distance after the last step of the plan (upstream). sum: the sum over all steps."""
     samples_at_once: PositiveInt = 64
     """Action sequences that go through the predictor at once: bounds its memory."""
 
@@ -93,37 +94,38 @@ class PlanningConfig(Section):
     """One decision: from the current frame to an action."""
 
     planner: Annotated[Component, ComponentOf(PLANNERS, "cem")] = Component("cem")
-    """How actions are searched: cem, icem, mppi, gradient, or a planner of your own (docs/extending.md). prior: not at
-    all, the mean of `prior` is taken."""
+    """How actions are searched: cem, icem, mppi, gradient, or a planner of your own (docs/extending.md). prior: no
+    search, the plan is the mean of `prior`."""
     horizon: PositiveInt = 1
     """Model steps that a plan spans."""
     action_repeat: PositiveInt = 1
-    """Model steps for which a plan repeats an action; the horizon is a multiple of it. Each step is decided anew."""
+    """Model steps for which a plan repeats an action; the horizon is a multiple of it. Every model step makes a new
+    plan."""
     samples: Annotated[int, Field(ge=2)] = 800
-    """Action sequences an iteration; the planner gradient has its option `starts` instead."""
+    """Action sequences per iteration; the planner gradient has the option `starts` instead."""
     iterations: PositiveInt = 10
     """Iterations of sampling and fitting."""
     budget_s: Positive | None = None
-    """Seconds of search after which the best plan so far is taken: no iteration begins that would not end by then. The
-    first always runs. Encoding the frame is not counted. null: all iterations run."""
+    """Time limit of a search in seconds: an iteration that would end later is not started, and the best plan so far is
+    used. The first iteration always runs. Encoding the frame does not count. null: all iterations run."""
     prior: Local | None = None
-    """Folder of an action prior (`vjepa2-ac prior`), of which every search starts: from its mean, as wide as it is
-    unsure."""
+    """Folder of an action prior (`vjepa2-ac prior`): every search starts from the mean and standard deviation that it
+    predicts."""
     monitor: Local | None = None
-    """A monitor.json (`vjepa2-ac monitor`): each frame is compared with what the last decision predicted."""
+    """A monitor.json (`vjepa2-ac monitor`): each frame is compared with the prediction of the last decision."""
     warm_start: bool = False
-    """Whether a decision starts from the last one's plan, shifted by the steps executed. Not at horizon 1, where the
-    plan is the last action only: the arm overshoots (docs/decisions.md)."""
+    """Whether a search starts from the last plan, shifted by the executed steps. Not recommended at horizon 1, where
+    the plan is the last action only: the arm overshoots (docs/decisions.md)."""
     views: Annotated[int, Field(ge=1, le=4)] = 1
-    """Cameras whose pictures stand side by side in every image, all of one width: the model sees each by itself, and
-    the energy is the mean over them. One view leaves a direction in which near and far look alike. The model has to
-    know all of them: `data.camera` of several."""
+    """Number of cameras whose images are side by side in every frame, all of one width. The model predicts each view
+    separately, and the energy is the mean over them. A single view hardly shows depth. The model must be trained on
+    all views (`data.camera` with several names)."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
-    """blocks: torch.compile for the predictor's blocks; needs a C compiler, and a minute within the first decision. The
-    same energies to rounding."""
+    """blocks: torch.compile for the predictor's blocks; needs a C compiler, and the first decision takes a minute
+    longer. Energies are equal up to rounding."""
     axes: Local | None = None
-    """Calibrated axes of the model (`data calibrate --axes`, its axes.json): it is given what the robot does turned by
-    their angle, as its training camera would have seen it. Of poses in the base frame."""
+    """Calibrated axes of the model: the axes.json of `data calibrate --axes`. Actions and poses are rotated by the
+    calibrated angle before the model receives them. Only for poses in the base frame."""
     limits: LimitsConfig = LimitsConfig()
     """Limits of every action."""
     energy: EnergyConfig = EnergyConfig()

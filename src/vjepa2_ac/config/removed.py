@@ -12,9 +12,9 @@ class RemovedKey(NamedTuple):
     """What replaces a removed config key."""
 
     always: str
-    """The behaviour that every run has now, in words: it ends the sentence "it is always ..."."""
+    """The behaviour of every run now, as the end of the sentence "it is always ..."."""
     values: tuple[Any, ...]
-    """The plain values of the config of an older run that had the same meaning; a section is a dict."""
+    """The values in older configs that had the same meaning; a section is a dict."""
 
 
 REMOVED: dict[str, RemovedKey] = {
@@ -24,7 +24,7 @@ REMOVED: dict[str, RemovedKey] = {
     "planning.limits.gripper_from": RemovedKey("0", (0,)),
     "planning.limits.gripper_rounding": RemovedKey("0.25", (0.25,)),
     "planning.prior_steps": RemovedKey("3", (3,)),
-    "planning.goals": RemovedKey("what each goal says", ({"share": None, "stop_share": None},)),
+    "planning.goals": RemovedKey("the share of each goal", ({"share": None, "stop_share": None},)),
     "planning.replan": RemovedKey("always", ("always",)),
     "decoder.average": RemovedKey("0.999, less in a short training", (0.999, 0.998, 0.99)),
     "decoder.checkpoint_every": RemovedKey("500, or a third of decoder.steps", (500, 200)),
@@ -35,10 +35,10 @@ REMOVED: dict[str, RemovedKey] = {
     "decoder.weight_decay": RemovedKey("0.05", (0.05,)),
     "model.encoder_weights": RemovedKey("target_encoder, if the file has it", ("target_encoder",)),
     "model.encode_chunk": RemovedKey("16", (16,)),
-    "model.sizes.encoder.family": RemovedKey("v2 of a random encoder, else what the file holds", ("v2",)),
+    "model.sizes.encoder.family": RemovedKey("v2 for a random encoder, else that of the file", ("v2",)),
     "model.sizes.encoder.frame": RemovedKey("tubelet, or model.encoder.frame", ("tubelet",)),
     "model.sizes.encoder.mlp_ratio": RemovedKey("that of the published width, else 4", (48 / 11, 4.0)),
-    "model.sizes.patch_size": RemovedKey("16 of a random encoder, else what the file holds", (16,)),
+    "model.sizes.patch_size": RemovedKey("16 for a random encoder, else that of the file", (16,)),
     "model.sizes.predictor.action_dim": RemovedKey("the width of the data's actions", (7,)),
     "model.sizes.predictor.mlp_ratio": RemovedKey("4", (4.0,)),
     "model.sizes.predictor.state_dim": RemovedKey("the width of the data's states", (7,)),
@@ -50,7 +50,7 @@ REMOVED: dict[str, RemovedKey] = {
     "data.check_crc": RemovedKey("once", ("once",)),
     "data.connections": RemovedKey("16", (16,)),
     "data.droid_raw": RemovedKey("drop, at 15 Hz", ({"skip_action": "drop", "control_rate_hz": 15.0},)),
-    "data.lerobot.fps": RemovedKey("what meta/info.json says", (None,)),
+    "data.lerobot.fps": RemovedKey("the rate in meta/info.json", (None,)),
     "data.lerobot.joint_velocity": RemovedKey(
         "action.joint_velocity, if there is one", ("action.joint_velocity", None)
     ),

@@ -1,7 +1,7 @@
 """Base class of config sections: frozen, strict, every key documented; what each key affects; and components.
 
-A section has one mark: `Section.affects`, or `Annotated[…, Affects.RUN]` where it is used. A key that differs has its
-own.
+A section has one mark: `Section.affects`, or `Annotated[…, Affects.RUN]` where the section is used. A key that differs
+has a mark of its own.
 
 A component is given by its name, with options of its own: `planner: icem`, or
 `planner: {name: icem, options: {elites: 20}}`.
@@ -37,10 +37,10 @@ LocalOrBuiltin = Annotated[str, AfterValidator(places.of_a_model)]  # likewise, 
 class Affects(Flag):
     """What changes when a config key has another value."""
 
-    NOTHING = 0  # how fast, where, what is written
+    NOTHING = 0  # only speed, paths and outputs
     LATENTS = auto()  # a latent cache
-    MEASURED = auto()  # what a validation measures, besides its clips, which are compared themselves
-    RUN = auto()  # what a run computes: it does not resume with another value
+    MEASURED = auto()  # what a validation measures; the clips are compared separately
+    RUN = auto()  # the result of training: a run cannot resume with another value
     PLAN = auto()  # a decision of the planner
     CLIPS = LATENTS | MEASURED | RUN
 
@@ -48,17 +48,20 @@ class Affects(Flag):
 class Section(BaseModel):
     """A group of config keys: frozen, and unknown keys are errors."""
 
-    affects: ClassVar[Affects | None] = None  # the mark of its keys and sections that have none; None: the outer one
+    affects: ClassVar[Affects | None] = None  # the mark of keys without a mark; None: that of the outer section
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
     def refused(self, *rules: tuple[object, str]) -> Self:
-        """Return the section, for a validator; each rule says when it is broken, and what is wrong then.
+        """Return the section if no rule is broken; called by validators.
+
+        Args:
+            rules: Pairs (is_broken, message).
 
         Raises:
-            ValueError: With what is wrong by the first rule that is broken.
+            ValueError: With the message of the first broken rule.
         """
         for is_broken, why in rules:
             if is_broken:
@@ -74,7 +77,7 @@ def marks_of(section: type[BaseModel]) -> Mapping[str, Affects]:
     """Return the mark of each key of a section and of the sections in it, by its dotted key.
 
     Raises:
-        TypeError: A key has none.
+        TypeError: A key has no mark.
     """
     return dict(_marks(section, getattr(section, "affects", None), ""))
 
@@ -168,8 +171,8 @@ class ComponentOf:
     The options are checked by the `Config` class of the component when the config is read.
 
     Args:
-        registry: Of the components.
-        usual: The name that is meant where only options are given.
+        registry: The registry of the components.
+        usual: The name to use if only options are given.
     """
 
     registry: Registry

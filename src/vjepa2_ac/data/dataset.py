@@ -43,8 +43,8 @@ _MOST_EPISODES_READ = 8  # to find the widths, if some are broken
 class Removed:
     """What a filter removed, after the previous filters."""
 
-    name: str  # excluded, broken, outcome, idle
-    episodes: int  # without remaining steps
+    name: str  # of the filter: excluded, broken, outcome or idle
+    episodes: int  # number of episodes without remaining steps
     steps: int  # of episodes that could be read
     windows: int | None  # clips; None while data.stride is auto
 
@@ -66,7 +66,7 @@ class Dataset:
 
     @cached_property
     def taking_part(self) -> Bool[np.ndarray, " episodes"]:
-        """Which episodes are used, although none of their steps may be kept."""
+        """A mask of the episodes that are used; the idle filter may still remove all steps of such an episode."""
         chosen = np.asarray(included(self.table, self.config) & of_outcome(self.table, self.config))
         chosen[[place for place, _ in self.kept.problems]] = False
         return chosen
@@ -208,7 +208,7 @@ class Dataset:
         """The widths of states and actions: 7 for poses, else those of the first readable episode.
 
         Raises:
-            InputError: None of the first episodes can be read.
+            InputError: The first episodes cannot be read.
         """
         if self.config.states == "pose":
             return POSE_WIDTHS

@@ -35,11 +35,11 @@ class ProcessShare:
 
     rank: int = 0
     processes: int = 1
-    of_step: int | None = None  # micro-batches of an optimizer step, of all processes; None: one of each
+    of_step: int | None = None  # micro-batches of an optimizer step, of all processes; None: one per process
 
     @property
     def own(self) -> range:
-        """Which micro-batches of a step are its own: every so-many-th, one more than others' where that is uneven."""
+        """The micro-batches of a step that this process computes: every n-th, for n processes."""
         return range(self.rank, self.processes if self.of_step is None else self.of_step, self.processes)
 
 
@@ -70,8 +70,9 @@ def training_loader(
     start_position + m * batch_size; the process has its own of each step. If `data.broken_episodes` is skip, clips that
     cannot be read are missing from their micro-batch, which may even be empty; no other clip replaces them.
 
-    Of two data sets each has its own sequence. Clip p of the run is the second one's if floor(p * share) grows after
-    it, and that number is its position there: the share is exact in every stretch of the run, up to a clip.
+    Each of two data sets has a sequence of its own. Clip p of the run is clip floor(p * share) of the second data set
+    if floor((p + 1) * share) is larger than floor(p * share). So the share is exact in every part of the run, up to a
+    clip.
 
     If batches are prefetched to a device (`copies`), they are in pinned memory.
 
@@ -119,7 +120,7 @@ def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size
 
 
 def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tuple[int, int]]:
-    """Return the starts of those clips: (episode, first control step), in their order.
+    """Return the windows of the clips of `validation_batches`, in order: (episode, first control step).
 
     Raises:
         InputError: The split is empty.

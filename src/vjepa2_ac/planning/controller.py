@@ -52,7 +52,7 @@ class PlanningPrior(Protocol):
     """A network that proposes actions, of `planning.prior`."""
 
     def start(self, cost: WorldModelCost, wanted: Latents, remaining: int, space: SearchSpace) -> PlanStart:
-        """Return where a search towards the latents of a goal starts, with so many model steps left."""
+        """Return where a search towards the latents of a goal starts, with this number of model steps left."""
         ...
 
 
@@ -111,16 +111,16 @@ class Controller:
             world_model: A base or merged model, which is put into eval mode; or a trained one, of which a merged copy
                 plans (see `planning.model_setup`).
             config: Planning settings; None: the defaults.
-            seed: Of all decisions.
+            seed: Seed of all decisions.
             crop: As in training (`data.crop`).
             extrinsics: Pose of the camera, if the model uses it.
             spaces: What its states and actions are.
 
         Raises:
-            InputError: The model's states and actions are of other spaces, or nobody knows which state follows from an
-                action; or it needs a camera pose and none is given, or the other way round; or its blocks cannot be
-                compiled; or vectors have no limits, or a workspace; or `planning.axes` are not
-                this model's.
+            InputError: The widths of the model's states and actions do not fit `spaces`; or it is not known which state
+                follows from an action; or a camera pose is missing or not used; or the blocks cannot be compiled; or
+                limits for vectors are missing; or a workspace is set for vectors; or `planning.axes` belong to another
+                model.
         """
         self.config = config or PlanningConfig()
         self.seed, self.crop, self.spaces = seed, crop, spaces
@@ -167,7 +167,7 @@ class Controller:
     ) -> Controller:
         """Return the controller of a trained run: with its crop and, unless others are given, its settings and seed.
 
-        Limits beyond what the run was taught, and narrow data, are logged as warnings.
+        Limits beyond the motions in the training data, and low-diversity data, are logged as warnings.
 
         Raises:
             InputError: As `Controller`.
@@ -268,20 +268,19 @@ class Controller:
         samples: Float[np.ndarray, "samples steps dim"] | None = None,
         cancelled: Cancelled = lambda: False,
     ) -> Float[np.ndarray, " dim"]:
-        """Return the action of the next model step: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`).
+        """Return the action of the next model step: dx, dy, dz, three rotations, gripper (see `vjepa2_ac.episode`).
 
-        Of vectors: as many numbers as the state, what each of them changes by; targets where the model was trained on
-        recorded targets.
+        For vector states: the change of each number of the state; targets if the model was trained on recorded targets.
 
         Call it once per model step. `decision` then holds the reason.
 
         Args:
-            frame: What the camera sees, of the goal image's size.
+            frame: The current camera image, with the size of the goal image.
             state: Measured: pose and gripper, or the vector; a vector of any width where the model has no states and an
                 action is a change.
-            samples: What a policy would do, as changes of each model step (`policies.score`): the search starts from
-                their mean, as wide as they are apart. None: from `planning.prior`, if any.
-            cancelled: Asked before every iteration: whether nobody waits for the action any more.
+            samples: Actions that a policy proposes, as changes of each model step (`policies.score`): the search starts
+                from their mean and standard deviation. None: from `planning.prior`, if any.
+            cancelled: Called before every iteration; returns whether the action is no longer needed.
 
         Raises:
             InputError: The image or the state cannot be used.
@@ -309,10 +308,10 @@ class Controller:
         *,
         cancelled: Cancelled = lambda: False,
     ) -> ChunkScores:
-        """Return the energy of what somebody else would do, beside doing nothing, towards the goal that applies now.
+        """Return the energies of given action sequences and of the zero action, towards the goal that applies now.
 
-        Nothing is remembered, and nothing is planned. Limits do not apply: of a chunk that leaves them the model may
-        know nothing.
+        The controller does not plan, and its state does not change. Limits do not apply; predictions for actions beyond
+        the limits may be unreliable.
 
         Args:
             frame: As of `act`.
@@ -360,7 +359,7 @@ class Controller:
         """Return the latents of an image on the model's device; those of several views follow one another.
 
         Raises:
-            InputError: Its width is not that of so many views.
+            InputError: The width does not fit the number of views.
         """
         return self.cameras.encode(image[None])[0]
 
@@ -375,7 +374,7 @@ class Controller:
         return self._progress.after(self._goals, self._done, energy)
 
     def _goal_from(self, place: int) -> Goal:
-        """Return a goal and what follows it by count at the latest, for plans of several steps."""
+        """Return a goal and the goals that follow it after at most a given number of steps, for longer plans."""
         durations: list[int] = []
         for goal in self._goals[place:-1]:
             if goal.at_most is None:
@@ -386,7 +385,7 @@ class Controller:
     def _still(
         self, latents: Latents, progress: GoalProgress, steps: int
     ) -> tuple[Float[Tensor, " steps"], tuple[int, ...]]:
-        """Return how far the current image is from the goal of each of so many steps, and which goals these are."""
+        """Return the distance of the current image from the goal of each of the next steps, and these goals."""
         goal, done = self._goal_from(progress.place), self._done - progress.since
         wanted = goal.ahead(done, steps)
         still = distance(latents.expand_as(wanted), wanted, self._energy, goal.weights)
@@ -431,7 +430,7 @@ class Controller:
         )
 
     def _surprise(self, latents: Latents) -> Surprise | None:
-        """Return how far what is seen is from what the last decision predicted."""
+        """Return the difference between the current frame and the prediction of the last decision."""
         before = self.decision
         if self._monitor is None or before is None or before.cost is None or before.plan is None:
             return None
@@ -440,7 +439,7 @@ class Controller:
         return self._monitor.compare(predicted[0, 0], latents)
 
     def _start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
-        """Return where a search starts: what a policy or the prior says, or what is left of the last plan."""
+        """Return the start of a search: from samples of a policy, the prior, or the rest of the last plan."""
         if samples is not None:
             return PlanStart.of_samples(torch.from_numpy(np.array(samples, dtype=np.float64)), self.space)
         if self._prior is not None:
@@ -451,7 +450,7 @@ class Controller:
         return before.start_after() if before is not None and self.config.warm_start else None
 
     def _planned(self, state: np.ndarray, cost: WorldModelCost, start: PlanStart | None, cancelled: Cancelled) -> Plan:
-        """Return what a search finds, inside the workspace if there is one; the energy is of what is sent."""
+        """Return the plan of a search, inside the workspace if there is one; with the energy of the final actions."""
         generator, box = torch.Generator().manual_seed(self.seed + self._done), self._workspace
         space = self.space if box is None else box.narrowed(self.space, state)
         plan = self.planner.plan(cost, generator, start, cancelled, space)
@@ -465,10 +464,10 @@ class Controller:
         return replace(plan, actions=kept, energy=energy, evaluations=plan.evaluations + 1)
 
     def _space_with(self, gripper: GripperMode | None) -> SearchSpace:
-        """Return what a gripper mode allows.
+        """Return the search space of a gripper mode.
 
         Raises:
-            InputError: Nothing, or the robot has no gripper of its own.
+            InputError: Nothing is left to plan, or the gripper is not known.
         """
         if gripper is None:
             return self._searched[None]
@@ -484,7 +483,7 @@ class Controller:
         return space
 
     def _command(self, state: np.ndarray, change: np.ndarray) -> Float[np.ndarray, " action_dim"]:
-        """Return the action that changes the state so: the change itself, or the state that it leads to."""
+        """Return the action for a change of the state: the change itself, or the resulting state."""
         return state + change if self.spaces.action.follows == "target" else change
 
 
@@ -503,6 +502,6 @@ def _require_spaces(model: WorldModel, spaces: Spaces) -> None:
         needed = f"{spaces.widths.state} and {spaces.widths.action}, as the spaces of the data that it was trained on"
         raise InputError(where="model", found=widths_as_text(model.sizes), needed=needed)
     if spaces.action.follows == "unknown":
-        found = "commands of which nobody knows what they do to the state"
+        found = "commands whose effect on the state is not known"
         fix = "To plan, train with data.actions: difference, or with join_actions: sum or last"
         raise InputError(where="data.actions: recorded", found=found, fix=fix)

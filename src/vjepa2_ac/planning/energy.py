@@ -65,7 +65,7 @@ def patch_weights(
     """Return the weight of each patch: the mean of a mask over the patch, patches row by row, view after view.
 
     Args:
-        mask: Over the image as the model sees it (cropped), of any resolution; 1 counts, 0 does not.
+        mask: Mask over the cropped image, of any resolution; 1 for pixels that count, else 0.
         grid: Patches along one side.
 
     Raises:
@@ -90,12 +90,12 @@ class Scene:
     def seen(
         self, actions: Float[Tensor, "*batch action_dim"], states: Float[Tensor, "*batch state_dim"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch state_dim"]]:
-        """Return actions and states of the robot as they are given to the model."""
+        """Return actions and states as the model receives them: rotated by the calibrated axes, if there are any."""
         return (actions, states) if self.axes is None else (self.axes.actions(actions), self.axes.poses(states))
 
     @property
     def camera(self) -> Float[Tensor, " 6"] | None:
-        """The camera's pose as it is given to the model."""
+        """The camera's pose as the model receives it."""
         return self.extrinsics if self.axes is None or self.extrinsics is None else self.axes.poses(self.extrinsics)
 
 
@@ -232,13 +232,13 @@ class ChunkScores:
     """Energies of chunks towards a goal: lower is better."""
 
     energies: Float[np.ndarray, " chunks"]  # predicted, of each chunk
-    doing_nothing: float  # predicted, of no motion for as long
-    now: float  # of the current image, as it is
+    doing_nothing: float  # predicted energy of the zero action for the same number of steps
+    now: float  # energy of the current image
     goal: int  # index of the goal that applies
 
     @property
     def order(self) -> Int[np.ndarray, " chunks"]:
-        """The chunks, best first; of equal ones the first comes first."""
+        """The chunks, best first; equal chunks keep their order."""
         return np.argsort(self.energies, kind="stable")
 
     @property
@@ -254,7 +254,7 @@ class ChunkScores:
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the energies over the energy now; 0: the model sees no difference."""
+        """Standard deviation of the energies over the energy now; 0: the model predicts no difference."""
         return float(self.energies.std() / max(self.now, 1e-12))
 
     def as_dict(self, *, is_blind: bool) -> dict[str, Any]:

@@ -27,10 +27,10 @@ class SearchSpace:
 
     lower: Float[Tensor, "decisions dim"]
     upper: Float[Tensor, "decisions dim"]
-    std: Float[Tensor, "decisions dim"]  # of first samples, unless a planner's option says a share of it
+    std: Float[Tensor, "decisions dim"]  # of the first samples; `start_std` of a planner is a share of it
     repeat: int = 1  # model steps of a decision
     l1: float | None = None  # the largest sum of the absolute dx, dy and dz
-    gripper: int | None = None  # which number, where one is
+    gripper: int | None = None  # the index of the gripper in an action; None: not known
     gripper_rounding: float = 0.0  # changes below this are set to zero in a finished plan
 
     @property
@@ -88,16 +88,17 @@ class SearchSpace:
 
 
 def search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
-    """Return the allowed changes of a state: of a pose within the limits of an arm, of a vector within `limits.axes`.
+    """Return the allowed changes of a state: poses within the limits of an arm, vectors within `limits.axes`.
 
     Raises:
-        InputError: There are no limits for vectors, or not one for each number.
+        InputError: There are no limits for a vector, or their number is wrong.
     """
     if space.is_pose:
         return pose_space(config)
     limits, width = config.limits.axes, len(space)
     if not isinstance(limits, tuple) or len(limits) not in {1, width}:
-        found = "data, of a model that does not say what it was taught" if limits == "data" else f"{limits}"
+        without_record = "data, for a model without a record of the motions in its training data"
+        found = without_record if limits == "data" else f"{limits}"
         needed = f"the largest change of each of the {width} numbers in a model step, or one for all, such as [0.05]"
         raise InputError(where="planning.limits.axes", found=found, needed=needed)
     upper = _towards_zero(list(limits) * (width // len(limits))).repeat(config.horizon // config.action_repeat, 1)
@@ -105,7 +106,7 @@ def search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
 
 
 def pose_space(config: PlanningConfig) -> SearchSpace:
-    """Return the allowed actions of an arm: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`)."""
+    """Return the allowed actions of an arm: dx, dy, dz, three rotations, gripper (see `vjepa2_ac.episode`)."""
     limits, decisions = config.limits, config.horizon // config.action_repeat
     gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
     reach = _towards_zero([*limits.xyz_m, *[limits.rotation] * 3, gripper])
@@ -133,7 +134,7 @@ def _towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
     return torch.where(nearest.double() > exact, torch.nextafter(nearest, torch.zeros_like(nearest)), nearest)
 
 
-_NEAR_M = 1e-8  # actions are float32, and no robot measures it
+_NEAR_M = 1e-8  # rounding of float32 actions; far below the resolution of a robot
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ class Workspace:
         """Return the box of these limits; None: there is none.
 
         Raises:
-            InputError: States are no poses in the base frame.
+            InputError: States are not poses in the base frame.
         """
         if limits.workspace is None:
             return None
@@ -159,9 +160,9 @@ class Workspace:
         return cls(*(np.array(corner, dtype=np.float64) for corner in limits.workspace))
 
     def narrowed(self, space: SearchSpace, state: Float[np.ndarray, " 7"]) -> SearchSpace:
-        """Return the search space whose first decision stays inside, for each of the model steps it is repeated.
+        """Return the search space whose first decision stays inside, in each model step for which it is repeated.
 
-        From outside, along an axis, no motion farther outwards is searched; `kept` then asks for the way back.
+        From a position outside along an axis, no motion farther outwards is searched; `kept` adds the motion inside.
         """
         lower, upper = space.lower.clone(), space.upper.clone()
         room_down = torch.from_numpy(np.minimum(self.low - state[:3], 0.0)).float() / space.repeat
@@ -173,14 +174,15 @@ class Workspace:
     def kept(
         self, state: Float[np.ndarray, " 7"], actions: Float[np.ndarray, "steps 7"], limits: LimitsConfig
     ) -> Float[np.ndarray, "steps 7"]:
-        """Return actions whose targets are all inside, of a robot whom one action leads back.
+        """Return actions whose targets are all inside, for a robot that a single action can bring inside.
 
-        A target is moved to the nearest place inside; where that is more than an action may be, towards the way back.
+        A target outside is moved to the nearest position inside. If the action then exceeds its limits, it is shortened
+        towards the shortest motion that ends inside.
 
         Args:
-            state: Where the robot is.
+            state: The state of the robot.
             actions: Changes of each model step, within the limits.
-            limits: Of an action.
+            limits: The limits of an action.
         """
         kept, position = np.array(actions, dtype=np.float64), np.array(state[:3], dtype=np.float64)
         reach = np.array(limits.xyz_m)
@@ -192,7 +194,7 @@ class Workspace:
         return kept
 
     def way_back(self, position: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Return the shortest way inside; zeros from there."""
+        """Return the shortest motion that ends inside; zeros from a position inside."""
         return np.asarray(np.clip(position, self.low, self.high) - position)
 
 
