@@ -39,7 +39,7 @@ def main(data: str = "", steps: str = "60") -> None:
         print("Recording 12 episodes of the simulated arm ...")
         record_dataset(RECORDED, RecordingSpec("B", steps=33, seed=4), episodes=12)
     model, losses = train(data or str(RECORDED), int(steps))
-    print(f"The loss fell from {losses[0]:.4f} to {losses[-1]:.4f}")
+    print(f"Loss of the first step {losses[0]:.4f}, of the last {losses[-1]:.4f}")
     cast(PeftModel, model.predictor).save_pretrained("demo/examples/adapter")  # in PEFT's format
 
 

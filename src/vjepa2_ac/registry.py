@@ -74,8 +74,8 @@ class Registry:
             InputError: Several packages have registered it.
         """
         if name not in (names := self.names()):
-            known = ", ".join(map(repr, names))
-            raise ValueError(f"no {self.kind} of this name. {did_you_mean(name, names)}Known are {known}")
+            known = f"Known are {', '.join(map(repr, names))}" if names else "None is registered: is its plug-in named?"
+            raise ValueError(f"no {self.kind} of this name. {did_you_mean(name, names)}{known}")
         origins = [self._origins.get(name), *(one.value for one in installed(self.group) if one.name == name)]
         packages = {_package(origin): _module(origin) for origin in origins if origin}
         if len(packages) > 1:

@@ -150,3 +150,13 @@ def test_options_of_a_component_are_given_by_its_name_or_by_overrides() -> None:
         parse_config(VALUES, ["planning.planner.options.elite=20"], where="mine.yaml")
     with pytest.raises(InputError, match=r"planning.planner: a name, or {name: NAME, options"):
         parse_config(VALUES, ["planning.planner={elites: 20}"], where="mine.yaml")
+
+
+def test_removed_key_on_the_command_line_of_a_run_is_an_error() -> None:
+    for override, words in {
+        "training.momentum=0.9": "removed in 0.2; it is always 0.9 now",
+        "planning.cem.elites=5": "moved in 0.2, to planning.planner",
+        "planning.limits.radius=0.05": "moved in 0.2, to planning.limits.l1",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            parse_config(VALUES, [override], where="run/config.yaml", here=False)

@@ -112,19 +112,19 @@ def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, wh
         InputError: Names every key that is wrong, all at once.
     """
     given = json.loads(_as_json(values, where))
+    _keep_drawn_splits(given)
+    if not here:
+        drop_removed_keys(given, where)
+        move_norm_limit(given, where)
+        move_component_options(given, where)
     for override in overrides:
         key, separator, text = override.partition("=")
         if not separator or not key:
             raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
         _set(given, key.split("."), parse_yaml(text, where=f"override {key}"), override)
-    _keep_drawn_splits(given)
     _replace_older_keys(given)
     if isinstance(given.get("model"), dict):
         _replace_keys_of_model(given["model"])
-    if not here:
-        drop_removed_keys(given, where)
-        move_norm_limit(given, where)
-        move_component_options(given, where)
     try:
         given = with_plugins(given, where=where, here=here)
         return Config.model_validate_json(_as_json(with_complete_replay(given), where))

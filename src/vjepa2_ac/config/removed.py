@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import cache
 from typing import Any, NamedTuple
 
 logger = logging.getLogger(__name__)
@@ -25,12 +26,12 @@ REMOVED: dict[str, RemovedKey] = {
     "planning.limits.gripper_rounding": RemovedKey("0.25", (0.25,)),
     "planning.prior_steps": RemovedKey("3", (3,)),
     "planning.goals": RemovedKey("the share of each goal", ({"share": None, "stop_share": None},)),
-    "planning.replan": RemovedKey("always", ("always",)),
+    "planning.replan": RemovedKey("a new search at each decision", ("always",)),
     "decoder.average": RemovedKey("0.999, less in a short training", (0.999, 0.998, 0.99)),
     "decoder.checkpoint_every": RemovedKey("500, or a third of decoder.steps", (500, 200)),
     "decoder.held_out_frames": RemovedKey("1,000", (1_000,)),
     "decoder.max_grad_norm": RemovedKey("1", (1.0,)),
-    "decoder.noise": RemovedKey("0, no noise", (0.0,)),
+    "decoder.noise": RemovedKey("0", (0.0,)),
     "decoder.warmup_steps": RemovedKey("500, at most a 15th of decoder.steps", (500, 100, 30)),
     "decoder.weight_decay": RemovedKey("0.05", (0.05,)),
     "model.encoder_weights": RemovedKey("target_encoder, if the file has it", ("target_encoder",)),
@@ -44,12 +45,14 @@ REMOVED: dict[str, RemovedKey] = {
     "model.sizes.predictor.state_dim": RemovedKey("the width of the data's states", (7,)),
     "model.random_start": RemovedKey("persistence", ("persistence",)),
     "data.augment": RemovedKey(
-        "off; use data.transforms",
+        "off (data.transforms changes training clips)",
         ({"crop_scale": None, "crop_aspect": [0.75, 1.35], "brightness": 0.0, "contrast": 0.0, "saturation": 0.0},),
     ),
     "data.check_crc": RemovedKey("once", ("once",)),
     "data.connections": RemovedKey("16", (16,)),
-    "data.droid_raw": RemovedKey("drop, at 15 Hz", ({"skip_action": "drop", "control_rate_hz": 15.0},)),
+    "data.droid_raw": RemovedKey(
+        "15 Hz, without the steps that have no operator", ({"skip_action": "drop", "control_rate_hz": 15.0},)
+    ),
     "data.lerobot.fps": RemovedKey("the rate in meta/info.json", (None,)),
     "data.lerobot.joint_velocity": RemovedKey(
         "action.joint_velocity, if there is one", ("action.joint_velocity", None)
@@ -94,6 +97,12 @@ def why_removed(key: str) -> str | None:
     return removed and f"removed in 0.2; it is always {removed.always} now. Delete the key"
 
 
+@cache
+def _warn(text: str, *values: object) -> None:
+    """Log a warning once: a command reads the config of its run several times."""
+    logger.warning(text, *values)
+
+
 def drop_removed_keys(values: dict[str, Any], where: str) -> None:
     """Delete removed keys from the config of an older run, in place.
 
@@ -112,7 +121,7 @@ def drop_removed_keys(values: dict[str, Any], where: str) -> None:
             if not isinstance(section, dict) or name not in section:
                 continue
             if (value := section.pop(name)) not in removed.values:
-                logger.warning("%s: %s was %s; this version always uses %s", where, path, value, removed.always)
+                _warn("%s: %s was %s; this version always uses %s", where, path, str(value), removed.always)
 
 
 def move_norm_limit(values: dict[str, Any], where: str) -> None:
@@ -135,7 +144,7 @@ def move_norm_limit(values: dict[str, Any], where: str) -> None:
     limits.setdefault("l1", radius)
     if ball != "l1":
         text = "%s: planning.limits.ball was %s; this version uses the stricter planning.limits.l1: %s"
-        logger.warning(text, where, ball, limits["l1"])
+        _warn(text, where, str(ball), str(limits["l1"]))
 
 
 def move_component_options(values: dict[str, Any], where: str) -> None:
@@ -172,7 +181,7 @@ def move_component_options(values: dict[str, Any], where: str) -> None:
                 older[name] = {**(of_planner if isinstance(of_planner, dict) else {}), "start_std": start_std}
             elif name != "prior":  # which draws no samples
                 text = "%s: planning.start_std was %s; the planner %s has no such option, and uses 1"
-                logger.warning(text, where, start_std, name)
+                _warn(text, where, str(start_std), name)
         given = (older.get(name), older.get(f"{key}_options"), older.get("options"), component.get("options"))
         options = {option: one[option] for one in given if isinstance(one, dict) for option in one}
         section[key] = {**component, "options": options} if options else component

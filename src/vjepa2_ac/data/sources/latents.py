@@ -14,6 +14,7 @@ from jaxtyping import Int
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.removed import REMOVED
 from vjepa2_ac.config.section import Affects, values_that_affect
 from vjepa2_ac.data.files import fetched_data
 from vjepa2_ac.data.index import EpisodeTable, NotATableError, T
@@ -142,9 +143,15 @@ def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: s
             found = f"a folder with other things in it, such as {others[0]}"
             raise InputError(where=where, found=found, needed="a new or empty one", fix=fix) from None
         return
-    if differing := CacheKey(there.get("key") or {}).differences(key.parts):
+    parts = {name: one for name, one in (there.get("key") or {}).items() if not _is_removed(name, one, key)}
+    if differing := CacheKey(parts).differences(key.parts):
         found, needed = f"made otherwise: {'; '.join(differing)}", "a new folder, or one made with these settings"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
+
+
+def _is_removed(name: str, value: Any, key: CacheKey) -> bool:
+    """Return whether an older version wrote a config key that is removed, with the value that holds today."""
+    return name not in key.parts and name in REMOVED and value in REMOVED[name].values
 
 
 def _differences(name: str, here: Any, there: Any) -> list[str]:
