@@ -1,7 +1,8 @@
 """The latent cache: same clips in the same order; a wrong or damaged cache is refused."""
 
+import json
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -30,7 +31,7 @@ from vjepa2_ac.data.sources.latent_files import (
     pack_latents,
     unpack_latents,
 )
-from vjepa2_ac.data.sources.latents import CACHE, EPISODES, KEPT
+from vjepa2_ac.data.sources.latents import CACHE, EPISODES, KEPT, CacheKey, require_own_folder
 from vjepa2_ac.encoding import batch
 from vjepa2_ac.encoding.latent_cache import LatentCache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
@@ -391,3 +392,11 @@ def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_p
             read()
     with pytest.raises(InputError, match="no latent cache"):
         alone(through, path=str(tmp_path))
+
+
+def test_key_of_an_older_version_has_removed_config_keys_with_the_values_of_today(tmp_path: Path) -> None:
+    key = CacheKey({"decoder": {"size": "small"}})
+    for noise, is_accepted in ((0.0, True), (0.5, False)):
+        (tmp_path / "key.json").write_text(json.dumps({"key": {"decoder": {"size": "small", "noise": noise}}}))
+        with nullcontext() if is_accepted else pytest.raises(InputError, match="decoder.noise: 0.5"):
+            require_own_folder(tmp_path, "key.json", key, where="decoder.folder")

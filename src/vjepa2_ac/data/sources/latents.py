@@ -143,20 +143,14 @@ def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: s
             found = f"a folder with other things in it, such as {others[0]}"
             raise InputError(where=where, found=found, needed="a new or empty one", fix=fix) from None
         return
-    parts = {name: one for name, one in (there.get("key") or {}).items() if not _is_removed(name, one, key)}
-    if differing := CacheKey(parts).differences(key.parts):
+    if differing := CacheKey(there.get("key") or {}).differences(key.parts):
         found, needed = f"made otherwise: {'; '.join(differing)}", "a new folder, or one made with these settings"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 
-def _is_removed(name: str, value: Any, key: CacheKey) -> bool:
-    """Return whether an older version wrote a config key that is removed, with the value that holds today."""
-    return name not in key.parts and name in REMOVED and value in REMOVED[name].values
-
-
 def _differences(name: str, here: Any, there: Any) -> list[str]:
-    if here == there:
-        return []
+    if here == there or (there is None and name in REMOVED and here in REMOVED[name].values):
+        return []  # equal; or a removed config key that an older version wrote, with the value that holds today
     if isinstance(here, dict) and isinstance(there, dict):
         inner = sorted(here.keys() | there)
         return [text for key in inner for text in _differences(f"{name}.{key}", here.get(key), there.get(key))]
