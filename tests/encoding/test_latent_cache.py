@@ -398,5 +398,5 @@ def test_key_of_an_older_version_has_removed_config_keys_with_the_values_of_toda
     key = CacheKey({"decoder": {"size": "small"}})
     for noise, is_accepted in ((0.0, True), (0.5, False)):
         (tmp_path / "key.json").write_text(json.dumps({"key": {"decoder": {"size": "small", "noise": noise}}}))
-        with nullcontext() if is_accepted else pytest.raises(InputError, match="noise: 0.5"):
+        with nullcontext() if is_accepted else pytest.raises(InputError, match=r"noise: 0\.5"):
             require_own_folder(tmp_path, "key.json", key, where="decoder.folder")
