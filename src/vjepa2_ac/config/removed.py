@@ -150,7 +150,7 @@ def move_norm_limit(values: dict[str, Any], where: str) -> None:
 def move_component_options(values: dict[str, Any], where: str) -> None:
     """Move the options of planner, energy and loss in the config of an older run to their component, in place.
 
-    `planning.start_std` of a planner without this option is reported as a warning.
+    A value of the removed key start_std is reported as a warning for a planner without this option.
 
     Args:
         values: The plain values of the config.
