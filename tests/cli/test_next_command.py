@@ -2,11 +2,13 @@
 
 import argparse
 import shlex
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+import vjepa2_ac
 from vjepa2_ac.cli.evaluate import _next
 from vjepa2_ac.cli.options import QUICK_WORDS, option_words, parsed, quick_words
 from vjepa2_ac.cli.program import _parser
@@ -86,6 +88,15 @@ def test_real_data_are_never_sent_to_the_simulated_arm(monkeypatch: pytest.Monke
     parse(shlex.split(expected))
     minutes = round(50 * 12 * 256 * 2.0 / (10 * 101) / 60)  # decisions, sequences, steps, measured seconds
     assert cost == f"  (about {minutes} minutes here: 600 decisions of 256 action sequences each)"
+
+
+def test_name_of_a_model_is_no_setting_and_no_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(record, "read_simulation", lambda _: RecordedSimulation.of(RecordingSpec("B", task="pick"), 3))
+    model = shutil.copytree(Path(vjepa2_ac.__file__).parent / "assets/sim-tiny", tmp_path / "reach=1")
+    monkeypatch.chdir(tmp_path)
+    command, cost = next_of_evaluate(model.name)
+    assert command.startswith("Next: vjepa2-ac simulate reach=1 --task pick ")
+    assert cost.endswith("here: 600 decisions of 256 action sequences each)")
 
 
 def test_a_robot_is_recommended_only_after_a_measured_gain() -> None:

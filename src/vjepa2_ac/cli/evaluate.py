@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.config.model import RANDOM
@@ -17,6 +17,7 @@ from vjepa2_ac.process import is_first
 _NAMED = ("none", "up", "left", "close")  # actions from an image, whose true ones are not known
 
 if TYPE_CHECKING:
+    from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.decoding.imagine import Imagination
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.evaluation.result import About, Evaluation
@@ -144,7 +145,7 @@ def _next(measured: Evaluated, options: argparse.Namespace, seconds: Mapping[str
         if about.is_base or "no" in {verdict.conclusion for verdict in summary.verdicts[:3]}:
             words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
         elif summary.plans is None and (simulation := _simulation(about, options)):
-            words, cost = simulation, _simulation_cost(measured.evaluation, simulation, seconds)
+            words, cost = simulation.words, _simulation_cost(measured.evaluation, simulation, seconds)
         elif summary.verdicts[2].conclusion == "yes":  # a robot is not recommended without a measured gain
             words = ["serve", about.subject, *cli.option_words(options, "checkpoint"), *settings]
         else:
@@ -153,43 +154,49 @@ def _next(measured: Evaluated, options: argparse.Namespace, seconds: Mapping[str
     return [command, f"  ({cost})"] if cost else [command]
 
 
-def _simulation(about: About, options: argparse.Namespace) -> list[str]:
-    """Return the words of the command that tests a run in closed loop; none for data not made by `simulate record`."""
+class _Simulation(NamedTuple):
+    """A recommended closed loop."""
+
+    words: list[str]  # of the command, without the program's name
+    decisions: int
+    planning: PlanningConfig
+
+
+def _simulation(about: About, options: argparse.Namespace) -> _Simulation | None:
+    """Return the closed loop that tests a run; None for data that `simulate record` did not make."""
     from vjepa2_ac.distributed import is_on_cpu
     from vjepa2_ac.planning.settings import planning_settings
+    from vjepa2_ac.simulation.benchmark import BenchmarkOptions
     from vjepa2_ac.simulation.domains import Domain
     from vjepa2_ac.simulation.record import read_simulation
+    from vjepa2_ac.simulation.tasks import STEPS
 
     try:
         recorded = read_simulation(Path(about.data).resolve(strict=True))
     except (OSError, UserError):
-        return []
-    domain = recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
+        return None
+    task, domain = recorded.task or "reach", recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
     config = planning_settings(about.subject, overrides=options.overrides)
     quick = cli.quick_words(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
-    words = ["simulate", about.subject, "--task", recorded.task or "reach", "--domain", domain]
-    return [*words, *cli.option_words(options, "checkpoint"), *options.overrides, *quick]
+    overrides = [*options.overrides, *quick]
+    words = ["simulate", about.subject, "--task", task, "--domain", domain, *cli.option_words(options, "checkpoint")]
+    planning = config.planning.model_copy(update=cli.QUICK) if quick else config.planning
+    return _Simulation([*words, *overrides], BenchmarkOptions.episodes * STEPS[task], planning)
 
 
-def _simulation_cost(evaluation: Evaluation, words: Sequence[str], seconds: Mapping[str, float]) -> str:
+def _simulation_cost(evaluation: Evaluation, simulation: _Simulation, seconds: Mapping[str, float]) -> str:
     """Return how long a simulation takes on this machine, from the duration of the action ranking."""
     from vjepa2_ac.planning.planner import samples_of_iterations
-    from vjepa2_ac.planning.settings import planning_settings
     from vjepa2_ac.reporter import duration
-    from vjepa2_ac.simulation.benchmark import BenchmarkOptions
-    from vjepa2_ac.simulation.tasks import STEPS
 
     ranking = evaluation.models[evaluation.trained].ranking
-    overrides = [word for word in words if "=" in word]
-    planning = planning_settings(evaluation.about.subject, overrides=overrides).planning
-    decisions = BenchmarkOptions.episodes * next(steps for task, steps in STEPS.items() if task in words)
-    sequences = sum(samples_of_iterations(planning))
-    about = f"{counted(decisions, 'decision')} of {counted(sequences, 'action sequence')} each"
+    sequences = sum(samples_of_iterations(simulation.planning))
+    about = f"{counted(simulation.decisions, 'decision')} of {counted(sequences, 'action sequence')} each"
     ranked_s = seconds.get(f"action ranking, {evaluation.trained}")
     if ranking is None or ranked_s is None:
         return f"its time was not measured: {about}"
     prediction_s = ranked_s * int(os.environ.get("WORLD_SIZE", "1")) / (len(ranking.ranks) * (1 + 2 * ranking.samples))
-    hours = decisions * sequences * planning.horizon * prediction_s / 3600
+    hours = simulation.decisions * sequences * simulation.planning.horizon * prediction_s / 3600
     return f"{duration(hours)} here: {about}"
 
 

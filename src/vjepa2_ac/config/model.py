@@ -28,11 +28,11 @@ FramePath = Literal["tubelet", "image"]
 EncoderKey = Literal["ema_encoder", "target_encoder", "encoder"]
 
 RANDOM = "random"
-"""The value of `model.base` that stands for a fresh predictor; a folder of this name is `./random`."""
+"""The value of `model.base` for a fresh predictor; write a folder of this name as `./random`."""
 
 
-class EncoderSizes(Section):
-    """Sizes of the frozen video encoder; the defaults are those of V-JEPA 2's ViT-g/16."""
+class _EncoderShape(Section):
+    """The sizes of an encoder that a config chooses and a model file holds; the defaults are ViT-g/16's."""
 
     width: Width = 1408
     """Width of a latent."""
@@ -40,6 +40,27 @@ class EncoderSizes(Section):
     """Transformer blocks."""
     heads: Heads = 22
     """Attention heads; width / heads is the size of a head."""
+
+
+class _PredictorShape(Section):
+    """The sizes and inputs of a predictor that a config chooses and a model file holds; the defaults are released."""
+
+    width: Width = 1024
+    """Width of a token."""
+    depth: Depth = 24
+    """Transformer blocks."""
+    heads: Heads = 16
+    """Attention heads."""
+    use_extrinsics: bool = False
+    """Whether the camera pose is one more input token per time step."""
+    use_states: bool = True
+    """Whether the state is an input token of each time step. false: the states are no input, for a robot whose states
+    are not calibrated. The states of the data may then have any width."""
+
+
+class EncoderSizes(_EncoderShape):
+    """Sizes of the frozen video encoder; the defaults are those of V-JEPA 2's ViT-g/16."""
+
     mlp_ratio: Ratio = 48 / 11
     """Hidden width of the MLP over the width."""
     family: Family = "v2"
@@ -49,22 +70,11 @@ class EncoderSizes(Section):
     (with family v2.1): as one image, through patches of its own."""
 
 
-class PredictorSizes(Section):
+class PredictorSizes(_PredictorShape):
     """Sizes of the action-conditioned predictor; the defaults are the released ones."""
 
-    width: Width = 1024
-    """Width of a token."""
-    depth: Depth = 24
-    """Transformer blocks."""
-    heads: Heads = 16
-    """Attention heads."""
     mlp_ratio: Ratio = 4.0
     """Hidden width of the MLP over the width."""
-    use_extrinsics: bool = False
-    """Whether the camera pose is one more input token per time step."""
-    use_states: bool = True
-    """Whether the state is an input token of each time step. false: the model never sees the states, for a robot whose
-    states are not calibrated; those of the data may then have any width."""
     action_dim: VectorWidth = 7
     """Width of an action. Where the data's are others, its encoder is replaced by a fresh one."""
     state_dim: VectorWidth = _STATE_DIM
@@ -140,31 +150,12 @@ class ModelSizes(Section):
         )
 
 
-class EncoderSizesConfig(Section):
+class EncoderSizesConfig(_EncoderShape):
     """Sizes of a random encoder; of an official `.pt` its heads."""
 
-    width: Width = 1408
-    """Width of a latent."""
-    depth: Depth = 40
-    """Transformer blocks."""
-    heads: Heads = 22
-    """Attention heads; width / heads is the size of a head."""
 
-
-class PredictorSizesConfig(Section):
+class PredictorSizesConfig(_PredictorShape):
     """Sizes of a fresh predictor; of an official `.pt` its heads, and whether the camera pose is an input."""
-
-    width: Width = 1024
-    """Width of a token."""
-    depth: Depth = 24
-    """Transformer blocks."""
-    heads: Heads = 16
-    """Attention heads."""
-    use_extrinsics: bool = False
-    """Whether the camera pose is one more input token per time step."""
-    use_states: bool = True
-    """Whether the state is an input token of each time step. false: the model never sees the states, for a robot whose
-    states are not calibrated; those of the data may then have any width."""
 
 
 class SizesConfig(Section):

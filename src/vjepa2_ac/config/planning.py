@@ -35,7 +35,7 @@ class LimitsConfig(Section):
     percentile of the motions in the training data, along each axis."""
     l1: Positive | None = None
     """Largest sum of the absolute dx, dy and dz in metres; longer motions are scaled down. The paper's planner has
-    0.075 and no other limit of the position. null: none."""
+    0.075. null: no such limit."""
     workspace: tuple[Corner, Corner] | None = None
     """Corners (lowest and highest x, y, z, in metres) of a box for the flange; null: none. Actions are shortened so
     that every target is inside. A robot that is outside by more than one step does not move. Only for poses in the base
