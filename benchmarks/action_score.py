@@ -31,10 +31,10 @@ from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.evaluation.action_use import start_of
 from vjepa2_ac.intervals import bootstrapped
-from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.model.distances import squared_difference
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.model.state_integration import states_along
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.search_space import GRIPPER, pose_space
 from vjepa2_ac.runs.folder import is_run

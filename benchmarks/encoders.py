@@ -30,7 +30,7 @@ from vjepa2_ac.data.sources.latent_files import bytes_per_frame
 from vjepa2_ac.distributed import matmul_speed
 from vjepa2_ac.encoding.latent_cache import picture_bytes
 from vjepa2_ac.model.model_files import PUBLISHED
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.cost import GIGABYTE, count_parameters, estimate_memory
 from vjepa2_ac.training.flops import frame_flops

@@ -26,10 +26,10 @@ from torch.nn.functional import layer_norm
 
 from vjepa2_ac.config import AdapterConfig, ModelSizes, TrainingConfig
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.adapter.lora import lora_layers
+from vjepa2_ac.model.blocks import NORM_EPSILON
 from vjepa2_ac.model.checkpoints import official_name
-from vjepa2_ac.model.network.blocks import NORM_EPSILON
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import lora_layers
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.step import Objective
 
 TARGETS = ["qkv", "proj", "fc1", "fc2"]

@@ -19,9 +19,9 @@ from torch.nn.functional import layer_norm
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
 from vjepa2_ac.config.section import Component
-from vjepa2_ac.model.adapter.lora import lora_layers
 from vjepa2_ac.model.checkpoints import to_official
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import lora_layers
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Cost, Plan, Planner

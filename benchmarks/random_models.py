@@ -9,8 +9,8 @@ from unittest import mock
 import torch
 
 from vjepa2_ac.config import AdapterConfig, ModelSizes
-from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import add_adapter, lora_layers
+from vjepa2_ac.model.world_model import WorldModel
 
 _OF_AN_ADAPTER = 0.01  # standard deviation of its second matrices
 
@@ -35,5 +35,5 @@ def add_random_adapter(model: WorldModel) -> None:
 @contextmanager
 def no_fingerprints() -> Iterator[None]:
     """Let models be adapted, merged and cached without the SHA-256 of their weights: seconds that nobody asked for."""
-    with mock.patch("vjepa2_ac.model.network.world_model.fingerprint", return_value="of a benchmark"):
+    with mock.patch("vjepa2_ac.model.world_model.fingerprint", return_value="of a benchmark"):
         yield

@@ -45,7 +45,7 @@ from timing import Turns, about, add_options, introduction, prepare, profiled, r
 from train_step_variants import OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, Started, has_checkout, our_ways
 
 from vjepa2_ac.distributed import matmul_speed
-from vjepa2_ac.model.adapter.lora import trainable_report
+from vjepa2_ac.model.lora import trainable_report
 
 QUICK = {
     "layers": 1, "width": 128, "latent_dim": 128, "encoder_layers": 1, "image_size": 64, "frames": [4], "batch": ["1"],

@@ -35,7 +35,7 @@ from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.model.checkpoints import to_official
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.training.cost import ALLOWANCE, estimate_memory
 from vjepa2_ac.training.cuda_graph import GraphedMicroStep

@@ -22,9 +22,9 @@ from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import PredictionErrors, Way
-from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import merge_adapter
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.policies.train_prior import train_prior
 from vjepa2_ac.reporter import SILENT

@@ -13,7 +13,7 @@ from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.action_use import moves_of, rank_actions
 from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.spaces import ActionSpace
 
 MOVES = 32  # clips whose moves are ranked

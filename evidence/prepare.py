@@ -18,7 +18,7 @@ from vjepa2_ac.encoding.encode_dataset import encode_config, with_latents_if_the
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.export import export_run
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.domains import DOMAIN_A
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset

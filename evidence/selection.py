@@ -18,7 +18,7 @@ from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.model.adapter.lora import merge_adapter
+from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.metrics_log import read_metrics_log

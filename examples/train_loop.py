@@ -20,9 +20,9 @@ from vjepa2_ac import UserError, encode, load_model, open_dataset, read_clips
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.adapter.lora import LoraLinear
-from vjepa2_ac.model.network.predictor import KeyValueCache
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import LoraLinear
+from vjepa2_ac.model.predictor import KeyValueCache
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 RECORDED = Path("demo/examples/data")

@@ -183,7 +183,7 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     import torch._dynamo
     from torch._dynamo.utils import counters
 
-    from vjepa2_ac.model.network import compilation
+    from vjepa2_ac.model import compilation
 
     monkeypatch.setattr(compilation, "BACKEND", "eager")
     torch._dynamo.reset()

@@ -55,10 +55,13 @@ ORDERS: dict[str, list[str]] = {
         "about server",
     ],
     "model": [
-        "model_files state_integration distances",
-        "network",
-        "adapter",
-        "checkpoints",
+        "model_files state_integration distances compilation low_rank",
+        "attention",
+        "blocks",
+        "encoder predictor",
+        "world_model",
+        "lora checkpoints",
+        "adapter_folder",
     ],
     "evaluation": [
         "request result",
@@ -126,19 +129,19 @@ HOMES = {
     "matplotlib": ["inspection/sheet.py", "media/", "reports/"],
     "msgpack": ["serving/wire.py"],
     "mujoco": ["simulation/domains.py"],
-    "peft": ["model/adapter/"],
+    "peft": ["model/adapter_folder.py", "model/lora.py"],
     "pyarrow": ["data/sources/parquet.py"],
     "ray": ["encoding/ray_engine.py"],
     "rich": ["cli/console/"],
     "simplejpeg": ["media/", "simulation/droid_writer.py"],
     "tensorflow": [],
     "torchvision": [],
-    "transformers": ["model/network/"],
+    "transformers": ["model/encoder.py", "model/predictor.py"],
     "websockets": ["explore/", "serving/"],
 }  # fmt: skip
 
 MOST_PARAMETERS = 6  # of a function, without self and cls: more are a record
-OF_OTHERS = {"model/adapter/low_rank.py: forward"}  # torch.autograd.Function takes every tensor as an argument
+OF_OTHERS = {"model/low_rank.py: forward"}  # torch.autograd.Function takes every tensor as an argument
 MOST_FILES = 16  # in one folder, `__init__` included
 MOST_AT_THE_TOP, MOST_FLOORS = 31, 12  # rooms and files; lines of their order
 

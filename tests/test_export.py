@@ -20,9 +20,9 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.export import CARD, Exported, export_run
-from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.checkpoints import load_official
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import base_only
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import select_checkpoint, write_manifest

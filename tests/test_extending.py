@@ -52,7 +52,7 @@ def test_training_loads_the_core_only() -> None:
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == "", "libraries say nothing when they are imported"
     loaded = done.stdout.split()
-    assert "vjepa2_ac.model.adapter.lora" in loaded
+    assert "vjepa2_ac.model.lora" in loaded
     rooms = {name.split(".")[1] for name in loaded if "." in name}
     assert len(loaded) <= 120
     beside = "simulation init serving inspection calibration goals policies console cli export"

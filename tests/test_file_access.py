@@ -22,10 +22,10 @@ from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError, RefusedError, in_words
 from vjepa2_ac.export import export_run
-from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
-from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.checkpoints import load_base, load_official, to_official
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.policies.action_prior import ActionPrior, PriorCard, PriorSizes, load_prior, save_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.reports.metrics_json import read_metrics

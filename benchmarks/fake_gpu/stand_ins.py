@@ -19,9 +19,9 @@ from torch.utils._python_dispatch import _disable_current_modes
 from train_step_variants import Bench
 
 from vjepa2_ac.config import AdapterConfig, Config, ModelSizes
-from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network import attention
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model import attention
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
 
 FAKE = FakeTensorMode()  # one for all rows: our code keeps tables from one call to the next
 _MASK_ALIGNMENT = 16  # numbers

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.api import encode, evaluate, load_model, load_run, open_dataset, read_clips, train
     from vjepa2_ac.config.loading import load_config
     from vjepa2_ac.errors import UserError
-    from vjepa2_ac.model.network.world_model import WorldModel
+    from vjepa2_ac.model.world_model import WorldModel
     from vjepa2_ac.planning.controller import Controller
 
 __all__ = [
@@ -26,7 +26,7 @@ _NAMES = {  # the same as above, for the time of use
     "vjepa2_ac.api": ("encode", "evaluate", "load_model", "load_run", "open_dataset", "read_clips", "train"),
     "vjepa2_ac.config.loading": ("load_config",),
     "vjepa2_ac.errors": ("UserError",),
-    "vjepa2_ac.model.network.world_model": ("WorldModel",),
+    "vjepa2_ac.model.world_model": ("WorldModel",),
     "vjepa2_ac.planning.controller": ("Controller",),
 }
 

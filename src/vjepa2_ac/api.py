@@ -26,9 +26,9 @@ from vjepa2_ac.distributed import has_bf16, no_cuda, require_type_of_weights
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE, load_trained
+from vjepa2_ac.model.adapter_folder import ADAPTER_FILE, load_trained
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.subject import Subject, load_subject, run_config_of

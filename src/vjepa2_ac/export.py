@@ -18,10 +18,10 @@ from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError, counted, escaped
 from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.evaluation.summary import with_closed_loop
-from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
-from vjepa2_ac.model.adapter.lora import merge_adapter, trainable_report
+from vjepa2_ac.model.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.checkpoints import to_official
-from vjepa2_ac.model.network.world_model import widths_as_text, widths_of_model
+from vjepa2_ac.model.lora import merge_adapter, trainable_report
+from vjepa2_ac.model.world_model import widths_as_text, widths_of_model
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state, write_torch

@@ -11,7 +11,7 @@ import pytest
 
 from benches import imported
 from paths import ROOT
-from vjepa2_ac.model.network.attention import AttentionKind
+from vjepa2_ac.model.attention import AttentionKind
 
 SECTION = (ROOT / "docs/IMPLEMENTATION_NOTES.md").read_text().split("\n## On a GPU\n")[1].split("\n## ")[0]
 

@@ -23,7 +23,7 @@ from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.latents import key_of_cache
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.settings import USED, planning_settings
 from vjepa2_ac.runs.folder import check_run_folder, open_run_folder
 

@@ -21,7 +21,7 @@ from vjepa2_ac.decoding.network import as_images
 from vjepa2_ac.decoding.training import DecoderSteps, learning_rate_at, train_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import psnr
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.process import StoppedError
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 

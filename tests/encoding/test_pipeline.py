@@ -18,7 +18,7 @@ from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 
 LENGTHS = [FRAMES_AT_ONCE + 1, 3, 2 * FRAMES_AT_ONCE]
 Run = Callable[..., LatentFiles]

@@ -33,7 +33,7 @@ ACCIDENT = """
 import time
 from pathlib import Path
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.registry import TRACKERS
 
 TRACKERS.register("unused")(object)  # a plug-in registers something

@@ -21,7 +21,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject, load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.reports.metrics_json import read_metrics
 from vjepa2_ac.reports.write import Evaluated, write_evaluation

@@ -17,7 +17,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import imagined
 from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
 from vjepa2_ac.evaluation.request import EvaluationOptions
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.simulation.counterfactual import simulated_outcome
 from vjepa2_ac.spaces import actions_from_states
 

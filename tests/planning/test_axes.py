@@ -17,8 +17,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.axes import TRIED_DEGREES, fit_axes
-from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import apply_actions
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.axes import Axes
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import WorldModelCost

@@ -10,8 +10,8 @@ from tracing import tracing
 from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
 from vjepa2_ac.config.section import Component
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network import compilation
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model import compilation
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 
 pytestmark = tracing

@@ -9,7 +9,7 @@ from decisions import STATE, image
 from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_model
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance
 from vjepa2_ac.planning.planner import Planner

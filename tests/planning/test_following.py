@@ -12,7 +12,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import GripperMode, SubGoal, write_goals
 from vjepa2_ac.spaces import Spaces

@@ -23,8 +23,8 @@ from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import imagined
 from vjepa2_ac.evaluation.imagined import imagine_image
-from vjepa2_ac.model.network import compilation
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model import compilation
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, decide
 from vjepa2_ac.planning.goals import timed

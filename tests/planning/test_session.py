@@ -14,8 +14,8 @@ from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
+from vjepa2_ac.model.predictor import ActionConditionedPredictor
+from vjepa2_ac.model.world_model import WorldModel, fingerprint
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.folder import read_run_config

@@ -10,8 +10,8 @@ from decisions import STATE
 from tiny_models import actions, cost, tiny_model
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning import controller
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import prepare_for_planning

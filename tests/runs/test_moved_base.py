@@ -18,7 +18,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.export import export_run
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.training import setup

@@ -12,10 +12,10 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.export import CARD, export_run
-from vjepa2_ac.model.adapter.adapter_folder import save_trained
-from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.adapter_folder import save_trained
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.world_model import fit_heads
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import fit_heads
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import read_metrics
 from vjepa2_ac.reports.write import write_evaluation

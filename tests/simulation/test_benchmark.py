@@ -19,7 +19,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.evaluation.imagined import imagined_next
 from vjepa2_ac.media.video import read_header
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.simulation.benchmark import FILM, JOINT_FIELDS, Agent, BenchmarkOptions, film_frames, run_benchmark
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset

@@ -7,9 +7,9 @@ import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.model.adapter.adapter_folder import save_trained
-from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.adapter_folder import save_trained
 from vjepa2_ac.model.checkpoints import load_base
+from vjepa2_ac.model.lora import add_adapter
 from vjepa2_ac.runs.checkpoint import ADAPTER, RunState, write_checkpoint
 from vjepa2_ac.runs.folder import CONFIG
 

@@ -18,7 +18,7 @@ from vjepa2_ac.data.transforms import pixels_to_input, view
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.latent_cache import LatentCache
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 
 Frames = UInt8[np.ndarray, "frames height width 3"]
 Encode = Callable[[np.ndarray], torch.Tensor]  # cropped frames to latents

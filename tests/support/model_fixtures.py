@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 
 SIZES = ModelSizes(
     image_size=48,

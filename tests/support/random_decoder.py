@@ -6,7 +6,7 @@ import torch
 
 from vjepa2_ac.decoding.decoder_folder import DecoderCard, save_decoder
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 
 
 def write_decoder(folder: Path, model: WorldModel, *, encoder: str | None = None) -> Path:

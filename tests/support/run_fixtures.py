@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # the process that only hands out tests does without PyTorch,
     import torch
     from accelerate import Accelerator
 
-    from vjepa2_ac.model.network.world_model import WorldModel
+    from vjepa2_ac.model.world_model import WorldModel
     from vjepa2_ac.training.run import Run
 
 TINY = {
@@ -105,7 +105,7 @@ def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def base_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from vjepa2_ac.config import ModelSizes
-    from vjepa2_ac.model.network.world_model import WorldModel
+    from vjepa2_ac.model.world_model import WorldModel
 
     folder = tmp_path_factory.mktemp("base") / "model"
     WorldModel.random(ModelSizes.model_validate(TINY), seed=3).save_pretrained(folder)
@@ -212,7 +212,7 @@ def as_yaml(config: Config) -> str:
 @pytest.fixture
 def encoded_frames(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many frames went through the encoder, a number for each chunk."""
-    from vjepa2_ac.model.network.world_model import WorldModel
+    from vjepa2_ac.model.world_model import WorldModel
 
     counted: list[int] = []
     encode = WorldModel.encode

@@ -14,7 +14,7 @@ from ranks import Rank
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.serving.about import roboarena_metadata
 from vjepa2_ac.serving.access import Access

@@ -6,8 +6,8 @@ import torch
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
 
 LORA = {"rank": 4, "alpha": 8}
 

@@ -5,8 +5,8 @@ from torch import Tensor
 
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import EnergyConfig
-from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost
 
 TOKENS, DIM = 9, 24

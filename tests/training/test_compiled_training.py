@@ -3,7 +3,7 @@
 import pytest
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network import compilation
+from vjepa2_ac.model import compilation
 from vjepa2_ac.training.loop import train
 
 

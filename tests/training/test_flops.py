@@ -11,8 +11,8 @@ from paths import ROOT
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.flops import clip_flops, frame_flops, plan_flops
 from vjepa2_ac.training.step import Objective
 

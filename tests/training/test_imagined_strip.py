@@ -15,7 +15,7 @@ from vjepa2_ac.decoding.imagine import AS_RECORDED
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import read_image
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.validation import validate

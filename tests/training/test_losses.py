@@ -14,10 +14,10 @@ from torch.nn.functional import layer_norm, smooth_l1_loss
 from paths import GOLDEN
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes, TrainingConfig
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model import predictor
 from vjepa2_ac.model.checkpoints import load_official
-from vjepa2_ac.model.network import predictor
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.step import Objective, prediction_losses
 
 FRAMES = 7

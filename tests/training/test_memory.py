@@ -12,7 +12,7 @@ from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config, EncoderSizes, ModelSizes
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.model.adapter.lora import trainable_report
+from vjepa2_ac.model.lora import trainable_report
 from vjepa2_ac.training.cost import count_parameters, estimate_memory, ways_to_fit
 from vjepa2_ac.training.optim import make_optimizer
 

@@ -18,7 +18,7 @@ from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.export import export_run
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.world_model import widths_of_model
+from vjepa2_ac.model.world_model import widths_of_model
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train

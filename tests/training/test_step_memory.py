@@ -13,9 +13,9 @@ from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.distributed import PRECISIONS
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.adapter.low_rank import CastMatrices
-from vjepa2_ac.model.network.attention import rotary_tables
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.attention import rotary_tables
+from vjepa2_ac.model.low_rank import CastMatrices
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training import cost as cost_step
 from vjepa2_ac.training.cost import LiveStorages, measure_step
 from vjepa2_ac.training.step import Objective

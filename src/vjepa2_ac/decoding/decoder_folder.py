@@ -21,7 +21,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.model.model_files import ASSETS
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import folder_writer
 from vjepa2_ac.storage.places import BUILTIN, NO_DATA, SIMULATION_FILE
 from vjepa2_ac.storage.structured import read_json_object, record_of

@@ -22,8 +22,8 @@ from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_png
-from vjepa2_ac.model.adapter.lora import base_only
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import base_only
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import checkpoint_name
 from vjepa2_ac.runs.folder import IMAGINED
 from vjepa2_ac.storage import write_atomically

@@ -19,8 +19,8 @@ from vjepa2_ac.data.sources.latents import Encoding, LatentSource, another_cache
 from vjepa2_ac.data.transforms import Crop, pixels_to_input, split_views, view
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.encoder import ENCODE_CHUNK
-from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text
+from vjepa2_ac.model.encoder import ENCODE_CHUNK
+from vjepa2_ac.model.world_model import WorldModel, heads_to_replace, widths_as_text
 
 
 @torch.no_grad()

@@ -26,8 +26,8 @@ from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
 from vjepa2_ac.distributed import autocast
 from vjepa2_ac.episode import Episode, Progress, StoredLatents, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.encoder import ENCODE_CHUNK
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.encoder import ENCODE_CHUNK
+from vjepa2_ac.model.world_model import WorldModel
 
 FRAMES_AT_ONCE = 64  # decoded in one go: a run of a video, and 180 MB of 720p at most
 _PREFETCHED_PARTS = 2  # per thread: one in progress, and one ready

@@ -29,8 +29,8 @@ from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, Repe
 from vjepa2_ac.evaluation.measure import actions_before
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation
-from vjepa2_ac.model.adapter.lora import base_only
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import base_only
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run

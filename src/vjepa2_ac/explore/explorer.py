@@ -25,9 +25,9 @@ from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import Models
 from vjepa2_ac.explore.messages import MOST_STEPS, GoalFrame
-from vjepa2_ac.model.network.predictor import KeyValueCache
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.predictor import KeyValueCache
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.planner import Cancelled
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces

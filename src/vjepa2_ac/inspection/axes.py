@@ -31,8 +31,8 @@ from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.inspection.variants import load_named
 from vjepa2_ac.intervals import Estimate, bootstrapped, ratio
 from vjepa2_ac.media.figure import BLUE, GREY, headline, written_figure
-from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.model.distances import squared_difference
+from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.planning.axes import AXES_FORMAT, Axes, require_axes_in
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.storage.structured import utc_now

@@ -31,7 +31,7 @@ from vjepa2_ac.evaluation.measure import ONE_STEP, ClipSample, Predictor, measur
 from vjepa2_ac.evaluation.result import L1
 from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.subject import load_subject

@@ -26,6 +26,7 @@ from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes
 from vjepa2_ac.config.model import Depth, EncoderConfig, Family, FramePath, Heads, Ratio, Width
 from vjepa2_ac.episode import POSE_WIDTHS
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.blocks import mlp_ratio_of
 from vjepa2_ac.model.model_files import (
     CONFIG,
     ENCODER_NEEDED,
@@ -39,8 +40,7 @@ from vjepa2_ac.model.model_files import (
     read_encoder_origin,
     read_sizes,
 )
-from vjepa2_ac.model.network.blocks import mlp_ratio_of
-from vjepa2_ac.model.network.world_model import ENCODER, WorldModel, widths_as_text, widths_of_model
+from vjepa2_ac.model.world_model import ENCODER, WorldModel, widths_as_text, widths_of_model
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import read_json_object, record_of
 from vjepa2_ac.storage.tensors import check_tensors, open_safetensors, require_finite, require_floats

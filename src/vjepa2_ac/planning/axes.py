@@ -15,7 +15,7 @@ from torch import Tensor
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.world_model import Fingerprints
+from vjepa2_ac.model.world_model import Fingerprints
 from vjepa2_ac.spaces import euler_from_matrices, matrices_from_euler
 from vjepa2_ac.storage.structured import read_json_object, record_of
 

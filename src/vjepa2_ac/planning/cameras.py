@@ -19,7 +19,7 @@ from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.camera_check import CameraFrame, has_moved, is_uniform, newest_frames, require_contrast
 from vjepa2_ac.media.images import require_image, require_mask
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.energy import patch_weights
 from vjepa2_ac.spaces import StateSpace
 

@@ -18,8 +18,8 @@ from vjepa2_ac.data.sources.indexed_source import spaces_of
 from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import require_image
-from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.state_integration import states_along
+from vjepa2_ac.model.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.planning.axes import Axes, require_base_frame
 from vjepa2_ac.planning.cameras import Cameras, Fault
 from vjepa2_ac.planning.energy import ChunkScores, EnergyFunction, Goal, Scene, WorldModelCost, distance

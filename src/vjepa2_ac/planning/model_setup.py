@@ -10,9 +10,9 @@ import torch
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_type_of_weights
-from vjepa2_ac.model.adapter.lora import merge_adapter, unadapted_copy
-from vjepa2_ac.model.network.compilation import require_compiler
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.compilation import require_compiler
+from vjepa2_ac.model.lora import merge_adapter, unadapted_copy
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.subject import Subject, load_subject

@@ -21,7 +21,7 @@ from torch.nn.functional import gelu
 
 from vjepa2_ac import __version__
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.world_model import Fingerprints
+from vjepa2_ac.model.world_model import Fingerprints
 from vjepa2_ac.planning.cameras import Cameras
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.search_space import SearchSpace

@@ -19,7 +19,7 @@ from vjepa2_ac.data.windows import require_frames, require_stride
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.model.network.world_model import Fingerprints, WorldModel
+from vjepa2_ac.model.world_model import Fingerprints, WorldModel
 from vjepa2_ac.planning.cameras import Cameras
 from vjepa2_ac.planning.controller import Surprise
 from vjepa2_ac.planning.energy import mean_difference

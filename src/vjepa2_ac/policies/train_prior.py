@@ -25,7 +25,7 @@ from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.intervals import Estimate, ratio
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.policies.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 CHECKPOINTS = "checkpoints"  # of a run's folder
 STATE = "state.json"
 MANIFEST = "manifest.json"
-ADAPTER = "adapter"  # a folder: what `model.adapter.adapter_folder.save_trained` writes
+ADAPTER = "adapter"  # a folder: what `model.adapter_folder.save_trained` writes
 OPTIMIZER = "optimizer.pt"
 FETCHING = ".fetching-"  # a checkpoint being fetched, see `runs.mirror`
 

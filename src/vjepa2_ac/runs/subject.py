@@ -12,10 +12,10 @@ from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_of_model
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_folder import CARD, load_trained
+from vjepa2_ac.model.adapter_folder import CARD, load_trained
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.model_files import require_base_of_run
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.process import is_first
 from vjepa2_ac.runs.checkpoint import ADAPTER, BEST, NEWEST, SELECTED, SelectedCheckpoint, select_checkpoint, step_of
 from vjepa2_ac.runs.folder import MOVABLE, is_of_moved, is_run, read_run_config

@@ -32,10 +32,10 @@ from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.distributed import PRECISIONS, autocast
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.adapter.low_rank import CastMatrices
-from vjepa2_ac.model.network.attention import rotary_tables
-from vjepa2_ac.model.network.encoder import ENCODE_CHUNK
-from vjepa2_ac.model.network.predictor import LatentDynamics, PredictorNetwork, predictor_fields
+from vjepa2_ac.model.attention import rotary_tables
+from vjepa2_ac.model.encoder import ENCODE_CHUNK
+from vjepa2_ac.model.low_rank import CastMatrices
+from vjepa2_ac.model.predictor import LatentDynamics, PredictorNetwork, predictor_fields
 from vjepa2_ac.training.step import Objective
 
 Kind = Literal["cpu", "cuda"]
@@ -94,7 +94,7 @@ def meta_predictor(config: Config, sizes: ModelSizes) -> nn.Module:
         for name in predictor.unused_layers:
             predictor.get_submodule(name).requires_grad_(False)
         return predictor
-    from vjepa2_ac.model.adapter.lora import with_adapter  # PEFT takes seconds
+    from vjepa2_ac.model.lora import with_adapter  # PEFT takes seconds
 
     with torch.device("meta"):
         return with_adapter(predictor.requires_grad_(False), config.adapter)

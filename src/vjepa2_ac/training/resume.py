@@ -17,7 +17,7 @@ from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.distributed import broadcast_object, broadcast_tensors, first_only, require_same
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
+from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import (
     ADAPTER,

@@ -18,8 +18,8 @@ from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader
 from vjepa2_ac.data.streams import copies_for
 from vjepa2_ac.distributed import PRECISIONS
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.adapter.low_rank import CastMatrices
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.low_rank import CastMatrices
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.training.optim import trained_parameters
 

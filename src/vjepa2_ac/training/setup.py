@@ -26,11 +26,11 @@ from vjepa2_ac.encoding.batch import extrinsics_for
 from vjepa2_ac.encoding.encode_dataset import with_latents
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.model.adapter.adapter_folder import read_card
-from vjepa2_ac.model.adapter.lora import add_adapter, trainable_report
+from vjepa2_ac.model.adapter_folder import read_card
 from vjepa2_ac.model.checkpoints import base_sizes, load_base
-from vjepa2_ac.model.network.compilation import require_compiler
-from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
+from vjepa2_ac.model.compilation import require_compiler
+from vjepa2_ac.model.lora import add_adapter, trainable_report
+from vjepa2_ac.model.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.registry import TRAINING_HOOKS
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import ADAPTER, CHECKPOINTS, RunState, newest_checkpoint, written_state

@@ -19,8 +19,8 @@ from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.model.distances import absolute_difference
-from vjepa2_ac.model.network.predictor import KeyValueCache, LatentDynamics
-from vjepa2_ac.model.network.world_model import seed_of
+from vjepa2_ac.model.predictor import KeyValueCache, LatentDynamics
+from vjepa2_ac.model.world_model import seed_of
 from vjepa2_ac.registry import LOSSES
 from vjepa2_ac.storage import is_url
 from vjepa2_ac.training.optim import learning_rate_at

@@ -10,9 +10,9 @@ from pydantic import ValidationError
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE, CARD, load_trained, save_trained
-from vjepa2_ac.model.adapter.lora import add_adapter, knobs_of
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.adapter_folder import ADAPTER_FILE, CARD, load_trained, save_trained
+from vjepa2_ac.model.lora import add_adapter, knobs_of
+from vjepa2_ac.model.world_model import WorldModel
 
 Fresh = Callable[..., WorldModel]
 

@@ -13,10 +13,10 @@ from torch import Tensor
 from model_fixtures import tiny_inputs, tiny_model
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
-from vjepa2_ac.model.adapter.lora import add_adapter, base_only, merge_adapter, trainable_report
-from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.adapter_folder import load_trained, save_trained
+from vjepa2_ac.model.lora import add_adapter, base_only, merge_adapter, trainable_report
+from vjepa2_ac.model.predictor import ActionConditionedPredictor
+from vjepa2_ac.model.world_model import WorldModel
 
 LORA = AdapterConfig(rank=4, alpha=8.0, dropout=0.0)
 EVERYTHING = AdapterConfig(kind="none")

@@ -9,8 +9,8 @@ from peft import LoraConfig, get_peft_model
 from peft.tuners.lora import Linear
 from torch import Tensor, nn
 
-from vjepa2_ac.model.adapter.lora import LoraLinear
-from vjepa2_ac.model.adapter.low_rank import _LowRankLinear
+from vjepa2_ac.model.lora import LoraLinear
+from vjepa2_ac.model.low_rank import _LowRankLinear
 
 PLAIN = {"r": 3, "lora_alpha": 5, "use_rslora": True}
 

@@ -18,7 +18,7 @@ from vjepa2_ac.config import EncoderSizes, ModelConfig
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.model.checkpoints import load_base, load_official, to_official
 from vjepa2_ac.model.model_files import beyond_tensors, find_base
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 
 FILES = GOLDEN / "encoders"
 V2, V21 = FILES / "vjepa2_pretrained.pt", FILES / "vjepa2_1_distilled.pt"

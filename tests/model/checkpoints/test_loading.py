@@ -14,7 +14,7 @@ from tiny_models import draw, tiny_model
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes, SizesConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints import load_base, load_official
-from vjepa2_ac.model.network.world_model import ENCODER, PREDICTOR, WorldModel
+from vjepa2_ac.model.world_model import ENCODER, PREDICTOR, WorldModel
 
 
 def load_with(base: Path | str, sizes: SizesConfig) -> WorldModel:

@@ -19,7 +19,7 @@ from paths import GOLDEN
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints import load_official, official_name, to_official
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 
 
 class Reference(NamedTuple):

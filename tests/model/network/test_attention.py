@@ -11,15 +11,15 @@ from torch.utils.checkpoint import checkpoint
 
 from tracing import tracing
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network import attention
-from vjepa2_ac.model.network.attention import (
+from vjepa2_ac.model import attention
+from vjepa2_ac.model.attention import (
     AttentionKind,
     TokenLayout,
     block_causal_attention,
     rotary_tables,
     rotate,
 )
-from vjepa2_ac.model.network.blocks import Block
+from vjepa2_ac.model.blocks import Block
 
 CPU = torch.device("cpu")
 

@@ -10,8 +10,8 @@ from torch._dynamo.utils import counters
 from tracing import tracing
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.step import prediction_losses
 
 pytestmark = [pytest.mark.usefixtures("traced"), *tracing]

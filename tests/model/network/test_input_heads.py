@@ -9,11 +9,11 @@ from torch import Tensor
 from vjepa2_ac.config import AdapterConfig, ModelConfig, ModelSizes
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
-from vjepa2_ac.model.adapter.lora import add_adapter, merge_adapter
+from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model
+from vjepa2_ac.model.lora import add_adapter, merge_adapter
+from vjepa2_ac.model.predictor import ActionConditionedPredictor
+from vjepa2_ac.model.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model
 
 TINY = ModelSizes.model_validate(
     {

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
-from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.predictor import (
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.predictor import (
     ActionConditionedPredictor,
     KeyValueCache,
     PredictorConfig,
     predictor_fields,
 )
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 
 WIDE = ModelSizes(
     image_size=32,

@@ -11,10 +11,10 @@ from tiny_models import DIM, draw, tiny_model
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
-from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.attention import TokenLayout, rotary_tables
-from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model
+from vjepa2_ac.model.adapter_folder import load_trained, save_trained
+from vjepa2_ac.model.attention import TokenLayout, rotary_tables
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model
 
 STEPS, GRID = 4, 3
 LORA = AdapterConfig(rank=2, alpha=4.0)

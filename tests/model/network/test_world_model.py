@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel
 
 Fresh = Callable[..., WorldModel]
 

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from vjepa2_ac.model.network.attention import Attend, AttentionKind, RotaryTables, block_causal_attention, rotate
-from vjepa2_ac.model.network.compilation import When, compiled
+from vjepa2_ac.model.attention import Attend, AttentionKind, RotaryTables, block_causal_attention, rotate
+from vjepa2_ac.model.compilation import When, compiled
 
 NORM_EPSILON = 1e-6
 INIT_STD = 0.02

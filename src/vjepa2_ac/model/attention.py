@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
 
-from vjepa2_ac.model.network.compilation import compiled, has_triton
+from vjepa2_ac.model.compilation import compiled, has_triton
 
 THETA = 10_000
 

@@ -15,7 +15,7 @@ from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.model import VectorWidth
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError, quiet_imports
-from vjepa2_ac.model.adapter.lora import (
+from vjepa2_ac.model.lora import (
     FIX,
     NEEDED,
     adaptation_of,
@@ -26,7 +26,7 @@ from vjepa2_ac.model.adapter.lora import (
     train_everything,
     wrap,
 )
-from vjepa2_ac.model.network.world_model import WorldModel, fit_heads
+from vjepa2_ac.model.world_model import WorldModel, fit_heads
 from vjepa2_ac.storage.structured import read_json_object, record_of
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 

@@ -20,6 +20,8 @@ from torch import Tensor, nn
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.blocks import initialise
+from vjepa2_ac.model.encoder import ENCODE_CHUNK, Encoder
 from vjepa2_ac.model.model_files import (
     CONFIG,
     FORMAT,
@@ -28,9 +30,7 @@ from vjepa2_ac.model.model_files import (
     read_encoder_origin,
     read_sizes,
 )
-from vjepa2_ac.model.network.blocks import initialise
-from vjepa2_ac.model.network.encoder import ENCODE_CHUNK, Encoder
-from vjepa2_ac.model.network.predictor import (
+from vjepa2_ac.model.predictor import (
     ActionConditionedPredictor,
     LatentDynamics,
     PredictorConfig,
@@ -45,7 +45,7 @@ ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
 
 @dataclass(frozen=True)
 class Adaptation:
-    """The adaptation of the predictor by `model.adapter.lora`."""
+    """The adaptation of the predictor by `model.lora`."""
 
     kind: Literal["lora", "none"]  # as in config.AdapterConfig; none: every weight is trained
     base: str  # fingerprint of the predictor it started from
@@ -81,7 +81,7 @@ class WorldModel(LatentDynamics):
     """A frozen encoder and an action-conditioned predictor.
 
     Latents and predictions are layer-normalised over `dim` without affine, and float32 whatever the weights' type:
-    inputs are cast inside. `model.adapter.lora.add_adapter` selects the trained weights; before that there are none.
+    inputs are cast inside. `model.lora.add_adapter` selects the trained weights; before that there are none.
 
     Create one with `random`, `from_pretrained` or `model.checkpoints.load_official`.
     """

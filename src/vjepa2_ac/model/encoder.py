@@ -13,8 +13,8 @@ from torch.nn.functional import layer_norm, linear
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.config.model import FramePath
 from vjepa2_ac.errors import quiet_imports
-from vjepa2_ac.model.network.attention import TokenLayout, rotary_tables, rotate
-from vjepa2_ac.model.network.blocks import NORM_EPSILON, initialise, output_std, without_needless_autocast
+from vjepa2_ac.model.attention import TokenLayout, rotary_tables, rotate
+from vjepa2_ac.model.blocks import NORM_EPSILON, initialise, output_std, without_needless_autocast
 
 with quiet_imports():
     from transformers import VJEPA2Config

@@ -20,9 +20,9 @@ from torch import Tensor, nn
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.model import PEFT_NAMES
 from vjepa2_ac.errors import InputError, quiet_imports
-from vjepa2_ac.model.adapter.low_rank import LowRankLayer, low_rank_linear
-from vjepa2_ac.model.network.predictor import PredictorNetwork
-from vjepa2_ac.model.network.world_model import Adaptation, WorldModel, base_weights, require_trained
+from vjepa2_ac.model.low_rank import LowRankLayer, low_rank_linear
+from vjepa2_ac.model.predictor import PredictorNetwork
+from vjepa2_ac.model.world_model import Adaptation, WorldModel, base_weights, require_trained
 from vjepa2_ac.storage.structured import record_of, shown
 
 with quiet_imports():

@@ -15,9 +15,9 @@ from torch.utils.checkpoint import checkpoint
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.episode import EXTRINSICS_DIM
 from vjepa2_ac.errors import quiet_imports
-from vjepa2_ac.model.network.attention import Attend, AttentionKind, TokenLayout, rotary_tables
-from vjepa2_ac.model.network.blocks import NORM_EPSILON, Block, hidden_width, initialise, normalised
-from vjepa2_ac.model.network.compilation import When
+from vjepa2_ac.model.attention import Attend, AttentionKind, TokenLayout, rotary_tables
+from vjepa2_ac.model.blocks import NORM_EPSILON, Block, hidden_width, initialise, normalised
+from vjepa2_ac.model.compilation import When
 
 with quiet_imports():
     from transformers import PreTrainedConfig, PreTrainedModel
@@ -319,12 +319,12 @@ class LatentDynamics(nn.Module):
         predictor.has_dropout = any(isinstance(one, nn.Dropout) and one.p > 0 for one in predictor.blocks.modules())
 
     def set_compiled(self, when: When) -> None:
-        """Choose when predictor blocks are compiled (see `model.network.compilation`)."""
+        """Choose when predictor blocks are compiled (see `model.compilation`)."""
         for block in self.base_predictor.blocks:
             block.compiled = when
 
     def set_attention(self, kind: AttentionKind | Attend) -> None:
-        """Choose how the predictor computes block-causal attention (see `model.network.attention`)."""
+        """Choose how the predictor computes block-causal attention (see `model.attention`)."""
         self.base_predictor.attention = kind
 
 

@@ -1,1 +1,0 @@
-"""The adapter: LoRA on the predictor's layers, its initialisation, files and merging."""

@@ -1,1 +1,0 @@
-"""The network: encoder, predictor, and their building blocks."""
