@@ -58,6 +58,7 @@ def test_every_key_is_on_its_page_with_its_range() -> None:
         ("[a](https://x.org/y) and [b](#here)", "[a](https://x.org/y) and [b](#here)"),
         ("the [b](NOTICE) file", "the b file"),
         ("[a](nothing/there.md)", "[a](nothing/there.md)"),  # the build complains
+        ("[![a badge](https://x.org/y.svg)](LICENSE)\nb", "b"),
     ],
 )
 def test_links_lead_to_pages(text: str, expected: str) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s#]+)(#[^()\s]*)?\)")
+_BADGE = re.compile(r"\[!\[[^\]]*\]\(https://[^)]*\)\]\([^)]*\)\n?")
 _ROOT_PAGES = {
     "README.md": "index.md",
     "CHANGELOG.md": "made/changelog.md",
@@ -19,7 +20,8 @@ _ROOT_PAGES = {
 def on_site(text: str, file: str, page: str) -> str:
     """Return the text of a file with links that lead to the pages of the site.
 
-    A link to a file that has no page becomes its label; one to nothing stays, and the build complains.
+    A link to a file that has no page becomes its label. A link to a file that does not exist stays, and the build
+    reports it. Badges are removed, because the site loads nothing from the network.
 
     Args:
         text: Markdown.
@@ -38,7 +40,7 @@ def on_site(text: str, file: str, page: str) -> str:
         place, _, inside = found.partition("#")
         return f"{mark}[{label}]({os.path.relpath(place, Path(page).parent)}{'#' * bool(inside)}{inside})"
 
-    return _LINK.sub(replaced, text)
+    return _LINK.sub(replaced, _BADGE.sub("", text))
 
 
 def _page_of(path: str, anchor: str) -> str | None:
