@@ -13,8 +13,6 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 from tiny_models import tiny_model
 from vjepa2_ac.api import open_dataset
 from vjepa2_ac.cli import main
-from vjepa2_ac.planning.goals import read_goal_folder
-from vjepa2_ac.serving.about import read_kept_goals
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 QUICK = ["planning.samples=8", "planning.iterations=2", "planning.planner.options.elites=4"]
@@ -68,32 +66,6 @@ def test_an_episode_is_named_or_numbered_and_every_so_many_frames_are_taken(work
     assert named["origin"]["every"] == 10
 
 
-def test_two_photographs_find_the_episode_that_they_are_alike(
-    workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    dataset = open_dataset(workshop / "set", frames=4)
-    for index in range(2):
-        seen = np.array(dataset.source.read(index).read_frames([0, 40]))
-        seen = np.clip(seen + np.random.default_rng(0).normal(0, 4, seen.shape), 0, 255).astype(np.uint8)
-        for name, image in zip(("now", "goal"), seen, strict=True):
-            Image.fromarray(image).save(tmp_path / f"{name}.png")
-        model = ["--model", str(workshop / "model"), "--alike", str(tmp_path / "now.png"), str(tmp_path / "goal.png")]
-        status, file = goals(workshop, tmp_path / f"{index}", *model)
-        assert status == 0
-        assert file["origin"]["episode"] == dataset.table.identity(index)
-        first, second, *_, last = (goal["name"] for goal in file["goals"])
-        assert (first, second, last) == ("before closing", "closed", "the photograph")
-        photograph = read_goal_folder(tmp_path / f"{index}")[-1].image
-        np.testing.assert_array_equal(photograph, seen[1])
-    Image.fromarray(seen[0, ::2]).save(tmp_path / "now.png")
-    capsys.readouterr()
-    assert goals(workshop, tmp_path / "small", *model)[0] == 2
-    assert "now.png: 320 x 90 pixels" in capsys.readouterr().err
-    Image.fromarray(seen[1, ::2]).save(tmp_path / "goal.png")
-    assert goals(workshop, tmp_path / "small", *model)[0] == 2
-    assert "the image of the start: 320 x 90 pixels (width x height). needed: 320 x 180" in capsys.readouterr().err
-
-
 def test_plan_and_simulate_take_the_folder(workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, model = tmp_path / "goals", str(workshop / "model")
     goals(workshop, folder, "--share", "0.5")
@@ -138,8 +110,6 @@ def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
 @pytest.mark.parametrize(
     ("words", "wrong"),
     [
-        (["config.yaml", "--alike", "a.png", "b.png"], "--alike: no model"),
-        (["config.yaml", "--alike", "a.png", "b.png", "--model", "m", "--episode", "0"], "--alike: --episode, too"),
         (["config.yaml", "--episode", "9"], "--episode 9: no such episode"),
         (["config.yaml", "data.stride=auto"], "data.stride: auto"),
     ],
@@ -154,19 +124,6 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(
     assert error.startswith("error: ")
     assert wrong in error
     assert not list(tmp_path.iterdir())
-
-
-def test_language_labels_become_goals_that_a_client_may_prompt(workshop: Path, tmp_path: Path) -> None:
-    status = main(["goals", str(workshop / "config.yaml"), "--task", "BLOCK", "--out", str(tmp_path / "goals")])
-    assert status == 0
-    kept = read_kept_goals(tmp_path / "goals")
-    assert list(kept) == ["pick up the block"]
-    source = open_dataset(workshop / "set", frames=4).source
-    ends = [source.read(number).read_frames([40])[0] for number in range(2)]
-    shown = kept["pick up the block"][0].image
-    assert any(np.array_equal(shown, end) for end in ends)
-    assert main(["goals", str(workshop / "config.yaml"), "--task", "pour", "--out", str(tmp_path / "none")]) == 2
-    assert not list((tmp_path / "none").glob("*"))
 
 
 def test_a_plan_takes_its_goal_from_an_episode(whole_run: Path, data_folder: Path, tmp_path: Path) -> None:

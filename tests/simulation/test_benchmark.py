@@ -1,7 +1,6 @@
 """The closed-loop benchmark: table, metrics and video agree."""
 
 import json
-import re
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +21,6 @@ from vjepa2_ac.media.video import read_header
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.simulation.benchmark import FILM, JOINT_FIELDS, Agent, BenchmarkOptions, film_frames, run_benchmark
-from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
 
 SMALL = [
@@ -172,20 +170,3 @@ def test_goals_on_the_way_come_from_one_demonstration_of_the_same_problem(model:
     for name in ("zero action", "oracle"):
         one, *others = (run["policies"][name]["by_episode"]["distance_cm"] for run in found.values())
         assert others == [one, one], "only the model has goals on the way"
-
-
-def test_goals_come_from_the_demonstration_that_looks_like_the_problem(
-    model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    record_dataset(tmp_path / "set", RecordingSpec("A", 41, seed=3, task="pick"), episodes=1)
-    data = {"path": str(tmp_path / "set"), "frames": 4, "stride": 4, "validation_share": 0.0, "test_share": 0.0}
-    config = {"run_dir": str(tmp_path / "run"), "data": data, "model": {"base": model}}
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
-    given = ["--task", "pick", "--episodes", "1", "--steps", "1", "--films", "0", "--sub-goals", "alike"]
-    where = ["--config", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "out")]
-    assert main(["simulate", model, *given, *where, *SMALL]) == 0
-    assert metrics(tmp_path / "out")["about"]["sub_goals"] == "alike"
-    shown = capsys.readouterr().out
-    assert re.search(r"Start and goal are [\d.]+ from those of the demonstration most alike", shown)
-    assert main(["simulate", model, *given, "--out", str(tmp_path / "there")]) == 2
-    assert "needed: a run; or a model with --config" in capsys.readouterr().err

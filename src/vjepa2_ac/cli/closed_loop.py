@@ -75,9 +75,8 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add_all(group)
     cli.add_checkpoint(group, default=None)
     cli.add(group, "--config CONFIG", "for a model: the config whose `planning` is used", cli.as_local)
-    text = "goals on the way, of the oracle's solution: where gripper or arm stop, or each model step of it; alike: of"
-    text += " that episode of the model's data which begins and ends most like the problem (none)"
-    cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step", "alike"])
+    text = "goals on the way, of the oracle's solution: where gripper or arm stop, or each model step of it (none)"
+    cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
     cli.add(group, "--goals FOLDER", "goals on the way, that `vjepa2-ac goals` made, of a fixed scene", cli.as_local)
     cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
     cli.add_decoder(group, "in the video what the model imagined of each frame, a step ago")
@@ -263,16 +262,11 @@ def _run_benchmark(options: argparse.Namespace) -> int:
 
 def _require_benchmark(options: argparse.Namespace) -> None:
     """Refuse options that do not belong together, and a model that cannot plan."""
-    from vjepa2_ac.runs.folder import is_run
-
     if options.domain == "random":
         raise InputError(where="--domain random", found="a model that steers", needed="A or B")
     if options.goals is not None and options.sub_goals is not None:
         found = f"--sub-goals {options.sub_goals}, too"
         raise InputError(where=f"--goals {options.goals}", found=found, needed="one of the two")
-    if options.sub_goals == "alike" and not is_run(options.subject) and options.config is None:
-        needed = "a run; or a model with --config, whose data has the demonstrations"
-        raise InputError(where="--sub-goals alike", found=options.subject, needed=needed)
     cli.require_to_plan(options)
 
 

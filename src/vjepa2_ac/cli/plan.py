@@ -49,16 +49,10 @@ def add_goals(commands: cli.Commands) -> None:
     cli.add(parser, "source CONFIG", "the config of the data with the episode", cli.as_local)
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
     cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
-    cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
-    text = "instead: two images, for the successful episode that begins and ends most like them; it then ends in GOAL"
-    cli.add(parser, "--alike", text, nargs=2, metavar=("NOW", "GOAL"))
-    text = "instead: the last frame of a successful episode of each language label with this text, for prompts"
-    cli.add(parser, "--task TEXT", text, nargs="?", const="")
+    cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)", default="0")
     text = "instead of where the gripper changes or the arm stops: every N control steps"
     cli.add(parser, "--every N", text, cli.count)
-    cli.add(parser, "--model RUN_OR_MODEL", "the model that will plan, for --alike", cli.as_model)
     group = parser.add_argument_group("where goals lie, and when the next one follows")
-    cli.add_checkpoint(group, default=None)
     cli.add(group, "--apart N", "least frames from a stop of the arm to another goal (4)", cli.count, default=4)
     cli.add(group, "--slack N", "model steps that a goal may take fewer or more (3)", cli.whole_number(0), default=3)
     share, energy = cli.number_between(0.0, 1.0, "the energy"), "below this share of the energy at a goal's beginning"
@@ -169,18 +163,12 @@ def _goals(options: argparse.Namespace) -> None:
     """
     from vjepa2_ac.data.windows import require_stride
 
-    photographs = _photographs(options)
     cli.require_new_place(options.out)
-    if options.task is not None:
-        _goals_by_label(options)
-        return
     config = cli.read_config(options.source, options.overrides)
     stride = require_stride(config.data, to="make goals", fix="Say how many control steps it has: data.stride=4")
 
     from vjepa2_ac.cli.console.tables import goals_table
     from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals, recording_of_episode
-    from vjepa2_ac.goals.nearest import demonstrations_alike, ending_with
-    from vjepa2_ac.planning.model_setup import load_to_plan
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
     from vjepa2_ac.storage import user_can_write
@@ -188,44 +176,9 @@ def _goals(options: argparse.Namespace) -> None:
     by = "gripper" if options.every is None else "every"
     chosen = cli.record_of_options(KeyFrameOptions, options, by=by, stride=stride)
     with cli.reporter() as reporter:
-        if photographs is not None:
-            cli.say_places_elsewhere(options.model)
-            session = load_to_plan(options.model, checkpoint=options.checkpoint or "selected")
-            (recording,) = demonstrations_alike(config.data, session, [photographs], reporter)
-        else:
-            progress, views = reporter.task(INDEXING), config.planning.views
-            recording = recording_of_episode(config.data, options.episode or "0", progress, views=views)
+        progress, views = reporter.task(INDEXING), config.planning.views
+        recording = recording_of_episode(config.data, options.episode, progress, views=views)
     made = make_goals(recording, chosen)
-    if photographs is not None:
-        made = ending_with(made, photographs[1])
     with user_can_write(options.out):
         written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
     cli.show(goals_table(made), files=written)
-
-
-def _goals_by_label(options: argparse.Namespace) -> None:
-    config = cli.read_config(options.source, options.overrides)
-
-    from vjepa2_ac.goals.make_goals import goals_by_label
-
-    with cli.reporter() as reporter:
-        found, folder = goals_by_label(config.data, options.task, options.out, reporter)
-    cli.show(*(f"{label}: {episode}" for label, episode in found.items()), f"Serve them as prompts: --goals {folder}")
-
-
-def _photographs(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return start and goal to which a demonstration is to be alike; None: other ways to choose one are given."""
-    if options.alike is None:
-        return None
-    if options.model is None:
-        raise InputError(where="--alike", found="no model", needed="--model RUN_OR_MODEL")
-    others = {"--episode": options.episode, "--task": options.task is not None}
-    for name, given in others.items():
-        if given:
-            raise InputError(where="--alike", found=f"{name}, too", needed="a config alone, among whose data it looks")
-
-    from vjepa2_ac.media.images import read_image, require_image
-
-    start, goal = (read_image(path) for path in options.alike)
-    require_image(start, where=f"--alike {options.alike[0]}", like=goal)
-    return start, goal

@@ -1,1 +1,1 @@
-"""Goals from demonstrations: key frames, sub-goals, and the nearest demonstration."""
+"""Goals from demonstrations: key frames and sub-goals."""

@@ -26,16 +26,11 @@ from vjepa2_ac.goals.key_frames import (
     gripper_key_frames,
     sub_goals_of,
 )
-from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.planning.cameras import read_views, require_views
 from vjepa2_ac.planning.goals import SubGoal, write_goals
-from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
 By = Literal["gripper", "every"]
-
-_LONGEST_LABEL = 120  # letters, in the name of a file
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,46 +116,6 @@ def frame_of_episode(config: DataConfig, place: str) -> UInt8[np.ndarray, "heigh
         found = f"an episode of {counted(count, 'step')}"
         raise InputError(where=f"--goal-from {place}", found=found, needed="one of them, from 0")
     return np.asarray(episode.read_frames([int(step) if step else count - 1])[0])
-
-
-def goals_by_label(
-    config: DataConfig, text: str, folder: Path, reporter: Reporter = SILENT
-) -> tuple[dict[str, str], Path]:
-    """Write the last frame of a successful episode of each language label, a picture that has the label as its name.
-
-    `vjepa2-ac serve --goals FOLDER` then takes the label as a prompt. All episodes count where a set does not say which
-    succeeded.
-
-    Args:
-        config: The data set, and which camera.
-        text: Part of a label, in any case; empty: of all.
-        folder: New or empty.
-        reporter: Shows the progress.
-
-    Returns:
-        The episode of each label, and the folder.
-
-    Raises:
-        InputError: There is no such label, an episode cannot be read, or the folder cannot be written.
-    """
-    require_frames(config, to="make goals of")
-    dataset, found = open_dataset(config, progress=reporter.task(INDEXING)), dict[str, str]()
-    chosen = np.flatnonzero(dataset.taking_part & (dataset.table.success != 0)).tolist()
-    progress = reporter.task("looking for labels", "episodes")
-    with user_can_write(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        for done, index in enumerate(chosen, start=1):
-            episode = dataset.source.read(index)
-            label = re.sub(r"[^\w ,.'-]+", " ", episode.metadata.get("language", "")).strip(" .")[:_LONGEST_LABEL]
-            if label and label not in found and text.lower() in label.lower():
-                found[label] = dataset.table.identity(index)
-                pixels = episode.read_frames([len(episode.states) - 1])[0]
-                write_atomically(folder / f"{label}.png", encode_png(pixels))
-            progress(done, len(chosen))
-    if not found:
-        found_text = f"no successful episode with a language label that has {text!r}" if text else "no language labels"
-        raise InputError(where=config.path, found=found_text, fix="Take goals of one episode: --episode")
-    return found, folder
 
 
 @dataclass(frozen=True)

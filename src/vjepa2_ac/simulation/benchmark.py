@@ -27,7 +27,6 @@ from vjepa2_ac.goals.key_frames import (
     sub_goals_of,
     with_frames_between,
 )
-from vjepa2_ac.goals.nearest import goals_alike
 from vjepa2_ac.media.film import below_each_other, side_by_side
 from vjepa2_ac.media.video import video_library, write_video
 from vjepa2_ac.planning.controller import Controller, Decision
@@ -168,11 +167,10 @@ class Agent:
 FILM = "closed_loop.mp4"
 FORMAT = 2  # incremented when a reader of the file would have to change
 
-SubGoals = Literal["none", "demonstration", "every-step", "alike"]
+SubGoals = Literal["none", "demonstration", "every-step"]
 _HELP = {
     "demonstration": ", with key frames of the oracle's solution as sub-goals",
     "every-step": ", with each step of the oracle's solution as sub-goal",
-    "alike": ", with key frames of the nearest demonstration as sub-goals",
 }
 
 
@@ -187,7 +185,7 @@ class BenchmarkOptions:
     steps: int | None = None  # model steps of an episode; None: the task's default
     stride: int = 4  # control steps of a model step (15 per second); in a benchmark the model's
     films: int = 6  # episodes, the first ones, whose frames are stored for a video; 0: no video
-    sub_goals: SubGoals = "none"  # from key frames or every step of the expert's solution, or the nearest demonstration
+    sub_goals: SubGoals = "none"  # from key frames or every step of the expert's solution
     goals: str | None = None  # a folder of goals, the same in every problem
 
     @property
@@ -281,7 +279,7 @@ def run_benchmark(agent: Agent, options: BenchmarkOptions, reporter: Reporter = 
         reporter.task("demonstrations of all problems")
         goals = [demonstrated_goals(trial, arm, limits, options.sub_goals) for trial in trials.trials]
         trials = with_goals(trials, goals)
-    trials = with_own_goals(trials, agent, environment, options, reporter)
+    trials = with_own_goals(trials, options)
     policies = (model, ZeroActions(), RandomActions(limits, options.seed), Oracle(limits))
     return ClosedLoopBenchmark(agent, trials, try_policies(environment, policies, trials, options.films, reporter))
 
@@ -331,23 +329,15 @@ def with_goals(trials: Trials, goals: Sequence[Sequence[SubGoal]]) -> Trials:
     return replace(trials, trials=tuple(replace(trial, goals=tuple(made)) for trial, made in pairs))
 
 
-def with_own_goals(
-    trials: Trials, agent: Agent, environment: Environment, options: BenchmarkOptions, reporter: Reporter
-) -> Trials:
-    """Return trials with the sub-goals of a folder, or of the agent's nearest demonstrations, if options say so.
+def with_own_goals(trials: Trials, options: BenchmarkOptions) -> Trials:
+    """Return trials with the sub-goals of a folder, if options name one.
 
     Raises:
-        InputError: The folder or the demonstrations cannot be used.
+        InputError: The folder cannot be used.
     """
-    if options.goals is not None:
-        return with_goals(trials, [read_goal_folder(Path(options.goals))] * len(trials.trials))
-    if options.sub_goals != "alike":
+    if options.goals is None:
         return trials
-    ends = []
-    for trial in trials.trials:
-        start, info = environment.reset(seed=trial.seed, options={"problem": trial.problem, "stride": trial.stride})
-        ends.append((start.image, info["goal_image"] if trial.goal_image is None else trial.goal_image))
-    return with_goals(trials, goals_alike(agent.subject, ends, reporter))
+    return with_goals(trials, [read_goal_folder(Path(options.goals))] * len(trials.trials))
 
 
 def try_policies(

@@ -295,7 +295,7 @@ def run_world_benchmark(
     model = agent.policy(None)
     progress = reporter.task(f"{world.about.task}: {Expert.name}")
     trials, shown = find_trials(world, options, agent.subject.config.data.model_stride, progress)
-    trials = with_own_goals(trials, agent, world, options, reporter)
+    trials = with_own_goals(trials, options)
     policies = (model, ZeroActions(), RandomActions(agent.planning.limits, options.seed))
     results = try_policies(world, policies, trials, options.films, reporter)
     return ClosedLoopBenchmark(agent, trials, (*results, shown))
