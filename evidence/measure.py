@@ -26,7 +26,7 @@ from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.policies.train_prior import train_prior
+from vjepa2_ac.policies.action_prior import train_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.subject import load_subject

@@ -80,12 +80,11 @@ ORDERS: dict[str, list[str]] = {
         "server",
     ],
     "decoding": [
-        "network",
-        "decoder_folder frame_pairs",
-        "imagine training",
-        "imagined_strip",
+        "decoder",
+        "frame_pairs imagine",
+        "training",
     ],
-    "reports": ["metrics_json", "comparison", "figures", "write"],
+    "reports": ["metrics_json", "comparison", "evaluation_figures planning_figures", "write"],
     "cli": [
         "console",
         "options",

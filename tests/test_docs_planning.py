@@ -52,7 +52,7 @@ def test_the_command_runs_and_writes_what_the_page_lists(
     shown = PAGE.split("```sh\n")[1].split("```")[0].replace("\\\n", " ")
     shown = shown.replace("samples=200", "samples=12").replace("iterations=5", "iterations=1")
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("vjepa2_ac.reports.figures.planning.plot_plan", lambda _, path, *__: path)
+    monkeypatch.setattr("vjepa2_ac.reports.planning_figures.plot_plan", lambda _, path, *__: path)
     words = shlex.split(shown)
     assert words[0] == "vjepa2-ac"
     assert main([*words[1:], "--out", str(tmp_path), "--nodes", "3"]) == 0

@@ -18,7 +18,7 @@ from vjepa2_ac.config import AdapterConfig, DiskCacheConfig, EncoderConfig, Mode
 from vjepa2_ac.data.index import EpisodeTable, get_or_build
 from vjepa2_ac.data.sources.latent_files import LatentFiles
 from vjepa2_ac.data.sources.latents import EPISODES, read_tables
-from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.decoding.decoder import load_decoder
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError, RefusedError, in_words
 from vjepa2_ac.export import export_run

@@ -221,7 +221,7 @@ TRAINING_HOOKS = Registry(
     "",  # no entry points
     {
         "data.stride": "inspection.variants:StrideChoice",
-        "validation.decoder": "decoding.imagined_strip:ImaginedStrip",
+        "validation.decoder": "decoding.imagine:ImaginedStrip",
         "motion": "inspection.motion:warnings_from_index",
         "coverage": "inspection.coverage:coverage_in",
     },

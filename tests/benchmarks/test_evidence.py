@@ -14,7 +14,7 @@ import pytest
 
 from paths import ROOT
 from vjepa2_ac.config import ValidationConfig
-from vjepa2_ac.policies.train_prior import PriorOptions, train_prior
+from vjepa2_ac.policies.action_prior import PriorOptions, train_prior
 from vjepa2_ac.simulation.record import RecordingSpec
 
 pytest.importorskip("mujoco")

@@ -48,7 +48,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the image, which takes most of the time."""
-    monkeypatch.setattr("vjepa2_ac.reports.figures.planning.plot_plan", lambda _, path, *__: path)
+    monkeypatch.setattr("vjepa2_ac.reports.planning_figures.plot_plan", lambda _, path, *__: path)
 
 
 def plan(here: Path, *more: str, subject: str = "model", state: str = STATE, goal: str = "goal") -> tuple[int, dict]:
@@ -169,7 +169,7 @@ def test_a_decoder_shows_what_was_imagined_and_only_its_name_goes_into_the_file(
     folder = write_decoder(tmp_path / "decoder", tiny_model())
     drawn = []
     monkeypatch.setattr(
-        "vjepa2_ac.reports.figures.planning.plot_plan", lambda _, path, imagined: drawn.append(imagined) or path
+        "vjepa2_ac.reports.planning_figures.plot_plan", lambda _, path, imagined: drawn.append(imagined) or path
     )
     _, plain = plan(workshop, *QUICK)
     status, file = plan(workshop, *QUICK, "--decoder", str(folder))

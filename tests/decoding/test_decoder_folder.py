@@ -12,7 +12,7 @@ import torch
 
 from run_fixtures import TINY
 from vjepa2_ac.config import DataConfig, ModelSizes
-from vjepa2_ac.decoding.decoder_folder import CARD, SIMULATED, WEIGHTS, load_decoder, save_decoder
+from vjepa2_ac.decoding.decoder import CARD, SIMULATED, WEIGHTS, load_decoder, save_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage.places import NO_DATA, SIMULATION_FILE

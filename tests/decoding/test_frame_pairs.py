@@ -11,8 +11,8 @@ from decoders import EncodeSplit
 from run_fixtures import MakeConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
+from vjepa2_ac.decoding.decoder import Decoder, DecoderShape
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, measure_decoders, wanted_frames
-from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.encoding.latent_cache import needed_frames
 from vjepa2_ac.episode import no_progress
 from vjepa2_ac.errors import InputError

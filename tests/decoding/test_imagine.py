@@ -9,7 +9,7 @@ from decisions import asked, image
 from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.data.transforms import frames_as_seen, view
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import Start, rolled_out, shown
 from vjepa2_ac.evaluation.imagined import imagine_plan, imagined_next
 from vjepa2_ac.model.state_integration import counterfactual_states

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from vjepa2_ac.decoding.network import Decoder, DecoderShape
+from vjepa2_ac.decoding.decoder import Decoder, DecoderShape
 from vjepa2_ac.decoding.training import decoder_loss
 
 SIZES = ["linear", "tiny"]

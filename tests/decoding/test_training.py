@@ -15,9 +15,8 @@ from killable import KILLED, Nursery
 from run_fixtures import TINY, MakeConfig, SilentReporter, as_yaml
 from vjepa2_ac.config import DecoderConfig, ModelSizes
 from vjepa2_ac.decoding import training
-from vjepa2_ac.decoding.decoder_folder import CARD, WEIGHTS, load_decoder, read_card
+from vjepa2_ac.decoding.decoder import CARD, WEIGHTS, as_images, load_decoder, read_card
 from vjepa2_ac.decoding.frame_pairs import Pairs
-from vjepa2_ac.decoding.network import as_images
 from vjepa2_ac.decoding.training import DecoderSteps, learning_rate_at, train_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import psnr

@@ -15,8 +15,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.decoding.decoder_folder import DecoderCard, save_decoder
-from vjepa2_ac.decoding.network import Decoder, DecoderShape
+from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, DecoderShape, save_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject, load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions

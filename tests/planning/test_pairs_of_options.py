@@ -19,7 +19,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.config.section import marks_of
-from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.decoding.decoder import load_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import imagined
 from vjepa2_ac.evaluation.imagined import imagine_image

@@ -13,7 +13,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.decoding.decoder import load_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.imagined import ImagineOptions, Seen, imagine_image, imagined_next
 from vjepa2_ac.goals.make_goals import recording_of_episode

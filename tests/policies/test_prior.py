@@ -22,11 +22,12 @@ from vjepa2_ac.policies.action_prior import (
     WEIGHTS,
     ActionPrior,
     PriorCard,
+    PriorOptions,
     PriorSizes,
     load_prior,
     save_prior,
+    train_prior,
 )
-from vjepa2_ac.policies.train_prior import PriorOptions, train_prior
 
 SIZES = PriorSizes(grid=3, dim=24, state=7, action=7, ahead=3)
 MEAN = (0.03, -0.02, 0.01, 0.0, 0.0, 0.0, 0.3)

@@ -13,7 +13,7 @@ from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.summary import Conclusion
 from vjepa2_ac.reports.comparison import Comparison, compare
-from vjepa2_ac.reports.figures.evaluation import plot_comparison
+from vjepa2_ac.reports.evaluation_figures import plot_comparison
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_csv, write_metrics
 from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 

@@ -15,7 +15,7 @@ pytest.importorskip("av", reason="the extra `video` is not installed")
 from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
-from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.decoding.decoder import load_decoder
 from vjepa2_ac.evaluation.imagined import imagined_next
 from vjepa2_ac.media.video import read_header
 from vjepa2_ac.model.world_model import WorldModel

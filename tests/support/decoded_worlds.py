@@ -8,8 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from vjepa2_ac.decoding.decoder_folder import DecoderCard, TrainedDecoder
-from vjepa2_ac.decoding.network import Decoder, DecoderShape, as_pixels
+from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, DecoderShape, TrainedDecoder, as_pixels
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.evaluate import Contender, RepeatableClips
 from worlds import DIM, TOKENS, in_batches, rows

@@ -8,7 +8,7 @@ from run_fixtures import tiny_config
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
 from vjepa2_ac.evaluation.evaluate_run import Models, load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.explore.explorer import Explorer, open_explorer

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import torch
 
-from vjepa2_ac.decoding.decoder_folder import DecoderCard, save_decoder
-from vjepa2_ac.decoding.network import Decoder, DecoderShape
+from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, DecoderShape, save_decoder
 from vjepa2_ac.model.world_model import WorldModel
 
 

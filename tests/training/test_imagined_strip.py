@@ -10,7 +10,7 @@ from run_fixtures import set_up
 from same_run import assert_same_run
 from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.decoding import imagined_strip
-from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.decoding.decoder import load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import read_image

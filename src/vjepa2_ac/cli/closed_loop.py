@@ -339,7 +339,7 @@ def _evaluate_command(options: argparse.Namespace) -> str:
 
 def _agent(options: argparse.Namespace) -> Agent:
     """Load the model, and the decoder by which videos show predicted frames."""
-    from vjepa2_ac.decoding.decoder_folder import SIMULATED
+    from vjepa2_ac.decoding.decoder import SIMULATED
     from vjepa2_ac.evaluation.imagined import imagined_next
     from vjepa2_ac.simulation.benchmark import Agent
 

@@ -226,7 +226,7 @@ def _compare(options: argparse.Namespace) -> None:
     comparison = compare(options.runs)
 
     from vjepa2_ac.cli.console.tables import row_tables
-    from vjepa2_ac.reports.figures.evaluation import plot_comparison
+    from vjepa2_ac.reports.evaluation_figures import plot_comparison
     from vjepa2_ac.reports.metrics_json import write_csv
 
     tables = row_tables(comparison.rows, comparison.title) if options.all else []

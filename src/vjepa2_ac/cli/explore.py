@@ -21,7 +21,7 @@ from vjepa2_ac.storage.places import BUILTIN
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
-    from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+    from vjepa2_ac.decoding.decoder import TrainedDecoder
     from vjepa2_ac.explore.views import Views
     from vjepa2_ac.reporter import Reporter
     from vjepa2_ac.serving.access import Access
@@ -122,7 +122,7 @@ def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
 
 def _decoder(subject: str, options: argparse.Namespace) -> TrainedDecoder:
     """Load the decoder: the given one, or the one next to the run, or that of the package."""
-    from vjepa2_ac.decoding.decoder_folder import CARD, load_decoder
+    from vjepa2_ac.decoding.decoder import CARD, load_decoder
 
     folder = Path(subject).parent / "decoder"
     return load_decoder(options.decoder or (folder if (folder / CARD).is_file() else _BUILTIN_MODEL))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.config import Config
     from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.data.dataset import Dataset
-    from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+    from vjepa2_ac.decoding.decoder import TrainedDecoder
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.runs.subject import Subject
     from vjepa2_ac.serving.access import Access
@@ -332,7 +332,7 @@ def write_json(path: Path, values: Any) -> Path:
 
 def given_decoder(options: argparse.Namespace) -> TrainedDecoder | None:
     """Load the decoder of `--decoder`, before the model that it is for."""
-    from vjepa2_ac.decoding.decoder_folder import load_decoder
+    from vjepa2_ac.decoding.decoder import load_decoder
 
     return None if options.decoder is None else load_decoder(options.decoder)
 

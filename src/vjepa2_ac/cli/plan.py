@@ -82,7 +82,7 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.evaluation.imagined import imagine_plan
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
-    from vjepa2_ac.reports.figures.planning import PLAN_IMAGE, plot_plan
+    from vjepa2_ac.reports.planning_figures import PLAN_IMAGE, plot_plan
     from vjepa2_ac.storage import user_can_write
 
     decoder = cli.given_decoder(options)
@@ -170,7 +170,7 @@ def _goals(options: argparse.Namespace) -> None:
     from vjepa2_ac.cli.console.tables import goals_table
     from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals, recording_of_episode
     from vjepa2_ac.reporter import INDEXING
-    from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
+    from vjepa2_ac.reports.planning_figures import GOALS_IMAGE, plot_goals
     from vjepa2_ac.storage import user_can_write
 
     by = "gripper" if options.every is None else "every"

@@ -108,7 +108,7 @@ def _monitor(options: argparse.Namespace) -> int:
     from vjepa2_ac.cli.console.tables import watched_table
     from vjepa2_ac.goals.make_goals import number_of_episode
     from vjepa2_ac.policies.monitor import MONITOR, Monitor, calibrate_monitor, watch_episodes
-    from vjepa2_ac.reports.figures.planning import MONITOR_IMAGE, most_surprising, plot_watched
+    from vjepa2_ac.reports.planning_figures import MONITOR_IMAGE, most_surprising, plot_watched
 
     session = cli.load_planning_session(options)
     model, files = session.world_model, []
@@ -149,7 +149,7 @@ def _prior(options: argparse.Namespace) -> None:
     file = Path(options.subject) / CONFIG if run else options.subject
     config = cli.read_config(file, options.overrides, base=True, of_run=run)
 
-    from vjepa2_ac.policies.train_prior import PriorOptions, train_prior
+    from vjepa2_ac.policies.action_prior import PriorOptions, train_prior
 
     folder = options.out or Path(options.subject if run else config.run_dir) / "prior"
     with cli.reporter() as reporter:

@@ -136,7 +136,7 @@ def _decoder(options: argparse.Namespace) -> None:
     config = cli.read_config(options.config, options.overrides, base=True)
 
     from vjepa2_ac.cli.console.tables import held_out_table
-    from vjepa2_ac.decoding.decoder_folder import read_card
+    from vjepa2_ac.decoding.decoder import read_card
     from vjepa2_ac.decoding.training import train_decoder
 
     with cli.reporter() as reporter:

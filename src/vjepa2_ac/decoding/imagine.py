@@ -1,4 +1,4 @@
-"""Rollouts from one frame as images: a strip, a video and a GIF, under any actions.
+"""Rollouts from one frame as images, under any actions: a strip, a video and a GIF; and the strip of a validation.
 
 The first frame and its state are given; nothing after them is. The states along the way are integrated from the first
 one: those of a recording would tell a model what did happen.
@@ -6,8 +6,9 @@ one: those of a recording would tell a model what did happen.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
@@ -16,18 +17,26 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.decoding.decoder_folder import DecoderCard
-from vjepa2_ac.decoding.network import Decoder, as_pixels
-from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.dataset import Dataset, frames_of
+from vjepa2_ac.data.transforms import frames_as_seen
+from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, TrainedDecoder, as_pixels, load_decoder
+from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.media.film import FilmStrip, StripRow, draw_strip, film_frames, loop_of
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import write_gif, write_video
+from vjepa2_ac.model.lora import base_only
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.runs.checkpoint import checkpoint_name
+from vjepa2_ac.runs.folder import IMAGINED
 from vjepa2_ac.spaces import StateSpace
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import json_text
+
+logger = logging.getLogger(__name__)
 
 Actions = Float[np.ndarray, "steps action_dim"]
 Image = UInt8[np.ndarray, "size size 3"]  # as the encoder sees it
@@ -221,3 +230,90 @@ def _as_dict(imagination: Imagination) -> dict[str, object]:
         ],
         "notes": list(imagination.notes),
     }
+
+
+class ImaginedStrip:
+    """The strip of a validation, a hook of training: what base and model predict for one clip, and the true frames.
+
+    The clip is always the same: the validation clip with the most motion (with several processes: of rank 0's clips).
+    Nothing that fails here ends a run: the strip is left out with a warning.
+
+    Args:
+        config: The run, whose decoder is loaded.
+
+    Raises:
+        InputError: `validation.decoder` is no decoder.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._decoder: TrainedDecoder = load_decoder(str(config.validation.decoder), where="validation.decoder:")
+        self._most = -1.0  # motion of a clip
+        self._clip: tuple[Batch, int, LatentBatch] | None = None  # its row in a batch; its latents and states alone
+        self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # what happened; read once
+
+    def require_fit(self, world_model: WorldModel, config: Config) -> None:
+        """Refuse a decoder of another encoder or camera.
+
+        Raises:
+            InputError: Names both.
+        """
+        self._decoder.require_fit(world_model, config.data, subject=config.model.base)
+
+    def seen(self, dataset: Dataset, batch: Batch, encoded: LatentBatch) -> None:
+        """Look for the clip with the most motion in a batch of validation clips and its latents."""
+        self._dataset = dataset
+        for row, states in enumerate(encoded.states.double().cpu().numpy()):
+            motion = dataset.spaces.state.path_length(states)
+            if motion > self._most:
+                clip = encoded.clip(row)
+                own = replace(clip, latents=clip.latents.detach().float().cpu().clone())  # or all clips would stay
+                self._most, self._clip = motion, (replace(batch, latents=None, on_device=None), row, own)
+
+    def draw(self, world_model: WorldModel, device: torch.device, run: Path, step: int) -> np.ndarray | None:
+        """Write RUN/imagined/step-XXXXXXXX.png; return the image, None if none was drawn."""
+        try:
+            image = draw_strip(strip_of(self.imagine(world_model, device, f"{run.name}, step {step:,}")))
+            (run / IMAGINED).mkdir(exist_ok=True)
+            write_atomically(run / IMAGINED / f"{checkpoint_name(step)}.png", encode_png(image))
+        except Exception as error:  # an image is not worth a run
+            logger.warning("The predictions at step %d could not be drawn: %s", step, error)
+            return None
+        return image
+
+    @torch.no_grad()
+    def imagine(self, world_model: WorldModel, device: torch.device, subject: str) -> Imagination:
+        """Return what the model imagines of the clip, and the base where an adapter can be switched off.
+
+        Raises:
+            ValueError: No clip was seen.
+        """
+        if self._clip is None:
+            raise ValueError("no clip was seen")
+        batch, row, clip = self._clip
+        if self._frames is None:
+            self._frames = frames_as_seen(frames_of(self._dataset, batch, row), world_model.image_size)
+        decoder, latents = self._decoder.to(device).decoder, clip.latents.to(device)
+        actions, states = (values[0].double().cpu().numpy() for values in (clip.actions, clip.states))
+        start = Start.of(replace(clip, latents=latents), self._dataset.spaces.state)
+        world_model.eval()
+
+        def rollout(name: str) -> Imagined:
+            rolled = rolled_out(world_model.rollout, start, actions, states[:-1])
+            return Imagined(name, AS_RECORDED, actions, shown(decoder, rolled))
+
+        rollouts, adaptation = [rollout("model now")], world_model.adaptation
+        if adaptation is not None and adaptation.kind == "lora" and world_model.fresh_heads is None:
+            with base_only(world_model):
+                rollouts.insert(0, rollout("base"))
+        decoded = shown(decoder, latents[0])
+        return Imagination(
+            subject=subject,
+            episode_id=batch.episode_ids[row],
+            start=batch.starts[row],
+            seconds_per_step=self._dataset.config.model_stride / self._dataset.control_rate_hz,
+            first=self._frames[0],
+            decoded_first=decoded[0],
+            rollouts=tuple(rollouts),
+            truth=self._frames[1:],
+            decoded_truth=decoded[1:],
+        )

@@ -27,9 +27,18 @@ from vjepa2_ac.data.sources.latent_files import LatentFiles, bytes_per_frame
 from vjepa2_ac.data.sources.latents import CacheKey, Encoding, require_own_folder
 from vjepa2_ac.data.splits import SPLIT
 from vjepa2_ac.data.windows import permuted, require_frames, require_stride
-from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, read_card, save_decoder
+from vjepa2_ac.decoding.decoder import (
+    CARD,
+    UPSAMPLED,
+    Decoder,
+    DecoderCard,
+    DecoderShape,
+    Images,
+    as_images,
+    read_card,
+    save_decoder,
+)
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
-from vjepa2_ac.decoding.network import UPSAMPLED, Decoder, DecoderShape, Images, as_images
 from vjepa2_ac.distributed import autocast, computing_device
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in, require_space

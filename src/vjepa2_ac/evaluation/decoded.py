@@ -21,8 +21,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-from vjepa2_ac.decoding.network import as_images, as_pixels
+from vjepa2_ac.decoding.decoder import TrainedDecoder, as_images, as_pixels
 from vjepa2_ac.distributed import gathered
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.distribution import frechet_distance

@@ -17,8 +17,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, frames_of, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.transforms import frames_as_seen, pixels_to_input
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
-from vjepa2_ac.decoding.network import as_pixels
+from vjepa2_ac.decoding.decoder import TrainedDecoder, as_pixels, load_decoder
 from vjepa2_ac.distributed import first_of_machine, first_only, joined, own_part, sharing
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there

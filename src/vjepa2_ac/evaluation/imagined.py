@@ -16,7 +16,7 @@ from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.sources.indexed_source import measured_space
 from vjepa2_ac.data.transforms import frames_as_seen, split_views, view
 from vjepa2_ac.data.windows import require_frames, spread_with_ends
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown, worth_knowing
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames

@@ -18,7 +18,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.data.windows import require_frames
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+from vjepa2_ac.decoding.decoder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames

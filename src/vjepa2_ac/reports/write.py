@@ -28,7 +28,7 @@ from vjepa2_ac.evaluation.summary import Summary, Verdict, interval_of, percent,
 from vjepa2_ac.media.figure import svg_of, visible
 from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_webp
-from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation
+from vjepa2_ac.reports.evaluation_figures import decoded_strip, drawings, example_strip, plot_evaluation
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, not_measured, write_csv, write_metrics
 from vjepa2_ac.storage import write_atomically
 

@@ -40,7 +40,7 @@ class Run:
     micro_batches: int  # of an optimizer step, of all processes together
     calibration: Mapping[str, Any] | None = None  # if data.stride was auto and was chosen in this start
     replayed: Dataset | None = None  # the second data set, if there is one
-    strip: Any = None  # the hook `validation.decoder`: decoding.imagined_strip.ImaginedStrip
+    strip: Any = None  # the hook `validation.decoder`: decoding.imagine.ImaginedStrip
 
     @property
     def folder(self) -> Path:

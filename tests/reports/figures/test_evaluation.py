@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from evaluation_results import decoded_strips, evaluation
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import Comparison
-from vjepa2_ac.reports.figures.evaluation import draw_decoded, plot_comparison, plot_evaluation
+from vjepa2_ac.reports.evaluation_figures import draw_decoded, plot_comparison, plot_evaluation
 
 NAMES = ("runs/lora", "_hidden", r"$\frac$", *(f"run {number}" for number in range(10)))
 

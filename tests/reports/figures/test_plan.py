@@ -8,10 +8,10 @@ from PIL import Image
 from decisions import asked, image
 from random_decoder import write_decoder
 from tiny_models import tiny_model
-from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.decoding.decoder import load_decoder
 from vjepa2_ac.evaluation.imagined import imagine_plan
 from vjepa2_ac.planning.decision import PlanResult
-from vjepa2_ac.reports.figures.planning import plot_plan
+from vjepa2_ac.reports.planning_figures import plot_plan
 
 
 def drawn(found: PlanResult, folder: Path) -> np.ndarray:

@@ -17,7 +17,7 @@ from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:
-    from vjepa2_ac.decoding.decoder_folder import DecoderCard
+    from vjepa2_ac.decoding.decoder import DecoderCard
     from vjepa2_ac.goals.make_goals import MadeGoals
     from vjepa2_ac.inspection.findings import Finding
     from vjepa2_ac.inspection.statistics import StepSizes

@@ -1,1 +1,0 @@
-"""Figures of results, data and plans, drawn with matplotlib."""
