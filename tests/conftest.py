@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
-import missing
 import shape_checks
 
 # Where arrays change shape, each call with arrays is checked while testing. In the other packages it would double the
@@ -23,15 +23,10 @@ CHECKED = [
     "vjepa2_ac.evaluation.action_use",
     "vjepa2_ac.simulation.motion",
 ]
-ABSENT = missing.absent(os.environ)
-if missing.SHAPES not in ABSENT:
-    shape_checks.install(CHECKED, "beartype.beartype")
-if missing.is_installed("hypothesis"):
-    from hypothesis import HealthCheck, settings
-
-    # A busy machine is slow, and that is no fault of what is tested.
-    settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-    settings.load_profile("busy")
+shape_checks.install(CHECKED, "beartype.beartype")
+# A busy machine is slow, and that is no fault of what is tested.
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 
 import gcs as gcs_server  # noqa: E402 - the hook comes first
 from data_fixtures import droid, spoiled  # noqa: E402, F401 - fixtures for every folder
@@ -63,8 +58,7 @@ LONGEST = (
 SLOW = (
     "benchmarks/", "distributed/test_nothing_hangs", "distributed/test_shared_work", "explore/test_command",
     "explore/test_page_in_browser", "judge/", "reports/test_page_in_browser", "serving/test_real_client",
-    "test_extending", "test_missing",
-    "test_notebook", "test_quickstart", "test_site", "test_spot", "test_sweeps", "test_wheel",
+    "test_extending", "test_notebook", "test_quickstart", "test_site", "test_spot", "test_sweeps", "test_wheel",
     "training/test_soak",
 )  # fmt: skip
 """Whole programs: `make test-slow`."""
@@ -78,11 +72,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if name.startswith(SLOW) or "test_a_real_world" in item.name:
             item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: places.get(item.path.name, len(places)))
-
-
-def pytest_report_header() -> list[str]:
-    """Say what is not tested here."""
-    return [missing.WITHOUT[name] for name in ABSENT]
 
 
 @pytest.hookimpl(wrapper=True)
@@ -159,8 +148,6 @@ def drawn(_undrawn: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.Mo
 
 @pytest.fixture(scope="session")
 def _gcs() -> Iterator[gcs_server.Gcs]:
-    if missing.STORAGE in ABSENT:
-        pytest.skip(missing.WITHOUT[missing.STORAGE])
     with gcs_server.running() as running:
         yield running
 

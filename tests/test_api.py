@@ -61,10 +61,14 @@ def test_importing_the_package_imports_next_to_nothing_and_dir_knows_the_names()
         "assert set(vjepa2_ac.__all__) <= set(dir(vjepa2_ac))\n"
         "found = {name for name in sys.modules if name.startswith('vjepa2_ac.')}\n"
         "assert not found and not {'torch', 'numpy', 'pydantic'} & set(sys.modules), found\n"
+        "from vjepa2_ac.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "assert not {'torch', 'transformers', 'numpy', 'mujoco'} & set(sys.modules)\n"
         "from vjepa2_ac import UserError, load_config\n"
         "assert not {'torch', 'transformers'} & set(sys.modules)\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
 def test_a_name_that_is_not_there_is_told_with_those_that_are() -> None:

@@ -7,13 +7,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import psutil
 import pytest
 
 from latent_sets import contents
-from missing import is_installed
 from run_fixtures import MakeConfig, Popen, as_yaml
 from vjepa2_ac.cli import main
 from vjepa2_ac.config.loading import config_as_dict
@@ -25,7 +25,7 @@ from vjepa2_ac.encoding.ray_engine import _Actor, _Task
 from vjepa2_ac.errors import InputError
 
 needs_ray = pytest.mark.skipif(
-    not is_installed("ray"), reason='Ray is not tested: pip install -c constraints.txt -e ".[cluster]"'
+    find_spec("ray") is None, reason='Ray is not tested: pip install -c constraints.txt -e ".[cluster]"'
 )
 
 # A plug-in of the config, which actors import, too: from the third file on the encoder waits for a word, or fails.

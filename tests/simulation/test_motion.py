@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 from vjepa2_ac.simulation.domains import DOMAIN_A
 from vjepa2_ac.simulation.motion import (
@@ -71,3 +72,9 @@ def test_inverse_kinematics_returns_to_every_pose_within_the_limits() -> None:
 def test_a_pose_out_of_reach_is_refused() -> None:
     with pytest.raises(OutOfReachError, match="no joint angles"):
         inverse_kinematics(np.array([1.5, 0.0, 0.5, np.pi, 0.0, 0.0]))
+
+
+def test_the_suite_refuses_arrays_of_another_shape() -> None:
+    """`tests/conftest.py` checks the annotations of this package."""
+    with pytest.raises(TypeCheckError):
+        forward_kinematics(np.zeros(3))
