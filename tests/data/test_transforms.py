@@ -11,8 +11,6 @@ from vjepa2_ac.data import transforms
 from vjepa2_ac.data.transforms import (
     CropBox,
     crop_box,
-    frame_of_seen,
-    frames_as_seen,
     input_to_pixels,
     per_channel,
     pixels_to_input,
@@ -79,17 +77,3 @@ def test_what_inference_has_kept_can_be_trained_with() -> None:
 def test_input_goes_back_to_the_image_that_it_is() -> None:
     frames = torch.randint(0, 256, (2, 3, 8, 8, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     assert torch.equal(input_to_pixels(pixels_to_input(frames, 8)).permute(0, 1, 3, 4, 2), frames)
-
-
-@pytest.mark.parametrize("kind", ["released", "square", "letterbox"])
-@pytest.mark.parametrize("size", [(40, 100), (100, 40), (60, 60)])
-def test_what_is_seen_goes_back_to_its_place_in_the_frame(kind: transforms.Crop, size: tuple[int, int]) -> None:
-    rows, columns = np.linspace(0, 200, size[0]), np.linspace(0, 50, size[1])
-    frame = (rows[:, None, None] + columns[None, :, None] + np.zeros(3)).astype(np.uint8)
-    back = frame_of_seen(frames_as_seen(view(frame[None], kind), 96)[0], *size, kind)
-    box = CropBox(0, 0, *size) if kind == "letterbox" else crop_box(*size, kind)
-    inner = (slice(box.top + 2, box.top + box.height - 2), slice(box.left + 2, box.left + box.width - 2))
-    assert abs(back[inner].astype(int) - frame[inner]).max() <= 8
-    back[box.top : box.top + box.height, box.left : box.left + box.width] = 255
-    assert back.shape == frame.shape
-    assert (back == 255).all()

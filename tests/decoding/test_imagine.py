@@ -11,7 +11,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import Start, rolled_out, shown
-from vjepa2_ac.evaluation.imagined import imagine_plan, imagined_next
+from vjepa2_ac.evaluation.imagined import imagine_plan
 from vjepa2_ac.model.state_integration import counterfactual_states
 from vjepa2_ac.planning.counterfactual import named_actions
 from vjepa2_ac.spaces import POSE
@@ -98,12 +98,3 @@ def test_of_a_long_plan_eight_steps_are_shown_the_end_among_them(decoder: Traine
 def test_without_a_plan_or_finite_predictions_nothing_is_imagined(decoder: TrainedDecoder, answer: dict) -> None:
     answer = asked(nodes=0, **answer)
     assert imagine_plan(answer, decoder).steps == {}
-    assert imagined_next(answer.decision, decoder) is None
-
-
-def test_the_next_frame_is_the_first_step_of_the_plan(decoder: TrainedDecoder) -> None:
-    answer = asked(nodes=0)
-    following = imagined_next(answer.decision, decoder)
-    assert following is not None
-    difference = following.astype(int) - imagine_plan(answer, decoder).steps[1]
-    assert abs(difference).max() <= 1

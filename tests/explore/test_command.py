@@ -37,7 +37,6 @@ def test_without_arguments_the_model_of_the_package_is_explored(
     ("words", "says"),
     [
         (["nowhere/run"], "nowhere/run"),
-        (["--host", "0.0.0.0"], "--key-file"),  # noqa: S104 - it is refused
         (["builtin:sim-tiny", "--decoder", "nowhere"], "nowhere"),
     ],
 )

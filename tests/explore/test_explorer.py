@@ -6,8 +6,7 @@ import torch
 
 from vjepa2_ac.decoding.imagine import Start, rolled_out
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.explore.explorer import Explorer, Place
-from vjepa2_ac.explore.messages import MOST_STEPS
+from vjepa2_ac.explore.explorer import MOST_STEPS, Explorer, Place
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.simulation.counterfactual import resimulate
 

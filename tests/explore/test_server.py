@@ -10,10 +10,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from vjepa2_ac.explore.views import Views
-from vjepa2_ac.serving.access import Access
 from windows import header, serving
-
-KEY = "a-key-of-sixteen-characters"
 
 
 def got(url: str, path: str, **headers: str) -> http.client.HTTPResponse:
@@ -56,25 +53,6 @@ def test_a_name_that_is_not_this_servers_gets_no_page(recorded: Views) -> None:
         assert got(url, "/", Host="rebound.example").status == 403
         with pytest.raises(InvalidStatus):
             socket(url, "http://rebound.example", Host="rebound.example")
-
-
-def test_a_key_opens_the_page_once_and_then_a_cookie_does(recorded: Views) -> None:
-    with serving(recorded, Access("127.0.0.1", KEY)) as url:
-        assert got(url, "/").status == 401
-        assert got(url, "/?key=wrong-key-of-sixteen").status == 401
-        for path in ("//[", "//[?a=b"):  # which is no URL
-            assert got(url, path).status == 401
-            assert got(url, path, Authorization=f"Bearer {KEY}").status == 404
-        entered = got(url, f"/?key={KEY}")
-        cookie = (entered.getheader("Set-Cookie") or "").partition(";")[0]
-        assert (entered.status, entered.getheader("Location")) == (303, "/")
-        assert "HttpOnly; SameSite=Strict" in (entered.getheader("Set-Cookie") or "")
-        assert got(url, "/", Cookie=cookie).status == 200
-        assert got(url, "/", Cookie=f"{cookie}x").status == 401
-        with pytest.raises(InvalidStatus):
-            socket(url)
-        with socket(url, Cookie=cookie) as page:
-            assert header(page.recv())["kind"] == "hello"
 
 
 def test_the_newest_request_wins_and_a_search_ends_for_it(recorded: Views) -> None:

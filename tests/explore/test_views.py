@@ -10,8 +10,7 @@ import torch
 from vjepa2_ac.episode import no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.explore.explorer import Place
-from vjepa2_ac.explore.messages import GoalFrame, PageRequest, read_request
-from vjepa2_ac.explore.views import Views
+from vjepa2_ac.explore.views import GoalFrame, PageRequest, Views, read_request
 from vjepa2_ac.media.images import decode_image
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost
 from vjepa2_ac.planning.planner import SearchCancelledError

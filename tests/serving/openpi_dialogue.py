@@ -1,9 +1,8 @@
 """A robot with the real openpi-client, in an environment of its own: drives a server, and prints what it got as JSON.
 
-Run by test_real_client.py as `python openpi_dialogue.py openpi|roboarena HOST PORT KEY`. Knows nothing of vjepa2_ac.
+Run by test_real_client.py as `python openpi_dialogue.py HOST PORT KEY`. Knows nothing of vjepa2_ac.
 """
 
-import dataclasses
 import json
 import sys
 
@@ -17,7 +16,7 @@ def picture(seed):
     return np.random.default_rng(seed).integers(0, 256, (48, 60, 3), dtype=np.uint8)
 
 
-def openpi(policy):
+def dialogue(policy):
     """A goal once, decisions, an error, a decision after it, a new episode; and actions one by one from a chunk."""
     found = {"metadata": policy.get_server_metadata()["policy"]}
     first = policy.infer({"observation/image": picture(0), "observation/state": STATE, "goal/image": picture(100)})
@@ -38,38 +37,7 @@ def openpi(policy):
     return found
 
 
-@dataclasses.dataclass
-class PolicyServerConfig:
-    """RoboArena's: a key more or less is an error."""
-
-    image_resolution: object
-    needs_wrist_camera: bool
-    n_external_cameras: int
-    needs_stereo_camera: bool
-    needs_session_id: bool
-    action_space: str
-
-
-def roboarena(policy):
-    """Two sessions, as the evaluation client of RoboArena begins them, and a reset between them."""
-    config = PolicyServerConfig(**policy.get_server_metadata())
-    found = {"action_space": config.action_space, "actions": []}
-    for session in ("one", "two"):
-        request = {
-            "endpoint": "infer",
-            "session_id": session,
-            "prompt": "cup",
-            "observation/exterior_image_0_left": picture(0),
-            "observation/cartesian_position": STATE[:6],
-            "observation/joint_position": np.zeros(7),
-            "observation/gripper_position": STATE[6:],
-        }
-        found["actions"] += [policy.infer(request)["actions"].tolist()]
-        found["reset"] = policy.infer({"endpoint": "reset", "session_id": session})
-    return found
-
-
 if __name__ == "__main__":
-    _, what, host, port, key = sys.argv
-    client = websocket_client_policy.WebsocketClientPolicy(host, int(port), key or None)
-    sys.stdout.write(json.dumps({"openpi": openpi, "roboarena": roboarena}[what](client)))
+    _, host, port, key = sys.argv
+    client = websocket_client_policy.WebsocketClientPolicy(host, int(port), key)
+    sys.stdout.write(json.dumps(dialogue(client)))

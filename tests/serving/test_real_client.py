@@ -5,15 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from served import STATE, controller, image, serving, session
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.serving.about import roboarena_metadata
 from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.session import SessionOptions
-from vjepa2_ac.spaces import apply_action
 
 CLIENT = "openpi-client==0.1.2"
 KEY = "correct-horse-battery-staple"
@@ -38,13 +34,6 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
-def driven(robot: Path, what: str, url: str, key: str = "") -> dict:
-    host, port = url.removeprefix("ws://").split(":")
-    done = subprocess.run([robot, SCRIPT, what, host, port, key], capture_output=True, text=True, timeout=120, cwd="/")
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
 def test_it_gets_the_controllers_actions_errors_and_a_new_episode(robot: Path) -> None:
     own = controller()
     own.reset(image(100))
@@ -53,11 +42,11 @@ def test_it_gets_the_controllers_actions_errors_and_a_new_episode(robot: Path) -
         own.act(image(seed), STATE)
         expected.append(own.decision.plan.actions.double().tolist())
 
-    def told(_: object) -> dict:
-        return {"policy": "vjepa2-ac"}
-
-    with serving(lambda: session(goals=CUP), Access("127.0.0.1", KEY), told=told) as running:
-        found = driven(robot, "openpi", running.url, KEY)
+    with serving(lambda: session(goals=CUP), Access("127.0.0.1", KEY), told={"policy": "vjepa2-ac"}) as running:
+        host, port = running.url.removeprefix("ws://").split(":")
+        done = subprocess.run([robot, SCRIPT, host, port, KEY], capture_output=True, text=True, timeout=120, cwd="/")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
     assert found["metadata"] == "vjepa2-ac"
     assert found["actions"] == [*expected, expected[0]]
     assert found["why"] == ["planned"] * 4
@@ -65,17 +54,3 @@ def test_it_gets_the_controllers_actions_errors_and_a_new_episode(robot: Path) -
     own.reset(image(50))
     own.act(image(3), STATE)
     assert found["one_by_one"] == own.decision.plan.actions.double().tolist()
-
-
-def test_roboarenas_dialect(robot: Path) -> None:
-    options = SessionOptions("pose", control_steps=4)
-    with serving(lambda: session(options, CUP), told=roboarena_metadata) as running:
-        found = driven(robot, "roboarena", running.url)
-    own = controller()
-    own.reset(image(50))
-    target = apply_action(STATE, own.act(image(0), STATE))
-    assert found["action_space"] == "cartesian_position"
-    assert found["actions"][0] == found["actions"][1], "another session is another episode"
-    np.testing.assert_array_equal(found["actions"][0][-1], [*target[:6], np.clip(target[6], 0, 1)])
-    assert np.shape(found["actions"][0]) == (4, 7)
-    assert found["reset"] == {"status": "reset"}

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import http.client
 import random
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +20,7 @@ from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.serving import access
 from vjepa2_ac.serving.access import Access
 from vjepa2_ac.serving.client import PlanningClient
+from vjepa2_ac.serving.server import PlanningServer
 from vjepa2_ac.serving.session import Session
 from vjepa2_ac.serving.wire import pack, unpack
 
@@ -73,7 +75,6 @@ def test_actions_through_the_socket_are_the_controllers_bit_for_bit() -> None:
     own = controller()
     own.reset(image(100))
     with serving(session) as running, PlanningClient(running.url) as client:
-        assert client.metadata["action_space"] == "cartesian_delta"
         for step in range(3):
             found = client.infer(request(step, goal_image=image(100)))
             np.testing.assert_array_equal(found["actions"][0], own.act(image(step), STATE))
@@ -82,23 +83,49 @@ def test_actions_through_the_socket_are_the_controllers_bit_for_bit() -> None:
         np.testing.assert_array_equal(client.infer(request(3))["actions"][0], own.act(image(3), STATE))
 
 
-def test_it_is_alive_at_once_and_ready_when_it_is_loaded() -> None:
+def test_it_listens_when_the_model_is_loaded() -> None:
+    stop, lines = asyncio.Event(), list[str]()
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+
+    def load() -> tuple[Session, dict]:
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", port))
+        assert not lines
+        return session(), {}
+
+    def told(line: str) -> None:
+        lines.append(line)
+        stop.set()
+
+    assert asyncio.run(PlanningServer(Access("127.0.0.1"), port, told).run(load, stop))
+    assert lines == [f"listening on ws://127.0.0.1:{port}"]
+
+
+def test_a_port_that_is_taken_is_told_before_loading_and_after_it() -> None:
+    def load() -> tuple[Session, dict]:
+        taken.append(socket.create_server(("127.0.0.1", port)))
+        return session(), {}
+
+    taken = list[socket.socket]()
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    for _ in range(2):
+        with pytest.raises(InputError, match=f"127.0.0.1:{port}: cannot be listened on"):
+            asyncio.run(PlanningServer(Access("127.0.0.1"), port, print).run(load, asyncio.Event()))
+    (own,) = taken
+    own.close()
+
+
+def test_a_server_that_is_stopped_while_it_loads_does_not_listen() -> None:
+    async def stopped() -> bool:
+        stop = asyncio.Event()
+        asyncio.get_running_loop().call_later(0.1, stop.set)
+        return await PlanningServer(Access("127.0.0.1"), 0, print).run(lambda: (go.wait(120), session())[1:] * 2, stop)
+
     go = threading.Event()
-
-    def load() -> Session:
-        assert go.wait(120)
-        return session()
-
-    with serving(load, wait=False) as running:
-        assert get(running, "/healthz") == (200, "OK\n")
-        assert get(running, "/readyz") == (503, "loading\n")
-        assert "vjepa2_ac_ready 0" in get(running, "/metrics")[1]
-        with connect(running) as early:
-            with pytest.raises(TimeoutError):
-                early.recv(timeout=0.2)
-            go.set()
-            assert unpack(early.recv(timeout=120))["needs_session_id"] is True
-        assert get(running, "/readyz") == (200, "ready\n")
+    assert not asyncio.run(stopped()), "the planning thread has not ended"
+    go.set()
 
 
 def test_a_second_robot_is_refused_by_the_name_of_the_first_until_that_leaves() -> None:
@@ -184,7 +211,7 @@ def test_pages_in_a_browser_are_refused() -> None:
             assert caught.value.response.status_code == status
         assert get(running, "/metrics", Host="evil.example")[0] == 403
         with connect(running) as connection:
-            assert unpack(connection.recv())
+            assert unpack(connection.recv()) == {}
 
 
 def test_what_is_no_request_is_answered_by_a_sentence_and_the_next_one_is_served() -> None:
@@ -223,16 +250,6 @@ def test_a_message_that_is_too_large_ends_the_connection_and_not_the_server() ->
             assert client.infer(request(0, goal_image=image(1)))["why"] == "planned"
 
 
-def test_a_port_that_is_taken_is_told() -> None:
-    from vjepa2_ac.serving.server import PlanningServer, Served, ServerOptions
-
-    with serving(session) as running:
-        port = int(running.url.rpartition(":")[2])
-        server = PlanningServer(lambda: Served(session(), {}), ServerOptions(Access("127.0.0.1"), port), print)
-        with pytest.raises(InputError, match=f"127.0.0.1:{port}: cannot be listened on"):
-            asyncio.run(server.run(asyncio.Event()))
-
-
 def test_a_server_ends_while_something_is_computed_that_nothing_cancels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "END_S", 0.1)
     one, asked, go = session(), threading.Event(), threading.Event()
@@ -261,5 +278,5 @@ def test_a_client_waits_for_an_answer_as_long_as_it_says_and_no_longer() -> None
 
 @pytest.mark.parametrize("deadline_s", [5.0, 300.0])
 def test_a_client_waits_longer_than_the_deadline_of_its_server(deadline_s: float) -> None:
-    with serving(session, told=lambda _: {"deadline_s": deadline_s}) as running, PlanningClient(running.url) as client:
+    with serving(session, told={"deadline_s": deadline_s}) as running, PlanningClient(running.url) as client:
         assert client._timeout_s == max(120.0, 2 * deadline_s)

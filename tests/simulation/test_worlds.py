@@ -20,7 +20,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.model_setup import load_to_plan
-from vjepa2_ac.simulation.benchmark import Agent, BenchmarkOptions
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.policies import ZeroActions
 from vjepa2_ac.simulation.rollout import Image, Observation, Trial, run_trials
 from vjepa2_ac.simulation.worlds import OtherWorld, find_trials, record_world, run_world_benchmark
@@ -111,9 +111,9 @@ def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) 
     ],
 )
 def test_what_a_world_does_wrong_is_said(model: str, world: str, said: str) -> None:
-    agent = Agent(load_to_plan(model, overrides=SMALL))
+    subject = load_to_plan(model, overrides=SMALL)
     with pytest.raises(InputError, match=said), OtherWorld(world) as opened:
-        run_world_benchmark(agent, opened, BenchmarkOptions(episodes=2, films=0))
+        run_world_benchmark(subject, opened, BenchmarkOptions(episodes=2, films=0))
 
 
 def test_options_of_our_arm_mean_nothing_in_a_world(model: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import re
 import signal
 import threading
 import time
@@ -16,9 +17,8 @@ from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.serving.about import roboarena_metadata
 from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.server import PlanningServer, Served, ServerOptions
+from vjepa2_ac.serving.server import PlanningServer
 from vjepa2_ac.serving.session import Session, SessionOptions
 from vjepa2_ac.spaces import Spaces
 
@@ -66,31 +66,22 @@ class Running:
 def serving(
     load: Callable[[], Session],
     access: Access | None = None,
-    *,
-    ping_s: float = 20.0,
-    wait: bool = True,
-    told: Callable[[Session], dict] = roboarena_metadata,
+    told: dict | None = None,
 ) -> Iterator[Running]:
-    """Serve in a thread as long as the context lasts; `wait` until it is ready."""
+    """Serve in a thread as long as the context lasts."""
     lines: list[str] = []
-    begun, ready, loop_of, failed = threading.Event(), threading.Event(), [], []
+    begun, loop_of, failed = threading.Event(), [], []
 
     def tell(line: str) -> None:
         lines.append(line)
         if line.startswith("listening on "):
             begun.set()
-        if line == "ready":
-            ready.set()
-
-    def loaded() -> Served:
-        made = load()
-        return Served(made, told(made))
 
     async def run() -> bool:
         stop = asyncio.Event()
-        server = PlanningServer(loaded, ServerOptions(access or Access("127.0.0.1"), 0, None, ping_s), tell)
+        server = PlanningServer(access or Access("127.0.0.1"), 0, tell)
         loop_of.extend((asyncio.get_running_loop(), stop, server))
-        return await server.run(stop)
+        return await server.run(lambda: (load(), told or {}), stop)
 
     def thread() -> None:
         try:
@@ -99,12 +90,10 @@ def serving(
             failed.append(error)
         finally:
             begun.set()
-            ready.set()
 
     running = threading.Thread(target=thread)
     running.start()
     assert begun.wait(120)
-    assert not wait or ready.wait(120)
     if failed:
         running.join()
         raise failed[0]
@@ -121,12 +110,11 @@ def started(*words: str) -> tuple[Rank, str]:
     """Start a server; return it and its address."""
     process = Rank(["-m", "vjepa2_ac.cli", "serve", *words, "--port", "0"], dict(os.environ))
     until = time.monotonic() + 120
-    while "ready" not in (said := process.written()[0]).splitlines():
+    while not (addresses := re.findall(r"^listening on (.+)\n", process.written()[0], re.MULTILINE)):
         assert process.poll() is None, process.written()
         assert time.monotonic() < until
         time.sleep(0.02)
-    address = next(line for line in said.splitlines() if line.startswith("listening on "))
-    return process, address.removeprefix("listening on ")
+    return process, addresses[0]
 
 
 def ended(process: Rank) -> str:

@@ -10,7 +10,6 @@ from typing import Any
 from browser import browser
 from vjepa2_ac.explore.server import ExploreServer
 from vjepa2_ac.explore.views import Views
-from vjepa2_ac.serving.access import Access
 
 
 def header(message: Any) -> dict[str, Any]:
@@ -20,7 +19,7 @@ def header(message: Any) -> dict[str, Any]:
 
 
 @contextmanager
-def serving(views: Views, access: Access | None = None, port: int = 0) -> Iterator[str]:
+def serving(views: Views, port: int = 0) -> Iterator[str]:
     """Serve as long as the context lasts; yield the page's address."""
     ready, address, of_loop, failed = threading.Event(), [], [], []
 
@@ -31,7 +30,7 @@ def serving(views: Views, access: Access | None = None, port: int = 0) -> Iterat
     async def run() -> None:
         stop = asyncio.Event()
         of_loop.extend((asyncio.get_running_loop(), stop))
-        await ExploreServer(views, access or Access("127.0.0.1"), port).run(stop, tell)
+        await ExploreServer(views, port).run(stop, tell)
 
     def thread() -> None:
         try:

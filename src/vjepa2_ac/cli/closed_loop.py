@@ -9,7 +9,6 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,15 +17,16 @@ from vjepa2_ac.cli.console.waiting import Work
 from vjepa2_ac.errors import InputError, counted, shell_command
 
 if TYPE_CHECKING:
-    import ssl
+    from collections.abc import Mapping
+    from typing import Any
 
     from vjepa2_ac.evaluation.summary import Summary, Verdict
     from vjepa2_ac.serving.about import KeptGoals
-    from vjepa2_ac.serving.server import Served
-    from vjepa2_ac.simulation.benchmark import Agent, ClosedLoopBenchmark
+    from vjepa2_ac.serving.session import Session
+    from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
 
 _OF_RECORD = ("cameras", "workers")
-_OF_A_MODEL = ("sub_goals", "goals", "films", "decoder", "checkpoint", "config", "out")
+_OF_A_MODEL = ("sub_goals", "films", "checkpoint", "config", "out")
 
 
 def add_serve(commands: cli.Commands) -> None:
@@ -44,14 +44,12 @@ def add_serve(commands: cli.Commands) -> None:
     cli.add(parser, "--record FOLDER", text, cli.as_path)
     group = parser.add_argument_group("messages")
     cli.add(group, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
-    text = "what is told on connect; roboarena: its six keys only (full)"
-    cli.add(group, "--metadata full|roboarena", text, choices=["full", "roboarena"], default="full")
     text = "longest time for a decision; then the action is zero (60)"
     cli.add(group, "--deadline SECONDS", text, cli.number_between(0, 3600, "seconds"), default=60.0)
     group = parser.add_argument_group("access")
-    cli.add_access(group)
-    cli.add(group, "--certificate FILE", "TLS: the certificate and those it is signed by, PEM", cli.as_path)
-    cli.add(group, "--certificate-key FILE", "its private key, PEM (in the same file)", cli.as_path)
+    cli.add(group, "--insecure", "no key, although others can reach the address", action="store_true")
+    text = "a name that a proxy serves it under; repeatable"
+    cli.add(group, "--allow-host NAME", text, action="append", default=[])
 
 
 def add_simulate(commands: cli.Commands) -> None:
@@ -77,9 +75,7 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(group, "--config CONFIG", "for a model: the config whose `planning` is used", cli.as_local)
     text = "goals on the way, of the oracle's solution: where gripper or arm stop, or each model step of it (none)"
     cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
-    cli.add(group, "--goals FOLDER", "goals on the way, that `vjepa2-ac goals` made, of a fixed scene", cli.as_local)
     cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
-    cli.add_decoder(group, "in the video what the model imagined of each frame, a step ago")
     cli.add(group, "--out FOLDER", "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)", cli.as_path)
     group = parser.add_argument_group("to record data")
     text = "of 3 that have an image of their own, the others show the first (1)"
@@ -93,22 +89,20 @@ def _serve(options: argparse.Namespace) -> int:
     In the protocol of openpi's clients: pictures, states and goals in, actions within planning.limits out
     (docs/serving.md). Runs until SIGTERM or Ctrl-C.
     """
-    if options.metadata == "roboarena" and options.actions != "pose":
-        found, needed = f"--actions {options.actions}", "--actions pose: RoboArena knows no changes of a pose"
-        raise InputError(where="--metadata roboarena", found=found, needed=needed)
-    access = cli.access_of(options)
-    tls = _tls(options)
+    from vjepa2_ac.serving.access import Access, read_key
+
+    key = None if options.key_file is None else read_key(options.key_file)
+    access = Access(options.host, key, options.insecure, tuple(options.allow_host))
     cli.require_goals(options.goals)
     cli.require_to_plan(options)
 
     from vjepa2_ac.serving.about import read_kept_goals
-    from vjepa2_ac.serving.server import ServerOptions, serve
+    from vjepa2_ac.serving.server import serve
 
     if options.record is not None:
         cli.require_new_place(options.record)
     goals = None if options.goals is None else read_kept_goals(options.goals)
-    how = ServerOptions(access, options.port, tls)
-    ended = serve(lambda: _loaded(options, goals), how, cli.show)
+    ended = serve(lambda: _loaded(options, goals), access, options.port, cli.show)
     if not ended:  # a search or a loading that takes longer than anybody waits: nothing of it is to be kept
         sys.stdout.flush()
         sys.stderr.flush()
@@ -116,40 +110,15 @@ def _serve(options: argparse.Namespace) -> int:
     return 0
 
 
-def _tls(options: argparse.Namespace) -> ssl.SSLContext | None:
-    """Return how connections are encrypted.
-
-    Raises:
-        InputError: The certificate or its key cannot be used.
-    """
-    import ssl
-
-    if options.certificate is None:
-        if options.certificate_key is not None:
-            found, needed = "no --certificate", "the certificate that the key belongs to"
-            raise InputError(where=f"--certificate-key {options.certificate_key}", found=found, needed=needed)
-        return None
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    try:
-        context.load_cert_chain(
-            options.certificate, options.certificate_key, password=""
-        )  # else OpenSSL asks at the terminal
-    except (OSError, ValueError) as error:
-        needed = "a certificate and its private key without a password, in PEM"
-        raise InputError(where=f"--certificate {options.certificate}", found=str(error), needed=needed) from None
-    return context
-
-
-def _loaded(options: argparse.Namespace, goals: KeptGoals | None) -> Served:
-    """Load the model, and make a first decision; runs in the planning thread."""
+def _loaded(options: argparse.Namespace, goals: KeptGoals | None) -> tuple[Session, Mapping[str, Any]]:
+    """Load the model, and make a first decision; return what is served, and what a robot is told of it."""
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.goals import require_ends
     from vjepa2_ac.policies.score import is_blind, ranking_of_run
-    from vjepa2_ac.serving.about import in_words, metadata_of, roboarena_metadata, warm_up
+    from vjepa2_ac.serving.about import in_words, metadata_of, warm_up
     from vjepa2_ac.serving.recording import Recorder
     from vjepa2_ac.serving.request import IMAGE_KEYS
-    from vjepa2_ac.serving.server import Served
     from vjepa2_ac.serving.session import Session, SessionOptions
 
     loaded = cli.load_planning_session(options)
@@ -167,14 +136,13 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None) -> Served:
         require_ends(kept, first=1)
     session = Session(controller, goals or {}, how)
     about = metadata_of(loaded, session)
-    told = about if options.metadata == "full" else roboarena_metadata(session)
     Work.begin("the first decision")
     cli.show(in_words(about, options.subject), f"a first decision took {warm_up(controller):.1f} s")
     Work.begin("")
     if options.record is not None:
-        about = {**about, "overrides": options.overrides, "config": options.config, **loaded.as_dict()}
-        session.recorder = Recorder(options.record, about)
-    return Served(session, told)
+        of_record = {**about, "overrides": options.overrides, "config": options.config, **loaded.as_dict()}
+        session.recorder = Recorder(options.record, of_record)
+    return session, about
 
 
 def _simulate(options: argparse.Namespace) -> int:
@@ -251,7 +219,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     )
     files = write_benchmark(benchmark, folder, asdict(verdict))
     if options.all:
-        subject = benchmark.agent.subject
+        subject = benchmark.subject
         title = f"{subject.name}: checkpoint {subject.chosen}" if subject.chosen else subject.name
         cli.show(title, benchmark_table(benchmark), files=files)
     summary = _summary(benchmark, verdict, options)
@@ -264,9 +232,6 @@ def _require_benchmark(options: argparse.Namespace) -> None:
     """Refuse options that do not belong together, and a model that cannot plan."""
     if options.domain == "random":
         raise InputError(where="--domain random", found="a model that steers", needed="A or B")
-    if options.goals is not None and options.sub_goals is not None:
-        found = f"--sub-goals {options.sub_goals}, too"
-        raise InputError(where=f"--goals {options.goals}", found=found, needed="one of the two")
     cli.require_to_plan(options)
 
 
@@ -285,13 +250,13 @@ def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
         else:
             env = stack.enter_context(OtherWorld(options.world, options.world_timeout))
             name = re.sub(r"\W+", "-", f"{env.about.task} {env.about.world}", flags=re.ASCII).strip("-")[:200]
-        agent, reporter = _agent(options), stack.enter_context(cli.reporter())
+        subject, reporter = cli.load_planning_session(options), stack.enter_context(cli.reporter())
         home = Path(options.subject) if is_run(options.subject) else Path()
         folder = options.out or home / "closed_loop" / name
         cli.make_folder(folder)
         if options.world is None:
-            return run_benchmark(agent, chosen, reporter), folder
-        return run_world_benchmark(agent, env, chosen, reporter), folder
+            return run_benchmark(subject, chosen, reporter), folder
+        return run_world_benchmark(subject, env, chosen, reporter), folder
 
 
 def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse.Namespace) -> Summary:
@@ -299,7 +264,7 @@ def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse
     from vjepa2_ac.evaluation.summary import Summary, not_measured
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
-    subject, trials = benchmark.agent.subject, benchmark.trials
+    subject, trials = benchmark.subject, benchmark.trials
     how = _evaluate_command(options) or "`vjepa2-ac evaluate`"
     predicts, uses, ranks = (not_measured(name, how) for name in ("predicts", "uses actions", "ranks actions"))
     measured = f"{trials.task}, {trials.place}, {counted(trials.steps, 'step')} of {trials.seconds_per_step:.2f} s"
@@ -320,7 +285,7 @@ def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> li
     if verdict.needs or options.sub_goals is not None:  # the verdict names the fix; a server plans without sub-goals
         return []
     if verdict.conclusion == "yes" and (is_evaluated or not command):
-        words = cli.option_words(options, "checkpoint", "config", "goals", "plugin")
+        words = cli.option_words(options, "checkpoint", "config", "plugin")
         command = shell_command("serve", options.subject, *words, *options.overrides)
     elif command and is_evaluated:
         if any(map(is_of_moved, options.overrides)):  # `data calibrate` needs the base in its place
@@ -335,21 +300,6 @@ def _evaluate_command(options: argparse.Namespace) -> str:
 
     words = [*cli.option_words(options, "checkpoint", "plugin"), *filter(is_of_moved, options.overrides)]
     return shell_command("evaluate", options.subject, *words) if is_run(options.subject) else ""
-
-
-def _agent(options: argparse.Namespace) -> Agent:
-    """Load the model, and the decoder by which videos show predicted frames."""
-    from vjepa2_ac.decoding.decoder import SIMULATED
-    from vjepa2_ac.evaluation.imagined import imagined_next
-    from vjepa2_ac.simulation.benchmark import Agent
-
-    decoder, subject = cli.given_decoder(options), cli.load_planning_session(options)
-    if decoder is None:
-        return Agent(subject)
-    shown = SIMULATED if options.world is None else None  # a third-party environment is what the data show
-    decoder.require_fit(subject.world_model, subject.config.data, subject=subject.name, shown=shown)
-    decoder.to(subject.world_model.device)
-    return Agent(subject, partial(imagined_next, decoder=decoder), decoder.name)
 
 
 def _refuse(options: argparse.Namespace, names: Sequence[str], *, needed: str) -> None:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from vjepa2_ac.decoding.decoder import TrainedDecoder
     from vjepa2_ac.explore.views import Views
     from vjepa2_ac.reporter import Reporter
-    from vjepa2_ac.serving.access import Access
 
 _DEMO_RUN, _BUILTIN_MODEL = "demo/run", f"{BUILTIN}sim-tiny"
 _EPISODES = 8  # simulated where a model of the package comes without data
@@ -48,9 +47,6 @@ def add_explore(commands: cli.Commands) -> None:
     group = parser.add_argument_group("the page")
     cli.add(group, "--no-open", "print the page's address, and open no browser", action="store_true")
     cli.add(group, "--port N", "0: a free one (8001)", cli.whole_number(0, 65535), default=8001)
-    cli.add(group, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
-    cli.add(group, "--key-file FILE", "with the key that opens it; needed where others can reach it", cli.as_path)
-    cli.add_access(group)
 
 
 def _explore(options: argparse.Namespace) -> int:
@@ -64,7 +60,6 @@ def _explore(options: argparse.Namespace) -> int:
     if options.subject is not None and cli.is_override(options.subject):
         options.subject, options.overrides = None, [options.subject, *options.overrides]
     subject = options.subject or (_DEMO_RUN if is_run(_DEMO_RUN) else _BUILTIN_MODEL)
-    access = cli.access_of(options)
     config = read_run_config(Path(subject), options.overrides) if is_run(subject) else None
     cli.require_subject(subject, config, options.words)
     cli.say_places_elsewhere(subject)
@@ -74,21 +69,21 @@ def _explore(options: argparse.Namespace) -> int:
             views = _views(subject, data, decoder, options, reporter)
             episodes = counted(len(views.explorer.episodes), "episode")
             about = f"{subject}, {episodes}; a step takes {views.step_seconds:.2f} s here"
-        _serve(views, access, options, about)
+        _serve(views, options, about)
     return 0
 
 
-def _serve(views: Views, access: Access, options: argparse.Namespace, about: str) -> None:
+def _serve(views: Views, options: argparse.Namespace, about: str) -> None:
     from vjepa2_ac.explore.server import serve_page
 
     def ready(url: str) -> None:
         Work.begin("")
-        cli.show(about, f"The page: {url}{'' if access.key is None else '?key=KEY'}   (Ctrl-C ends it)")
-        if not options.no_open and access.key is None and _has_window():
+        cli.show(about, f"The page: {url}   (Ctrl-C ends it)")
+        if not options.no_open and _has_window():
             webbrowser.open(url)
 
     with contextlib.suppress(KeyboardInterrupt):
-        serve_page(views, access, options.port, ready)
+        serve_page(views, options.port, ready)
 
 
 def _has_window() -> bool:

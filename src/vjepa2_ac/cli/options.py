@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from vjepa2_ac.decoding.decoder import TrainedDecoder
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.runs.subject import Subject
-    from vjepa2_ac.serving.access import Access
 
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 Handler = Callable[[argparse.Namespace], int | None]
@@ -186,24 +185,6 @@ def add_decoder(parser: argparse._ActionsContainer, shows: str, **how: Any) -> N
     """Add `--decoder`, with which something is drawn."""
     text = f"show {shows}, with what `vjepa2-ac decoder` made, or builtin:sim-tiny"
     add(parser, "--decoder FOLDER", text, as_model, **how)
-
-
-def add_access(parser: argparse._ActionsContainer) -> None:
-    """Add who may reach a server without its key, and under which names."""
-    add(parser, "--insecure", "no key, although others can reach the address", action="store_true")
-    add(parser, "--allow-host NAME", "a name that a proxy serves it under; repeatable", action="append", default=[])
-
-
-def access_of(options: argparse.Namespace) -> Access:
-    """Return the rules of a server: its address, key and names.
-
-    Raises:
-        InputError: The key cannot be read, or others could reach the address without one.
-    """
-    from vjepa2_ac.serving.access import Access, read_key
-
-    key = None if options.key_file is None else read_key(options.key_file)
-    return Access(options.host, key, options.insecure, tuple(options.allow_host))
 
 
 def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **others: Any) -> _Record:

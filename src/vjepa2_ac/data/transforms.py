@@ -132,24 +132,6 @@ def frames_as_seen(
     return np.ascontiguousarray(input_to_pixels(inputs).permute(0, 2, 3, 1).numpy())
 
 
-def frame_of_seen(
-    seen: UInt8[np.ndarray, "size size 3"], height: int, width: int, kind: Crop = "released"
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Return what the encoder sees at its place in a camera frame, for people: white where nothing is seen."""
-    box, side = crop_box(height, width, kind), max(height, width)
-    if kind == "letterbox":
-        box = CropBox((height - side) // 2, (width - side) // 2, side, side)  # larger than the frame: with the bars
-    part = torch.nn.functional.interpolate(
-        torch.tensor(seen).permute(2, 0, 1)[None].float(), size=(box.height, box.width), mode="bilinear"
-    )
-    pixels = part[0].round().to(torch.uint8).permute(1, 2, 0).numpy()
-    pixels = pixels[max(0, -box.top) :, max(0, -box.left) :][:height, :width]
-    frame = np.full((height, width, 3), 255, np.uint8)
-    top, left = max(0, box.top), max(0, box.left)
-    frame[top : top + len(pixels), left : left + pixels.shape[1]] = pixels
-    return frame
-
-
 @dataclass(frozen=True)
 class ClipChanges:
     """The user's transforms of the training clips of a run."""

@@ -246,16 +246,13 @@ class TrainedDecoder:
         """Return its name and its encoder's fingerprint, for a JSON of what it has shown."""
         return {"name": self.name, "encoder": self.card.encoder}
 
-    def require_fit(
-        self, world_model: WorldModel, data: DataConfig, *, subject: str, shown: str | None = None
-    ) -> tuple[str, ...]:
+    def require_fit(self, world_model: WorldModel, data: DataConfig, *, subject: str) -> tuple[str, ...]:
         """Refuse a model with another encoder or crop; log and return a warning if the decoder has seen other data.
 
         Args:
             world_model: Its latents are decoded.
-            data: Its crop is that of the frames.
+            data: Of the frames, with their crop.
             subject: What is decoded, for messages.
-            shown: The data set of the frames, by its path, or `SIMULATED`; None: that of `data`.
 
         Raises:
             InputError: The encoder or the crop differs.
@@ -274,7 +271,7 @@ class TrainedDecoder:
             fix = "Train one with `vjepa2-ac decoder CONFIG`, on the config of this model"
             raise InputError(where=f"{self.where} {self.name}", found=found, needed=needed, fix=fix)
         learned = SIMULATED if self.name.startswith(BUILTIN) else card.data
-        shown = shown or (NO_DATA if data.is_cache else data.path)
+        shown = NO_DATA if data.is_cache else data.path
         if shown == NO_DATA or _is_same_data(learned, shown):
             return ()
         warning = f"The decoder {self.name} was trained on {learned}, not on {shown}: its images may be wrong."

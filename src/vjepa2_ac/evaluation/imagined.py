@@ -286,25 +286,19 @@ def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
     decoder.to(controller.device)
     given = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
     start, decoded_goal = shown(decoder.decoder, given, controller.config.views)
-    frames = _rollout(answer.decision, decoder, steps=answer.space.steps)
+    frames = _rollout(answer.decision, decoder)
     places = spread_with_ends(len(frames), _MOST_PLAN_STEPS)
     views = view(split_views(goal[None], controller.config.views), controller.crop)
     seen = np.concatenate(frames_as_seen(views, decoder.card.shape.image_size), axis=1)
     return ImaginedPlan(start, {place + 1: frames[place] for place in places}, seen, decoded_goal)
 
 
-def imagined_next(decision: Decision, decoder: TrainedDecoder) -> Image | None:
-    """Return the next frame as the planner imagined it when it decided; None: it imagined none."""
-    frames = _rollout(decision, decoder, steps=1)
-    return frames[0] if len(frames) else None
-
-
 @torch.no_grad()
-def _rollout(decision: Decision, decoder: TrainedDecoder, *, steps: int) -> Frames:
-    """Return the images after the first steps of a plan; none without a plan, or if the predictions are not finite."""
+def _rollout(decision: Decision, decoder: TrainedDecoder) -> Frames:
+    """Return the images after each step of a plan; none without a plan, or if the predictions are not finite."""
     side = decoder.card.shape.image_size
     none = np.zeros((0, side, side, 3), np.uint8)
     if decision.plan is None or decision.cost is None:
         return none
-    latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.imagine(decision.plan.actions[None, :steps])[0][0]
+    latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.imagine(decision.plan.actions[None])[0][0]
     return shown(decoder.decoder, latents, decision.cost.views) if bool(torch.isfinite(latents).all()) else none

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import http
-import http.cookies
 import logging
 import threading
 from collections.abc import Callable
@@ -13,13 +12,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
-from urllib.parse import parse_qs, quote, unquote
 
 from vjepa2_ac.errors import InputError, UserError, require_library
-from vjepa2_ac.explore.messages import MOST_BYTES, PageRequest, packed, read_request
-from vjepa2_ac.explore.views import Views
+from vjepa2_ac.explore.views import MOST_BYTES, PageRequest, Views, packed, read_request
 from vjepa2_ac.planning.planner import SearchCancelledError
-from vjepa2_ac.serving.access import Access, ends, listen, single_header, until_signalled, url_of
+from vjepa2_ac.serving.access import Access, ends, listening_on, single_header, until_signalled, url_of
 
 logger = logging.getLogger(__name__)
 
@@ -53,15 +50,14 @@ class _Client:
 class ExploreServer:
     """Serves `Views` to the pages of this machine's browsers."""
 
-    def __init__(self, views: Views, access: Access, port: int = 0) -> None:
+    def __init__(self, views: Views, port: int = 0) -> None:
         """Prepare.
 
         Args:
             views: Answers requests.
-            access: Where it listens, and for whom.
-            port: 0: a free one.
+            port: Of this machine; 0: a free one.
         """
-        self._views, self._access, self._port = views, access, port
+        self._views, self._access, self._port = views, Access("127.0.0.1"), port
         self._computing = ThreadPoolExecutor(1, "imagining")
         self._pages = 0
 
@@ -72,8 +68,9 @@ class ExploreServer:
             InputError: The address cannot be listened on.
         """
         library = require_library("websockets.asyncio.server", where="explore", called="websockets", extra="explore")
-        how = {"process_request": self._respond, "max_size": MOST_BYTES}
-        server = await listen(library, self._came, self._access, self._port, **how)
+        how = {"process_request": self._respond, "max_size": MOST_BYTES, "compression": None, "server_header": None}
+        with listening_on(self._access, self._port):
+            server = await library.serve(self._came, self._access.host, self._port, **how)
         ready(f"{url_of(server, 'http')}/")
         try:
             await stop.wait()
@@ -85,24 +82,13 @@ class ExploreServer:
     def _respond(self, connection: Any, request: Any) -> Any:
         """Return the HTTP response to a request; None: the socket of a page may open.
 
-        A browser cannot send the key as a header: the key arrives once as `?key=`, then in a cookie that no script
-        reads. The socket is only for this server's own page: `Origin` has to name the host of the request.
+        The socket is only for this server's own page: `Origin` has to name the host of the request.
         """
-        path, _, query = request.path.partition("?")
-        host, status = single_header(request, "Host"), http.HTTPStatus
-        key = parse_qs(query).get("key")
-        cookie = f"vjepa2-ac-{(host or '').rpartition(':')[2]}"  # browsers share cookies among the ports of a host
-        refusal = self._access.why_not(host, _authorization(request, cookie) if key is None else f"Bearer {key[0]}")
-        if refusal is not None:
-            hint = "; in a browser: /?key=KEY" if refusal[0] == status.UNAUTHORIZED else ""
-            return connection.respond(status(refusal[0]), f"{refusal[1]}{hint}\n")
-        if key is not None:
-            response = connection.respond(status.SEE_OTHER, "")
-            response.headers["Location"] = "/"
-            response.headers["Set-Cookie"] = f"{cookie}={quote(key[0])}; HttpOnly; SameSite=Strict; Path=/"
-            return response
+        path, host, status = request.path.partition("?")[0], single_header(request, "Host"), http.HTTPStatus
+        if self._access.why_not(host, None) is not None:
+            return connection.respond(status.FORBIDDEN, "the page is for this machine only, under its own names\n")
         if path == "/socket":
-            is_own = single_header(request, "Origin") in {f"http://{host}", f"https://{host}"}
+            is_own = single_header(request, "Origin") == f"http://{host}"
             return None if is_own else connection.respond(status.FORBIDDEN, "not this server's page\n")
         if path not in _FILES:
             return connection.respond(status.NOT_FOUND, "no such page\n")
@@ -183,21 +169,11 @@ def _file(connection: Any, name: str, kind: str) -> Any:
     return response
 
 
-def _authorization(request: Any, cookie: str) -> str | None:
-    """Return the key in a request as a header: from the cookie, else from the header `Authorization`."""
-    cookies: http.cookies.SimpleCookie = http.cookies.SimpleCookie()
-    try:
-        cookies.load("; ".join(request.headers.get_all("Cookie")))
-    except http.cookies.CookieError:
-        return None
-    return f"Bearer {unquote(cookies[cookie].value)}" if cookie in cookies else single_header(request, "Authorization")
-
-
-def serve_page(views: Views, access: Access, port: int, ready: Callable[[str], None]) -> None:
+def serve_page(views: Views, port: int, ready: Callable[[str], None]) -> None:
     """Serve until SIGTERM or SIGINT.
 
     Raises:
         InputError: As `ExploreServer.run`.
     """
-    server = ExploreServer(views, access, port)
+    server = ExploreServer(views, port)
     until_signalled(lambda stop: server.run(stop, ready))

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import math
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from pydantic import Field
 from torch import Tensor
 
 from vjepa2_ac.config import Config
@@ -16,12 +20,13 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.episode import Progress, short_names
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.explore.explorer import Explorer, Pixels, Place, goal_moment, relative_spread
-from vjepa2_ac.explore.messages import MOST_STEPS, Image, PageRequest, packed, shown_units
-from vjepa2_ac.explore.search import Search
+from vjepa2_ac.explore.explorer import MOST_STEPS, Explorer, Moment, Pixels, Place, Search, relative_spread
 from vjepa2_ac.media.film import error_colours
+from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.planning.energy import mean_difference
 from vjepa2_ac.planning.planner import Cancelled
+from vjepa2_ac.spaces import Space
+from vjepa2_ac.storage.structured import plain, record_of
 
 _QUICK = {"samples": 64, "iterations": 4}  # of a plan: docs/planning.md says how good it is
 _MOST_FRAMES = 16  # of a film strip
@@ -30,7 +35,7 @@ _SEARCHED = 32  # episodes, for the one with the most motion, and for the sizes 
 _USUAL = 90.0  # percentile of recorded changes, of those that are more than a share of the largest: a gripper rests
 _MOVES_FROM = 0.1
 _UNKNOWN = 0.05, 0.1, 0.5, 0.05  # step of a position, rotation, gripper, other number that the data never change
-_MOVES = (
+_MOVES: tuple[tuple[str, int | None, int], ...] = (
     ("forward", 0, 1), ("back", 0, -1), ("left", 1, 1), ("right", 1, -1), ("up", 2, 1), ("down", 2, -1),
     ("turn left", 5, 1), ("turn right", 5, -1), ("open", 6, -1), ("close", 6, 1), ("still", None, 0),
 )  # fmt: skip
@@ -126,16 +131,13 @@ class Views:
 
     @property
     def moves(self) -> list[dict[str, Any]]:
-        """The moves of a person, by name."""
-        space = self.explorer.spaces.state
-        if space.is_base_pose:
-            return [{"id": name, "label": name, "axis": axis, "sign": sign} for name, axis, sign in _MOVES]
-        signs = [(number, sign, word) for number in range(len(space)) for sign, word in ((1, "+"), (-1, "-"))]
-        moves = [
-            {"id": f"{number}{word}", "label": f"{space.change_names[number]} {word}", "axis": number, "sign": sign}
-            for number, sign, word in signs
-        ]
-        return [*moves, {"id": "still", "label": "still", "axis": None, "sign": 0}]
+        """The moves of a person, by name: an axis of an action, and a sign."""
+        space, moves = self.explorer.spaces.state, _MOVES
+        if not space.is_base_pose:
+            names = enumerate(space.change_names)
+            signs = [(f"{name} {word}", axis, sign) for axis, name in names for word, sign in (("+", 1), ("-", -1))]
+            moves = (*signs, _MOVES[-1])
+        return [{"id": name, "label": name, "axis": axis, "sign": sign} for name, axis, sign in moves]
 
     @cached_property
     def _recorded_changes(self) -> list[Float[np.ndarray, "steps dim"]]:
@@ -184,7 +186,7 @@ class Views:
 
     def _look(self, request: PageRequest, place: Place, cancelled: Cancelled) -> bytes:
         explorer, start = self.explorer, self.explorer.moment(place.episode, place.start)
-        goal = None if request.goal is None else goal_moment(explorer, request.goal)
+        goal = self._goal(request)
         outcome, states = explorer.truth(place, cancelled), explorer.states(place)
         known = None if outcome is None else "simulated" if outcome.is_simulated else "recorded"
         images = [Image("given", start.pixels, f"the given frame, recorded at control step {place.start}")]
@@ -220,6 +222,16 @@ class Views:
         }
         return packed("look", request.seq, told, images)
 
+    def _goal(self, request: PageRequest) -> Moment | None:
+        """Return the frame to be reached; None: there is none."""
+        explorer, goal = self.explorer, request.goal
+        if goal is None:
+            return None
+        if goal.episode >= len(explorer.episodes) or goal.step >= explorer.steps(goal.episode):
+            found = f"step {goal.step} of episode {goal.episode}"
+            raise InputError(where="goal", found=found, needed="a frame of an episode that is shown")
+        return explorer.moment(goal.episode, goal.step)
+
     def _error_map(self, errors: Float[Tensor, " tokens"]) -> Pixels:
         size = self.explorer.world_model.image_size
         grid = size // self.explorer.world_model.sizes.patch_size
@@ -227,9 +239,10 @@ class Views:
 
     def _searched(self, request: PageRequest, place: Place, progress: Progress, cancelled: Cancelled) -> bytes:
         names = [one.name for one in self.explorer.contenders]
-        if request.goal is None or request.teller not in names:
+        moment = self._goal(request)
+        if moment is None or request.teller not in names:
             raise InputError(where=request.kind, found="no goal, or no model", needed="both")
-        goal, teller = goal_moment(self.explorer, request.goal).latents, names.index(request.teller)
+        goal, teller = moment.latents, names.index(request.teller)
         if request.kind == "plan":
             found = self.search.plan(teller, place, goal, request.steps, progress, cancelled)
             told = {
@@ -255,3 +268,80 @@ class Views:
         ]  # fmt: skip
         now = self.search.energy(self.explorer.imagined(teller, place), goal)
         return packed("energy", request.seq, {"maps": shown, "now": now}, ())
+
+
+# ---- messages between page and server: requests in JSON; answers with a header in JSON, and images behind it ----
+
+MOST_BYTES = 1 << 16  # of a request
+_QUALITY = 90
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Action = Annotated[list[Number], Field(max_length=64)]
+Index = Annotated[int, Field(ge=0, le=1 << 40)]
+
+
+@dataclass(frozen=True)
+class GoalFrame:
+    """The frame of an episode that is to be reached."""
+
+    episode: Index
+    step: Index  # control step
+
+
+@dataclass(frozen=True)
+class PageRequest:
+    """What a page asks for; which of the fields count depends on the kind."""
+
+    seq: Index
+    kind: Literal["episode", "look", "energy", "plan"]
+    episode: Index = 0
+    start: Index = 0  # control step of the given frame
+    actions: Annotated[list[Action], Field(max_length=MOST_STEPS)] = field(default_factory=list)
+    goal: GoalFrame | None = None
+    teller: Annotated[str, Field(max_length=200)] = ""  # whose energy it is
+    action: Action = field(default_factory=list)  # around which it is shown
+    steps: Annotated[int, Field(ge=1, le=8)] = 1  # of a plan
+
+
+def read_request(text: str | bytes) -> PageRequest:
+    """Return a request.
+
+    Raises:
+        InputError: It is none.
+    """
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError):
+        raise InputError(where="request", found="no JSON", needed="what explore's own page sends") from None
+    return record_of(PageRequest, values, where="request", needed="what explore's own page sends")
+
+
+@dataclass(frozen=True)
+class Image:
+    """A picture of an answer."""
+
+    name: str
+    pixels: UInt8[np.ndarray, "height width 3"]
+    alt: str  # what it shows, in words
+
+
+def packed(kind: str, seq: int | None, values: dict[str, Any], images: Sequence[Image] = ()) -> bytes:
+    """Return an answer: the length of the header in 4 bytes, the header, and the images as JPEG.
+
+    Args:
+        kind: Of the answer.
+        seq: Of its request; None: there was none.
+        values: The rest of the header; numbers that are not finite become null.
+        images: What follows it.
+    """
+    jpegs = [encode_jpeg(one.pixels, quality=_QUALITY) for one in images]
+    about = [{"name": one.name, "bytes": len(data), "alt": one.alt} for one, data in zip(images, jpegs, strict=True)]
+    text = json.dumps(plain({"kind": kind, "seq": seq, "images": about, **values}), allow_nan=False).encode()
+    return b"".join([len(text).to_bytes(4, "big"), text, *jpegs])
+
+
+def shown_units(space: Space) -> list[dict[str, Any]]:
+    """Return, for each number of a state or an action: its name and unit, and the unit and factor for people."""
+    shown = {"m": ("cm", 100.0), "rad": ("°", 180 / math.pi)}
+    units = [(name, unit, *shown.get(unit, (unit, 1.0))) for name, unit in zip(space.names, space.units, strict=True)]
+    return [dict(zip(("name", "unit", "shown_unit", "factor"), one, strict=True)) for one in units]

@@ -48,22 +48,16 @@ def metadata_of(loaded: Subject, session: Session) -> dict[str, Any]:
         "image_keys": list(options.image_keys),
         "goals": sorted(session.goals)[:_MOST_NAMES],
         "warnings": list(loaded.warnings),
-        **roboarena_metadata(session),
+        "action_space": action_space(session),
     }
 
 
-def roboarena_metadata(session: Session) -> dict[str, Any]:
-    """Return the six keys of RoboArena's clients, which take no others."""
+def action_space(session: Session) -> str:
+    """Return what the numbers of an action are, in the words of RoboArena."""
     space = session.controller.spaces
-    change = "cartesian_delta" if space.state.is_pose else f"vector_{space.action.follows}"
-    return {
-        "image_resolution": None,
-        "needs_wrist_camera": False,
-        "n_external_cameras": 1,
-        "needs_stereo_camera": False,
-        "needs_session_id": True,
-        "action_space": "cartesian_position" if session.options.actions == "pose" else change,
-    }
+    if session.options.actions == "pose":
+        return "cartesian_position"
+    return "cartesian_delta" if space.state.is_pose else f"vector_{space.action.follows}"
 
 
 def in_words(about: Mapping[str, Any], subject: str) -> str:

@@ -11,7 +11,8 @@ import shlex
 import signal
 import stat
 import threading
-from collections.abc import Awaitable, Callable, Collection, Coroutine
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -118,25 +119,17 @@ def single_header(request: Any, name: str) -> str | None:
     return values[0] if len(values) == 1 else None
 
 
-async def listen(
-    library: Any, handler: Callable[[Any], Coroutine[Any, Any, None]], access: Access, port: int, **options: Any
-) -> Any:
-    """Return a websocket server that listens.
-
-    Args:
-        library: `websockets.asyncio.server`.
-        handler: Serves a connection.
-        access: Where the server listens.
-        port: 0: a free port.
-        options: As `serve` of the library takes them.
+@contextmanager
+def listening_on(access: Access, port: int) -> Iterator[None]:
+    """Turn the error of an address that cannot be listened on into one for users.
 
     Raises:
-        InputError: The address cannot be listened on.
+        InputError: Names the address.
     """
     try:
-        return await library.serve(handler, access.host, port, compression=None, server_header=None, **options)
+        yield
     except OSError as error:
-        where, fix = f"{access.host}:{port}", "Choose another --host or --port; 0 takes a free one"
+        where, fix = f"{access.host}:{port}", "Choose another port: --port 0 takes a free one"
         raise InputError(where=where, found=f"cannot be listened on: {error.strerror or error}", fix=fix) from None
 
 

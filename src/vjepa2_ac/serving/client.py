@@ -8,7 +8,7 @@ from typing import Any
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
 from vjepa2_ac.serving.wire import MOST_BYTES, pack, require_msgpack, unpack
 
-_READY_S = 600.0  # for a server that loads its model
+_HELLO_S = 30.0  # for what a server tells on connect: it listens when its model is loaded
 _ANSWER_S = 120.0
 
 
@@ -21,7 +21,7 @@ class PlanningClient(ExitStack):
     """
 
     def __init__(self, url: str, key: str | None = None, *, timeout_s: float | None = None) -> None:
-        """Connect, and wait until the server is ready.
+        """Connect.
 
         Args:
             url: ws://HOST:PORT, or wss://.
@@ -40,7 +40,7 @@ class PlanningClient(ExitStack):
             self._connection = self.enter_context(
                 library.connect(url, compression=None, max_size=MOST_BYTES, additional_headers=headers, proxy=None)
             )
-            self.metadata = unpack(self._connection.recv(timeout=_READY_S))
+            self.metadata = unpack(self._connection.recv(timeout=_HELLO_S))
         except Exception as error:
             self.close()
             body = getattr(getattr(error, "response", None), "body", None)  # the server's words, where it refuses

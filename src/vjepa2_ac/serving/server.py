@@ -5,83 +5,78 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import http
-import ssl
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from vjepa2_ac.errors import require_library
-from vjepa2_ac.serving.access import Access, ends, listen, single_header, until_signalled, url_of
-from vjepa2_ac.serving.session import Counts, GoneError, Session
+from vjepa2_ac.serving.access import Access, ends, listening_on, single_header, until_signalled, url_of
+from vjepa2_ac.serving.session import GoneError, Session
 from vjepa2_ac.serving.wire import MOST_BYTES, pack
 
 _OPEN_S = 10.0  # that a handshake may take
+_PING_S = 20.0  # between pings; a client that does not answer one for as long is gone
 _WAITING = 2  # messages of a client that are read before they are answered
 
-
-@dataclass(frozen=True)
-class ServerOptions:
-    """Where and for whom a server listens."""
-
-    access: Access
-    port: int = 8000  # 0: a free one
-    certificate: ssl.SSLContext | None = None  # None: no TLS
-    ping_s: float = 20.0  # between pings; a client that does not answer one for as long is gone
-
-
-@dataclass(frozen=True)
-class Served:
-    """What is served, once it is loaded."""
-
-    session: Session
-    metadata: Mapping[str, Any]
+Load = Callable[[], tuple[Session, Mapping[str, Any]]]
+"""Loads the model and makes a first decision; returns the session, and what a robot is told on connect."""
 
 
 class PlanningServer:
     """Serves a planner to one robot at a time."""
 
-    def __init__(self, load: Callable[[], Served], options: ServerOptions, tell: Callable[[str], None]) -> None:
+    def __init__(self, access: Access, port: int, tell: Callable[[str], None]) -> None:
         """Prepare; nothing is loaded yet.
 
         Args:
-            load: Loads the model and makes a first decision; runs in the planning thread while the server listens.
-            options: Where it listens, and for whom.
+            access: Where it listens, and for whom.
+            port: 0: a free one.
             tell: Takes a line for whoever started it.
         """
-        self._load, self._options, self._tell = load, options, tell
+        self._access, self._port, self._tell = access, port, tell
         self._planning = ThreadPoolExecutor(1, "planning")
-        self._served: Served | None = None
-        self._ready = asyncio.Event()
         self._robot: str | None = None  # the address of the one that is served
         self._turned_away: Counter[str] = Counter()  # by HTTP status
 
-    async def run(self, stop: asyncio.Event) -> bool:
-        """Listen until `stop`; return whether the planning thread has ended, too.
+    async def run(self, load: Load, stop: asyncio.Event) -> bool:
+        """Take the port, load, then listen until `stop`; return whether the planning thread has ended, too.
+
+        Args:
+            load: Runs in the planning thread.
+            stop: Ends it.
 
         Raises:
             InputError: What is to be served cannot be loaded, or the address cannot be listened on.
         """
         library = require_library("websockets.asyncio.server", where="serve", called="websockets", extra="serve")
-        options = self._options
-        server = await listen(
-            library,
-            self._robot_came,
-            options.access,
-            options.port,
-            process_request=self._asked,
-            max_size=MOST_BYTES,
-            max_queue=_WAITING,
-            open_timeout=_OPEN_S,
-            ping_interval=options.ping_s,
-            ping_timeout=options.ping_s,
-            ssl=options.certificate,
-        )
+        with listening_on(self._access, self._port):
+            server = await library.serve(
+                self._robot_came,
+                self._access.host,
+                self._port,
+                start_serving=False,  # only the address is taken
+                process_request=self._asked,
+                max_size=MOST_BYTES,
+                max_queue=_WAITING,
+                open_timeout=_OPEN_S,
+                ping_interval=_PING_S,
+                ping_timeout=_PING_S,
+                compression=None,
+                server_header=None,
+            )
+        loading = asyncio.wrap_future(self._planning.submit(load))
+        stopping = asyncio.ensure_future(stop.wait())
         try:
-            self._tell(f"listening on {url_of(server, 'ws' if options.certificate is None else 'wss')}")
-            await self._serve(stop)
+            await _first_of(loading, stopping)
+            if not stop.is_set():
+                self._session, self._metadata = loading.result()
+                with listening_on(self._access, self._port):  # another program may have been faster
+                    await server.start_serving()
+                self._tell(f"listening on {url_of(server, 'ws')}")
+                await stopping
         finally:
             server.close()  # its clients are gone, which ends what is computed for them
             last = asyncio.wrap_future(self._planning.submit(int))
@@ -89,29 +84,13 @@ class PlanningServer:
             has_ended = await ends(server.wait_closed(), last)
         return has_ended
 
-    async def _serve(self, stop: asyncio.Event) -> None:
-        loading = asyncio.wrap_future(self._planning.submit(self._load))
-        stopping = asyncio.ensure_future(stop.wait())
-        await _first_of(loading, stopping)
-        if stop.is_set():
-            return
-        self._served = loading.result()
-        self._ready.set()
-        self._tell("ready")
-        await stopping
-
     def _asked(self, connection: Any, request: Any) -> Any:
         """Answer what comes over HTTP, and refuse who may not come in; None: a robot may begin."""
         path, status = request.path.partition("?")[0], http.HTTPStatus
         host, authorization = (single_header(request, name) for name in ("Host", "Authorization"))
-        if path == "/healthz":
+        if path in {"/healthz", "/readyz"}:
             return connection.respond(status.OK, "OK\n")
-        if path == "/readyz":
-            is_ready = self._ready.is_set()
-            return connection.respond(
-                status.OK if is_ready else status.SERVICE_UNAVAILABLE, "ready\n" if is_ready else "loading\n"
-            )
-        refused = self._options.access.why_not(host, authorization)
+        refused = self._access.why_not(host, authorization)
         if refused is None and path == "/metrics":
             return connection.respond(status.OK, self._metrics())
         if refused is None and path != "/":
@@ -127,41 +106,32 @@ class PlanningServer:
         return connection.respond(status(refused[0]), f"{refused[1]}\n")
 
     async def _robot_came(self, connection: Any) -> None:
-        """Serve a robot until it leaves; one that comes before the model is loaded waits."""
+        """Serve a robot until it leaves."""
         if self._robot is not None:  # both came at once
             await connection.close(1013, _busy(self._robot)[:100])
             return
         self._robot = _name(connection)
         left = asyncio.ensure_future(connection.wait_closed())
+        closed = require_library("websockets.exceptions", where="serve", called="websockets", extra="serve")
+        self._tell(f"{self._robot} is here")
         try:
-            await _first_of(left, ready := asyncio.ensure_future(self._ready.wait()))
-            ready.cancel()
-            if self._served is not None and not left.done():
-                await self._serve_robot(connection, left, self._served)
+            await asyncio.wrap_future(self._planning.submit(self._session.begin))
+            with contextlib.suppress(closed.ConnectionClosed):
+                await connection.send(pack(self._metadata))
+                async for message in connection:
+                    if isinstance(message, str):
+                        await connection.send("a request is a binary message, in msgpack")
+                    elif (answer := await self._answer(message, left)) is not None:
+                        await connection.send(answer)
+            self._tell(f"{self._robot} has left")
         finally:
             self._robot = None
             left.cancel()
 
-    async def _serve_robot(self, connection: Any, left: asyncio.Future[None], served: Served) -> None:
-        self._tell(f"{self._robot} is here")
-        await asyncio.wrap_future(self._planning.submit(served.session.begin))
-        closed = require_library("websockets.exceptions", where="serve", called="websockets", extra="serve")
-        with contextlib.suppress(closed.ConnectionClosed):
-            await connection.send(pack(served.metadata))
-            async for message in connection:
-                if isinstance(message, str):
-                    await connection.send("a request is a binary message, in msgpack")
-                    continue
-                answer = await self._answer(message, left, served.session)
-                if answer is None:
-                    break
-                await connection.send(answer)
-        self._tell(f"{self._robot} has left")
-
-    async def _answer(self, message: bytes, left: asyncio.Future[None], session: Session) -> bytes | str | None:
+    async def _answer(self, message: bytes, left: asyncio.Future[None]) -> bytes | str | None:
         """Return the answer to a message; None: the robot has left, and its search ends within an iteration."""
         gone = threading.Event()
-        answering = asyncio.wrap_future(self._planning.submit(lambda: session.answer(message, gone.is_set)))
+        answering = asyncio.wrap_future(self._planning.submit(lambda: self._session.answer(message, gone.is_set)))
         try:
             await _first_of(answering, left)
         finally:
@@ -174,9 +144,8 @@ class PlanningServer:
 
     def _metrics(self) -> str:
         """Return the counters in Prometheus' text format."""
-        counts = Counts() if self._served is None else self._served.session.counts
+        counts = self._session.counts
         values = {
-            "ready": int(self._ready.is_set()),
             "robots": int(self._robot is not None),
             "requests_refused_total": counts.refused,
             "requests_failed_total": counts.failed,
@@ -191,13 +160,13 @@ class PlanningServer:
         return "".join(f"vjepa2_ac_{name} {value}\n" for name, value in values.items())
 
 
-def serve(load: Callable[[], Served], options: ServerOptions, tell: Callable[[str], None]) -> bool:
+def serve(load: Load, access: Access, port: int, tell: Callable[[str], None]) -> bool:
     """Serve until SIGTERM or SIGINT; return whether the planning thread has ended, too.
 
     Raises:
         InputError: As `PlanningServer.run`.
     """
-    return until_signalled(PlanningServer(load, options, tell).run)
+    return until_signalled(partial(PlanningServer(access, port, tell).run, load))
 
 
 async def _first_of(*futures: asyncio.Future[Any]) -> None:

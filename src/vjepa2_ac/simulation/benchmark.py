@@ -1,10 +1,10 @@
-"""The closed-loop benchmark: an agent (a model that plans) and its references in the same trials; and its video."""
+"""The closed-loop benchmark: a model that plans and its references in the same trials; and its video."""
 
 from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac import __version__
-from vjepa2_ac.config import PlanningConfig, RldsData
+from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.data.transforms import frame_of_seen, split_views
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
@@ -29,8 +28,8 @@ from vjepa2_ac.goals.key_frames import (
 )
 from vjepa2_ac.media.film import below_each_other, side_by_side
 from vjepa2_ac.media.video import video_library, write_video
-from vjepa2_ac.planning.controller import Controller, Decision
-from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.simulation.arm import SimulatedArm
@@ -58,7 +57,6 @@ from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
 from vjepa2_ac.storage.structured import utc_now
 
 JOINT_FIELDS = ("steps/observation/joint_position", "steps/observation/gripper_position")
-Imagine = Callable[[Decision], Image | None]
 
 
 class Planning:
@@ -67,12 +65,10 @@ class Planning:
     Args:
         controller: Plans with the model; its last `decision` can be read after every action.
         name: Of the model, as shown in tables.
-        imagine: Returns the frame that a decision predicts, as the encoder sees it; None: no decoder.
     """
 
-    def __init__(self, controller: Controller, name: str = "model", imagine: Imagine | None = None) -> None:
-        self.controller, self.name, self.why, self._imagine = controller, name, "", imagine
-        self._size = (0, 0)  # of the last image
+    def __init__(self, controller: Controller, name: str = "model") -> None:
+        self.controller, self.name, self.why = controller, name, ""
 
     def reset(self, trial: Trial, goal_image: Image) -> None:
         """Give the planner the goal image, or the sub-goals; without their gripper modes if it moves joints."""
@@ -88,78 +84,38 @@ class Planning:
         Raises:
             ValueError: The model moves joints, and they are not measured.
         """
-        spaces, image = self.controller.spaces, observation.image
+        spaces = self.controller.spaces
         state = observation.joints if spaces.state.position is None else observation.state
         if state is None:
             raise ValueError(f"{self.name} moves joints, which this environment does not measure")
-        action = self.controller.act(image, state)
-        self._size = image.shape[0], image.shape[1]
+        action = self.controller.act(observation.image, state)
         self.why = self.controller.decision.why if self.controller.decision else ""
         return action - state if spaces.action.follows == "target" else action
 
-    def imagined(self) -> Image | None:
-        """Return the next camera image as predicted for the last action; white where the model receives no pixels.
 
-        None: there is no decoder, or nothing was predicted, for example since the goal is reached.
-        """
-        decision = self.controller.decision
-        predicted = None if self._imagine is None or decision is None else self._imagine(decision)
-        if predicted is None:
-            return None
-        height, width, views = *self._size, self.controller.config.views
-        parts = split_views(predicted[None], views)
-        return np.hstack([frame_of_seen(part, height, width // views, self.controller.crop) for part in parts])
-
-
-@dataclass(frozen=True)
-class Agent:
-    """A model that acts, and what videos show of it.
-
-    Args:
-        subject: The model and its settings, loaded for planning.
-        imagine: As of `Planning`.
-        decoder: Name of the decoder by which it imagines.
+def policy_of(subject: Subject, arm: SimulatedArm | None) -> Planning:
+    """Return the policy of a model; without an arm for a third-party environment, whose camera's pose is not known.
 
     Raises:
-        InputError: It takes what the simulated arm does not measure, or its model step has no known length.
+        InputError: It takes what is not measured there, or its model step has no known length.
     """
-
-    subject: Subject
-    imagine: Imagine | None = None
-    decoder: str | None = None
-
-    def __post_init__(self) -> None:
-        data = self.subject.config.data
-        require_stride(data, to="act", fix="Say which, as data.stride=4")
-        if data.pose_frame != "base":
-            needed = "base: the simulated arm moves in the frame of its base"
-            raise InputError(where="data.pose_frame", found=data.pose_frame, needed=needed)
-        if data.states == "vector" and not (isinstance(data, RldsData) and data.fields.state == JOINT_FIELDS):
-            found = "a model of other numbers than the simulated arm measures"
-            needed = f"poses; or seven joint angles and the gripper: data.fields.state: [{', '.join(JOINT_FIELDS)}]"
-            raise InputError(where="data.states: vector", found=found, needed=needed)
-
-    @property
-    def planning(self) -> PlanningConfig:
-        """The planning settings, which the references share."""
-        return self.subject.config.planning
-
-    def policy(self, arm: SimulatedArm | None) -> Planning:
-        """Return the policy for an arm; None: for a third-party environment, whose camera's pose is not known.
-
-        Raises:
-            InputError: The model needs more than such an environment measures.
-        """
-        subject = self.subject
-        uses_camera = subject.world_model.sizes.predictor.use_extrinsics
-        if arm is None and (uses_camera or subject.config.data.states == "vector"):
-            found = "a model that takes the pose of the camera" if uses_camera else "a model of joints"
-            raise InputError(where="--world", found=found, needed="a model of poses: environments measure nothing else")
-        name = Path(subject.name).name or subject.name
-        if name in {ZeroActions.name, RandomActions.name, Oracle.name}:  # in tables these are the references
-            name = f"model {name}"
-        controller = Controller.of_subject(subject, extrinsics=arm.extrinsics() if arm and uses_camera else None)
-        return Planning(controller, name, self.imagine)
+    data, uses_camera = subject.config.data, subject.world_model.sizes.predictor.use_extrinsics
+    require_stride(data, to="act", fix="Say which, as data.stride=4")
+    if data.pose_frame != "base":
+        needed = "base: the simulated arm moves in the frame of its base"
+        raise InputError(where="data.pose_frame", found=data.pose_frame, needed=needed)
+    if data.states == "vector" and not (isinstance(data, RldsData) and data.fields.state == JOINT_FIELDS):
+        found = "a model of other numbers than the simulated arm measures"
+        needed = f"poses; or seven joint angles and the gripper: data.fields.state: [{', '.join(JOINT_FIELDS)}]"
+        raise InputError(where="data.states: vector", found=found, needed=needed)
+    if arm is None and (uses_camera or data.states == "vector"):
+        found = "a model that takes the pose of the camera" if uses_camera else "a model of joints"
+        raise InputError(where="--world", found=found, needed="a model of poses: environments measure nothing else")
+    name = Path(subject.name).name or subject.name
+    if name in {ZeroActions.name, RandomActions.name, Oracle.name}:  # in tables these are the references
+        name = f"model {name}"
+    controller = Controller.of_subject(subject, extrinsics=arm.extrinsics() if arm and uses_camera else None)
+    return Planning(controller, name)
 
 
 # ---- the problems ----
@@ -186,7 +142,6 @@ class BenchmarkOptions:
     stride: int = 4  # control steps of a model step (15 per second); in a benchmark the model's
     films: int = 6  # episodes, the first ones, whose frames are stored for a video; 0: no video
     sub_goals: SubGoals = "none"  # from key frames or every step of the expert's solution
-    goals: str | None = None  # a folder of goals, the same in every problem
 
     @property
     def world(self) -> Domain:
@@ -245,43 +200,41 @@ def run_task(
 class ClosedLoopBenchmark:
     """The results of a model (first), zero actions, chance and the expert (last), in the same trials."""
 
-    agent: Agent
+    subject: Subject
     trials: Trials
     results: tuple[ClosedLoopResult, ...]
 
     @property
     def conditions(self) -> str:
         """Where, and with which sub-goals the model acts, as text."""
-        about = self.trials.about
-        goals = f", with the goals in {about['goals']}" if about["goals"] else ""
-        return f"in {self.trials.place}{_HELP.get(about['sub_goals'], goals)}"
+        return f"in {self.trials.place}{_HELP.get(self.trials.about['sub_goals'], '')}"
 
 
-def run_benchmark(agent: Agent, options: BenchmarkOptions, reporter: Reporter = SILENT) -> ClosedLoopBenchmark:
+def run_benchmark(subject: Subject, options: BenchmarkOptions, reporter: Reporter = SILENT) -> ClosedLoopBenchmark:
     """Let a model, zero actions, random actions and an oracle solve the same problems with the simulated arm.
 
     Args:
-        agent: The model and its planning settings.
+        subject: The model and its planning settings.
         options: The problems, and the sub-goals of the model.
         reporter: Shows the progress of each policy.
 
     Raises:
-        InputError: No such domain, goals that cannot be used, or a problem that the oracle does not solve although its
-            demonstration is required.
+        InputError: No such domain, a model that needs what the arm does not measure, or a problem that the oracle does
+            not solve although its demonstration is required.
         UnreachableError: MuJoCo or PyAV is missing.
     """
     if options.films:
         video_library()
-    options, limits = replace(options, stride=agent.subject.config.data.model_stride), agent.planning.limits
-    arm = arm_for(options.task, options.world, views=agent.planning.views)
-    environment, model, trials = ArmEnvironment(arm), agent.policy(arm), options.trials()
-    if options.sub_goals in {"demonstration", "every-step"}:
+    options, planning = replace(options, stride=subject.config.data.model_stride), subject.config.planning
+    arm, limits = arm_for(options.task, options.world, views=planning.views), planning.limits
+    model, trials = policy_of(subject, arm), options.trials()
+    if options.sub_goals != "none":
         reporter.task("demonstrations of all problems")
         goals = [demonstrated_goals(trial, arm, limits, options.sub_goals) for trial in trials.trials]
         trials = with_goals(trials, goals)
-    trials = with_own_goals(trials, options)
     policies = (model, ZeroActions(), RandomActions(limits, options.seed), Oracle(limits))
-    return ClosedLoopBenchmark(agent, trials, try_policies(environment, policies, trials, options.films, reporter))
+    results = try_policies(ArmEnvironment(arm), policies, trials, options.films, reporter)
+    return ClosedLoopBenchmark(subject, trials, results)
 
 
 def demonstrated_goals(
@@ -329,17 +282,6 @@ def with_goals(trials: Trials, goals: Sequence[Sequence[SubGoal]]) -> Trials:
     return replace(trials, trials=tuple(replace(trial, goals=tuple(made)) for trial, made in pairs))
 
 
-def with_own_goals(trials: Trials, options: BenchmarkOptions) -> Trials:
-    """Return trials with the sub-goals of a folder, if options name one.
-
-    Raises:
-        InputError: The folder cannot be used.
-    """
-    if options.goals is None:
-        return trials
-    return with_goals(trials, [read_goal_folder(Path(options.goals))] * len(trials.trials))
-
-
 def try_policies(
     environment: Environment, policies: Sequence[Policy], trials: Trials, films: int, reporter: Reporter
 ) -> tuple[ClosedLoopResult, ...]:
@@ -357,15 +299,14 @@ def write_benchmark(benchmark: ClosedLoopBenchmark, folder: Path, verdict: Mappi
     Raises:
         UnreachableError: PyAV is missing.
     """
-    agent, model, file = benchmark.agent, benchmark.results[0], folder / CLOSED_LOOP_FILE
+    subject, model, file = benchmark.subject, benchmark.results[0], folder / CLOSED_LOOP_FILE
     about = {
-        "subject": agent.subject.name,
-        "checkpoint": agent.subject.chosen,
-        "decoder": agent.decoder,
+        "subject": subject.name,
+        "checkpoint": subject.chosen,
         **benchmark.trials.about,
-        "planning": agent.planning.model_dump(mode="json"),
-        "warnings": list(agent.subject.warnings),
-        "planning_seed": agent.subject.config.seed,
+        "planning": subject.config.planning.model_dump(mode="json"),
+        "warnings": list(subject.warnings),
+        "planning_seed": subject.config.seed,
         "version": __version__,
         "time": utc_now(),
     }
@@ -410,12 +351,7 @@ def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]
         for step, (frame, distance_m) in enumerate(zip(episode.frames, episode.distances_m, strict=True)):
             outcome = f"   {'reached' if episode.success else 'missed'}" if step == steps else ""
             caption = f"{result.policy}:   {100 * distance_m:.1f} cm from the goal{outcome}"
-            images, captions = [frame, episode.goal_image], [caption, "goal"]
-            if any(one is not None for one in episode.imagined):
-                predicted = episode.imagined[step - 1] if step else None
-                images.append(np.full_like(episode.goal_image, 255) if predicted is None else predicted)
-                captions.append("predicted one step ago" if predicted is not None else "no prediction")
             scale = max(1, FRAME_SIZE[1] // int(frame.shape[1]))  # captions need room over the images
-            large = side_by_side(images[:1], captions[:1], f"{about}    step {step} of {steps}", enlarged=2 * scale)
-            image = below_each_other([large, side_by_side(images[1:], captions[1:], enlarged=scale)])
+            large = side_by_side([frame], [caption], f"{about}    step {step} of {steps}", enlarged=2 * scale)
+            image = below_each_other([large, side_by_side([episode.goal_image], ["goal"], enlarged=scale)])
             yield from itertools.repeat(image, _HOLD if step in {0, steps} else 1)

@@ -135,7 +135,6 @@ class EpisodeResult:
     unreachable: int  # commands that the arm could not follow completely
     goal_image: Image
     frames: UInt8[np.ndarray, "time height width 3"] | None  # if they are stored
-    imagined: tuple[Image | None, ...] = ()  # after each action, likewise; None: nothing
 
     @property
     def success(self) -> bool:
@@ -168,7 +167,7 @@ def run(
 
     Args:
         environment: Where it acts.
-        policy: The policy. If it has a method `imagined`, that returns the predicted image after its last action.
+        policy: The policy.
         trial: Start, goal and limits.
         keep_frames: Whether the result holds the camera images.
         progress: Called with the number of finished model steps.
@@ -176,10 +175,8 @@ def run(
     Raises:
         ValueError: As `steps_of`.
     """
-    steps, imagined = list[Step](), list[Image | None]()
+    steps = list[Step]()
     for step in steps_of(environment, policy, trial):
-        if steps and keep_frames and hasattr(policy, "imagined"):
-            imagined.append(policy.imagined())
         if steps:
             progress(len(steps))
         steps.append(step)
@@ -199,7 +196,6 @@ def run(
         unreachable=sum(not info.get("is_reachable", True) for info in infos),
         goal_image=observations[-1].image if goal_image is None else goal_image,
         frames=np.stack([one.image for one in observations]) if keep_frames else None,
-        imagined=tuple(imagined),
     )
 
 

@@ -32,14 +32,14 @@ from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.goals.key_frames import OF_MODEL_STEPS, every_key_frame, gripper_key_frames
 from vjepa2_ac.media.video import video_library
 from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.simulation.arm import State
 from vjepa2_ac.simulation.benchmark import (
-    Agent,
     BenchmarkOptions,
     ClosedLoopBenchmark,
     goals_of_episode,
+    policy_of,
     try_policies,
-    with_own_goals,
 )
 from vjepa2_ac.simulation.policies import Expert, RandomActions, ZeroActions
 from vjepa2_ac.simulation.rollout import (
@@ -275,30 +275,29 @@ def _image(found: dict[str, Any]) -> Image:
 
 
 def run_world_benchmark(
-    agent: Agent, world: OtherWorld, options: BenchmarkOptions, reporter: Reporter = SILENT
+    subject: Subject, world: OtherWorld, options: BenchmarkOptions, reporter: Reporter = SILENT
 ) -> ClosedLoopBenchmark:
     """Let a model, zero actions and random actions solve what the expert of an environment solves.
 
     Args:
-        agent: The model and its planning settings.
+        subject: The model and its planning settings.
         world: Where they act.
         options: Number and first seed of the problems, and the sub-goals. Task and domain are the environment's.
         reporter: Shows the progress of each policy.
 
     Raises:
-        InputError: A model that needs what such environments do not measure, goals that cannot be used, no expert, or
-            one that solves fewer than half of the problems.
+        InputError: A model that needs what such environments do not measure, no expert, or one that solves fewer than
+            half of the problems.
         UnreachableError: PyAV is missing.
     """
     if options.films:
         video_library()
-    model = agent.policy(None)
+    model = policy_of(subject, None)
     progress = reporter.task(f"{world.about.task}: {Expert.name}")
-    trials, shown = find_trials(world, options, agent.subject.config.data.model_stride, progress)
-    trials = with_own_goals(trials, options)
-    policies = (model, ZeroActions(), RandomActions(agent.planning.limits, options.seed))
+    trials, shown = find_trials(world, options, subject.config.data.model_stride, progress)
+    policies = (model, ZeroActions(), RandomActions(subject.config.planning.limits, options.seed))
     results = try_policies(world, policies, trials, options.films, reporter)
-    return ClosedLoopBenchmark(agent, trials, (*results, shown))
+    return ClosedLoopBenchmark(subject, trials, (*results, shown))
 
 
 def find_trials(
@@ -335,7 +334,7 @@ def find_trials(
         tried = counted(len(trials) + len(left_out), "problem")
         found = f"the expert solves {len(trials)} of {tried} in {counted(steps, 'model step')}"
         raise world.refused(found, "half of them", "Allow more of them with --steps")
-    chosen = {key: getattr(options, key) for key in ("episodes", "seed", "sub_goals", "goals")}
+    chosen = {key: getattr(options, key) for key in ("episodes", "seed", "sub_goals")}
     seeds = {"seeds": [trial.seed for trial in trials], "left_out": left_out}
     length = {"stride": stride, "steps": steps, "seconds_per_step": stride / about.rate_hz}
     values = {**vars(about), **chosen, **seeds, **length}
