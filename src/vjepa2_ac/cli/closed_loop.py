@@ -238,7 +238,7 @@ def _require_benchmark(options: argparse.Namespace) -> None:
 def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
     """Let the model and its competitors act; return the benchmark and the folder for its files."""
     from vjepa2_ac.runs.folder import is_run
-    from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_benchmark
+    from vjepa2_ac.simulation.benchmark import BenchmarkOptions, require_to_act, run_benchmark
     from vjepa2_ac.simulation.domains import load_mujoco
     from vjepa2_ac.simulation.worlds import OtherWorld, run_world_benchmark
 
@@ -251,6 +251,7 @@ def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
             env = stack.enter_context(OtherWorld(options.world, options.world_timeout))
             name = re.sub(r"\W+", "-", f"{env.about.task} {env.about.world}", flags=re.ASCII).strip("-")[:200]
         subject, reporter = cli.load_planning_session(options), stack.enter_context(cli.reporter())
+        require_to_act(subject, world=options.world is not None)
         home = Path(options.subject) if is_run(options.subject) else Path()
         folder = options.out or home / "closed_loop" / name
         cli.make_folder(folder)

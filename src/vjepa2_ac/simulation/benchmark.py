@@ -93,13 +93,17 @@ class Planning:
         return action - state if spaces.action.follows == "target" else action
 
 
-def policy_of(subject: Subject, arm: SimulatedArm | None) -> Planning:
-    """Return the policy of a model; without an arm for a third-party environment, whose camera's pose is not known.
+def require_to_act(subject: Subject, *, world: bool) -> None:
+    """Refuse a model that takes what is not measured, or whose model step has no known length.
+
+    Args:
+        subject: Loaded for planning.
+        world: Whether it acts in a third-party environment, whose camera's pose is not known.
 
     Raises:
-        InputError: It takes what is not measured there, or its model step has no known length.
+        InputError: It cannot act.
     """
-    data, uses_camera = subject.config.data, subject.world_model.sizes.predictor.use_extrinsics
+    data = subject.config.data
     require_stride(data, to="act", fix="Say which, as data.stride=4")
     if data.pose_frame != "base":
         needed = "base: the simulated arm moves in the frame of its base"
@@ -108,12 +112,23 @@ def policy_of(subject: Subject, arm: SimulatedArm | None) -> Planning:
         found = "a model of other numbers than the simulated arm measures"
         needed = f"poses; or seven joint angles and the gripper: data.fields.state: [{', '.join(JOINT_FIELDS)}]"
         raise InputError(where="data.states: vector", found=found, needed=needed)
-    if arm is None and (uses_camera or data.states == "vector"):
+    uses_camera = subject.world_model.sizes.predictor.use_extrinsics
+    if world and (uses_camera or data.states == "vector"):
         found = "a model that takes the pose of the camera" if uses_camera else "a model of joints"
         raise InputError(where="--world", found=found, needed="a model of poses: environments measure nothing else")
+
+
+def policy_of(subject: Subject, arm: SimulatedArm | None) -> Planning:
+    """Return the policy of a model for an arm; None: for a third-party environment.
+
+    Raises:
+        InputError: As `require_to_act`.
+    """
+    require_to_act(subject, world=arm is None)
     name = Path(subject.name).name or subject.name
     if name in {ZeroActions.name, RandomActions.name, Oracle.name}:  # in tables these are the references
         name = f"model {name}"
+    uses_camera = subject.world_model.sizes.predictor.use_extrinsics
     controller = Controller.of_subject(subject, extrinsics=arm.extrinsics() if arm and uses_camera else None)
     return Planning(controller, name)
 
@@ -225,14 +240,15 @@ def run_benchmark(subject: Subject, options: BenchmarkOptions, reporter: Reporte
     """
     if options.films:
         video_library()
-    options, planning = replace(options, stride=subject.config.data.model_stride), subject.config.planning
-    arm, limits = arm_for(options.task, options.world, views=planning.views), planning.limits
-    model, trials = policy_of(subject, arm), options.trials()
+    planning = subject.config.planning
+    arm = arm_for(options.task, options.world, views=planning.views)
+    model = policy_of(subject, arm)
+    trials = replace(options, stride=subject.config.data.model_stride).trials()
     if options.sub_goals != "none":
         reporter.task("demonstrations of all problems")
-        goals = [demonstrated_goals(trial, arm, limits, options.sub_goals) for trial in trials.trials]
+        goals = [demonstrated_goals(trial, arm, planning.limits, options.sub_goals) for trial in trials.trials]
         trials = with_goals(trials, goals)
-    policies = (model, ZeroActions(), RandomActions(limits, options.seed), Oracle(limits))
+    policies = (model, ZeroActions(), RandomActions(planning.limits, options.seed), Oracle(planning.limits))
     results = try_policies(ArmEnvironment(arm), policies, trials, options.films, reporter)
     return ClosedLoopBenchmark(subject, trials, results)
 
