@@ -18,7 +18,12 @@ from vjepa2_ac.storage import write_atomically
 
 KEPT = Path(__file__).with_name("results")
 REACHED_CM = 5.0
-CHANGES = {"look": "camera and look", "motion": "robot turned", "randomized": "all anew"}
+CHANGES = {
+    "look": "camera and appearance changed",
+    "motion": "robot mounting rotated",
+    "randomized": "fully randomised scenes",
+}
+BASE_MODELS = {"one camera": "one-camera base model", "many cameras": "multi-camera base model", "none": "no base model"}
 SHIFTED = ("one_step", "one_step_zero_actions", "one_step_shuffled_actions")
 Figures = dict[str, Any]
 
@@ -87,6 +92,22 @@ def pick(results: Sequence[Figures], **wanted: Any) -> list[Figures]:
     """Return the results whose cells have these values, by seed."""
     chosen = [one for one in results if all(one["cell"][key] == value for key, value in wanted.items())]
     return sorted(chosen, key=lambda one: one["cell"]["seed"])
+
+
+def label(method: str) -> str:
+    """Return the name of a method in tables and plots."""
+    for stored, shown in (
+        ("zero-shot", "base model"),
+        ("before the change", "before the domain shift"),
+        ("LoRA r", "LoRA, rank "),
+        (" + in/out", " + projections"),
+        ("in/out only", "projections only"),
+        ("DoRA r", "DoRA, rank "),
+        ("scratch", "from scratch"),
+        ("3x steps", "3 times the steps"),
+    ):
+        method = method.replace(stored, shown)
+    return "full fine-tuning" if method == "full" else method
 
 
 def main_cells(results: Sequence[Figures], base: str, method: str, shift: str = "look") -> list[Figures]:
