@@ -23,7 +23,11 @@ CHANGES = {
     "motion": "robot mounting rotated",
     "randomized": "fully randomised scenes",
 }
-BASE_MODELS = {"one camera": "one-camera base model", "many cameras": "multi-camera base model", "none": "no base model"}
+BASE_MODELS = {
+    "one camera": "one-camera base model",
+    "many cameras": "multi-camera base model",
+    "none": "no base model",
+}
 SHIFTED = ("one_step", "one_step_zero_actions", "one_step_shuffled_actions")
 Figures = dict[str, Any]
 

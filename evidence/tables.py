@@ -199,11 +199,11 @@ def correlated_numbers(results: Sequence[Figures]) -> Correlated:
     cells = [one for one in results if "offline" in one and "visited" in one["reach"]["l1"]]
     groups = {"all": cells, "randomized": [one for one in cells if one["cell"]["shift"] == "randomized"]}
     correlated = {}
-    for label, some in groups.items():
+    for shift, some in groups.items():
         if len(some) >= FEWEST:
             missed = [-float(np.mean(reached(one))) for one in some]
             kinds = [tuple(one["cell"][key] for key in ("shift", "base", "method", "episodes")) for one in some]
-            correlated[label] = len(some), correlations([_offline_row(one) for one in some], missed, kinds)
+            correlated[shift] = len(some), correlations([_offline_row(one) for one in some], missed, kinds)
     return correlated
 
 
