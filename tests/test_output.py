@@ -42,7 +42,7 @@ def test_work_goes_on_when_its_reader_leaves(start: Start, tmp_path: Path) -> No
 def test_a_silent_command_prints_on_stderr_what_it_does_and_ends_at_once(start: Start) -> None:
     code = """
     import time
-    from vjepa2_ac.cli.console import waiting
+    from vjepa2_ac.cli import waiting
     waiting._SILENT_S, waiting._CHECK_S = (0.1,), 0.01
     with waiting.watch_silence():
         print("{}")

@@ -220,7 +220,7 @@ TRAINING_HOOKS = Registry(
     "hook of training",
     "",  # no entry points
     {
-        "data.stride": "inspection.variants:StrideChoice",
+        "data.stride": "inspection.variants:choose_stride",
         "validation.decoder": "decoding.imagine:ImaginedStrip",
         "motion": "inspection.motion:warnings_from_index",
         "coverage": "inspection.coverage:coverage_in",

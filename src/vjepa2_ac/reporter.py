@@ -5,17 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.errors import counted
 
 INDEXING, LOADING = "looking through the data set", "loading the model"  # tasks of many
-
-
-def duration(hours: float) -> str:
-    """Return a time for people: hours, or minutes."""
-    if hours >= 1:
-        return f"about {hours:,.1f} hours"
-    minutes = round(60 * hours)
-    return f"about {counted(minutes, 'minute')}" if minutes else "less than a minute"
 
 
 class Reporter:

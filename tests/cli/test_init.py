@@ -65,6 +65,6 @@ def test_simulated_data_are_recorded_first(form: str, here: Path, capsys: pytest
 def test_the_released_model_is_to_be_fetched_first(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init", "data/my robot/v1.0", "--out", "sub/a.yaml"]) == 0
     told = capsys.readouterr().out
-    assert "vjepa2-ac download   # the model, once: 11.7 GB, about 16 minutes at 100 Mbit/s" in told
+    assert "vjepa2-ac download   # the model, once: 11.7 GB" in told
     assert "# the real run, 200 times the trial's step time; repeat to resume" in told
     assert load_config("sub/a.yaml").model.base == "checkpoints/vjepa2-ac-vitg.pt"

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from evaluation_results import evaluation, page_of
-from vjepa2_ac.cli.console.progress import PlainConsole
-from vjepa2_ac.cli.console.tables import row_tables
+from vjepa2_ac.cli.progress import PlainConsole
+from vjepa2_ac.cli.tables import row_tables
 from vjepa2_ac.evaluation.result import gain_over, over_persistence, rank_difference
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.intervals import Estimate

@@ -28,20 +28,6 @@ def rename(folder: Path, name: str) -> Path:
     return folder
 
 
-def write_like_bridge(folder: Path, name: str) -> Path:
-    """Write the descriptions of a set with BridgeData's features; its one shard is empty."""
-    folder.mkdir(parents=True)
-    observation = {"image_0": {"image": {}}, "state": {"tensor": {"dtype": "float32", "shape": {"dimensions": ["7"]}}}}
-    features: dict[str, object] = {"featuresDict": {"features": observation}}
-    for key in ("observation", "steps"):
-        features = {"featuresDict": {"features": {key: features}}}
-    (folder / "features.json").write_text(json.dumps(features))
-    split = {"name": "train", "shardLengths": ["25"]}
-    (folder / "dataset_info.json").write_text(json.dumps({"name": name, "splits": [split]}))
-    (folder / f"{name}-train.tfrecord-00000-of-00001").touch()
-    return folder
-
-
 def drafted(path: Path) -> tuple[dict[str, Any], dict[str, str], str]:
     """Return the values of `data`, all guesses and the text of the config for a set."""
     found = look_at(str(path))

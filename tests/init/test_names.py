@@ -2,7 +2,7 @@
 
 import pytest
 
-from vjepa2_ac.init.found import camera_names, pick_camera, plain
+from vjepa2_ac.init.found import camera_names, pick_camera
 from vjepa2_ac.init.poses import Column, find_pose
 
 JOINTS = Column(
@@ -21,27 +21,6 @@ def test_droids_columns_are_known() -> None:
     assert pose is not None
     assert pose["state"].value == ["observation.state.cartesian_position", "observation.state.gripper_position"]
     assert (pose["rotation"].value, pose["state"].is_guess, "select" in pose) == ("euler_xyz", False, False)
-
-
-@pytest.mark.parametrize(
-    ("names", "rotation", "select"),
-    [
-        ("x y z roll pitch yaw gripper", "euler_xyz", None),
-        ("gripper x y z roll pitch yaw", "euler_xyz", [1, 2, 3, 4, 5, 6, 0]),
-        ("eef.x eef.y eef.z eef.qw eef.qx eef.qy eef.qz gripper.pos", "quaternion_wxyz", [0, 1, 2, 4, 5, 6, 3, 7]),
-        ("x y z qx qy qz qw gripper", "quaternion_xyzw", None),
-        ("j0 j1 x y z qx qy qz qw finger_joint", "quaternion_xyzw", [2, 3, 4, 5, 6, 7, 8, 9]),
-    ],
-)
-def test_numbers_that_have_names_are_chosen_by_them(names: str, rotation: str, select: list[int] | None) -> None:
-    named = tuple(names.split())
-    pose = find_pose({"action": Column(len(named), named), "observation.state": Column(len(named), named)})
-    assert pose is not None
-    if rotation == "quaternion_wxyz":
-        rotation = "quaternion_xyzw"  # the numbers are selected in this order
-    keys = plain(pose)
-    assert (keys["state"], keys["rotation"], keys.get("select")) == (["observation.state"], rotation, select)
-    assert not pose["state"].is_guess
 
 
 @pytest.mark.parametrize(

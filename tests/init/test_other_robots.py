@@ -233,6 +233,8 @@ def chosen_names(names: str) -> list[str]:
         ("x.pos y.pos z.pos roll.pos pitch.pos yaw.pos gripper.pos",) * 2,
         ("j_0 j_1 cube_x cube_y cube_z cube_roll cube_pitch cube_yaw gripper", ""),
         ("gripper_vel x y z roll pitch yaw gripper", "x y z roll pitch yaw gripper"),
+        ("gripper x y z roll pitch yaw", "x y z roll pitch yaw gripper"),
+        ("j0 j1 x y z qx qy qz qw finger_joint", "x y z qx qy qz qw finger_joint"),
     ],
 )
 def test_numbers_of_other_quantities_are_not_taken_for_the_pose(names: str, expected: str) -> None:

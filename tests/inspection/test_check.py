@@ -51,7 +51,6 @@ def test_good_numbers_are_all_well() -> None:
     [
         ("pixels", "error", "all pixels are 0", {"frames": torch.zeros_like(good()["frames"])}),
         ("pixels", "warning", "nearly black", {"frames": good()["frames"] // 100}),
-        ("frames", "error", "although the robot moved", {"frames": good()["frames"][:, :1].repeat(1, 5, 1, 1, 1)}),
         ("position", "error", "never changes", {"states": torch.zeros_like(good()["states"])}),
         ("position", "warning", "in metres, from the base", {"states": good()["states"] * 8}),
         ("position", "warning", "within 1 cm", {"states": good()["states"] * 0.01}),
@@ -97,7 +96,7 @@ def test_a_test_split_that_cannot_answer_is_told_the_share_that_can(tmp_path: Pa
         folder = write_vectors(tmp_path / str(episodes), width=3, episodes=episodes)
         config = knobs(folder, source="npz", states="vector", validation_share=0.1, test_share=0.05)
         texts[episodes] = [one.text for one in check_data(config, clips=2) if "cannot show whether" in one.text]
-    assert "No data.test_share of 6 episodes leaves enough for training" in texts[6][0]
+    assert texts[6][0].endswith("Record more episodes")
     share = float(re.search(r"data.test_share=([\d.]+)", texts[30][0])[1])
     config = knobs(tmp_path / "30", source="npz", states="vector", test_share=share)
     assert open_dataset(config).members("test").sum() >= 5

@@ -7,8 +7,8 @@ import pytest
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.inspection.check import check_data, coverage_findings
-from vjepa2_ac.inspection.coverage import PLAY, Coverage, ReadEpisode, coverage_in, coverage_of
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.coverage import PLAY, Coverage, ReadEpisode, coverage_findings, coverage_in, coverage_of
 from vjepa2_ac.inspection.statistics import inspect_dataset
 from vjepa2_ac.spaces import POSE, matrices_from_euler, rotation_differences, states_in_camera_frame, vector_states
 

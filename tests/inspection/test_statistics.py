@@ -30,13 +30,14 @@ def test_motion_per_step_is_in_centimetres_and_degrees_at_every_stride(monkeypat
     source = MemorySource([40], states=lambda _: straight_on(40))
     monkeypatch.setattr("vjepa2_ac.inspection.statistics.candidate_strides", lambda _: (1, 4, 15, 40))
     dataset = dataset_in_memory(source)
-    *found, too_wide = inspect_dataset(dataset).steps
+    inspection = inspect_dataset(dataset)
+    *found, too_wide = inspection.values["per_model_step"]
     for one, stride in zip(found, (1, 4, 15), strict=True):
-        assert (one.stride, one.seconds) == (stride, stride / 15)
-        assert len(one.sizes[MOVED]) == 40 - stride
-        assert one.percentiles[MOVED] == pytest.approx([stride] * 4)
-        assert one.percentiles[TURNED] == pytest.approx([stride] * 4)
-    assert too_wide.percentiles == {MOVED: [], TURNED: []}
+        assert (one["stride"], one["seconds"]) == (stride, stride / 15)
+        assert len(inspection.steps[stride][MOVED]) == 40 - stride
+        assert one[MOVED] == pytest.approx([stride] * 4)
+        assert one[TURNED] == pytest.approx([stride] * 4)
+    assert too_wide == {"stride": 40, "seconds": 40 / 15, MOVED: [], TURNED: []}
 
 
 def test_standing_still_counts_from_a_run_that_is_long_enough() -> None:
@@ -54,7 +55,7 @@ def test_figures_of_a_whole_set(droid: Path) -> None:
     assert values["hours"] == pytest.approx(87 / 15 / 3600)
     assert values["success_share"] == pytest.approx(4 / 6)
     assert len(found.sample) == 6
-    assert [one.stride for one in found.steps] == [4, 8, 15]
+    assert list(found.steps) == [4, 8, 15]
     splits = [split_of(info.id, dataset.config) for info in dataset.table]
     assert {name: one["episodes"] for name, one in values["splits"].items()} == {
         name: splits.count(name) for name in ("train", "validation", "test")

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from made_pages import _leaves
-from vjepa2_ac.cli.options import as_config, as_local, as_model, as_path, as_place, as_subject
+from vjepa2_ac.cli.options import as_config, as_local, as_model, as_path, as_place
 from vjepa2_ac.cli.program import _parser, main
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.config.loading import all_keys, config_as_flat_dict, parse_config
@@ -85,7 +85,7 @@ def test_every_path_on_the_command_line_is_read_alike() -> None:
         is_path = words & set(str(action.metavar).replace("|", " ").split())
         if is_path and action.dest != "overrides":
             found += 1
-            readers = {as_config, as_path, as_local, as_model, as_place, as_subject}
+            readers = {as_config, as_path, as_local, as_model, as_place}
             assert action.type in readers, f"{command}: {action.dest}"
     assert found > 20
 

@@ -134,7 +134,7 @@ def _serve() -> None:
     """Fork a child for each line of the standard input; tell its number, and later its status."""
     import torch
 
-    import vjepa2_ac.cli.console.progress
+    import vjepa2_ac.cli.progress
     import vjepa2_ac.training.loop  # noqa: F401 - what a start imports
     from vjepa2_ac.cli import main
 

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.cli.console.waiting import Work
+from vjepa2_ac.cli.waiting import Work
 from vjepa2_ac.errors import InputError, counted, shell_command
+from vjepa2_ac.runs.folder import is_of_moved, is_run
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,39 +37,43 @@ def add_serve(commands: cli.Commands) -> None:
     cli.add(parser, "--goals FOLDER", "what a client may name: pictures, and folders that `goals` made", cli.as_path)
     text = "delta: changes of each model step; pose: waypoints to the target pose, one a control step (delta)"
     cli.add(parser, "--actions delta|pose", text, choices=["delta", "pose"], default="delta")
-    cli.add(parser, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
-    cli.add(parser, "--port N", "0: a free one (8000)", cli.whole_number(0, 65535), default=8000)
-    cli.add(parser, "--key-file FILE", "with the key that clients send; needed where others can reach it", cli.as_path)
     cli.add(parser, "--dry-run", "plan, and answer zeros: the robot stays where it is", action="store_true")
-    text = "write every decision with its images to a new folder, up to 2 GB"
-    cli.add(parser, "--record FOLDER", text, cli.as_path)
+    cli.add(parser, "--record FOLDER", "write each decision with its images to a new folder, up to 2 GB", cli.as_path)
     group = parser.add_argument_group("messages")
     cli.add(group, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
-    text = "longest time for a decision; then the action is zero (60)"
-    cli.add(group, "--deadline SECONDS", text, cli.number_between(0, 3600, "seconds"), default=60.0)
+    seconds = cli.number_between(0, 3600, "seconds")
+    cli.add(group, "--deadline SECONDS", "after which the action of a decision is zero (60)", seconds, default=60.0)
     group = parser.add_argument_group("access")
+    cli.add(group, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
+    cli.add(group, "--port N", "0: a free one (8000)", cli.whole_number(0, 65535), default=8000)
+    cli.add(group, "--key-file FILE", "with the key that clients send; needed where others can reach it", cli.as_path)
     cli.add(group, "--insecure", "no key, although others can reach the address", action="store_true")
-    text = "a name that a proxy serves it under; repeatable"
-    cli.add(group, "--allow-host NAME", text, action="append", default=[])
+    cli.add(group, "--allow-host NAME", "a name that a proxy serves it under", action="append", default=[])
 
 
 def add_simulate(commands: cli.Commands) -> None:
     """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
     parser = cli.command(commands, "simulate", _simulate, "demo/run --task reach --domain B --episodes 10")
-    text = "a run, or what model.base takes (builtin:sim-tiny); or: record"
-    cli.add(parser, "subject RUN_OR_MODEL|record", text, cli.as_model)
+    cli.add(parser, "subject RUN_OR_MODEL|record", "a run, or what model.base takes; or: record", cli.as_model)
     cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
     cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
-    text = "A or B; record: or random, another world in every episode (A)"
-    cli.add(parser, "--domain", text, choices=["A", "B", "random"])
+    cli.add(
+        parser, "--domain", "the world; random: record another one in every episode (A)", choices=["A", "B", "random"]
+    )
     cli.add(parser, "--episodes N", "how many (50; record: 40)", cli.count)
     cli.add(parser, "--steps N", "model steps (8; pick 12, place 18); record: control steps (41; place 81)", cli.count)
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
-    text = "instead of our arm a program in an environment of its own: 'PYTHON examples/worlds/robosuite.py Lift'"
-    cli.add(parser, "--world COMMAND", text)
-    text = "longest wait for an answer of that program; for its first one, with loading, five times as long (120)"
-    cli.add(parser, "--world-timeout SECONDS", text, cli.number_between(0, 86_400, "seconds"))
+    cli.add(
+        parser, "--world COMMAND", "another environment: 'PYTHON examples/worlds/robosuite.py Lift' (docs/worlds.md)"
+    )
+    seconds = cli.number_between(0, 86_400, "seconds")
+    cli.add(
+        parser,
+        "--world-timeout SECONDS",
+        "longest wait for an answer; for the first one 5 times as long (120)",
+        seconds,
+    )
     group = parser.add_argument_group("to test a model")
     cli.add_all(group)
     cli.add_checkpoint(group, default=None)
@@ -78,8 +83,7 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
     cli.add(group, "--out FOLDER", "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)", cli.as_path)
     group = parser.add_argument_group("to record data")
-    text = "of 3 that have an image of their own, the others show the first (1)"
-    cli.add(group, "--cameras N", text, cli.whole_number(1, 3))
+    cli.add(group, "--cameras N", "of 3 with an image of their own; others show the first (1)", cli.whole_number(1, 3))
     cli.add(group, "--workers N", "processes; the data are the same whatever their number (1)", cli.count)
 
 
@@ -204,7 +208,7 @@ def _record_world(options: argparse.Namespace, target: Path) -> int:
 def _run_benchmark(options: argparse.Namespace) -> int:
     _require_benchmark(options)
 
-    from vjepa2_ac.cli.console.tables import benchmark_notes, benchmark_table
+    from vjepa2_ac.cli.tables import benchmark_notes, benchmark_table
     from vjepa2_ac.evaluation.summary import closed_loop
     from vjepa2_ac.simulation.benchmark import write_benchmark
 
@@ -237,7 +241,6 @@ def _require_benchmark(options: argparse.Namespace) -> None:
 
 def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
     """Let the model and its competitors act; return the benchmark and the folder for its files."""
-    from vjepa2_ac.runs.folder import is_run
     from vjepa2_ac.simulation.benchmark import BenchmarkOptions, require_to_act, run_benchmark
     from vjepa2_ac.simulation.domains import load_mujoco
     from vjepa2_ac.simulation.worlds import OtherWorld, run_world_benchmark
@@ -280,8 +283,6 @@ def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse
 
 def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> list[str]:
     """Return the command that follows from the verdicts of a closed loop, as lines; none if no command does."""
-    from vjepa2_ac.runs.folder import is_of_moved
-
     is_evaluated, command = summary.predicts.value is not None, _evaluate_command(options)
     if verdict.needs or options.sub_goals is not None:  # the verdict names the fix; a server plans without sub-goals
         return []
@@ -297,8 +298,6 @@ def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> li
 
 def _evaluate_command(options: argparse.Namespace) -> str:
     """Return the command that evaluates what was simulated; empty for what is no run, whose data are not known."""
-    from vjepa2_ac.runs.folder import is_of_moved, is_run
-
     words = [*cli.option_words(options, "checkpoint", "plugin"), *filter(is_of_moved, options.overrides)]
     return shell_command("evaluate", options.subject, *words) if is_run(options.subject) else ""
 

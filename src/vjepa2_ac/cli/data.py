@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
+from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError, counted, shell_command
+from vjepa2_ac.reporter import INDEXING, SILENT
+from vjepa2_ac.storage.structured import json_text
 
 if TYPE_CHECKING:
-    from vjepa2_ac.config import Config
     from vjepa2_ac.episode import Progress
     from vjepa2_ac.inspection.probe import VariantProbe
 
@@ -112,11 +114,9 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
         model: A run or a model that measures the data, too.
         as_json: Print one JSON object and nothing else, when all checks are done.
     """
-    from vjepa2_ac.cli.console.tables import print_finding, variants_table
+    from vjepa2_ac.cli.tables import print_finding, variants_table
     from vjepa2_ac.inspection.check import check_data
     from vjepa2_ac.inspection.findings import Finding, findings_as_dict, summary_of
-    from vjepa2_ac.reporter import INDEXING, SILENT
-    from vjepa2_ac.storage.structured import json_text
 
     findings: list[Finding] = []
 
@@ -157,24 +157,19 @@ def _inspect(options: argparse.Namespace) -> None:
     config = cli.read_config(options.config, options.overrides)
     cli.make_folder(options.out)
 
-    from vjepa2_ac.cli.console.tables import motion_table
     from vjepa2_ac.inspection.sheet import plot_dataset
-    from vjepa2_ac.inspection.statistics import RELEASED, at_some_stride, inspect_dataset
+    from vjepa2_ac.inspection.statistics import at_some_stride, inspect_dataset
 
     with cli.reporter() as reporter:
         dataset = at_some_stride(cli.open_data(config, reporter))
         if config.data.stride == "auto":
             reporter.note(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
         inspection = inspect_dataset(dataset, episodes=options.episodes, progress=reporter.task("reading states"))
-        cli.show(*(f"{name:<16}{text}" for name, text in inspection.summary.items()), motion_table(inspection.steps))
-        if inspection.has_poses:
-            cli.show(f"For comparison: {RELEASED}.")
-        values, sheet = (
-            cli.write_json(options.out / "inspect.json", inspection.values),
-            options.out / "contact_sheet.png",
-        )
-        image = plot_dataset(inspection, sheet, rows=options.rows, progress=reporter.task("reading frames"))
-    cli.show(files=[image, values])
+        cli.show(*(f"{name:<16}{text}" for name, text in inspection.summary.items()))
+        values = cli.write_json(options.out / "inspect.json", inspection.values)
+        sheet = options.out / "contact_sheet.png"
+        plot_dataset(inspection, sheet, rows=options.rows, progress=reporter.task("reading frames"))
+    cli.show(files=[sheet, values])
 
 
 def _calibrate(options: argparse.Namespace) -> int:
@@ -190,7 +185,7 @@ def _calibrate(options: argparse.Namespace) -> int:
         cli.require_subject(options.model)
     cli.make_folder(options.out)
 
-    from vjepa2_ac.cli.console.tables import variants_table
+    from vjepa2_ac.cli.tables import variants_table
     from vjepa2_ac.evaluation.measure import ClipSample
     from vjepa2_ac.inspection.variants import calibrate_config
 

@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.config.model import RANDOM
-from vjepa2_ac.errors import InputError, UserError, counted, shell_command
+from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.process import is_first
+from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.runs.folder import is_of_moved, is_run
 
 _NAMED = ("none", "up", "left", "close")  # actions from an image, whose true ones are not known
 
 if TYPE_CHECKING:
-    from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.decoding.imagine import Imagination
-    from vjepa2_ac.evaluation.request import EvaluationOptions
-    from vjepa2_ac.evaluation.result import About, Evaluation
-    from vjepa2_ac.reporter import Reporter
+    from vjepa2_ac.evaluation.result import About
     from vjepa2_ac.reports.write import Evaluated
 
 
 def add_evaluate(commands: cli.Commands) -> None:
     """Add `evaluate` to a parser."""
     parser = cli.command(commands, "evaluate", _evaluate, "demo/run --clips 64 --decoder demo/decoder")
-    text = "folder of a run, or (with --data) what model.base takes; several: one after another"
-    cli.add(parser, "subjects RUN_OR_MODEL", text, cli.as_subject, nargs="+")
+    cli.add(parser, "subject RUN_OR_MODEL", "a run, or (with --data) what model.base takes", cli.as_model)
+    cli.add(parser, "overrides key=value", "model.base=PATH, if the base was moved", nargs="*")
     cli.add(parser, "--against base|RUN|MODEL", "what to compare with (the base of a run)", cli.as_model, nargs="+")
     cli.add(parser, "--clips N", "at most this many clips, spread over the episodes (256)", cli.count)
     cli.add_decoder(parser, "the rollouts as images, and measure these, too")
@@ -42,18 +38,11 @@ def add_evaluate(commands: cli.Commands) -> None:
     group = parser.add_argument_group("use of the actions")
     cli.add(group, "--ranking-clips N", "clips for the action-ranking error (32)", cli.whole_number(0))
     cli.add(group, "--samples N", "alternative actions for each of them (64)", cli.count)
-    cli.add(
-        group,
-        "--landscapes N",
-        "clips of those with a landscape (8)",
-        cli.whole_number(0),
-        dest="landscape_clips",
-    )
+    cli.add(group, "--landscapes N", "with a landscape (8)", cli.whole_number(0), dest="landscape_clips")
     cli.add(group, "--nodes N", "points of a landscape along each axis (9)", cli.whole_number(3, 51))
     cli.add(group, "--reach CM", "half its width (7.5)", cli.number_between(0.0, 1000.0, "cm"), dest="reach_cm")
     cli.add(group, "--examples N", "clips to show (4)", cli.whole_number(0))
     cli.add(group, "--at-once N", "actions computed together (64): lower it to save memory", cli.count)
-    parser.set_defaults(overrides=[])
 
 
 def add_compare(commands: cli.Commands) -> None:
@@ -69,10 +58,8 @@ def add_imagine(commands: cli.Commands) -> None:
     parser = cli.command(commands, "imagine", _imagine, "demo/run --decoder demo/decoder --actions true,up,left")
     cli.add_planner(parser, such_as="such as model.base=PATH; with --image: planning.limits.xyz=data")
     cli.add_decoder(parser, "what is imagined", required=True)
-    text = (
-        "with commas between them: true (as recorded), none, up, down, left, right, forward, back, open, close; or"
-        " files, .npy or .csv, with a row of 7 numbers for each step (true,none,up,left,close)"
-    )
+    text = "true (as recorded), none, up, down, left, right, forward, back, open, close, with commas between them; or"
+    text += " files, .npy or .csv, with a row of 7 numbers for each step (true,none,up,left,close)"
     cli.add(parser, "--actions NAMES", text, _names)
     cli.add(parser, "--steps N", "model steps to imagine (7)", cli.count, default=7)
     cli.add(parser, "--size CM", "of a named action in each step, within planning.limits (5)", float, default=5.0)
@@ -93,51 +80,44 @@ def _evaluate(options: argparse.Namespace) -> None:
     Its predictions are compared with those of its base model, with persistence, and with wrong actions. A model is
     measured likewise.
     """
-    from vjepa2_ac.evaluation.request import settle
+    from vjepa2_ac.evaluation.request import ProbeOptions, settle
 
-    asked = _asked(options)
-    for subject, how in asked:
-        cli.require_subject(subject, settle(subject, how), options.words)
+    subject = options.subject
+    if unused := [word for word in options.overrides if not is_of_moved(word)]:
+        needed = "model.base=PATH, for a run whose base was moved: evaluate does not change other config keys"
+        raise InputError(where="command line", found=" ".join(unused), needed=needed)
+    asked = cli.evaluation_options(options, probes=cli.record_of_options(ProbeOptions, options))
+    cli.require_subject(subject, settle(subject, asked), options.words)
+    cli.say_places_elsewhere(subject)
 
-    from vjepa2_ac.cli.console.tables import row_tables
+    from vjepa2_ac.cli.tables import row_tables
     from vjepa2_ac.distributed import leave_processes
     from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
     from vjepa2_ac.evaluation.rows import rows_of
-    from vjepa2_ac.reporter import SILENT
     from vjepa2_ac.reports.write import write_evaluation
 
-    for subject, how in asked:
-        cli.say_places_elsewhere(subject)
-        with cli.reporter() as reporter:
-            evaluation = evaluate_subject(subject, how, reporter=reporter if is_first() else SILENT)
-            if not is_first():  # it shared the work of the first process, which reports
-                continue
+    with cli.reporter() as reporter:
+        evaluation = evaluate_subject(subject, asked, reporter=reporter if is_first() else SILENT)
+        if is_first():  # the other processes shared its work
             reporter.task("writing report and figures")
-            measured = write_evaluation(evaluation, how.out or Path(subject))
+            measured = write_evaluation(evaluation, asked.out or Path(subject))
+    if is_first():
         if options.all:
             checkpoint, notes = evaluation.about.checkpoint, evaluation.notes
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
             tables = row_tables(rows_of(evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
-        cli.show(str(measured.summary), *_next(measured, options, reporter.seconds))
+        cli.show(str(measured.summary), *_next(measured, options))
         film = "" if evaluation.decoded is None else "film and "
         cli.show(f"Report with {film}all tables: {measured.report}")
     leave_processes()
 
 
-def _next(measured: Evaluated, options: argparse.Namespace, seconds: Mapping[str, float]) -> list[str]:
-    """Return the command that follows from the summary, as lines.
-
-    Args:
-        measured: The evaluation.
-        options: Those of the command.
-        seconds: The duration of each task of the evaluation, by its title.
-    """
-    from vjepa2_ac.runs.folder import is_of_moved
-
+def _next(measured: Evaluated, options: argparse.Namespace) -> list[str]:
+    """Return the command that follows from the summary; empty if no command does."""
     about, summary, settings = measured.evaluation.about, measured.summary, options.overrides
     config = options.data or f"{about.subject}/config.yaml"
-    words, cost = ["data", "check", config], ""
+    words = ["data", "check", config]
     if not about.checkpoint:
         is_other = cli.read_config(config).model.base not in {RANDOM, about.subject}
         words = ["train", config, *[f"model.base={about.subject}"] * is_other]
@@ -145,75 +125,30 @@ def _next(measured: Evaluated, options: argparse.Namespace, seconds: Mapping[str
         if about.is_base or "no" in {verdict.conclusion for verdict in summary.verdicts[:3]}:
             words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
         elif summary.plans is None and (simulation := _simulation(about, options)):
-            words, cost = simulation.words, _simulation_cost(measured.evaluation, simulation, seconds)
+            words = simulation
         elif summary.verdicts[2].conclusion == "yes":  # a robot is not recommended without a measured gain
             words = ["serve", about.subject, *cli.option_words(options, "checkpoint"), *settings]
         else:
             return []
-    command = f"Next: {shell_command(*words, *cli.option_words(options, 'plugin'))}"
-    return [command, f"  ({cost})"] if cost else [command]
+    return [f"Next: {shell_command(*words, *cli.option_words(options, 'plugin'))}"]
 
 
-class _Simulation(NamedTuple):
-    """A recommended closed loop."""
-
-    words: list[str]  # of the command, without the program's name
-    decisions: int
-    planning: PlanningConfig
-
-
-def _simulation(about: About, options: argparse.Namespace) -> _Simulation | None:
-    """Return the closed loop that tests a run; None for data that `simulate record` did not make."""
+def _simulation(about: About, options: argparse.Namespace) -> list[str]:
+    """Return the words of the command that tests a run in closed loop; empty unless `simulate record` made the data."""
     from vjepa2_ac.distributed import is_on_cpu
     from vjepa2_ac.planning.settings import planning_settings
-    from vjepa2_ac.simulation.benchmark import BenchmarkOptions
     from vjepa2_ac.simulation.domains import Domain
     from vjepa2_ac.simulation.record import read_simulation
-    from vjepa2_ac.simulation.tasks import STEPS
 
     try:
         recorded = read_simulation(Path(about.data).resolve(strict=True))
     except (OSError, UserError):
-        return None
+        return []
     task, domain = recorded.task or "reach", recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
     config = planning_settings(about.subject, overrides=options.overrides)
     quick = cli.quick_words(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
-    overrides = [*options.overrides, *quick]
     words = ["simulate", about.subject, "--task", task, "--domain", domain, *cli.option_words(options, "checkpoint")]
-    planning = config.planning.model_copy(update=cli.QUICK) if quick else config.planning
-    return _Simulation([*words, *overrides], BenchmarkOptions.episodes * STEPS[task], planning)
-
-
-def _simulation_cost(evaluation: Evaluation, simulation: _Simulation, seconds: Mapping[str, float]) -> str:
-    """Return how long a simulation takes on this machine, from the duration of the action ranking."""
-    from vjepa2_ac.planning.planner import samples_of_iterations
-    from vjepa2_ac.reporter import duration
-
-    ranking = evaluation.models[evaluation.trained].ranking
-    sequences = sum(samples_of_iterations(simulation.planning))
-    about = f"{counted(simulation.decisions, 'decision')} of {counted(sequences, 'action sequence')} each"
-    ranked_s = seconds.get(f"action ranking, {evaluation.trained}")
-    if ranking is None or ranked_s is None:
-        return f"its time was not measured: {about}"
-    prediction_s = ranked_s * int(os.environ.get("WORLD_SIZE", "1")) / (len(ranking.ranks) * (1 + 2 * ranking.samples))
-    hours = simulation.decisions * sequences * simulation.planning.horizon * prediction_s / 3600
-    return f"{duration(hours)} here: {about}"
-
-
-def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
-    """Return the options for each subject; refuse settings without effect."""
-    from vjepa2_ac.evaluation.request import ProbeOptions
-    from vjepa2_ac.runs.folder import is_of_moved
-
-    if unused := [word for word in options.overrides if not is_of_moved(word)]:
-        needed = "model.base=PATH, for a run whose base was moved: evaluate does not change other config keys"
-        raise InputError(where="command line", found=" ".join(unused), needed=needed)
-    every = cli.evaluation_options(options, probes=cli.record_of_options(ProbeOptions, options))
-    several = every.out is not None and len(options.subjects) > 1
-    return [
-        (subject, replace(every, out=every.out / Path(subject).name if several and every.out else every.out))
-        for subject in options.subjects
-    ]
+    return [*words, *options.overrides, *quick]
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -225,7 +160,7 @@ def _compare(options: argparse.Namespace) -> None:
 
     comparison = compare(options.runs)
 
-    from vjepa2_ac.cli.console.tables import row_tables
+    from vjepa2_ac.cli.tables import row_tables
     from vjepa2_ac.reports.evaluation_figures import plot_comparison
     from vjepa2_ac.reports.metrics_json import write_csv
 
@@ -245,7 +180,6 @@ def _imagine(options: argparse.Namespace) -> None:
     _require_one_start(options)
 
     from vjepa2_ac.decoding.imagine import write_imagination
-    from vjepa2_ac.runs.folder import is_run
 
     home = Path(options.subject) if is_run(options.subject) else Path()
     out = options.out or home / "imagined"

@@ -15,15 +15,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.cli.console.waiting import Work
+from vjepa2_ac.cli.waiting import Work
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.errors import InputError, counted
+from vjepa2_ac.reporter import Reporter
+from vjepa2_ac.runs.folder import is_run, read_run_config
 from vjepa2_ac.storage.places import BUILTIN
 
 if TYPE_CHECKING:
-    from vjepa2_ac.config import Config
     from vjepa2_ac.decoding.decoder import TrainedDecoder
     from vjepa2_ac.explore.views import Views
-    from vjepa2_ac.reporter import Reporter
 
 _DEMO_RUN, _BUILTIN_MODEL = "demo/run", f"{BUILTIN}sim-tiny"
 _EPISODES = 8  # simulated where a model of the package comes without data
@@ -33,14 +35,10 @@ def add_explore(commands: cli.Commands) -> None:
     """Add `explore` to a parser."""
     parser = cli.command(commands, "explore", _explore, "demo/run --against base")
     text = f"a run, or what model.base takes ({_DEMO_RUN} if it is there, else {_BUILTIN_MODEL})"
-    cli.add(parser, "subject RUN_OR_MODEL", text, cli.as_subject, nargs="?")
-    cli.add(
-        parser, "overrides key=value", "of planning, such as planning.samples=200 (on a CPU a quick one)", nargs="*"
-    )
-    text = "what imagines beside it; repeatable (the base of a run)"
-    cli.add(parser, "--against base|RUN|MODEL", text, cli.as_model, action="append")
-    text = "what shows images: `vjepa2-ac decoder` made it (beside the run, else builtin:sim-tiny)"
-    cli.add(parser, "--decoder FOLDER", text, cli.as_model)
+    cli.add(parser, "subject RUN_OR_MODEL", text, cli.as_model, nargs="?")
+    cli.add(parser, "overrides key=value", "such as planning.samples=200 (on a CPU a quick search)", nargs="*")
+    cli.add(parser, "--against base|RUN|MODEL", "repeatable (the base of a run)", cli.as_model, action="append")
+    cli.add(parser, "--decoder FOLDER", "of `vjepa2-ac decoder` (beside the run, else builtin:sim-tiny)", cli.as_model)
     cli.add(parser, "--data CONFIG", "explore its data; needed for a model but the package's own", cli.as_local)
     cli.add(parser, "--split", "which episodes (test)", choices=["test", "validation", "train"], default="test")
     cli.add_checkpoint(parser)
@@ -55,9 +53,7 @@ def _explore(options: argparse.Namespace) -> int:
     Press a key and see what the model thinks happens, beside its base and what is true; choose a goal, see the energy,
     let it plan (docs/explore.md). Runs until Ctrl-C.
     """
-    from vjepa2_ac.runs.folder import is_run, read_run_config
-
-    if options.subject is not None and cli.is_override(options.subject):
+    if "=" in (options.subject or "") and not Path(options.subject).exists():  # no subject, and an override first
         options.subject, options.overrides = None, [options.subject, *options.overrides]
     subject = options.subject or (_DEMO_RUN if is_run(_DEMO_RUN) else _BUILTIN_MODEL)
     config = read_run_config(Path(subject), options.overrides) if is_run(subject) else None
@@ -94,9 +90,6 @@ def _has_window() -> bool:
 @contextmanager
 def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
     """Yield the config whose data are explored: the given one; None, a run's own; or of episodes that are simulated."""
-    from vjepa2_ac.config.loading import load_config
-    from vjepa2_ac.runs.folder import is_run
-
     if options.data is not None:
         yield cli.read_config(options.data)
     elif is_run(subject):

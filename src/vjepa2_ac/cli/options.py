@@ -12,16 +12,20 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import load_config, load_config_of_run
+from vjepa2_ac.config.planning import ELITES, PlanningConfig
 from vjepa2_ac.errors import InputError, did_you_mean, printable, shell_command
 from vjepa2_ac.process import is_first
-from vjepa2_ac.storage import places
+from vjepa2_ac.reporter import INDEXING
+from vjepa2_ac.runs.folder import is_run, places_elsewhere, read_run_config
+from vjepa2_ac.storage import places, require_new_folder, try_writing_at, user_can_write, write_atomically
+from vjepa2_ac.storage.structured import json_text
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from vjepa2_ac.cli.console.progress import ConsoleReporter
-    from vjepa2_ac.config import Config
-    from vjepa2_ac.config.planning import PlanningConfig
+    from vjepa2_ac.cli.progress import ConsoleReporter
     from vjepa2_ac.data.dataset import Dataset
     from vjepa2_ac.decoding.decoder import TrainedDecoder
     from vjepa2_ac.evaluation.request import EvaluationOptions
@@ -35,7 +39,6 @@ QUICK_WORDS = tuple(f"planning.{key}={value}" for key, value in QUICK.items())
 _QUICK_SEQUENCES = 256
 _MOST = 10**9
 _OPTION = re.compile(r"-(?![\d.])")  # but a negative number is a value
-_OVERRIDE = re.compile(r"[a-z_]+(\.\w+)+=")
 _Record = TypeVar("_Record")
 _Number = TypeVar("_Number", int, float)
 _Read = TypeVar("_Read")
@@ -168,12 +171,7 @@ def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
     group = parser.add_argument_group("the model")
     add_checkpoint(group)
     add(group, "--config CONFIG", "for a model: the config whose planning, crop and dtype count", as_local)
-    add(
-        group,
-        "--extrinsics NUMBERS",
-        "the camera's x,y,z,roll,pitch,yaw in the base frame, if the model uses it",
-        _camera_pose,
-    )
+    add(group, "--extrinsics NUMBERS", "the camera's pose x,y,z,roll,pitch,yaw, if the model uses it", _camera_pose)
 
 
 def add_all(parser: argparse._ActionsContainer) -> None:
@@ -183,8 +181,7 @@ def add_all(parser: argparse._ActionsContainer) -> None:
 
 def add_decoder(parser: argparse._ActionsContainer, shows: str, **how: Any) -> None:
     """Add `--decoder`, with which something is drawn."""
-    text = f"show {shows}, with what `vjepa2-ac decoder` made, or builtin:sim-tiny"
-    add(parser, "--decoder FOLDER", text, as_model, **how)
+    add(parser, "--decoder FOLDER", f"show {shows}: of `vjepa2-ac decoder`, or builtin:sim-tiny", as_model, **how)
 
 
 def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **others: Any) -> _Record:
@@ -203,22 +200,20 @@ def evaluation_options(options: argparse.Namespace, **others: Any) -> Evaluation
 
 def show(*parts: Any, files: Iterable[str | Path] = ()) -> None:
     """Print texts and tables one below another, and the files that were written."""
-    from vjepa2_ac.cli.console.progress import show
+    from vjepa2_ac.cli.progress import show
 
     show(*parts, files=files)
 
 
 def reporter() -> ConsoleReporter:
     """Return what shows messages and progress."""
-    from vjepa2_ac.cli.console.progress import ConsoleReporter
+    from vjepa2_ac.cli.progress import ConsoleReporter
 
     return ConsoleReporter()
 
 
 def say_places_elsewhere(subject: str) -> None:
     """Print the addresses that the config of a run names, before any of them is contacted; nothing for a model."""
-    from vjepa2_ac.runs.folder import is_run, places_elsewhere, read_run_config
-
     if is_run(subject) and is_first():
         for place in places_elsewhere(read_run_config(Path(subject))):
             show(f"{subject} names a place elsewhere: {place}")
@@ -238,7 +233,6 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
     Raises:
         InputError: The config is wrong, or one of them is not there.
     """
-    from vjepa2_ac.config.loading import load_config, load_config_of_run
     from vjepa2_ac.model.model_files import require_model
 
     config = load_config_of_run(Path(path), overrides) if of_run else load_config(path, overrides)
@@ -264,7 +258,6 @@ def require_subject(subject: str, config: Config | None = None, command: Sequenc
         InputError: There is no such run or model, or the base of the run is gone.
     """
     from vjepa2_ac.model.model_files import find_base, require_base_of_run
-    from vjepa2_ac.runs.folder import is_run, read_run_config
 
     if is_run(subject):
         require_base_of_run((config or read_run_config(Path(subject))).model, Path(subject), command)
@@ -297,16 +290,12 @@ def load_planning_session(options: argparse.Namespace) -> Subject:
 def open_data(config: Config, reporter: ConsoleReporter) -> Dataset:
     """Open the data set of a config, and show the progress."""
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.reporter import INDEXING
 
     return open_dataset(config.data, progress=reporter.task(INDEXING))
 
 
 def write_json(path: Path, values: Any) -> Path:
     """Write plain values as JSON, atomically; return the file."""
-    from vjepa2_ac.storage import write_atomically
-    from vjepa2_ac.storage.structured import json_text
-
     write_atomically(path, json_text(values))
     return path
 
@@ -324,8 +313,6 @@ def make_folder(folder: Path) -> None:
     Raises:
         InputError: It cannot be.
     """
-    from vjepa2_ac.storage import user_can_write
-
     with user_can_write(f"--out {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
 
@@ -346,8 +333,6 @@ def require_new_place(folder: Path) -> None:
     Raises:
         InputError: It is one of these.
     """
-    from vjepa2_ac.storage import require_new_folder, try_writing_at, user_can_write
-
     require_new_folder(folder)
     with user_can_write(folder):
         try_writing_at(folder)
@@ -356,8 +341,7 @@ def require_new_place(folder: Path) -> None:
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse a command line; `key=value` may be anywhere after a command that takes it.
 
-    argparse does not accept such words after an option, and treats them as unknown arguments; and it takes those among
-    the names of several runs or models for names.
+    argparse does not accept such words after an option, and treats them as unknown arguments.
     """
     options, rest = parser.parse_known_args(arguments)
     parser, others = options.parser, [word for word in rest if "=" not in word or _OPTION.match(word)]
@@ -368,24 +352,9 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> 
         parser.error(text.removesuffix(". ").rstrip())
     if others and vars(options).get("subject") != "record":  # `simulate record` takes a folder there
         parser.error(f"{' '.join(others)!r} is no key=value (numbers go in one word: 0.4,0,0.3; names side by side)")
-    if "subjects" in options:
-        rest = [*filter(is_override, options.subjects), *rest]
-        options.subjects = [word for word in options.subjects if not is_override(word)]
-        if not options.subjects:
-            parser.error("the following arguments are required: RUN_OR_MODEL")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
-
-
-def as_subject(text: str) -> str:
-    """Parse the name of a run or a model, and leave a `key=value` among several of them unchanged, for `parsed`."""
-    return text if is_override(text) else as_model(text)
-
-
-def is_override(word: str) -> bool:
-    """Return whether a word is a `key=value`, and no path."""
-    return _OVERRIDE.match(word) is not None and not Path(word).exists()
 
 
 def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:
@@ -483,7 +452,6 @@ def option_words(options: argparse.Namespace, *names: str) -> list[str]:
 
 def quick_words(words: Sequence[str], planning: PlanningConfig, *, on_cpu: bool) -> list[str]:
     """Return the overrides for the quick planner if a search on a CPU would be long; none if `words` set its size."""
-    from vjepa2_ac.config.planning import ELITES
     from vjepa2_ac.planning.planner import samples_of_iterations
 
     is_chosen = any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)

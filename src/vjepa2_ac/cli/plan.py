@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.errors import InputError, counted
+from vjepa2_ac.reporter import INDEXING
+from vjepa2_ac.storage import user_can_write
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from vjepa2_ac.config import Config
-    from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.planning.goals import SubGoal
 
 _QUICK = " ".join(cli.QUICK_WORDS)
@@ -38,8 +40,7 @@ def add_plan(commands: cli.Commands) -> None:
     cli.add(group, "--mask IMAGE", "black where the goal image does not count, of its size", cli.as_local)
     group = parser.add_argument_group("the search, and its image")
     cli.add(group, "--seed N", "of the search (the config's)", cli.whole_number(0, 2**31 - 1))
-    text = "points of the energy maps along each axis; 0: no maps (9)"
-    cli.add(group, "--nodes N", text, cli.whole_number(0, 101), default=9)
+    cli.add(group, "--nodes N", "of the energy maps along each axis; 0: none (9)", cli.whole_number(0, 101), default=9)
     cli.add_decoder(group, "in the image what the planner imagined, beside the goal")
 
 
@@ -50,8 +51,7 @@ def add_goals(commands: cli.Commands) -> None:
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
     cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
     cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)", default="0")
-    text = "instead of where the gripper changes or the arm stops: every N control steps"
-    cli.add(parser, "--every N", text, cli.count)
+    cli.add(parser, "--every N", "control steps, instead of where the gripper changes or the arm stops", cli.count)
     group = parser.add_argument_group("where goals lie, and when the next one follows")
     cli.add(group, "--apart N", "least frames from a stop of the arm to another goal (4)", cli.count, default=4)
     cli.add(group, "--slack N", "model steps that a goal may take fewer or more (3)", cli.whole_number(0), default=3)
@@ -78,12 +78,11 @@ def _plan(options: argparse.Namespace) -> int:
     require_ends(goals, first=1)
     start, mask = _images(options, goals[0].image)
 
-    from vjepa2_ac.cli.console.tables import plan_table
+    from vjepa2_ac.cli.tables import plan_table
     from vjepa2_ac.evaluation.imagined import imagine_plan
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
     from vjepa2_ac.reports.planning_figures import PLAN_IMAGE, plot_plan
-    from vjepa2_ac.storage import user_can_write
 
     decoder = cli.given_decoder(options)
     session = cli.load_planning_session(options)
@@ -167,11 +166,9 @@ def _goals(options: argparse.Namespace) -> None:
     config = cli.read_config(options.source, options.overrides)
     stride = require_stride(config.data, to="make goals", fix="Say how many control steps it has: data.stride=4")
 
-    from vjepa2_ac.cli.console.tables import goals_table
+    from vjepa2_ac.cli.tables import goals_table
     from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals, recording_of_episode
-    from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.planning_figures import GOALS_IMAGE, plot_goals
-    from vjepa2_ac.storage import user_can_write
 
     by = "gripper" if options.every is None else "every"
     chosen = cli.record_of_options(KeyFrameOptions, options, by=by, stride=stride)

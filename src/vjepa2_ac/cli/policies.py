@@ -8,14 +8,14 @@ from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError, counted
+from vjepa2_ac.runs.folder import CONFIG, is_run
 
 _FORMS = ("targets", "deltas", "offsets")
 
 
 def add_score(commands: cli.Commands) -> None:
     """Add `score` to a parser."""
-    example = "demo/run --policy mine.npz --policy other.npz"
-    parser = cli.command(commands, "score", _score, example)
+    parser = cli.command(commands, "score", _score, "demo/run --policy mine.npz --policy other.npz")
     cli.add_planner(parser, such_as="such as planning.energy.distance=l2")
     text = "what a policy would do at frames of the data's episodes: .npz; again for others"
     cli.add(parser, "--policy FILE", text, cli.as_path, action="append", dest="policies", required=True)
@@ -41,11 +41,9 @@ def add_monitor(commands: cli.Commands) -> None:
     cli.add_planner(parser, such_as="such as model.dtype=bfloat16")
     cli.add(parser, "--data CONFIG", "watch episodes of its data (those of the run)", cli.as_local)
     cli.add(parser, "--episode ID|NUMBER", "watch this one of the data; repeatable", action="append", default=[])
-    text = "promised share of undisturbed episodes with an alarm (0.05)"
     share = cli.number_between(0.0, 1.0, "a share")
-    cli.add(parser, "--false-alarms SHARE", text, share, default=0.05)
-    text = "what it is to be measured by: a monitor.json (made of the held-out episodes of the data)"
-    cli.add(parser, "--threshold FILE", text, cli.as_local)
+    cli.add(parser, "--false-alarms SHARE", "of undisturbed episodes, at most (0.05)", share, default=0.05)
+    cli.add(parser, "--threshold FILE", "a monitor.json (made of the held-out episodes of the data)", cli.as_local)
     cli.add(parser, "--out FOLDER", "where monitor.json and monitor.png go (the run's)", cli.as_path)
 
 
@@ -57,7 +55,7 @@ def _score(options: argparse.Namespace) -> int:
     """
     cli.require_to_plan(options)
 
-    from vjepa2_ac.cli.console.tables import scores_table
+    from vjepa2_ac.cli.tables import scores_table
     from vjepa2_ac.data.windows import require_frames
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.policies.score import CHANCE, read_policy_chunks, score_policies
@@ -92,8 +90,6 @@ def _monitor(options: argparse.Namespace) -> int:
     gives the threshold; `planning.monitor` takes the file, and `serve` tells alarms. Status 1 where a watched episode
     has one.
     """
-    from vjepa2_ac.runs.folder import is_run
-
     if (views := cli.require_to_plan(options).planning.views) > 1:
         needed, fix = "1: a monitor is made with one camera", "Add planning.views=1"
         raise InputError(where="planning.views", found=f"{views}", needed=needed, fix=fix)
@@ -105,7 +101,7 @@ def _monitor(options: argparse.Namespace) -> int:
 
     from dataclasses import asdict
 
-    from vjepa2_ac.cli.console.tables import watched_table
+    from vjepa2_ac.cli.tables import watched_table
     from vjepa2_ac.goals.make_goals import number_of_episode
     from vjepa2_ac.policies.monitor import MONITOR, Monitor, calibrate_monitor, watch_episodes
     from vjepa2_ac.reports.planning_figures import MONITOR_IMAGE, most_surprising, plot_watched
@@ -143,8 +139,6 @@ def _prior(options: argparse.Namespace) -> None:
     It learns from the demonstrations of a run which action leads from one image to another. Searches then start from
     it (planning.prior=FOLDER) and need fewer samples, or none (planning.planner=prior).
     """
-    from vjepa2_ac.runs.folder import CONFIG, is_run
-
     run = is_run(options.subject)
     file = Path(options.subject) / CONFIG if run else options.subject
     config = cli.read_config(file, options.overrides, base=True, of_run=run)

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from vjepa2_ac import __version__, process
 from vjepa2_ac.cli import closed_loop, data, evaluate, explore, plan, policies, setup, train
-from vjepa2_ac.cli.console.waiting import watch_silence
 from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parsed
+from vjepa2_ac.cli.waiting import watch_silence
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
 from vjepa2_ac.process import EXIT_STATUS, StoppedError, is_first, tidy_end
 from vjepa2_ac.registry import installed, load_installed

@@ -10,15 +10,15 @@ from pathlib import Path
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError, counted, shell_command
 from vjepa2_ac.process import is_first
+from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.runs.folder import is_run, read_run_config
 
 
 def add_train(commands: cli.Commands) -> None:
     """Add `train` to a parser."""
     parser = cli.command(commands, "train", _train, "my_robot.yaml training.steps=1000")
     cli.add_config(parser, such_as="training.learning_rate=3e-4", what="a YAML config, or (--resume) a run's folder")
-    cli.add(
-        parser, "--resume", "resume the run in the folder CONFIG; key=value changes its config", action="store_true"
-    )
+    cli.add(parser, "--resume", "resume the run in CONFIG; key=value changes its config", action="store_true")
     cli.add(parser, "--check", "do everything that can fail, and stop before the first step", action="store_true")
     cli.add(parser, "--allow-config-change", "go on with a run though the config is another", action="store_true")
 
@@ -57,7 +57,6 @@ def _train(options: argparse.Namespace) -> None:
     on from there. A second signal: end at once.
     """
     from vjepa2_ac.model.model_files import require_base_of_run
-    from vjepa2_ac.runs.folder import is_run, read_run_config
 
     path = Path(options.config)
     if options.resume and any(override.startswith("run_dir=") for override in options.overrides):
@@ -73,7 +72,7 @@ def _train(options: argparse.Namespace) -> None:
     else:
         config = cli.read_config(path, options.overrides, base=True)
 
-    from vjepa2_ac.cli.console.training import TrainingConsole
+    from vjepa2_ac.cli.tables import TrainingConsole
     from vjepa2_ac.training.loop import train
 
     with TrainingConsole() as reporter:
@@ -94,7 +93,6 @@ def _encode(options: argparse.Namespace) -> None:
     config = cli.read_config(options.config, options.overrides, base=True)
 
     from vjepa2_ac.encoding.encode_dataset import encode_config
-    from vjepa2_ac.reporter import SILENT
 
     with contextlib.ExitStack() as closing:
         engine = None
@@ -135,7 +133,7 @@ def _decoder(options: argparse.Namespace) -> None:
     """
     config = cli.read_config(options.config, options.overrides, base=True)
 
-    from vjepa2_ac.cli.console.tables import held_out_table
+    from vjepa2_ac.cli.tables import held_out_table
     from vjepa2_ac.decoding.decoder import read_card
     from vjepa2_ac.decoding.training import train_decoder
 
@@ -151,8 +149,6 @@ def _decoder(options: argparse.Namespace) -> None:
 
 def _export(options: argparse.Namespace) -> None:
     """Write a run's model, or its adapter, for others to use."""
-    from vjepa2_ac.runs.folder import read_run_config
-
     config = read_run_config(options.run, options.overrides)
     cli.require_subject(str(options.run), config, options.words)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
@@ -28,6 +28,7 @@ from vjepa2_ac.registry import SOURCES, TRANSFORMS
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
 Split = Literal["train", "validation", "test"]
+RotationFormat = Literal["euler_xyz", "euler_xyz_degrees", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw"]
 _JOINED = "to sum (deltas), mean (velocities) or last (absolute targets)"
 
 
@@ -83,6 +84,33 @@ class DiskCacheConfig(Section):
     are cached, and none are removed. Indexes do not count."""
 
 
+class PoseFields(Section):
+    """How the numbers of a data set form a pose: which of them, in which units, and with which rotation."""
+
+    select: tuple[Count, ...] | None = None
+    """Which numbers of `state`, in this order, are x, y, z, rotation (3 or 4), gripper; or the vector; null: all."""
+    rotation: RotationFormat = "euler_xyz"
+    """Rotation format: extrinsic xyz Euler angles in radians or degrees; a rotation vector (axis times angle in
+    radians); or a unit quaternion with w first or last."""
+    position_unit: Literal["m", "cm", "mm"] = "m"
+    """Unit of the position. The model's states and actions are in metres."""
+    gripper_open: float = 0.0
+    """The gripper's value when it is open."""
+    gripper_closed: float = 1.0
+    """The gripper's value when it is closed; smaller than gripper_open if the sign is inverted."""
+
+    @model_validator(mode="after")
+    def _gripper_moves(self) -> Self:
+        is_broken = self.gripper_open == self.gripper_closed
+        return self.refused((is_broken, "gripper_open and gripper_closed are the same number"))
+
+    @property
+    def pose_keys(self) -> list[str]:
+        """The keys that have a meaning for poses only and differ from their defaults."""
+        keys = ("rotation", "position_unit", "gripper_open", "gripper_closed")
+        return [key for key in keys if getattr(self, key) != type(self).model_fields[key].default]
+
+
 def source_of(values: Any) -> str:
     """Return the form of the data of a config, or of the values of one: RLDS unless it says another."""
     found = values.get("source", "rlds") if isinstance(values, dict) else getattr(values, "source", "")
@@ -102,7 +130,6 @@ class DataConfig(Section):
     has_camera_poses: ClassVar[bool] = True
     has_vectors: ClassVar[bool] = True  # states may be other numbers than a pose
     same_identity_fix: ClassVar[str] = ""  # the way out where two episodes are named alike
-    gripper_fix: ClassVar[str] = "write 1 - gripper"  # the way out where the gripper is inverted
     constants: ClassVar[dict[str, dict[str, Any]]] = {}  # options of its sections in 0.1: part of keys of caches
 
     source: str
@@ -229,7 +256,9 @@ class DataConfig(Section):
             "pose_frame camera": self.pose_frame == "camera",
             "idle.rule motion": self.idle.rule == "motion",
         }
-        asked = [*(name for name, is_asked in of_poses.items() if is_asked), *self.own_knobs_of_poses]
+        section, fields = self.pose_fields
+        formats = fields.pose_keys if fields else ()
+        asked = [*(name for name, is_asked in of_poses.items() if is_asked), *(f"{section}.{key}" for key in formats)]
         is_vector, is_recorded = self.states == "vector", self.actions == "recorded"
         has_many = is_recorded and self.stride != 1 and self.join_actions is None
         return self.refused(
@@ -250,7 +279,7 @@ class DataConfig(Section):
     @property
     def known_cameras(self) -> tuple[str, ...] | None:
         """The cameras known from the config, or None if only the data set knows them."""
-        return None
+        return tuple(getattr(self.pose_fields[1], "cameras", ())) or None
 
     @property
     def offered_cameras(self) -> tuple[str, ...]:
@@ -263,9 +292,10 @@ class DataConfig(Section):
         return self.offered_cameras[0]
 
     @property
-    def own_knobs_of_poses(self) -> list[str]:
-        """The knobs of its own that are set and have a meaning for poses only."""
-        return []
+    def pose_fields(self) -> tuple[str, PoseFields | None]:
+        """The name and the values of the section that says where a pose is stored; None for a form without one."""
+        sections = ((name, getattr(self, name)) for name in self.own_sections())
+        return next(((name, fields) for name, fields in sections if isinstance(fields, PoseFields)), ("", None))
 
     @property
     def cameras(self) -> tuple[str, ...]:

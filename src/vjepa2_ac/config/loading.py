@@ -344,31 +344,6 @@ _admitted = dict(DataConfig.kinds)
 
 _TYPE_OF_A_UNION = re.compile(r"int|float|str|bool|.*[\[(-].*")  # as pydantic names it in the location of an error
 
-# Names of knobs in other programs.
-_ALSO_CALLED = {
-    "output_dir": "run_dir", "save_dir": "run_dir",
-    "mix": "replay", "data_mix": "replay",
-    "dataset": "data.path", "data_dir": "data.path",
-    "num_frames": "data.frames", "frames_per_clip": "data.frames",
-    "fps": "data.stride", "frameskip": "data.stride",
-    "num_workers": "data.workers",
-    "base_model": "model.base", "pretrained": "model.base",
-    "r": "adapter.rank", "lora_r": "adapter.rank", "lora_alpha": "adapter.alpha", "lora_dropout": "adapter.dropout",
-    "target_modules": "adapter.targets",
-    "max_steps": "training.steps", "num_steps": "training.steps", "epochs": "training.steps",
-    "num_epochs": "training.steps", "iterations": "training.steps",
-    "per_device_train_batch_size": "training.batch_size",
-    "gradient_accumulation_steps": "training.accumulation", "accumulate_grad_batches": "training.accumulation",
-    "auto_steps": "training.rollout_steps",
-    "lr": "training.learning_rate", "max_lr": "training.learning_rate",
-    "wd": "training.weight_decay", "warmup": "training.warmup_steps",
-    "grad_clip": "training.max_grad_norm", "clip_grad": "training.max_grad_norm",
-    "amp": "training.precision", "mixed_precision": "training.precision",
-    "activation_checkpointing": "training.gradient_checkpointing",
-    "torch_compile": "training.compile", "logging_steps": "training.log_every",
-    "eval_steps": "validation.every", "save_steps": "checkpoint.every",
-}  # fmt: skip
-
 
 def _wrong_values(error: ValidationError) -> list[str]:
     """Return a line for every wrong value; a knob that may be of several types gets one line, not one per type."""
@@ -417,10 +392,9 @@ def _explain(key: str, detail: Any) -> str:
         owners = [source for source, kind in DataConfig.kinds.items() if name in kind.model_fields]
         return f"a section of source {' or '.join(owners)}, and this is source {detail['loc'][-2]}"
     prefix = section + dot
-    siblings = [one for one in all_keys() if one.rpartition(".")[0] == section]
-    close = difflib.get_close_matches(name, [one.removeprefix(prefix) for one in siblings], n=1)
+    siblings = [one.removeprefix(prefix) for one in all_keys() if one.rpartition(".")[0] == section]
+    close = difflib.get_close_matches(name, siblings, n=1)
     elsewhere = [one for one in all_keys() if one.endswith(f".{name}")]
-    for meant in (_ALSO_CALLED.get(name), *(prefix + one for one in close), *elsewhere):
-        if meant is not None:
-            return f"unknown key; did you mean {meant.removeprefix(prefix)}?"
-    return f"unknown key; known here: {', '.join(one.removeprefix(prefix) for one in siblings)}"
+    if meant := [*close, *elsewhere]:
+        return f"unknown key; did you mean {meant[0]}?"
+    return f"unknown key; known here: {', '.join(siblings)}"

@@ -2,48 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from vjepa2_ac.config.data import DataConfig
-from vjepa2_ac.config.section import Count, Section
+from vjepa2_ac.config.data import DataConfig, PoseFields
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 RAW_RATE_HZ = 15.0  # control steps of raw DROID; an MP4 holds one frame for each, whatever its header says
 JOINT_VELOCITY = "action.joint_velocity"  # LeRobot's column of commanded joint velocities, which the idle filter reads
 
 RECORD: Literal["record"] = "record"  # as an identity
-RotationFormat = Literal["euler_xyz", "euler_xyz_degrees", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw"]
 
 _Names = Annotated[tuple[str, ...], Field(min_length=1)]
-
-
-class PoseFields(Section):
-    """How the numbers of a data set form a pose: which of them, in which units, and with which rotation."""
-
-    select: tuple[Count, ...] | None = None
-    """Which numbers of `state`, in this order, are x, y, z, rotation (3 or 4), gripper; or the vector; null: all."""
-    rotation: RotationFormat = "euler_xyz"
-    """Rotation format: extrinsic xyz Euler angles in radians or degrees; a rotation vector (axis times angle in
-    radians); or a unit quaternion with w first or last."""
-    position_unit: Literal["m", "cm", "mm"] = "m"
-    """Unit of the position. The model's states and actions are in metres."""
-    gripper_open: float = 0.0
-    """The gripper's value when it is open."""
-    gripper_closed: float = 1.0
-    """The gripper's value when it is closed; smaller than gripper_open if the sign is inverted."""
-
-    @model_validator(mode="after")
-    def _gripper_moves(self) -> Self:
-        is_broken = self.gripper_open == self.gripper_closed
-        return self.refused((is_broken, "gripper_open and gripper_closed are the same number"))
-
-    @property
-    def pose_keys(self) -> list[str]:
-        """The keys that have a meaning for poses only and differ from their defaults."""
-        keys = ("rotation", "position_unit", "gripper_open", "gripper_closed")
-        return [key for key in keys if getattr(self, key) != type(self).model_fields[key].default]
 
 
 class RldsFields(PoseFields):
@@ -107,7 +78,6 @@ class RldsData(DataConfig):
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.rlds:RldsSource"
     has_camera_poses: ClassVar[bool] = False
-    gripper_fix: ClassVar[str] = "exchange data.fields.gripper_open and gripper_closed"
     same_identity_fix: ClassVar[str] = (
         "Add a feature to data.fields.identity that differs between them, or set data.fields.identity: record"
     )
@@ -116,16 +86,6 @@ class RldsData(DataConfig):
     """rlds: TFRecord shards with a dataset_info.json, as TFDS writes them."""
     fields: RldsFields = RldsFields()
     """Names of the features."""
-
-    @property
-    def known_cameras(self) -> tuple[str, ...]:
-        """Those that have a feature. DROID's first is the left exterior one, which the released weights saw."""
-        return tuple(self.fields.cameras)
-
-    @property
-    def own_knobs_of_poses(self) -> list[str]:
-        """Formats of position, rotation and gripper."""
-        return [f"fields.{key}" for key in self.fields.pose_keys]
 
 
 class RawDroidData(DataConfig):
@@ -151,7 +111,6 @@ class LeRobotData(DataConfig):
     """A LeRobotDataset v2.1 or v3.0."""
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.lerobot:LeRobotSource"
-    gripper_fix: ClassVar[str] = "exchange data.lerobot.gripper_open and gripper_closed"
     constants: ClassVar[dict[str, dict[str, Any]]] = {"lerobot": {"joint_velocity": JOINT_VELOCITY, "fps": None}}
     has_camera_poses: ClassVar[bool] = False
 
@@ -159,16 +118,6 @@ class LeRobotData(DataConfig):
     """lerobot: LeRobotDataset v2.1 or v3.0."""
     lerobot: LeRobotFields = LeRobotFields()
     """Names and conventions of the columns."""
-
-    @property
-    def known_cameras(self) -> tuple[str, ...]:
-        """Those that have a video."""
-        return tuple(self.lerobot.cameras)
-
-    @property
-    def own_knobs_of_poses(self) -> list[str]:
-        """Formats of position, rotation and gripper."""
-        return [f"lerobot.{key}" for key in self.lerobot.pose_keys]
 
 
 class NpzData(DataConfig):
@@ -190,7 +139,6 @@ class LatentsData(DataConfig):
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.latents:LatentSource"
     is_cache: ClassVar[bool] = True
-    gripper_fix: ClassVar[str] = "change the convention of the data set that the cache was made from"
 
     source: Literal["latents"] = "latents"
     """latents: a latent cache alone, without the data set that it was made from."""

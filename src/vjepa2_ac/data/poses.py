@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from vjepa2_ac.config.sources import PoseFields, RotationFormat
+from vjepa2_ac.config.data import PoseFields, RotationFormat
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import ANGLE_RAD, POSE
 

@@ -18,7 +18,6 @@ from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.model.checkpoints import base_sizes
 from vjepa2_ac.model.model_files import OFFICIAL, PUBLISHED
-from vjepa2_ac.reporter import duration
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.training.cost import GIGABYTE, USUAL_GPU, estimate_memory
 
@@ -37,7 +36,6 @@ _PASSES = 3  # over the starts of clips
 _LEAST_STEPS, _MOST_STEPS = 200, 100_000
 _SHORT = 100  # control steps of an episode that has no pauses to spare
 _CACHE_SHARE = 1 / 3  # of the free disk
-_USUAL_BYTES_PER_S = 100e6 / 8  # 100 Mbit/s: assumed
 _IN_AND_OUT = ["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"]
 
 
@@ -104,12 +102,11 @@ class ModelChoice:
 
     @property
     def download(self) -> tuple[str, str] | None:
-        """The command that downloads the model, and its size and time; None: the model is not a published one."""
+        """The command that downloads the model, and its size; None: the model is not a published one."""
         for one in PUBLISHED:
             if Path(self.path) == Path("checkpoints", one.file):
-                time = duration(one.gigabytes * GIGABYTE / _USUAL_BYTES_PER_S / 3600)
                 command = "vjepa2-ac download" if one.name == OFFICIAL else f"vjepa2-ac download {one.name}"
-                return command, f"{one.gigabytes:g} GB, {time} at 100 Mbit/s"
+                return command, f"{one.gigabytes:g} GB"
         return None
 
 

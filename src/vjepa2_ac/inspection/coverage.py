@@ -23,6 +23,7 @@ from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.inspection.findings import Finding
 from vjepa2_ac.spaces import POSE, StateSpace, states_in_camera_frame
 
 T = TypeVar("T")
@@ -139,11 +140,15 @@ class Coverage:
         return {"percentile": PERCENTILE, "changes": self.usual.tolist(), "narrow": self.narrow}
 
 
-def lines_of(coverage: Coverage | None) -> dict[str, str]:
-    """Return the results as text by name, the verdict last; a text that begins with "needs" was not measured."""
+def coverage_findings(coverage: Coverage | None) -> Iterator[Finding]:
+    """Yield whether the motion is diverse enough to plan with, the verdict last; None: no step fits."""
     if coverage is None:
-        return {"coverage": "needs episodes with more consecutive steps than data.stride, found none"}
-    return {**coverage.lines, "coverage": coverage.verdict}
+        yield Finding("skipped", "coverage", "needs episodes with more consecutive steps than data.stride, found none")
+        return
+    directions = coverage.metrics.get("directions", 1.0)
+    is_low = {"directions": directions < ENOUGH_DIRECTIONS, "coverage": bool(coverage.narrow)}
+    for name, text in {**coverage.lines, "coverage": coverage.verdict}.items():
+        yield Finding("skipped" if text.startswith("needs") else "warning" if is_low.get(name) else "ok", name, text)
 
 
 def coverage_in(dataset: Dataset, *, episodes: int = 64) -> Coverage | None:

@@ -7,7 +7,7 @@ each limit is well away from all clean sets, so slight errors pass.
                                     clean sets                spoiled                              limit
     stale poses, share of steps     0 to 0.01                 0.19 (every 5th), 0.80 (4 of 5)      0.05; error 0.5
     copied steps, share             0                         0.46 and more (each twice)           0.2
-    frames without motion, share    0                         0.5 (each twice, poses not)          0.2
+    frames without motion, share    0                         0.5 (each twice, poses not)          0.2; error 0.9
     neighbours over far frames      0.04 to 0.33              1.0 (noise)                          0.9
     median distance from base       0.33 m to 0.60 m          0.02 m and less (deltas)             0.05 m
 """
@@ -35,7 +35,7 @@ _ROWS, _COLUMNS = 24, 32  # of a small frame: an arm is still some pixels wide, 
 BLANK = 8.0  # of 255: the parts of a black or uniform frame differ by less
 _STILL_FRAME = 0.1  # of an episode's median change: the codec noise of a repeated frame
 _STALE, _MOSTLY_STALE = 0.05, 0.5
-_COPIED = 0.2
+_COPIED, _MOSTLY_COPIED = 0.2, 0.9
 _FAR_LIKE_NEAR, _FEWEST_STEPS = 0.9, 8
 _INSIDE_M, _DELTA_JUMPS = 0.05, 0.3
 
@@ -46,7 +46,6 @@ _SHIFTS = 20  # pairings with other episodes, each covering all episodes
 _FEWEST_EPISODES = 8  # with fewer, chance level is not known well enough
 _SURE = 3.0  # standard errors, or deviations of chance
 _GAIN = 0.25  # of the value above chance, that another shift must add
-_BACKWARDS = 0.25  # by which an episode's frames fit better in opposite order; share of such episodes, at most
 _ABOVE = 0.15  # minimum above chance for matching frames: 0.3 and more was measured
 
 
@@ -162,13 +161,15 @@ def _repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, 
     singly = np.concatenate([_alone(one & other) for one, other in zip(each_held, each_still, strict=True)])
     held, still = np.concatenate(each_held), np.concatenate(each_still)
     fast = np.concatenate([one > np.median(one) for one in moved])
+    level: Level
     if (stale := _share(held, ~still)) > _STALE:
         text = f"{100 * stale:.0f} % of the poses repeat the previous pose while the frame changes"
-        level: Level = "error" if stale > _MOSTLY_STALE else "warning"
+        level = "error" if stale > _MOSTLY_STALE else "warning"
         yield Finding(level, "stale poses", f"{text}: they are measured at a lower rate than the frames, or are stale")
     if (shown_again := _share(still, fast & ~held)) > _COPIED:
         text = f"{100 * shown_again:.0f} % of the frames repeat the previous frame while the robot moves"
-        yield Finding("warning", "repeated", f"{text}: the camera has a lower rate. Check the control rate")
+        level = "error" if shown_again > _MOSTLY_COPIED else "warning"
+        yield Finding(level, "repeated", f"{text}: the camera has a lower rate. Check data.camera and the control rate")
     if (copied := float(singly.mean())) > _COPIED:
         text = f"{100 * copied:.0f} % of the steps are single repetitions of the previous step"
         fix = "Check the control rate, or double data.stride"
@@ -264,10 +265,6 @@ def _agreement(
         by = f"frames are {'at least ' * (abs(lag) == most)}{shift} ({abs(lag) / control_rate_hz:.2f} s)"
         level: Level = "error" if abs(lag) >= stride else "warning"  # an error: each action has the frames of another
         return Finding(level, "agreement", f"{by}; {text}. {fix}")
-    backwards = int((reverse - fitting > _BACKWARDS).sum())
-    if backwards > _BACKWARDS * len(pairs):
-        text = f"{backwards} of {counted(len(pairs), 'episode')} fit better with the frames in opposite order ({text})"
-        return Finding("warning", "agreement", f"{text}. Check the order in time of both")
     text += f"; it is highest for frames that are {shift}" if lag else ""
     return Finding("ok", "agreement", f"frames change when the robot moves ({text})")
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from vjepa2_ac import storage
-from vjepa2_ac.config.sources import PoseFields, RotationFormat
+from vjepa2_ac.config.data import RotationFormat
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import MEANS, SPANS
 from vjepa2_ac.data.poses import MIN_JUMPS, num_rotation_numbers, rotation_speeds, smoother_format
@@ -182,8 +182,7 @@ def _check_rotation_format(dataset: Dataset, sample: Sequence[ReadEpisode]) -> I
     if config.is_cache:
         yield Finding("skipped", about, "needs rotation numbers; check the data set that this cache was made from")
         return
-    sections = [(name, getattr(config, name)) for name in config.own_sections()]
-    section, fields = next(((name, one) for name, one in sections if isinstance(one, PoseFields)), ("", None))
+    section, fields = config.pose_fields
     configured: RotationFormat = "euler_xyz" if fields is None else fields.rotation
     if num_rotation_numbers(configured) == 4:  # a quaternion has the same speed in both orders
         return

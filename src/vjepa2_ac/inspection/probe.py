@@ -182,7 +182,9 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
             repair = f"negate {name}, with the rotation (as of a mirror)"
             found.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
         inverted = _of_states(lambda states: np.append(states[:, :-1], 1 - states[:, -1:], axis=1))
-        found.append(_variant("the gripper inverted", config.gripper_fix, inverted))
+        section, fields = config.pose_fields
+        repair = f"exchange data.{section}.gripper_open and gripper_closed" if fields else "write 1 - gripper"
+        found.append(_variant("the gripper inverted", repair, inverted))
     if not config.is_cache:
         exchanged, flipped = _of_frames(lambda frames: frames[..., ::-1]), _of_frames(lambda frames: frames[:, :, ::-1])
         repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"

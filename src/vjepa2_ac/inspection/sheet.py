@@ -173,7 +173,7 @@ def _directions(part: Any, axes: Any, directions: Float[np.ndarray, "rows column
 def _motion(axes: Any, inspection: Inspection) -> None:
     has_poses, rate_hz = inspection.has_poses, inspection.dataset.control_rate_hz
     unit, reference = ("cm", RELEASED_STEP_CM) if has_poses else ("%", 1.0)
-    by_stride = {one.stride: one.sizes[MOVED if has_poses else CHANGED] for one in inspection.steps}
+    by_stride = {stride: sizes[MOVED if has_poses else CHANGED] for stride, sizes in inspection.steps.items()}
     far = max([reference * 1.3, *(float(np.percentile(moved, 97)) for moved in by_stride.values() if len(moved))])
     reached = np.linspace(0, far, 200)
     for (stride, moved), colour in zip(by_stride.items(), _STRIDES, strict=False):

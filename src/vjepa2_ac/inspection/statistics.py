@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,13 +16,7 @@ from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
 from vjepa2_ac.data.windows import candidate_strides
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.inspection.coverage import (
-    Coverage,
-    ReadEpisode,
-    coverage_by,
-    lines_of,
-    read_sample,
-)
+from vjepa2_ac.inspection.coverage import Coverage, ReadEpisode, coverage_by, coverage_findings, read_sample
 from vjepa2_ac.inspection.findings import SPLITS, Duplicates, find_duplicates
 from vjepa2_ac.spaces import rotation_angles
 
@@ -31,27 +24,6 @@ PERCENTILES = (10, 50, 90, 99)
 MOVED, TURNED, CHANGED = "moved_cm", "turned_deg", "changed_percent_of_range"
 
 RELEASED_STEP_CM = 12.9  # motion of the flange between the two frames of upstream's example (franka_example_traj.npz)
-RELEASED = (
-    "the released weights saw DROID at a step of 4, 8 or 15 control steps (0.27, 0.53 or 1 s): which one is unsettled."
-    f" The one known pair of frames, upstream's own example, is {RELEASED_STEP_CM} cm apart."
-    " `data calibrate` lets the weights choose"
-)
-
-
-@dataclass(frozen=True, eq=False)
-class StepSizes:
-    """How far the state moves in a model step, at one stride."""
-
-    stride: int
-    seconds: float
-    sizes: dict[str, Float[np.ndarray, " pairs"]]  # of poses MOVED and TURNED, of vectors CHANGED
-
-    @property
-    def percentiles(self) -> dict[str, list[float]]:
-        """The percentiles 10, 50, 90 and 99 of each; empty if no pair of steps fits."""
-        return {
-            name: np.percentile(one, list(PERCENTILES)).tolist() if len(one) else [] for name, one in self.sizes.items()
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,21 +51,18 @@ class Inspection:
         return coverage_by(self.sample, self.dataset.spaces.state, self.dataset.config.model_stride)
 
     @cached_property
-    def steps(self) -> tuple[StepSizes, ...]:
-        """The motion per model step at each candidate stride."""
-        rate = self.dataset.control_rate_hz
-        return tuple(self._at_stride(stride, rate) for stride in candidate_strides(rate))
+    def steps(self) -> dict[int, dict[str, Float[np.ndarray, " pairs"]]]:
+        """How far the state moves in a model step at each candidate stride: of poses MOVED and TURNED, else CHANGED."""
+        return {stride: self._at_stride(stride) for stride in candidate_strides(self.dataset.control_rate_hz)}
 
-    def _at_stride(self, stride: int, control_rate_hz: float) -> StepSizes:
+    def _at_stride(self, stride: int) -> dict[str, Float[np.ndarray, " pairs"]]:
         space = self.dataset.spaces.state
         pieces = [piece for one in self.sample for piece in one.changes(stride, space)]
         changes = np.concatenate([np.zeros((0, len(space))), *pieces])
-        if self.has_poses:
-            turned_deg = np.rad2deg(rotation_angles(changes[:, space.rotation]))
-            sizes = {MOVED: space.shown_size(changes), TURNED: turned_deg}
-        else:
-            sizes = {CHANGED: largest_change(changes, self.ranges)}
-        return StepSizes(stride, stride / control_rate_hz, sizes)
+        if not self.has_poses:
+            return {CHANGED: largest_change(changes, self.ranges)}
+        turned_deg = np.rad2deg(rotation_angles(changes[:, space.rotation]))
+        return {MOVED: space.shown_size(changes), TURNED: turned_deg}
 
     @cached_property
     def values(self) -> dict[str, Any]:
@@ -117,7 +86,10 @@ class Inspection:
             "sampled_episodes": len(self.sample),
             "ranges": self.ranges.tolist(),
             "percentiles": list(PERCENTILES),
-            "per_model_step": [{"stride": one.stride, "seconds": one.seconds, **one.percentiles} for one in self.steps],
+            "per_model_step": [
+                {"stride": stride, "seconds": stride / rate, **{name: _percentiles(one) for name, one in sizes.items()}}
+                for stride, sizes in self.steps.items()
+            ],
             "coverage": None if self.coverage is None else dict(self.coverage.metrics),
         }
         if self.has_poses:
@@ -167,7 +139,7 @@ class Inspection:
             "duplicates": f"{self.duplicates}{'; inspect.json lists the copies' if copies else ''}",
             "sample": f"{counted(len(self.sample), 'episode')}, for what follows",
             **about_states,
-            **{name: re.sub("^needs", "not measured: needs", text) for name, text in lines_of(self.coverage).items()},
+            **{one.about: one.text for one in coverage_findings(self.coverage)},
         }
 
 
@@ -183,6 +155,11 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
         InputError: Episodes of the sample cannot be read, and `data.broken_episodes` does not skip them.
     """
     return Inspection(dataset, find_duplicates(dataset), tuple(read_sample(dataset, episodes, progress)))
+
+
+def _percentiles(values: Float[np.ndarray, " pairs"]) -> list[float]:
+    """Return the percentiles 10, 50, 90 and 99; empty without values."""
+    return np.percentile(values, list(PERCENTILES)).tolist() if len(values) else []
 
 
 def idle_runs(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[np.ndarray, " steps"]:

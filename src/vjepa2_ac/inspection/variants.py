@@ -18,7 +18,7 @@ import torch
 from accelerate import Accelerator
 from jaxtyping import Float
 
-from vjepa2_ac.config import Config, ModelConfig
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
@@ -184,26 +184,17 @@ def load_named(config: Config, dataset: Dataset, model: str | None) -> WorldMode
     Raises:
         InputError: There is none, it cannot be read, is randomly initialized, or does not fit the data.
     """
+    if model is None and config.model.is_random:
+        found, needed = "a model that has learned nothing", "one that can say which stride it was trained at"
+        fix = "Set data.stride to a number, or name another model with model.base (data calibrate: --model)"
+        raise InputError(where="model.base: random", found=found, needed=needed, fix=fix)
     if model is None:
-        require_learned(config.model)
         loaded = load_base(config.model, seed=config.seed)
     else:
         loaded = load_subject(model, config=None if is_run(model) else config).world_model
     require_widths(loaded, dataset.widths, where=model or f"model.base: {config.model.base}")
     require_same_encoder(loaded, dataset, config)
     return loaded
-
-
-def require_learned(model: ModelConfig) -> None:
-    """Refuse a randomly initialized model.
-
-    Raises:
-        InputError: It is.
-    """
-    if model.is_random:
-        found, needed = "a model that has learned nothing", "one that can say which stride it was trained at"
-        fix = "Set data.stride to a number, or name another model with model.base (data calibrate: --model)"
-        raise InputError(where="model.base: random", found=found, needed=needed, fix=fix)
 
 
 @dataclass(frozen=True)
@@ -370,45 +361,33 @@ def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[
     return [stride for stride in fitting if stride not in reasons], dict(sorted(reasons.items()))
 
 
-class StrideChoice:
-    """Choose the stride of a run before training, where `data.stride` is auto, among the candidates whose clips fit.
+def choose_stride(
+    config: Config, dataset: Dataset, accelerator: Accelerator, reporter: Reporter
+) -> tuple[WorldModel, Calibration]:
+    """Load the base of a run whose `data.stride` is auto, and calibrate it among the candidates whose clips fit.
 
-    Args:
-        config: The run.
+    The result is the same in all processes.
 
     Raises:
-        InputError: The run has no base that could choose.
+        InputError: The run has no base that could choose, no candidate fits, or as `calibrate_model`.
     """
-
-    def __init__(self, config: Config) -> None:
-        require_learned(config.model)
-        self._config = config
-
-    def __call__(
-        self, world_model: WorldModel, dataset: Dataset, accelerator: Accelerator, reporter: Reporter
-    ) -> Calibration:
-        """Return the calibration of the base, the same in all processes.
-
-        Raises:
-            InputError: No candidate fits, or as `calibrate_model`.
-        """
-        config = self._config
-        reporter.note("data.stride is auto: measuring the model at each candidate stride")
-        fitting, errors = [], []
-        for stride in candidate_strides(dataset.control_rate_hz):
-            view = dataset.with_stride(stride)
-            try:
-                view.windows("train"), view.windows("validation")
-            except InputError as error:
-                errors.append(error)
-                reporter.note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
-            else:
-                fitting.append(stride)
-        if not fitting:
-            raise errors[0]
-        sample = ClipSample(clips=config.validation.clips, strides=tuple(fitting))
-        calibration = calibrate_model(world_model, dataset, config, accelerator, sample)
-        for one in calibration.results.values():
-            reporter.note(f"  {one.name}: error/persistence {one.ratio:.3f}")
-        reporter.note(calibration.verdict())
-        return broadcast_object(accelerator, calibration)
+    world_model = load_named(config, dataset, None).to(accelerator.device)
+    reporter.note("data.stride is auto: measuring the model at each candidate stride")
+    fitting, errors = [], []
+    for stride in candidate_strides(dataset.control_rate_hz):
+        view = dataset.with_stride(stride)
+        try:
+            view.windows("train"), view.windows("validation")
+        except InputError as error:
+            errors.append(error)
+            reporter.note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
+        else:
+            fitting.append(stride)
+    if not fitting:
+        raise errors[0]
+    sample = ClipSample(clips=config.validation.clips, strides=tuple(fitting))
+    calibration = calibrate_model(world_model, dataset, config, accelerator, sample)
+    for one in calibration.results.values():
+        reporter.note(f"  {one.name}: error/persistence {one.ratio:.3f}")
+    reporter.note(calibration.verdict())
+    return world_model, broadcast_object(accelerator, calibration)

@@ -70,7 +70,6 @@ def set_up(
     accelerator = accelerator or make_accelerator(config)
     if config.training.compile == "blocks":
         require_compiler(accelerator.device.type, where="training.compile")
-    choose_stride = TRAINING_HOOKS.find("data.stride")(config) if config.data.stride == "auto" else None
     strip = TRAINING_HOOKS.find("validation.decoder")(config) if config.validation.decoder is not None else None
 
     # The other processes of a machine wait for the first process, and then read the index that it has written.
@@ -79,9 +78,8 @@ def set_up(
         reporter.note(f"Warning: {warning.text}.")
     _check_heads(config, dataset)
     world_model, calibration = None, None
-    if choose_stride is not None:
-        world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
-        calibration = choose_stride(world_model, dataset, accelerator, reporter)
+    if config.data.stride == "auto":
+        world_model, calibration = TRAINING_HOOKS.find("data.stride")(config, dataset, accelerator, reporter)
         config, dataset = config.with_stride(calibration.stride), dataset.with_stride(calibration.stride)
     splits: tuple[Split, ...] = ("train", "validation", "test") if config.data.test_share else ("train", "validation")
     clip, *_ = [first_clip(dataset, split) for split in splits]  # fails early: an empty split, a broken clip

@@ -10,11 +10,10 @@ from rich.console import Console
 from rich.table import Table
 
 from evaluation_results import ranking_of
-from vjepa2_ac.cli import main
-from vjepa2_ac.cli.console import progress as console_module
-from vjepa2_ac.cli.console import tables
-from vjepa2_ac.cli.console.progress import ConsoleReporter, ProgressBar
-from vjepa2_ac.cli.console.training import TrainingConsole
+from vjepa2_ac.cli import main, tables
+from vjepa2_ac.cli import progress as console_module
+from vjepa2_ac.cli.progress import ConsoleReporter, ProgressBar
+from vjepa2_ac.cli.tables import TrainingConsole
 from vjepa2_ac.evaluation.measure import VALIDATED
 from vjepa2_ac.evaluation.result import PredictionErrors, Validation
 from vjepa2_ac.inspection.findings import Finding

@@ -10,12 +10,11 @@ import pytest
 import torch
 from rich.table import Table
 
-from vjepa2_ac.cli.console.progress import PlainConsole
-from vjepa2_ac.cli.console.tables import benchmark_table, motion_table, plan_table, row_tables, variants_table
+from vjepa2_ac.cli.progress import PlainConsole
+from vjepa2_ac.cli.tables import benchmark_table, plan_table, row_tables, variants_table
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.rows import Row, rows_of
-from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
 from vjepa2_ac.inspection.variants import VariantResult
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
@@ -34,11 +33,6 @@ def variants() -> list[Table]:
         for name, difference in (("late", None), ("mirrored", SURE))
     ]
     return [variants_table("variants", results, results[1])]
-
-
-def motions() -> list[Table]:
-    sizes = np.array([1234.5, 2345.6, 3456.7, 4567.8])
-    return [motion_table([StepSizes(15, 1.0, dict.fromkeys(names, sizes))]) for names in ((MOVED, TURNED), (CHANGED,))]
 
 
 def evaluations() -> list[Table]:
@@ -86,7 +80,7 @@ def benchmarks() -> list[Table]:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-@pytest.mark.parametrize("made", [variants, motions, evaluations, comparisons, plans, benchmarks])
+@pytest.mark.parametrize("made", [variants, evaluations, comparisons, plans, benchmarks])
 def test_no_figure_and_no_word_is_cut_off(made: Callable[[], list[Table]], width: int) -> None:
     for table in made():
         console = PlainConsole(width=width)

@@ -1,18 +1,20 @@
-"""Tables and notes of the commands: what was measured, planned, simulated, trained and found in data."""
+"""Tables and notes of the commands: what was measured, planned, simulated, trained and found in data; and a run."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.table import Table
 
-from vjepa2_ac.cli.console.progress import MetricsTable, console, wrapped
+from vjepa2_ac.cli.progress import ConsoleReporter, MetricsTable, console, show, wrapped
 from vjepa2_ac.errors import counted
+from vjepa2_ac.evaluation.result import ACTIONS, Validation, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.rows import Row, sections
+from vjepa2_ac.evaluation.summary import interval_of, percent
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE
 
@@ -20,7 +22,6 @@ if TYPE_CHECKING:
     from vjepa2_ac.decoding.decoder import DecoderCard
     from vjepa2_ac.goals.make_goals import MadeGoals
     from vjepa2_ac.inspection.findings import Finding
-    from vjepa2_ac.inspection.statistics import StepSizes
     from vjepa2_ac.inspection.variants import VariantResult
     from vjepa2_ac.planning.decision import PlanResult
     from vjepa2_ac.policies.monitor import Monitor, WatchedEpisode
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red", "skipped": "cyan"}
 _USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that are not mentioned
 _DECODERS = {"decoder": "decoder", "linear": "linear decoder", "mean_image": "mean image"}
+_MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
 
 
 def row_tables(rows: Sequence[Row], title: str) -> list[Table]:
@@ -144,21 +146,6 @@ def print_finding(finding: Finding) -> None:
     console.print(text)
 
 
-def motion_table(steps: Sequence[StepSizes]) -> Table:
-    """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
-    from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED
-
-    changes = "the number that changes most (% of its range)"
-    sizes = {MOVED: "moves by (cm)", TURNED: "turns by (degrees)", CHANGED: changes}
-    names = list(steps[0].sizes)
-    title = f"{'Change' if CHANGED in names else 'Motion'} per model step: 10 / 50 / 90 / 99 %"
-    table = MetricsTable(title, ["stride", "seconds", *(sizes[name] for name in names)], labelled=False)
-    for one in steps:
-        cells = [" / ".join(f"{value:.1f}" for value in row) or "no step fits" for row in one.percentiles.values()]
-        table.add_row(str(one.stride), f"{one.seconds:.2f}", *cells)
-    return table
-
-
 def variants_table(title: str, results: Sequence[VariantResult], best: VariantResult | None = None) -> Table:
     """Return the table of `data check --model` and of `data calibrate`: a row for each variant of the same clips."""
     columns = ["variant", "error / persistence", "difference", "error", "persistence", "episodes"]
@@ -188,3 +175,45 @@ def watched_table(watched: Sequence[WatchedEpisode], monitor: Monitor) -> Table:
         first, highest = one.first_alarm(monitor), one.scores(monitor.expected).max() / monitor.threshold
         table.add_row(one.name, f"{highest:.2f}", "no alarm" if first is None else str(one.steps[first]))
     return table
+
+
+class TrainingConsole(ConsoleReporter):
+    """Shows a training run."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._steps, self._validation = 0, ""
+
+    def started(self, done: int, total: int) -> None:
+        """Begin the bar."""
+        bar, self._steps = self.task("training"), total
+        if done < total:
+            bar(done, total)
+
+    def stepped(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Move the bar."""
+        speed = metrics["samples_per_second"]
+        words = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
+        if "bytes_per_clip" in metrics:
+            words.append(f"{metrics['bytes_per_clip'] / 1e6:.2f} MB/clip")
+        if metrics.get("data_wait_share", 0.0) > _MUCH_WAITING:
+            words.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
+        self._bar(step, self._steps, "  ".join(word for word in words if word))
+
+    def validated(self, step: int, found: Validation) -> None:
+        """Print the validation's metrics; metrics.jsonl has them for every horizon."""
+        errors = found.errors
+        true, zero, shuffled = (one_step_over_persistence(errors, actions).value for actions in ACTIONS)
+        rollout = [one.value for one in over_persistence(errors, "rollout")]
+        self._validation = f"one-step error {true:.3f} of persistence"
+        rank = "not measured (needs validation.ranking_clips and clips in which the robot moves)"
+        if found.ranking is not None:
+            measured = found.ranking.rank
+            share = f"{percent(measured.value)} % {interval_of(measured)}".rstrip()
+            rank = f"{share} (0 % is best, chance 50 %)"
+        show(
+            f"validation at step {step:,}, errors relative to persistence (1: copying the last frame)",
+            f"  one-step error        {true:.3f}; with zero actions {zero:.3f}, with shuffled actions {shuffled:.3f}",
+            f"  rollout error         {rollout[0]:.3f} after 1 model step, {rollout[-1]:.3f} after {len(rollout)}",
+            f"  action-ranking error  {rank}",
+        )

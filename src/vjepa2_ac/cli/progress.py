@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextCol
 from rich.table import Column, Table
 from rich.text import Text
 
-from vjepa2_ac.cli.console.waiting import Work
+from vjepa2_ac.cli.waiting import Work
 from vjepa2_ac.errors import printable
 from vjepa2_ac.reporter import Reporter
 
@@ -179,9 +179,7 @@ class ConsoleReporter(Reporter):
     """Shows messages, and one task after another as a bar; at the end of its `with` block the terminal is restored."""
 
     def __init__(self) -> None:
-        self._bar, self._began = ProgressBar(""), time.monotonic()
-        self.seconds: dict[str, float] = {}
-        """Duration of each finished task, by its title."""
+        self._bar = ProgressBar("")
 
     def note(self, text: str) -> None:
         """Print a message."""
@@ -189,8 +187,8 @@ class ConsoleReporter(Reporter):
 
     def task(self, title: str, unit: str = "") -> ProgressBar:
         """Begin another task; return its bar."""
-        self._end()
-        self._bar, self._began = ProgressBar(title, unit), time.monotonic()
+        self._bar.close()
+        self._bar = ProgressBar(title, unit)
         Work.begin(title)
         return self._bar
 
@@ -200,8 +198,4 @@ class ConsoleReporter(Reporter):
 
     def __exit__(self, *_: object) -> None:
         """Restore the terminal."""
-        self._end()
-
-    def _end(self) -> None:
         self._bar.close()
-        self.seconds[self._bar.title] = time.monotonic() - self._began

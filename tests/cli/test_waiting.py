@@ -5,9 +5,9 @@ import time
 
 import pytest
 
-from vjepa2_ac.cli.console import waiting
-from vjepa2_ac.cli.console.progress import ConsoleReporter
-from vjepa2_ac.cli.console.waiting import Work, watch_silence
+from vjepa2_ac.cli import waiting
+from vjepa2_ac.cli.progress import ConsoleReporter
+from vjepa2_ac.cli.waiting import Work, watch_silence
 
 
 class Clock:

@@ -1,1 +1,0 @@
-"""Console output: progress bars, tables and lines of each command."""
