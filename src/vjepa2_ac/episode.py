@@ -154,7 +154,6 @@ class Batch:
     latents: StoredLatents | None = None
     cameras: tuple[str | None, ...] = ()  # one per clip; None: the config's first
     skipped: tuple[Skipped, ...] = ()  # clips that could not be read
-    on_device: Callable[[], Batch | None] | None = None  # returns, once, its copy that is being sent to the device
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Batch:
         """Return the batch with each tensor replaced."""

@@ -19,11 +19,9 @@ import torch
 
 from clips import clip_at, open_in_memory
 from memory_source import MemorySource
-from recording_cuda import Pinning, RecordingCuda
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare, collate, training_loader, validation_batches
-from vjepa2_ac.data.streams import ToDevice, copies_for
 from vjepa2_ac.episode import Batch, Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import actions_from_states, states_in_camera_frame
@@ -95,19 +93,14 @@ def test_validation_clips_are_few_distinct_and_from_all_held_out_episodes(droid:
     assert {name for name, _ in names(batches)} == everyone
 
 
-@pytest.mark.parametrize(("workers", "pinned"), [(0, False), (1, True)])
-def test_an_error_in_a_worker_is_the_error_the_user_reads(
-    spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, workers: int, *, pinned: bool
-) -> None:
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_in_a_worker_is_the_error_the_user_reads(spoiled: Callable[..., Path], workers: int) -> None:
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
 
     config = config_of(spoiled(spoil), workers=workers, validation_share=0.0)
-    copies = ToDevice(RecordingCuda()) if pinned else None
-    with monkeypatch.context() as patch:
-        _ = Pinning(patch) if pinned else None
-        with pytest.raises(InputError, match="not a JPEG") as caught:
-            take(60, config, copies=copies)
+    with pytest.raises(InputError, match="not a JPEG") as caught:
+        take(60, config)
     assert type(caught.value) is InputError
     assert "tfrecord-00000-of-00002: record 0 at byte 0" in caught.value.where
     assert caught.value.needed == "a JPEG or PNG image"
@@ -145,38 +138,14 @@ def test_workers_end_with_a_run_that_is_killed(droid: Path, tmp_path: Path) -> N
             pytest.fail("a worker outlives the run")
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_batches_for_a_device_are_pinned_by_the_loader(
-    droid: Path, monkeypatch: pytest.MonkeyPatch, workers: int
-) -> None:
-    expected = take(2, config_of(droid))
-    pinning, cuda = Pinning(monkeypatch), RecordingCuda()
-    with closing(
-        training_loader(open_dataset(config_of(droid, workers=workers)), seed=1, batch_size=2, copies=ToDevice(cuda))
-    ) as batches:
-        found = [next(batches), next(batches)]
-    assert_same(found, expected)
-    assert all(any(batch.frames is one for one in pinning.pinned) for batch in found)
-    assert all(any(batch.states is one for one in pinning.pinned) for batch in found)
-    assert cuda.calls.count("side 1: to device") == 2 * 3
-    assert "side 1: to pinned memory" not in cuda.calls, "that is the loader's work"
-    main = threading.current_thread().name
-    assert (main in pinning.threads) == (not workers), "beside the workers, a thread of its own does it"
-
-
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("workers", [0, 1])
-def test_batches_reach_a_cuda_device_as_they_are(droid: Path, workers: int) -> None:
+def test_batches_for_a_cuda_device_are_pinned_and_as_they_are(droid: Path, workers: int) -> None:
     dataset = open_dataset(config_of(droid, workers=workers))
-    copies = copies_for(torch.device("cuda"))
-    with closing(training_loader(dataset, seed=1, batch_size=2, copies=copies)) as batches:
-        found = [next(batches)]
-        batches.prefetch_next()
-        found.append(next(batches))
+    with closing(training_loader(dataset, seed=1, batch_size=2, pinned=True)) as batches:
+        found = [next(batches), next(batches)]
     assert all(batch.frames.is_pinned() for batch in found)
-    there = [batch.on_device() for batch in found]
-    assert all(batch.frames.is_cuda for batch in there)
-    assert_same([batch.mapped(torch.Tensor.cpu) for batch in there], take(2, config_of(droid)))
+    assert_same(found, take(2, config_of(droid)))
 
 
 def test_frames_of_two_sizes_do_not_stack(droid: Path) -> None:

@@ -1,8 +1,7 @@
-"""The encoding pipeline: each episode gets its own frames, an unreadable one does not affect others; and batches."""
+"""The encoding pipeline: each episode gets its own frames, an unreadable one does not affect others."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,14 +10,11 @@ import pytest
 import torch
 
 from memory_source import MemorySource
-from vjepa2_ac.config import DataConfig, ModelSizes
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset
 from vjepa2_ac.data.sources.latent_files import CacheType, LatentFiles, unpack_latents
-from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
-from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.model.world_model import WorldModel
 
 LENGTHS = [FRAMES_AT_ONCE + 1, 3, 2 * FRAMES_AT_ONCE]
 Run = Callable[..., LatentFiles]
@@ -69,39 +65,3 @@ def test_a_network_that_is_gone_is_no_fault_of_an_episode(run: Run, tmp_path: Pa
     with pytest.raises(UnreachableError):
         run(unreachable)
     assert not list(tmp_path.rglob("*.broken"))
-
-
-TINY = {
-    "image_size": 32,
-    "encoder": {"width": 24, "depth": 1, "heads": 2},
-    "predictor": {"width": 24, "depth": 1, "heads": 2},
-}
-
-
-def batch(frames: torch.Tensor) -> Batch:
-    clips, time = frames.shape[:2]
-    return Batch(
-        frames=frames,
-        states=torch.zeros(clips, time, 7),
-        actions=torch.zeros(clips, time - 1, 7),
-        extrinsics=None,
-        episode_ids=tuple("ab"[:clips]),
-        starts=(0,) * clips,
-    )
-
-
-def test_what_is_on_its_way_to_the_device_is_taken_from_there() -> None:
-    model = WorldModel.random(ModelSizes.model_validate(TINY), seed=0)
-    given = batch(torch.randint(0, 256, (2, 2, 40, 50, 3), dtype=torch.uint8))
-    there = given.mapped(lambda tensor: tensor + 1)
-    held = [there]
-    ahead = replace(given, on_device=lambda: held.pop() if held else None)
-
-    def encoded(of: Batch) -> LatentBatch:
-        return encode_batch(model, of, device=torch.device("cpu"), chunk=4)
-
-    for expected in (encoded(there), encoded(given)):  # taken once; then the batch itself is copied
-        found = encoded(ahead)
-        assert torch.equal(found.latents, expected.latents)
-        assert torch.equal(found.states, expected.states)
-        assert torch.equal(found.actions, expected.actions)

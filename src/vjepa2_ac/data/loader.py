@@ -20,7 +20,7 @@ from vjepa2_ac.data.clips import ClipRequest, collate, no_clips
 from vjepa2_ac.data.dataset import Dataset, read_clip
 from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.selection import BrokenEpisodes, named
-from vjepa2_ac.data.streams import ToDevice, in_shared_memory, in_worker, results_of_workers
+from vjepa2_ac.data.streams import in_shared_memory, in_worker, results_of_workers
 from vjepa2_ac.data.transforms import ClipChanges
 from vjepa2_ac.data.windows import ClipOrder, far_neighbours, spread
 from vjepa2_ac.episode import Batch, Clip, Skipped
@@ -62,7 +62,7 @@ def training_loader(
     batch_size: int,
     start_position: int = 0,
     share: ProcessShare = WHOLE,
-    copies: ToDevice | None = None,
+    pinned: bool = False,
 ) -> Batches:
     """Yield the micro-batches of one process, endlessly, from any position of the run.
 
@@ -74,7 +74,7 @@ def training_loader(
     if floor((p + 1) * share) is larger than floor(p * share). So the share is exact in every part of the run, up to a
     clip.
 
-    If batches are prefetched to a device (`copies`), they are in pinned memory.
+    Pinned batches are in memory from which copies to a CUDA device do not block the host.
 
     Raises:
         InputError: There is nothing to train on, or a clip cannot be read, also in a worker.
@@ -86,8 +86,8 @@ def training_loader(
         clips = replace(clips, replayed=_training_clips(replayed, seed), share=Fraction(str(both.share)))
     firsts = first_clips(share, batch_size, start=start_position)
     rows = (list(range(first, first + batch_size)) for first in firsts)
-    micro_batches = results_of_workers(clips, rows, dataset.config.workers, pinned=copies is not None)
-    return Batches(micro_batches, dataset.broken, copies, replayed.broken if replayed else None)
+    micro_batches = results_of_workers(clips, rows, dataset.config.workers, pinned=pinned)
+    return Batches(micro_batches, dataset.broken, replayed.broken if replayed else None)
 
 
 def first_clips(share: ProcessShare, batch_size: int, *, start: int) -> Iterator[int]:
@@ -206,15 +206,11 @@ class _MicroBatches(TorchDataset[Batch]):
 
 
 class Batches(Iterator[Batch]):
-    """The batches of a loader, in order, each being copied to the device since it was fetched.
-
-    They stay on the host; a copy on the device is in `on_device`. A batch's error and its skipped clips are reported
-    when it is requested, not when it is prefetched: a checkpoint in between must not contain them.
+    """The batches of a loader, in order; a batch's error and its skipped clips are reported when it is requested.
 
     Args:
         rows: The workers' results: micro-batches, or errors instead.
         broken: Records clips that could not be read.
-        copies: How batches are copied to the device; None: there are no copies and no prefetching.
         replayed: Records those of the second data set.
     """
 
@@ -222,12 +218,9 @@ class Batches(Iterator[Batch]):
         self,
         rows: Generator[Batch | UserError, None, None],
         broken: BrokenEpisodes,
-        copies: ToDevice | None = None,
         replayed: BrokenEpisodes | None = None,
     ) -> None:
-        self._rows, self._broken, self._copies = rows, broken, copies
-        self._replayed = broken if replayed is None else replayed
-        self._prefetched: Exception | Batch | None = None
+        self._rows, self._broken, self._replayed = rows, broken, replayed
 
     def __next__(self) -> Batch:
         """Return the next batch.
@@ -235,37 +228,15 @@ class Batches(Iterator[Batch]):
         Raises:
             InputError: A clip cannot be read, also in a worker; or too many cannot.
         """
-        fetched, self._prefetched = self._prefetched or self._fetched(), None
-        if isinstance(fetched, Exception):
+        row = next(self._rows)
+        if isinstance(row, UserError):
             self.close()
-            raise fetched
-        for one in fetched.skipped:
-            (self._replayed if one.replayed else self._broken).met(one.episode_id, one.reason)
-        return fetched
-
-    def prefetch_next(self) -> None:
-        """Fetch the next batch and start its copy to the device."""
-        if self._copies is not None and self._prefetched is None:
-            self._prefetched = self._fetched()
+            raise row
+        for one in row.skipped:
+            broken = self._replayed if one.replayed and self._replayed is not None else self._broken
+            broken.met(one.episode_id, one.reason)
+        return row
 
     def close(self) -> None:
-        """End the workers and drop the prefetched batch."""
-        self._prefetched = None
+        """End the workers."""
         self._rows.close()
-
-    def _fetched(self) -> Exception | Batch:
-        try:
-            row = next(self._rows)
-            if isinstance(row, UserError) or self._copies is None:
-                return row
-            held = [self._copies.start(row.mapped)]
-        except Exception as error:  # also the end of the rows
-            return error
-        take_once = lambda: held.pop()() if held else None  # noqa: E731 - so that the copy is freed after use
-        return replace(row, on_device=take_once)
-
-
-def prefetch_next(batches: Iterator[Batch]) -> None:
-    """Prefetch the next batch if these batches support it: to be called before the host waits for the device."""
-    if hasattr(batches, "prefetch_next"):
-        batches.prefetch_next()

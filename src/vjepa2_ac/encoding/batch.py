@@ -33,16 +33,14 @@ def encode_batch(
 
     Args:
         world_model: The model whose frozen encoder is used.
-        batch: Clips from the loader: uint8 pixels, cropped, of any size; or latents. If a copy to the device is in
-            progress, its result is used.
+        batch: Clips from the loader: uint8 pixels, cropped, of any size; or latents.
         device: The model's device.
         chunk: Frames per encoder call.
 
     Raises:
         InputError: The model needs camera poses and a clip has none.
     """
-    arrived = batch.on_device() if batch.on_device else None  # None, too, if it was used before
-    batch = (arrived or batch).to(device, non_blocking=True)
+    batch = batch.to(device, non_blocking=True)
     if batch.latents is not None:
         latents = unpack_latents(batch.latents)
     elif batch.frames is not None:

@@ -21,7 +21,6 @@ import statistics
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,6 @@ import torch
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.data.loader import prefetch_next
-from vjepa2_ac.data.streams import Cuda
 from vjepa2_ac.distributed import PRECISIONS, matmul_speed
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.reporter import Reporter
@@ -135,7 +132,7 @@ class Watch:
 
 
 class TimedBatches(Iterator[Batch]):
-    """Passes on batches, and measures how long the loader was waited for, also for prefetched ones.
+    """Passes on batches, and measures how long the loader was waited for.
 
     On CUDA only the idle time of the device counts: from the end of its queued work to the next work.
 
@@ -146,7 +143,7 @@ class TimedBatches(Iterator[Batch]):
 
     def __init__(self, batches: Iterator[Batch], device: torch.device) -> None:
         self._batches, self._waited_s = batches, 0.0
-        self._cuda = Cuda(device) if device.type == "cuda" else None
+        self._device = device
         self._spans: deque[tuple[Any, Any]] = deque()  # events that the device may not have reached yet
 
     @property
@@ -159,24 +156,23 @@ class TimedBatches(Iterator[Batch]):
 
     def __next__(self) -> Batch:
         """Return the next batch."""
-        with self._waiting():
-            return next(self._batches)
-
-    def prefetch_next(self) -> None:
-        """Fetch the next batch in advance, if the loader can."""
-        with self._waiting():
-            prefetch_next(self._batches)
-
-    @contextmanager
-    def _waiting(self) -> Iterator[None]:
-        began = time.perf_counter() if self._cuda is None else self._cuda.timestamp()
+        began = time.perf_counter()
+        on_device = self._timestamp()
         try:
-            yield
+            return next(self._batches)
         finally:
-            if self._cuda is None:
+            if on_device is None:
                 self._waited_s += time.perf_counter() - began
             else:
-                self._spans.append((began, self._cuda.timestamp()))
+                self._spans.append((on_device, self._timestamp()))
+
+    def _timestamp(self) -> Any:
+        """Enqueue an event with time on a CUDA device, and return it; None for another device."""
+        if self._device.type != "cuda":
+            return None
+        event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]  # torch
+        event.record(torch.cuda.current_stream(self._device))
+        return event
 
 
 @dataclass(frozen=True)

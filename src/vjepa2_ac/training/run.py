@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader
-from vjepa2_ac.data.streams import copies_for
 from vjepa2_ac.distributed import PRECISIONS
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.low_rank import CastMatrices
@@ -82,5 +81,5 @@ def batches_from(run: Run) -> Batches:
         batch_size=run.config.training.batch_size,
         start_position=run.state.clips_done,
         share=run.share,
-        copies=copies_for(run.accelerator.device),
+        pinned=run.accelerator.device.type == "cuda",
     )

@@ -13,7 +13,6 @@ from torch.nn.functional import smooth_l1_loss
 
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.config.section import Positive, Section
-from vjepa2_ac.data.loader import prefetch_next
 from vjepa2_ac.distributed import all_gather_object, all_reduce_gradients, all_reduce_sum, raise_first
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch
@@ -59,7 +58,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     learning_rate = learning_rate_at(step, run.config.training)
     for group in run.optimizer.param_groups:
         group["lr"] = learning_rate
-    computed = gradients(run, batches, more=step < run.config.training.steps)
+    computed = gradients(run, batches)
     update = Update(run.trained) if measure_update else None
     if computed.clips:  # without a clip there are no gradients, and the weights stay unchanged
         run.scaler.step(run.optimizer)  # skips the update after an overflow in fp16
@@ -83,7 +82,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     return metrics
 
 
-def gradients(run: Run, batches: Iterator[Batch], *, more: bool = False) -> Gradients:
+def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
     """Accumulate and clip the gradients of the next micro-batches of all processes; the weights are unchanged.
 
     Loss and gradient are means over the clips of the step. If clips are skipped (`data.broken_episodes`: skip),
@@ -92,7 +91,6 @@ def gradients(run: Run, batches: Iterator[Batch], *, more: bool = False) -> Grad
     Args:
         run: The run.
         batches: Source of micro-batches.
-        more: Whether another step follows, whose first micro-batch is fetched while the device is computing.
 
     Raises:
         InputError: A loss or gradient is not finite; names the clips of this process. Or a clip of any process cannot
@@ -104,8 +102,6 @@ def gradients(run: Run, batches: Iterator[Batch], *, more: bool = False) -> Grad
     try:
         with run.cast_matrices.current():
             totals, names, fetched = _accumulate(run, batches)
-        if more:
-            prefetch_next(batches)
     except UserError as raised:
         error = raised
     sums = [*totals.tolist(), len(names), fetched, error is not None]  # waits for the device
