@@ -32,9 +32,8 @@ from synthetic_droid import draw_episodes
 from vjepa2_ac.config import DataConfig, DiskCacheConfig, RldsData
 from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import open_dataset, read_clip
-from vjepa2_ac.data.index import EpisodeTable, get_or_build
+from vjepa2_ac.data.index import EpisodeTable, StepSelection, get_or_build
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.data.selection import StepSelection
 from vjepa2_ac.data.sources import rlds as rlds_source
 from vjepa2_ac.data.windows import ClipOrder, clip_starts, windows_of
 from vjepa2_ac.episode import EpisodeInfo

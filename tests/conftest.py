@@ -126,17 +126,17 @@ def _undrawn() -> Iterator[Callable[[pytest.MonkeyPatch], None]]:
     """
     from matplotlib.figure import Figure
 
-    from vjepa2_ac.media import film
+    from vjepa2_ac.media import figure
 
-    draw, columns = Figure.draw, film._MOST_COLUMNS
+    draw, columns = Figure.draw, figure._MOST_COLUMNS
 
     def draw_all(patch: pytest.MonkeyPatch) -> None:
         patch.setattr(Figure, "draw", draw)
-        patch.setattr(film, "_MOST_COLUMNS", columns)
+        patch.setattr(figure, "_MOST_COLUMNS", columns)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "draw", lambda *_: None)
-        patch.setattr(film, "_MOST_COLUMNS", 1)
+        patch.setattr(figure, "_MOST_COLUMNS", 1)
         yield draw_all
 
 

@@ -37,7 +37,7 @@ ORDERS: dict[str, list[str]] = {
         "poses streams",
         "index",
         "selection files transforms",
-        "idle splits windows",
+        "idle windows",
         "sources",
         "clips",
         "dataset",

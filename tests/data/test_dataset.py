@@ -14,8 +14,8 @@ from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable
-from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, StepSelection
+from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.errors import InputError
 
 

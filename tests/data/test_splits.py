@@ -13,7 +13,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.splits import describe_splits
+from vjepa2_ac.data.selection import describe_splits
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.check import check_data
 

@@ -13,11 +13,19 @@ from memory_source import MemorySource
 from paths import GOLDEN, ROOT
 from vjepa2_ac.config.data import DataConfig, Split
 from vjepa2_ac.config.loading import load_config
-from vjepa2_ac.data.index import EpisodeTable
-from vjepa2_ac.data.selection import StepSelection, included
-from vjepa2_ac.data.splits import in_split
-from vjepa2_ac.data.windows import ClipOrder, Windows, clip_starts, far_neighbours, permuted, spread
-from vjepa2_ac.data.windows import windows_of as windows_of_starts
+from vjepa2_ac.data.index import EpisodeTable, StepSelection
+from vjepa2_ac.data.selection import in_split, included
+from vjepa2_ac.data.windows import (
+    ClipOrder,
+    Windows,
+    clip_starts,
+    far_neighbours,
+    permuted,
+    spread,
+)
+from vjepa2_ac.data.windows import (
+    windows_of as windows_of_starts,
+)
 from vjepa2_ac.episode import EpisodeInfo
 
 

@@ -21,8 +21,9 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.index import StepSelection
 from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
-from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
+from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.data.sources.latent_files import (
     OPTIONAL,
     CacheType,

@@ -13,7 +13,7 @@ from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset
 from vjepa2_ac.data.sources.latent_files import CacheType, LatentFiles, unpack_latents
-from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
+from vjepa2_ac.encoding.latent_cache import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import UnreachableError
 
 LENGTHS = [FRAMES_AT_ONCE + 1, 3, 2 * FRAMES_AT_ONCE]

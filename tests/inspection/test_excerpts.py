@@ -12,7 +12,7 @@ from memory_source import MemorySource
 from moving_arms import STEPS, spot_excerpt, spot_frames, spot_states, write_spots
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.selection import StepSelection
+from vjepa2_ac.data.index import StepSelection
 from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.inspection.excerpts import excerpt_findings, excerpts_of
 from vjepa2_ac.inspection.findings import Finding

@@ -13,7 +13,8 @@ from memory_source import MemorySource
 from moving_arms import STEPS, spot_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
+from vjepa2_ac.data.index import StepSelection
+from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.episode import Batch, Episode, LatentBatch, StepRanges
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.inspection.probe import (

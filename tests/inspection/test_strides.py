@@ -10,7 +10,8 @@ from torch import Tensor
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
+from vjepa2_ac.data.index import StepSelection
+from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.measure import ClipSample

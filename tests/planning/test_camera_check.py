@@ -13,7 +13,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.camera_check import has_moved, is_uniform
+from vjepa2_ac.media.images import has_moved, is_uniform
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import timed
 from vjepa2_ac.simulation.arm import SimulatedArm

@@ -10,8 +10,8 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import Dataset, read_clip
-from vjepa2_ac.data.index import EpisodeTable, identity_hash
-from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
+from vjepa2_ac.data.index import EpisodeTable, StepSelection, identity_hash
+from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.episode import Clip, EpisodeSource
 
 

@@ -12,7 +12,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.sources.latent_files import LatentFiles
 from vjepa2_ac.decoding.frame_pairs import FramePairs, wanted_frames
 from vjepa2_ac.decoding.training import train_decoder
-from vjepa2_ac.encoding.pipeline import EncoderOnDevice, encode_files
+from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, encode_files
 from vjepa2_ac.model.checkpoints import load_base
 
 KNOBS = {"size": "tiny", "frames": 40, "steps": 6, "batch_size": 4, "learning_rate": 2e-3}

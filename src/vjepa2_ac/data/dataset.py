@@ -15,17 +15,18 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.files import connections_to
 from vjepa2_ac.data.idle import find_ranges
-from vjepa2_ac.data.index import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable, StepSelection
 from vjepa2_ac.data.selection import (
     BrokenEpisodes,
-    StepSelection,
+    groups_of,
+    held_out_by,
     included,
+    members_of,
     of_outcome,
     require_distinct,
     with_exclusion,
 )
 from vjepa2_ac.data.sources.indexed_source import open_source, spaces_of
-from vjepa2_ac.data.splits import groups_of, held_out_by, members_of
 from vjepa2_ac.data.windows import Windows, clip_starts, drawn, require_stride, windows_of
 from vjepa2_ac.episode import POSE_WIDTHS, Batch, Clip, Episode, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError, counted

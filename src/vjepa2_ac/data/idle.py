@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, IdleConfig
 from vjepa2_ac.data.files import connections_to, in_parallel
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, fingerprint_of, get_or_make, key_of
-from vjepa2_ac.data.selection import StepSelection, as_error, as_problem
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, StepSelection, fingerprint_of, get_or_make, key_of
 from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import POSE, rotation_angles
@@ -50,7 +49,7 @@ def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, pr
         try:
             return kept_ranges(source.read(place), config.idle)
         except InputError as error:
-            return as_problem(error, table.identity(place))
+            return EpisodeProblem.of(error, table.identity(place))
 
     found: list[Found] = []
     for one in in_parallel(look, range(len(table)), connections_to(config)):
@@ -59,7 +58,7 @@ def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, pr
         if len(found) == min(_ALL_BROKEN, len(table)):
             problems = [problem for problem in found if isinstance(problem, EpisodeProblem)]
             if len(problems) == len(found):
-                raise as_error(problems[0])
+                raise problems[0].error
     return StepSelection.of_each(found)
 
 

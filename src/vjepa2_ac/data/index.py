@@ -14,14 +14,14 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Float32, Int8, Int32, UInt64
+from jaxtyping import Bool, Float, Float32, Int8, Int32, UInt64
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig
-from vjepa2_ac.episode import STATE_DIM, EpisodeInfo
+from vjepa2_ac.episode import STATE_DIM, EpisodeInfo, StepRanges
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.spaces import step_sizes
 from vjepa2_ac.storage import places
@@ -43,22 +43,6 @@ _VERSION = 5  # of the cache: another number makes all of it be rebuilt
 
 class NotATableError(ValueError):
     """The bytes are not a table by `to_bytes`."""
-
-
-class Storable(Protocol):
-    """A table that can be stored as a file."""
-
-    def to_bytes(self) -> bytes:
-        """Return this as a file's content; equal tables give equal bytes, and each array has a checksum."""
-        ...
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> Self:
-        """Read the result of `to_bytes`, or raise a NotATableError."""
-        ...
-
-
-T = TypeVar("T", bound=Storable)
 
 
 def pack(arrays: Mapping[str, np.ndarray], text: object = None) -> bytes:
@@ -95,6 +79,16 @@ class EpisodeProblem:
     found: str
     needed: str = ""
     fix: str = ""
+
+    @classmethod
+    def of(cls, error: InputError, name: str) -> EpisodeProblem:
+        """Return the record of an error."""
+        return cls(name=name, where=error.where, found=error.found, needed=error.needed, fix=error.fix)
+
+    @property
+    def error(self) -> InputError:
+        """The error of the episode."""
+        return InputError(where=self.where, found=self.found, needed=self.needed, fix=self.fix)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,6 +229,66 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         if len({len(column) for column in (*columns.values(), *locators.values())}) != 1:
             raise NotATableError("columns of several lengths")
         return table
+
+
+@dataclass(frozen=True, eq=False)
+class StepSelection:
+    """Ranges [start, end) of control steps that a clip must fit into; by episode, then ascending and disjoint."""
+
+    episode: Int32[np.ndarray, " ranges"]  # index into the table
+    start: Int32[np.ndarray, " ranges"]
+    end: Int32[np.ndarray, " ranges"]
+    problems: tuple[tuple[int, EpisodeProblem], ...] = ()  # the episodes that could not be read, by the same index
+
+    @classmethod
+    def whole(cls, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"]) -> StepSelection:
+        """Keep every step of the used episodes."""
+        episode = np.flatnonzero(taking_part).astype(np.int32)
+        return cls(episode, np.zeros(len(episode), np.int32), table.num_steps[episode])
+
+    @classmethod
+    def of_each(cls, found: Sequence[list[tuple[int, int]] | EpisodeProblem]) -> StepSelection:
+        """Join the ranges of all episodes."""
+        problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, EpisodeProblem))
+        ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
+        episode, start, end = np.ascontiguousarray(np.array(ranges, np.int32).reshape(-1, 3).T)
+        return cls(episode, start, end, problems)
+
+    def only(self, episodes: Bool[np.ndarray, " episodes"]) -> StepSelection:
+        """Return the selection with these episodes only."""
+        stays = episodes[self.episode]
+        return replace(self, episode=self.episode[stays], start=self.start[stays], end=self.end[stays])
+
+    def of(self, episode: int) -> StepRanges:
+        """Return the ranges of one episode."""
+        first, last = np.searchsorted(self.episode, np.array([episode, episode + 1], np.int32))
+        return tuple(zip(self.start[first:last].tolist(), self.end[first:last].tolist(), strict=True))
+
+    @property
+    def steps(self) -> int:
+        """The total number of kept steps."""
+        return int((self.end.astype(np.int64) - self.start).sum())
+
+    def to_bytes(self) -> bytes:
+        """Return this as a file's content."""
+        problems = [(place, vars(problem)) for place, problem in self.problems]
+        return pack({"episode": self.episode, "start": self.start, "end": self.end}, problems)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> StepSelection:
+        """Read the result of `to_bytes`.
+
+        Raises:
+            NotATableError: It is another kind of file, or damaged.
+        """
+        arrays, problems = unpack(data)
+        try:
+            return cls(**arrays, problems=tuple((place, EpisodeProblem(**values)) for place, values in problems))
+        except (LookupError, TypeError, ValueError) as error:
+            raise NotATableError(f"no ranges of steps ({error})") from None
+
+
+T = TypeVar("T", EpisodeTable, StepSelection)
 
 
 def nul_error(identity: str, where: str) -> InputError:

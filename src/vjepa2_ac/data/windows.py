@@ -17,8 +17,8 @@ from jaxtyping import Bool, Int, Int32, Int64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.index import EpisodeTable
-from vjepa2_ac.data.selection import NAMED, StepSelection, named
+from vjepa2_ac.data.index import EpisodeTable, StepSelection
+from vjepa2_ac.data.selection import NAMED, named
 from vjepa2_ac.errors import InputError, counted
 
 logger = logging.getLogger(__name__)

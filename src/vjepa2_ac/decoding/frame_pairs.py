@@ -22,8 +22,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latent_files import LatentFiles, unpack_latents
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.decoding.decoder import Decoder, DecoderShape, as_images
-from vjepa2_ac.encoding.latent_cache import needed_frames
-from vjepa2_ac.encoding.pipeline import FramesToEncode
+from vjepa2_ac.encoding.latent_cache import FramesToEncode, needed_frames
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.intervals import mean_of
 from vjepa2_ac.media.image_similarity import psnr, ssim

@@ -23,7 +23,7 @@ from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, TrainedDecoder, as_pixels, load_decoder
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.media.film import FilmStrip, StripRow, draw_strip, film_frames, loop_of
+from vjepa2_ac.media.figure import FilmStrip, StripRow, draw_strip, film_frames, loop_of
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.model.lora import base_only
@@ -267,7 +267,7 @@ class ImaginedStrip:
             if motion > self._most:
                 clip = encoded.clip(row)
                 own = replace(clip, latents=clip.latents.detach().float().cpu().clone())  # or all clips would stay
-                self._most, self._clip = motion, (replace(batch, latents=None, on_device=None), row, own)
+                self._most, self._clip = motion, (replace(batch, latents=None), row, own)
 
     def draw(self, world_model: WorldModel, device: torch.device, run: Path, step: int) -> np.ndarray | None:
         """Write RUN/imagined/step-XXXXXXXX.png; return the image, None if none was drawn."""

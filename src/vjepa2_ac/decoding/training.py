@@ -23,9 +23,9 @@ from torch import Tensor
 from vjepa2_ac.config import Config, DecoderConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.selection import SPLIT
 from vjepa2_ac.data.sources.latent_files import LatentFiles, bytes_per_frame
 from vjepa2_ac.data.sources.latents import CacheKey, Encoding, require_own_folder
-from vjepa2_ac.data.splits import SPLIT
 from vjepa2_ac.data.windows import permuted, require_frames, require_stride
 from vjepa2_ac.decoding.decoder import (
     CARD,
@@ -41,8 +41,14 @@ from vjepa2_ac.decoding.decoder import (
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
 from vjepa2_ac.distributed import autocast, computing_device
 from vjepa2_ac.encoding.batch import encoding_of
-from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in, require_space
-from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
+from vjepa2_ac.encoding.latent_cache import (
+    EncoderOnDevice,
+    FramesToEncode,
+    LatentCache,
+    encode_files,
+    frames_in,
+    require_space,
+)
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import ms_ssim
 from vjepa2_ac.model.checkpoints import load_base

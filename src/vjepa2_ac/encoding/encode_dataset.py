@@ -23,8 +23,7 @@ from vjepa2_ac.data.loader import ProcessShare
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.distributed import agreed, computing_device, first_only
 from vjepa2_ac.encoding.batch import encoding_of, require_same_encoder
-from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in
-from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
+from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, LatentCache, encode_files, frames_in
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.world_model import WorldModel

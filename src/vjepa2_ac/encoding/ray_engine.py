@@ -17,8 +17,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.distributed import computing_device
 from vjepa2_ac.encoding.encode_dataset import Engine, begin_encoding, open_cache, require_shared
-from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in
-from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
+from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, LatentCache, encode_files, frames_in
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
 from vjepa2_ac.reporter import Reporter
 

@@ -21,7 +21,7 @@ from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.episode import Progress, short_names
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.explore.explorer import MOST_STEPS, Explorer, Moment, Pixels, Place, Search, relative_spread
-from vjepa2_ac.media.film import error_colours
+from vjepa2_ac.media.figure import error_colours
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.planning.energy import mean_difference
 from vjepa2_ac.planning.planner import Cancelled

@@ -16,11 +16,11 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
 from vjepa2_ac.data.files import in_parallel, walk
 from vjepa2_ac.data.index import EpisodeTable
+from vjepa2_ac.data.selection import describe_splits, held_out_by
 from vjepa2_ac.data.sources.droid_raw import find_episodes
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.lerobot_meta import INFO
 from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
-from vjepa2_ac.data.splits import describe_splits, held_out_by
 from vjepa2_ac.episode import STATE_DIM, Progress
 from vjepa2_ac.errors import InputError, UserError, counted, shell_command
 from vjepa2_ac.init.described import droid, like_droid, look_at_lerobot, look_at_rlds

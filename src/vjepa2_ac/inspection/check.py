@@ -16,7 +16,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.data.splits import describe_splits, held_out_by
+from vjepa2_ac.data.selection import describe_splits, held_out_by
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.inspection.coverage import coverage_findings, coverage_in

@@ -17,8 +17,15 @@ from vjepa2_ac.data.transforms import Crop, split_views, view
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.camera_check import CameraFrame, has_moved, is_uniform, newest_frames, require_contrast
-from vjepa2_ac.media.images import require_image, require_mask
+from vjepa2_ac.media.images import (
+    CameraFrame,
+    has_moved,
+    is_uniform,
+    newest_frames,
+    require_contrast,
+    require_image,
+    require_mask,
+)
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.energy import patch_weights
 from vjepa2_ac.spaces import StateSpace

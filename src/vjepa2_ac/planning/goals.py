@@ -16,8 +16,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.media.camera_check import require_contrast
-from vjepa2_ac.media.images import encode_png, read_image, require_image
+from vjepa2_ac.media.images import encode_png, read_image, require_contrast, require_image
 from vjepa2_ac.storage.files import folder_writer
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
 

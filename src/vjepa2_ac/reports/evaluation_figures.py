@@ -24,8 +24,21 @@ from vjepa2_ac.evaluation.result import (
     one_step_over_persistence,
     over_persistence,
 )
-from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, RED, headline, visible, written_figure
-from vjepa2_ac.media.film import FilmStrip, Kind, StripRow, draw_rows, error_colours
+from vjepa2_ac.media.figure import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    FilmStrip,
+    Kind,
+    StripRow,
+    draw_rows,
+    error_colours,
+    headline,
+    visible,
+    written_figure,
+)
 from vjepa2_ac.reports.comparison import Comparison
 
 _COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE, "decoded truth": GREEN, "raw persistence": RED}

@@ -13,8 +13,7 @@ from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.transforms import Crop, crop_box, view
 from vjepa2_ac.errors import counted
-from vjepa2_ac.media.figure import BLUE, GREY, ORANGE, RED, headline, written_figure
-from vjepa2_ac.media.film import MEANING, Kind, show_framed
+from vjepa2_ac.media.figure import BLUE, GREY, MEANING, ORANGE, RED, Kind, headline, show_framed, written_figure
 from vjepa2_ac.planning.decision import PlanResult, summarize
 from vjepa2_ac.spaces import POSE
 

@@ -25,8 +25,7 @@ from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import L1, Curve, DecodedStrip, Evaluation, Example, over_persistence
 from vjepa2_ac.evaluation.rows import Row, RowTable, rows_of, sections
 from vjepa2_ac.evaluation.summary import Summary, Verdict, interval_of, percent, summarize, with_closed_loop
-from vjepa2_ac.media.figure import svg_of, visible
-from vjepa2_ac.media.film import draw_strip
+from vjepa2_ac.media.figure import draw_strip, svg_of, visible
 from vjepa2_ac.media.images import encode_webp
 from vjepa2_ac.reports.evaluation_figures import decoded_strip, drawings, example_strip, plot_evaluation
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, not_measured, write_csv, write_metrics

@@ -11,8 +11,7 @@ import numpy as np
 
 from vjepa2_ac import __version__
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.camera_check import require_contrast
-from vjepa2_ac.media.images import read_image, require_image
+from vjepa2_ac.media.images import read_image, require_contrast, require_image
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import GOALS_FILE, SubGoal, read_goal_folder
 from vjepa2_ac.runs.subject import Subject

@@ -26,7 +26,7 @@ from vjepa2_ac.goals.key_frames import (
     sub_goals_of,
     with_frames_between,
 )
-from vjepa2_ac.media.film import below_each_other, side_by_side
+from vjepa2_ac.media.figure import below_each_other, side_by_side
 from vjepa2_ac.media.video import video_library, write_video
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal

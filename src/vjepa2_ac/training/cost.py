@@ -30,7 +30,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.distributed import PRECISIONS, autocast
-from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE
+from vjepa2_ac.encoding.latent_cache import FRAMES_AT_ONCE
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.attention import rotary_tables
 from vjepa2_ac.model.encoder import ENCODE_CHUNK

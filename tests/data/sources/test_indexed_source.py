@@ -13,7 +13,6 @@ import pytest
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.sources import NpzData
 from vjepa2_ac.data.index import EpisodeTable
-from vjepa2_ac.data.selection import as_error
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Scanned, table_of
 from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
@@ -82,7 +81,7 @@ def test_an_identity_with_a_nul_is_a_problem_of_that_episode(identity: str, tmp_
     assert [info.id for info in table] == ["a", "é"]
     [problem] = table.problems
     assert problem.name == identity
-    assert re.search(r"^file .*: a NUL character in the identity '.*\\x00", str(as_error(problem)))
+    assert re.search(r"^file .*: a NUL character in the identity '.*\\x00", str(problem.error))
     assert EpisodeTable.from_bytes(table.to_bytes()).problems == table.problems
     with pytest.raises(InputError, match=r"episode .*: a NUL character in the identity"):
         EpisodeTable.of([EpisodeInfo("a", 30), EpisodeInfo(identity, 30)])

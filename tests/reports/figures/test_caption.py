@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vjepa2_ac.media.film import side_by_side
+from vjepa2_ac.media.figure import side_by_side
 
 
 def test_images_stand_side_by_side_below_their_words() -> None:

@@ -17,7 +17,6 @@ from jaxtyping import UInt8
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import EpisodeFiles, connections_to, in_parallel
 from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, StatesSummary, labels_of, nul_error
-from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.episode import EpisodeInfo, EpisodeSource, FrameReader, Progress, Widths, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import CAMERA_POSE, POSE, POSE_CHANGE, Spaces, StateSpace, vector_states
@@ -79,7 +78,7 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
         if isinstance(one, EpisodeProblem):
             problems.append(one)
         elif "\0" in one.info.id:
-            problems.append(as_problem(nul_error(one.info.id, one.where), one.info.id))
+            problems.append(EpisodeProblem.of(nul_error(one.info.id, one.where), one.info.id))
         elif (first := usable.setdefault(one.info.id, one)) is one:
             kinds[one.kind] = kinds.get(one.kind, 0) + 1
         else:
@@ -88,7 +87,7 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
             problems.append(EpisodeProblem(one.info.id, one.where, wrong, needed, config.same_identity_fix))
         progress(done, total)
     if not usable:
-        raise as_error(problems[0])
+        raise problems[0].error
     usual = max(kinds, key=lambda kind: kinds[kind])
     fix = "Resample the episode, or keep the recordings of different robots in different folders"
     for name, one in usable.items():
@@ -172,7 +171,7 @@ class IndexedSource(ABC, Generic[Config, More]):
             try:
                 return scan(key)
             except InputError as error:
-                return as_problem(error, identities[key])
+                return EpisodeProblem.of(error, identities[key])
 
         found = in_parallel(scan_one, [*identities], connections_to(self._config))
         return table_of(found, self._config, len(identities), progress)

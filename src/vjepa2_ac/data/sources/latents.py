@@ -17,8 +17,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.removed import REMOVED
 from vjepa2_ac.config.section import Affects, values_that_affect
 from vjepa2_ac.data.files import fetched_data
-from vjepa2_ac.data.index import EpisodeTable, NotATableError, T
-from vjepa2_ac.data.selection import StepSelection
+from vjepa2_ac.data.index import EpisodeTable, NotATableError, StepSelection, T
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, measured_space
 from vjepa2_ac.data.sources.latent_files import FIX, OPTIONAL, LatentFiles
 from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges

@@ -14,9 +14,9 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.sources import JOINT_VELOCITY
 from vjepa2_ac.data.files import connections_to, in_parallel
-from vjepa2_ac.data.index import EpisodeTable, StatesSummary, get_or_build, index_key, summary_of
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, StatesSummary, get_or_build, index_key, summary_of
 from vjepa2_ac.data.poses import poses_from
-from vjepa2_ac.data.selection import as_problem
+from vjepa2_ac.data.selection import with_own_splits
 from vjepa2_ac.data.sources.indexed_source import Found, IndexedSource, Scanned, frames_by_step, table_of
 from vjepa2_ac.data.sources.lerobot_meta import (
     FIX_EPISODE,
@@ -33,7 +33,6 @@ from vjepa2_ac.data.sources.lerobot_meta import (
     row_of,
 )
 from vjepa2_ac.data.sources.parquet import EPISODE, Columns, ParquetRows
-from vjepa2_ac.data.splits import with_own_splits
 from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_image, stack_frames
@@ -158,7 +157,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
                 if not is_far:
                     require_long_videos(info, row, keys, header_of)
             except InputError as error:
-                return as_problem(error, row.id)
+                return EpisodeProblem.of(error, row.id)
             facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
             return Scanned(facts, self._where(row), row.place, summary, labels, self._control_rate_hz)
 

@@ -23,11 +23,11 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig, RldsData
 from vjepa2_ac.data.files import fetched_data, open_cache
 from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build, index_key
+from vjepa2_ac.data.selection import with_own_splits
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, frames_by_step
 from vjepa2_ac.data.sources.rlds_episode import STEP_FLAG, Record, build_index, episode_of, position_of, step_features
 from vjepa2_ac.data.sources.rlds_shards import NEEDED, Shard, find_shards, open_shard
 from vjepa2_ac.data.sources.tfrecord import NotAnExampleError, Place, Read, RecordSpan, item_places, require_intact
-from vjepa2_ac.data.splits import with_own_splits
 from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_images

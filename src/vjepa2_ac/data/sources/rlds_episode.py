@@ -19,7 +19,6 @@ from vjepa2_ac.config.sources import RECORD
 from vjepa2_ac.data.files import CONNECTIONS, in_parallel
 from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, summary_of
 from vjepa2_ac.data.poses import num_rotation_numbers, poses_from, require_selection
-from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.indexed_source import Found, Scanned, require_as_indexed, table_of
 from vjepa2_ac.data.sources.rlds_shards import Shard, open_shard
 from vjepa2_ac.data.sources.tfrecord import (
@@ -282,7 +281,7 @@ def _scan(shard: Shard, place: int, read: Read, config: RldsData, cameras: Seque
         try:
             span = span_at(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
         except InputError as error:
-            yield from (as_problem(error, f"{shard.name}: record {one}") for one in hidden)
+            yield from (EpisodeProblem.of(error, f"{shard.name}: record {one}") for one in hidden)
             return
         yield _examine(read, span, place, f"{shard.name}: record {number}", config, cameras)
         offset = span.end
@@ -309,7 +308,7 @@ def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsDa
         if steps == 0:
             raise zero_steps(f"{span} ({name})")
     except InputError as error:
-        return as_problem(error if is_far else _damage_or(error, read, span), name)
+        return EpisodeProblem.of(error if is_far else _damage_or(error, read, span), name)
     place = dict(zip(_PLACE, (shard, span.number, span.offset, span.length), strict=True))
     success = True if "/success/" in name else False if "/failure/" in name else None  # known for DROID only
     info = EpisodeInfo(id=name, num_steps=steps, success=success)
