@@ -65,16 +65,14 @@ class EpisodeFiles:
                 return self.cache.read_or_make(f"{path}@{version}", lambda: storage.read_bytes(path))
             return storage.read_bytes(path)
 
-    def arrays(self, key: str) -> dict[str, np.ndarray] | None:
-        """Return the arrays that were kept under a key; None if there are none, or they are damaged."""
-        data = self.cache.read(key)
-        with suppress(NotATableError):
-            return None if data is None else unpack(data)[0]
-        return None
-
-    def keep(self, key: str, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep what was parsed of an episode."""
+    def parsed(self, key: str, parse: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
+        """Return arrays of an episode that were parsed on this machine before, or now."""
+        if (data := self.cache.read(key)) is not None:
+            with suppress(NotATableError):
+                return unpack(data)[0]
+        arrays = parse()
         self.cache.write(key, pack(arrays))
+        return arrays
 
 
 def connections_to(config: DataConfig) -> int:

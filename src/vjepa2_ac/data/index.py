@@ -33,7 +33,6 @@ UNKNOWN = 0  # hash of an episode whose states were not read, since no other is 
 _NOT_KNOWN = -1  # number of a label, or success
 _COLUMNS = ("num_steps", "success", "ids", "id_hash", "id_rank")
 _HASH, _MOTION, _LOCATOR, _LABEL = "state_hash", "motion", "locator.", "label."
-_HASH_BYTES = 8
 _TEXT = "text"
 _NO_MOTION = (np.nan,) * 8
 MEANS, SPANS = slice(2, 5), slice(5, 8)  # of `StatesSummary.motion`
@@ -315,7 +314,8 @@ def hash_of_states(states: Float[np.ndarray, "steps state_dim"]) -> int:
     As float32, since the same recording is float64 in one file and float32 in another. Rounding further would not make
     other roundings agree: a value at an edge of any grid may be rounded to either side.
     """
-    return hash_of_bytes(f"{states.shape} ".encode() + (states.astype("<f4") + np.float32(0)).tobytes())  # -0 is 0
+    content = f"{states.shape} ".encode() + (states.astype("<f4") + np.float32(0)).tobytes()  # -0 is 0
+    return int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "big") or 1
 
 
 class StatesSummary(NamedTuple):
@@ -338,11 +338,6 @@ def summary_of(states: Float[np.ndarray, "steps state_dim"]) -> StatesSummary:
     fastest = step_sizes(states).max(axis=0, initial=0.0) if width == STATE_DIM else np.zeros(2)
     positions = states[:, np.arange(3) % width]
     return StatesSummary(hash_of_states(states), [*fastest, *positions.mean(axis=0), *positions.std(axis=0)])
-
-
-def hash_of_bytes(content: bytes) -> int:
-    """Return 64 bits of the BLAKE2b of data that represents an episode's states, never `UNKNOWN`."""
-    return int.from_bytes(hashlib.blake2b(content, digest_size=_HASH_BYTES).digest(), "big") or 1
 
 
 def cache_folder(config: DiskCacheConfig) -> Path:

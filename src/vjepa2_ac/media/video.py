@@ -34,6 +34,7 @@ _STRICT = {
     "max_pixels": str(MOST_PIXELS),
 }
 _START = -(1 << 40)  # before every frame
+_SAME_RATE = 0.98  # and more of the steps' rate: times in milliseconds round 30 Hz to 30.3 Hz
 _FIX = "Copy the file again, or leave the episode out"
 _CRF = 20  # x264's constant rate factor: text stays sharp
 _COLOURS = 255  # of a GIF
@@ -118,7 +119,7 @@ def _shown_by(video: _Video, clock: Clock, steps: Sequence[int]) -> list[int]:
     if not (missing := set(targets) - nearest.keys()):
         return [nearest[target] for target in targets]
     found, rate_hz = f"no frame at {min(missing) * video.unit_s:.3f} s", video.header().rate_hz
-    if 0 < rate_hz < clock.rate_hz and not is_same_rate(rate_hz, clock.rate_hz):
+    if 0 < rate_hz < _SAME_RATE * clock.rate_hz:
         found += f": the video has {rate_hz:.4g} frames a second, and {clock.source} says {clock.rate_hz:g}"
         fix = "Change the rate of the video or that of the steps, or leave the episode out"
         raise InputError(where=video.where, found=found, needed="a frame for each step", fix=fix)
@@ -135,11 +136,6 @@ def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
     """
     with _opened(file, where) as video:
         return video.header()
-
-
-def is_same_rate(video_hz: float, steps_hz: float) -> bool:
-    """Return whether a video has the rate of its steps, within 2 %: times in milliseconds round 30 Hz to 30.3 Hz."""
-    return abs(video_hz - steps_hz) <= 0.02 * steps_hz
 
 
 def frame_times(file: str | Path | ByteReader, *, where: str) -> list[int]:

@@ -6,7 +6,7 @@ The tree is LAB/success|failure/DATE/TIME/{trajectory.h5, metadata_*.json, recor
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -93,19 +93,12 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             metadata={} if task is None else {"language": task},
         )
 
-    def _parsed(self, key: str, parse: Callable[[], dict[str, np.ndarray]]) -> Arrays:
-        """Return arrays that were parsed on this machine before, or now."""
-        found = self._files.arrays(key)
-        if found is None:
-            self._files.keep(key, found := parse())
-        return found
-
     def _frames(
         self, video: str, version: str, frames: Sequence[int], steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
         opened = partial(self._files.open, video, version=version)
         walk = lambda: {"times": np.array(frame_times(opened(), where=video), np.int64)}  # noqa: E731
-        times = self._parsed(f"times {video} {version}", walk)["times"].tolist()
+        times = self._files.parsed(f"times {video} {version}", walk)["times"].tolist()
         return read_frames(opened(), [frames[step] for step in steps], where=video, times=times)
 
     def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
@@ -172,7 +165,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         path = self._path(place.folder, TRAJECTORY)
         key = f"trajectory {path} {place.version} {serials}"
         read = partial(self._files.read, path, version=place.version)
-        found = self._parsed(key, lambda: parse_trajectory(read(), path, serials))
+        found = self._files.parsed(key, lambda: parse_trajectory(read(), path, serials))
         steps = len(found["pose"])
         for serial, count in place.frames.items():
             if abs(steps - count) > 1:

@@ -244,11 +244,13 @@ def _name(number: int, camera: str, ending: str = _WHOLE) -> str:
 class EpisodeFile:
     """An open file; everything is read on request, latents and pictures frame by frame.
 
+    The safetensors format is read here by ranges, since the library reads local files only.
+
     Args:
         path: The file.
         key: Digest of the key of its cache.
         size: Of the file, in bytes.
-        read: Returns several (start, length) pieces of it.
+        read: Returns several (start, length) pieces of it, each complete.
 
     Raises:
         InputError: The file is missing, damaged, or belongs to another cache.
@@ -256,11 +258,19 @@ class EpisodeFile:
     """
 
     def __init__(self, path: str, key: str, size: int, read: Callable[[Ranges], list[bytes]]) -> None:
-        self.path = path
+        self.path, self._read, self._head = path, read, b""
         with self._reading():
-            self._file = TensorFile(read, size, path)
-            about, self.names = self._file.metadata, self._file.entries.keys()
+            self._head = self._pieces([(0, min(size, _HEAD_BYTES))])[0]
+            begin = _LENGTH_BYTES + int.from_bytes(self._head[:_LENGTH_BYTES], "little")
+            if not _LENGTH_BYTES < begin <= min(size, MOST_BYTES):
+                raise ValueError("no header")
+            header = json_object(self._pieces([(_LENGTH_BYTES, begin - _LENGTH_BYTES)])[0], where=path)
+            about = header.pop("__metadata__", {})
+            self._tensors = {name: _Tensor.of(entry, begin) for name, entry in header.items()}
+            if (end := max([begin, *(one.end for one in self._tensors.values())])) != size:
+                raise ValueError(f"{size:,} bytes of {end:,}")
             self.metadata = {name: str(text) for name, text in json_object(about["metadata"], where=path).items()}
+        self.names = self._tensors.keys()
         if about.get("key") != key:
             raise self._damaged("a file of another cache", "a file that was made with this one's cache.json")
 
@@ -276,7 +286,8 @@ class EpisodeFile:
             InputError: There is none of this name.
         """
         with self._reading():
-            return np.asarray(self._file.tensor(name).numpy())
+            one = self._tensors[name]
+            return np.asarray(one.joined(self._pieces([(one.start, one.end - one.start)]), one.shape).numpy())
 
     def places_of(self, steps: Sequence[int]) -> list[int]:
         """Return the indices of the frames at these control steps.
@@ -298,7 +309,7 @@ class EpisodeFile:
         """
         names = [name for name in ("latents", "scales") if name == "latents" or name in self.names]
         with self._reading():
-            return StoredLatents(*self._file.rows(names, places))
+            return StoredLatents(*self._rows(names, places))
 
     def pictures(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames size size 3"]:
         """Return frames as the encoder saw them, by their index.
@@ -307,11 +318,28 @@ class EpisodeFile:
             InputError: One is damaged.
         """
         with self._reading():
-            if len(self._file.entries["pictures"].shape) > 1:
-                return np.asarray(self._file.rows(["pictures"], places)[0].numpy())
-            ends = [0, *self._file.tensor("picture_ends").tolist()]
-            jpegs = self._file.slices("pictures", [(ends[place], ends[place + 1]) for place in places])
+            stored = self._tensors["pictures"]
+            if len(stored.shape) > 1:
+                return np.asarray(self._rows(["pictures"], places)[0].numpy())
+            ends = [0, *self.array("picture_ends").tolist()]
+            jpegs = self._pieces([stored.range_of(ends[place], ends[place + 1]) for place in places])
         return decode_jpegs(jpegs, self.frame_steps[list(places)].tolist(), self.path)
+
+    def _rows(self, names: Sequence[str], places: Sequence[int]) -> list[Tensor]:
+        """Return the same rows of several tensors, which are read together."""
+        tensors, count = [self._tensors[name] for name in names], len(places)
+        pieces = self._pieces([one.range_of(place, place + 1) for one in tensors for place in places])
+        parts = (pieces[number * count : (number + 1) * count] for number in range(len(tensors)))
+        return [one.joined(part, (count, *one.shape[1:])) for one, part in zip(tensors, parts, strict=True)]
+
+    def _pieces(self, ranges: Ranges) -> list[bytes]:
+        known, there = len(self._head), dict[tuple[int, int], bytes]()
+        for start, length in ranges:
+            if start + length <= known or not length:
+                there[start, length] = self._head[start : start + length]
+        lacking = [one for one in dict.fromkeys(ranges) if one not in there]
+        there |= zip(lacking, self._read(lacking), strict=True) if lacking else ()
+        return [there[one] for one in ranges]
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
@@ -326,19 +354,16 @@ class EpisodeFile:
         return InputError(where=self.path, found=found, needed=needed, fix=FIX)
 
 
-# ---- the safetensors format, by ranges ----
-
-
 @dataclass(frozen=True)
-class _Entry:
-    """A tensor of the header."""
+class _Tensor:
+    """A tensor of the header of a safetensors file."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
     start: int  # in the file
 
     @classmethod
-    def of(cls, about: Mapping[str, Any], begin: int) -> _Entry:
+    def of(cls, about: Mapping[str, Any], begin: int) -> _Tensor:
         """Return a tensor of a header; `begin`: where the header ends."""
         start, end = about["data_offsets"]
         one = cls(_TENSOR_TYPES[about["dtype"]], tuple(about["shape"]), begin + start)
@@ -358,56 +383,7 @@ class _Entry:
         row = prod(self.shape[1:]) * self.dtype.itemsize
         return self.start + start * row, (stop - start) * row
 
-
-class TensorFile:
-    """A safetensors file whose header was read; a wrong one is a ValueError, KeyError, TypeError or IndexError.
-
-    Args:
-        read: Returns several pieces of the file, each complete.
-        size: The file's.
-        where: Its name, for messages.
-    """
-
-    def __init__(self, read: Callable[[Ranges], list[bytes]], size: int, where: str) -> None:
-        self._read, self._head = read, b""
-        self._head = self._pieces([(0, min(size, _HEAD_BYTES))])[0]
-        begin = _LENGTH_BYTES + int.from_bytes(self._head[:_LENGTH_BYTES], "little")
-        if not _LENGTH_BYTES < begin <= min(size, MOST_BYTES):
-            raise ValueError("no header")
-        header = json_object(self._pieces([(_LENGTH_BYTES, begin - _LENGTH_BYTES)])[0], where=where)
-        self.metadata: Mapping[str, str] = header.pop("__metadata__", {})
-        self.entries = {name: _Entry.of(about, begin) for name, about in header.items()}
-        if (end := max([begin, *(one.end for one in self.entries.values())])) != size:
-            raise ValueError(f"{size:,} bytes of {end:,}")
-
-    def tensor(self, name: str) -> Tensor:
-        """Return a whole tensor."""
-        one = self.entries[name]
-        return _tensor(self._pieces([(one.start, one.end - one.start)]), one, one.shape)
-
-    def rows(self, names: Sequence[str], places: Sequence[int]) -> list[Tensor]:
-        """Return the same rows of several tensors, which are read together."""
-        entries = [self.entries[name] for name in names]
-        pieces = self._pieces([one.range_of(place, place + 1) for one in entries for place in places])
-        count = len(places)
-        return [
-            _tensor(pieces[i * count : (i + 1) * count], one, (count, *one.shape[1:])) for i, one in enumerate(entries)
-        ]
-
-    def slices(self, name: str, bounds: Sequence[tuple[int, int]]) -> list[bytes]:
-        """Return the bytes of rows from the first to before the second number of each pair, read together."""
-        return self._pieces([self.entries[name].range_of(*pair) for pair in bounds])
-
-    def _pieces(self, ranges: Ranges) -> list[bytes]:
-        known, there = len(self._head), dict[tuple[int, int], bytes]()
-        for start, length in ranges:
-            if start + length <= known or not length:
-                there[start, length] = self._head[start : start + length]
-        lacking = [one for one in dict.fromkeys(ranges) if one not in there]
-        there |= zip(lacking, self._read(lacking), strict=True) if lacking else ()
-        return [there[one] for one in ranges]
-
-
-def _tensor(pieces: Sequence[bytes], like: _Entry, shape: tuple[int, ...]) -> Tensor:
-    data = bytearray().join(pieces)  # one that can be written to
-    return torch.frombuffer(data, dtype=like.dtype).reshape(shape) if data else torch.empty(shape, dtype=like.dtype)
+    def joined(self, pieces: Sequence[bytes], shape: tuple[int, ...]) -> Tensor:
+        """Return pieces of it as a tensor."""
+        data = bytearray().join(pieces)  # one that can be written to
+        return torch.frombuffer(data, dtype=self.dtype).reshape(shape) if data else torch.empty(shape, dtype=self.dtype)

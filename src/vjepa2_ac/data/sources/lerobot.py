@@ -14,7 +14,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.sources import JOINT_VELOCITY
 from vjepa2_ac.data.files import connections_to, in_parallel
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, StatesSummary, get_or_build, index_key, summary_of
+from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, get_or_build, index_key, summary_of
 from vjepa2_ac.data.poses import poses_from
 from vjepa2_ac.data.selection import with_own_splits
 from vjepa2_ac.data.sources.indexed_source import Found, IndexedSource, Scanned, frames_by_step, table_of
@@ -135,8 +135,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         is_far, connections = storage.is_url(config.path), connections_to(config)
         of_config = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
         videos = [key for key in of_config if info.features[key].dtype == "video"]
-        states = fields.state if is_far else ()  # of local rows the states themselves are hashed
-        rows = read_episodes(info, tables, videos, states, fields.success, self._open_file)
+        rows = read_episodes(info, tables, videos, fields.success, self._open_file)
         if not rows:
             raise InputError(where=info.where, found="no episodes", needed="a data set with episodes")
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
@@ -145,7 +144,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         header_of = cache(lambda path: read_header(path, where=path))
 
         def look(row: EpisodeRow) -> Found:
-            success, summary = row.success, StatesSummary(row.state_hash)
+            success, summary = row.success, UNREAD
             try:
                 require_files(info, row, files, keys)
                 if row.id in overlaps:

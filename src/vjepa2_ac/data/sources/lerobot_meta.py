@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import json
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
@@ -15,7 +14,7 @@ from typing import Any
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData, LeRobotFields
 from vjepa2_ac.data.files import in_parallel
-from vjepa2_ac.data.index import UNKNOWN, EpisodeTable, hash_of_bytes
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.poses import require_selection
 from vjepa2_ac.data.sources.parquet import read_table
 from vjepa2_ac.errors import InputError, MissingFileError, counted, did_you_mean
@@ -47,7 +46,6 @@ _FIX_RANGES = (
     "Correct file_index, from_timestamp and to_timestamp in meta/episodes (they may be wrong for other episodes of the "
     "file, too), or leave both episodes out"
 )
-_STATISTICS = ("min", "max", "mean", "std")
 _ROUNDING_STEPS = 0.25  # by which the ranges of two episodes in a video may overlap
 
 
@@ -266,7 +264,6 @@ class EpisodeRow:
     task: str = ""
     lengths_s: Mapping[str, float] = field(default_factory=dict)  # of its part of each video, where the table says it
     success: bool | None = None
-    state_hash: int = UNKNOWN
 
     @property
     def index(self) -> int:
@@ -292,7 +289,6 @@ def read_episodes(
     info: DatasetInfo,
     tables: Sequence[str],
     videos: Sequence[str],
-    states: Sequence[str],
     success: str | None,
     open_file: Callable[[str], str | BlockCachedFile],
 ) -> list[EpisodeRow]:
@@ -302,17 +298,15 @@ def read_episodes(
         info: Of the data set.
         tables: The files that list the episodes, within the data set.
         videos: Features whose locations are requested.
-        states: Columns whose statistics are to find episodes with the same states; v2.1 has none.
-        success: Column whose statistics tell the outcome; likewise.
+        success: Column whose statistics tell the outcome; v2.1 has none.
         open_file: Returns the path or file to open for a path.
 
     Raises:
         InputError: The tables are missing, damaged, or do not match the count in meta/info.json.
         OSError: A remote file cannot be read.
     """
-    statistics = [f"stats/{name}/{kind}" for name in states for kind in _STATISTICS]
     outcome = f"stats/{success}/max"
-    own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome, *statistics}
+    own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome}
     prefixes = tuple(f"videos/{key}/" for key in videos)
     rows = []
     for table in tables:
@@ -324,7 +318,7 @@ def read_episodes(
             values = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         for number, row in enumerate(values):
             try:
-                rows.append(_row_of(info, row, videos, row.get(outcome), statistics))
+                rows.append(_row_of(info, row, videos, row.get(outcome)))
             except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
                 found, needed = f"not an episode ({error!r})", "LeRobot's own tables"
                 raise InputError(where=f"{path}: row {number}", found=found, needed=needed, fix=_FIX_TABLES) from None
@@ -346,9 +340,7 @@ def _lines(path: str) -> Iterator[dict[str, Any]]:
             yield json_object(line, where=where, needed="an episode", fix=_FIX_TABLES)
 
 
-def _row_of(
-    info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], outcome: object, statistics: Sequence[str]
-) -> EpisodeRow:
+def _row_of(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], outcome: object) -> EpisodeRow:
     index = int(row["episode_index"])
     if info.version == "v2.1":  # a file for each episode
         places = ("data", *(f"videos/{key}" for key in videos))
@@ -356,9 +348,6 @@ def _row_of(
         row |= {f"{place}/file_index": index for place in places} | {f"{place}/from_timestamp": 0 for place in places}
     while isinstance(outcome, list) and outcome:
         outcome = outcome[0]
-    of_states = [row.get(name) for name in statistics]
-    is_known = bool(of_states) and None not in of_states
-    hashed = json.dumps([row["length"], *of_states], default=str).encode()
     tasks = row.get("tasks") or ()
     place: dict[str, float] = {
         "index": index,
@@ -381,7 +370,6 @@ def _row_of(
         task="; ".join(map(str, tasks)) if isinstance(tasks, list | tuple) else str(tasks),
         lengths_s=lengths_s,
         success=bool(outcome) if isinstance(outcome, bool | int | float) else None,
-        state_hash=hash_of_bytes(hashed) if is_known else UNKNOWN,
     )
 
 

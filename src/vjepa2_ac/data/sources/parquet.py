@@ -41,8 +41,8 @@ class ParquetRows:
     """Reads rows of Parquet files; each thread keeps the row group that it decoded last.
 
     Args:
-        files: Opens them, and keeps rows that share their row group with other episodes: so that a row group of
-            hundreds of episodes is not decoded for each of them.
+        files: Opens them, and keeps the rows of each episode: so that a row group of hundreds of episodes is not
+            decoded for each of them.
         columns: The wanted ones, if a file has them; the index of the episode is always read.
         version: Of the cached rows: changes with the data set or the wanted columns.
     """
@@ -60,21 +60,17 @@ class ParquetRows:
             InputError: The file is missing or damaged, or a column does not contain numbers.
             OSError: A remote file cannot be read.
         """
-        key = f"rows {self._version} {path} {episode}"
-        if (known := self._files.arrays(key)) is not None:
-            return known
-        parts: list[Columns] = []
-        are_shared = False
-        with self._groups_with(path, episode) as (file, groups):
-            for number in groups:
-                group = self._group(path, file, number)
-                of_episode = group[EPISODE][:, 0] == episode
-                are_shared |= not of_episode.all()
-                parts.append({name: column[of_episode] for name, column in group.items()})
-        rows = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
-        if are_shared:
-            self._files.keep(key, rows)
-        return rows
+
+        def read() -> Columns:
+            parts: list[Columns] = []
+            with self._groups_with(path, episode) as (file, groups):
+                for number in groups:
+                    group = self._group(path, file, number)
+                    of_episode = group[EPISODE][:, 0] == episode
+                    parts.append({name: column[of_episode] for name, column in group.items()})
+            return {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
+
+        return self._files.parsed(f"rows {self._version} {path} {episode}", read)
 
     def images(self, path: str, column: str, episode: int) -> list[bytes]:
         """Return the encoded images of one episode from a column of {bytes, path}.

@@ -12,7 +12,7 @@ import json
 import os
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -128,17 +128,6 @@ def images_here(shard: Shard, feature: Place, num_steps: int, where: str) -> Fra
     return frames_by_step(num_steps, where, decode)
 
 
-@dataclass(frozen=True)
-class _Piece:
-    """Bytes of a file from an offset on, read as the file is."""
-
-    start: int
-    data: bytes
-
-    def __call__(self, offset: int, length: int) -> bytes:
-        return self.data[offset - self.start : offset - self.start + length]
-
-
 class RemoteEpisode:
     """One record behind a URL: its numbers, and the images of its cameras.
 
@@ -207,10 +196,14 @@ class RemoteEpisode:
         """Fetch all of a camera's images; cache their positions, and the needed ones."""
         start, end = feature[0], sum(feature)
         chunks = [(place, min(_CHUNK_BYTES, end - place)) for place in range(start, end, _CHUNK_BYTES)]
-        piece = _Piece(start, b"".join(storage.read_ranges(self._shard.path, chunks)))
-        places = _places_of(piece, feature, num_steps, where)
+        data = b"".join(storage.read_ranges(self._shard.path, chunks))
+
+        def read(offset: int, length: int) -> bytes:
+            return data[offset - start : offset - start + length]
+
+        places = _places_of(read, feature, num_steps, where)
         self._places.write(key, (np.array(places) - (start, 0)).astype(np.uint32).tobytes())
-        images = {step: piece(*place) for step, place in enumerate(places)}
+        images = {step: read(*place) for step, place in enumerate(places)}
         steps = {step for first, stop in needed or [(0, num_steps)] for step in range(first, stop)}
         self._contents.write_parts(key, [image if step in steps else b"" for step, image in images.items()])
         return images
