@@ -17,7 +17,6 @@ from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.convert import convert_to_lerobot
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.init.look import look_at
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.spaces import actions_from_states
 
@@ -169,12 +168,6 @@ def test_statistics_are_those_of_the_numbers_and_pixels(droid: Path, tmp_path: P
     for kind in ("min", "max", "mean", "std"):
         np.testing.assert_allclose(np.ravel(of_pixels[kind]), getattr(np, kind)(frames, axis=0), atol=1e-9)
     assert (np.shape(of_pixels["mean"]), of_pixels["count"]) == ((3, 1, 1), [87])
-
-
-def test_init_finds_what_was_written(droid: Path, tmp_path: Path) -> None:
-    convert_to_lerobot(config_of(droid, camera=list(CAMERAS)), tmp_path / "out", SILENT)
-    found = look_at(str(tmp_path / "out"))
-    assert (found.source, found.episodes) == ("lerobot", 6)
 
 
 def test_episodes_are_whole_whatever_is_idle_or_held_out_and_excluded_ones_are_left_out(

@@ -50,27 +50,6 @@ def test_an_outcome_that_nobody_tells_is_refused() -> None:
         open_in_memory(MemorySource([10, 10], [False, None]), outcome="success")
 
 
-def test_a_broken_episode_stops_by_default_and_says_how_to_go_on() -> None:
-    with pytest.raises(InputError) as caught:
-        open_in_memory(MemorySource([10] * 2000, problems=problems(12)))
-    error = caught.value
-    assert (error.where, error.found, error.needed) == ("shard 3: record 0", "all zeros", "poses")
-    assert error.fix.startswith(
-        "11 more cannot be used either. Look. To leave them out, set data.broken_episodes: skip, or add"
-        ' (the first 10 of 12) to data.exclude: ["bad 0", '
-    )
-    assert '"bad 9"]' in error.fix
-    assert "bad 10" not in error.fix
-
-
-def test_broken_episodes_are_skipped_by_policy_counted_and_named(caplog: Any) -> None:
-    dataset = open_in_memory(MemorySource([10] * 1188, problems=problems(12)), broken_episodes="skip")
-    assert "12 of 1200 episodes are broken and left out: bad 0, bad 1" in caplog.text
-    assert "and 2 more; the first: shard 3: record 0: all zeros" in caplog.text
-    assert len(dataset.broken) == 12
-    assert removed(dataset)["broken"] == (12, 0, 0)
-
-
 def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> None:
     def resumed(**knobs: Any) -> BrokenEpisodes:
         ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip", **knobs), 300)
@@ -86,16 +65,6 @@ def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> 
 def test_excluding_what_there_is_not_is_refused() -> None:
     with pytest.raises(InputError, match=r"data\.exclude: not the identity of any episode: elsewhere\."):
         open_in_memory(MemorySource([10], problems=problems(1)), exclude=("elsewhere", "bad 0"))
-
-
-def test_two_episodes_of_one_identity_are_refused() -> None:
-    source = MemorySource([10, 20, 30], names=["same", "other", "same"])
-    with pytest.raises(
-        InputError, match=r"episodes 0 and 2 have the same identity: same.*data\.fields\.identity"
-    ) as caught:
-        open_in_memory(source)
-    assert "broken_episodes" not in caught.value.fix, "that would not help"
-    assert open_in_memory(source, exclude=("same",)).windows("train").episodes.tolist() == [1]
 
 
 def droid_sized() -> EpisodeTable:

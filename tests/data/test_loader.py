@@ -61,20 +61,6 @@ def test_a_clip_holds_the_strided_steps_of_its_episode(droid: Path) -> None:
     assert np.array_equal(clip.frames, episode.read_frames([4, 7, 10, 13])[:, :, 15:80])
 
 
-def test_resumed_run_sees_the_clips_the_uninterrupted_run_would_have(droid: Path) -> None:
-    config = config_of(droid)
-    uninterrupted = take(40, config)  # more than an epoch
-    for done in (1, 17, 33):
-        assert_same(take(5, config, start_position=done * 2), uninterrupted[done : done + 5])
-
-
-def test_another_layout_goes_on_where_the_run_stopped(droid: Path) -> None:
-    config = config_of(droid)
-    alone = names(take(12, config))
-    ranks = [take(2, config, start_position=5, batch_size=3, share=ProcessShare(rank, 2)) for rank in range(2)]
-    assert names([ranks[rank][step] for step in range(2) for rank in range(2)]) == alone[5:17]
-
-
 def test_loading_does_not_draw_from_the_generator_of_dropout(droid: Path) -> None:
     before = torch.get_rng_state()
     take(2, config_of(droid))

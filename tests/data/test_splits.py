@@ -11,7 +11,6 @@ from copied_sets import write_rlds
 from split_sets import EPISODES, write_lerobot_splits, write_rlds_splits
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.selection import describe_splits
 from vjepa2_ac.errors import InputError
@@ -133,16 +132,3 @@ def test_check_says_which_splits_are_used(opened: Opened, tmp_path: Path) -> Non
     assert advice.endswith("data.splits=hash draws the test split from all episodes")
     single = config.model_copy(update={"path": str(write_rlds_splits(tmp_path / "one", "train")), "test_share": 0.1})
     assert "splits" not in {one.about for one in check_data(single, clips=2)}
-
-
-def test_the_config_of_an_older_run_draws_its_splits() -> None:
-    values = {"run_dir": "run", "data": {"path": "set"}, "model": {"base": "builtin:sim-tiny"}}
-    new = parse_config(values, where="here")
-    assert new.data.splits == "dataset"
-    resolved = config_as_dict(new)
-    assert parse_config(resolved, where="here") == new
-    del resolved["data"]["splits"]
-    resolved["data"] |= {"check_crc": "once", "connections": 16, "prefetch": 2, "short_episodes": "skip"}
-    resolved["replay"] = {"share": 0.1, "data": dict(resolved["data"])}
-    older = parse_config(resolved, where="here", here=False)
-    assert [data.splits for data in older.data_sets] == ["hash", "hash"]

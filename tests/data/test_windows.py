@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clips import open_in_memory, split_of
+from clips import open_in_memory
 from memory_source import MemorySource
 from paths import GOLDEN, ROOT
 from vjepa2_ac.config.data import DataConfig, Split
@@ -66,17 +66,6 @@ def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> N
     assert found == [(0, 3), (0, 7), (0, 11), (0, 23), (1, 0), (1, 4), (1, 8), (1, 12)]
 
 
-def test_an_epoch_sees_every_window_once() -> None:
-    windows = windows_of(episodes(10, 25, 12, 13), settings_of(**ALL_TRAIN), "train")
-    order = ClipOrder(windows, seed=3)
-    everything = sorted(
-        (episode, start) for episode, length in enumerate((10, 25, 12, 13)) for start in range(length - 9)
-    )
-    first, second = ([order.window(epoch * len(windows) + index) for index in range(len(windows))] for epoch in (0, 1))
-    assert sorted(first) == sorted(second) == everything
-    assert first != second
-
-
 def test_order_and_split_do_not_depend_on_the_order_of_the_episodes() -> None:
     infos = [EpisodeInfo(id=f"episode {number}", num_steps=10 + number % 7) for number in range(60)]
     shuffled = [infos[number] for number in np.random.default_rng(0).permutation(60)]
@@ -87,24 +76,6 @@ def test_order_and_split_do_not_depend_on_the_order_of_the_episodes() -> None:
             clips = ClipOrder(windows_of(order, config, split), seed=1)
             named.append([(order[episode].id, start) for episode, start in map(clips.window, range(30))])
         assert named[0] == named[1]
-
-
-def test_the_split_never_changes_between_versions() -> None:
-    config = settings_of(validation_share=0.3, test_share=0.3)
-    assert [split_of(f"episode {number}", config) for number in range(8)] == [
-        "validation",
-        "train",
-        "test",
-        "train",
-        "train",
-        "train",
-        "validation",
-        "train",
-    ]
-
-
-def test_the_order_never_changes_between_versions() -> None:
-    assert [permuted(index, size=11, seed=7, epoch=2) for index in range(11)] == [7, 9, 1, 10, 3, 6, 8, 2, 0, 5, 4]
 
 
 def test_the_demo_sees_the_clips_it_always_saw() -> None:

@@ -12,7 +12,7 @@ import torch
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset
-from vjepa2_ac.data.sources.latent_files import CacheType, LatentFiles, unpack_latents
+from vjepa2_ac.data.sources.latent_files import LatentFiles, unpack_latents
 from vjepa2_ac.encoding.latent_cache import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import UnreachableError
 
@@ -30,9 +30,9 @@ def colours(inputs: torch.Tensor, chunk: int) -> torch.Tensor:
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Encode every step of a source."""
 
-    def encode(source: MemorySource, kind: CacheType = "fp32", workers: int = 2) -> LatentFiles:
+    def encode(source: MemorySource) -> LatentFiles:
         monkeypatch.setattr(dataset, "open_source", lambda _: source)
-        config = DataConfig(path="memory", crop="letterbox", workers=workers, broken_episodes="skip", cache_dtype=kind)
+        config = DataConfig(path="memory", crop="letterbox", workers=2, broken_episodes="skip", cache_dtype="int8")
         wanted = [FramesToEncode(n, "left", np.arange(steps, dtype=np.int32)) for n, steps in enumerate(source.lengths)]
         model = SimpleNamespace(image_size=5, encode=colours)
         encoder = EncoderOnDevice(model, torch.device("cpu"), nullcontext, chunk=7)  # type: ignore[arg-type]
@@ -43,10 +43,9 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     return encode
 
 
-@pytest.mark.parametrize(("kind", "workers"), [("int8", 2)])
-def test_each_episode_gets_its_own_frames_which_are_read_once(run: Run, kind: CacheType, workers: int) -> None:
+def test_each_episode_gets_its_own_frames_which_are_read_once(run: Run) -> None:
     source = MemorySource(LENGTHS)
-    files = run(source, kind, workers)
+    files = run(source)
     assert sorted(source.decoded) == [(number, step) for number, steps in enumerate(LENGTHS) for step in range(steps)]
     assert sorted(index for index, _, _ in source.reads) == [0, 1, 2]
     for number, steps in enumerate(LENGTHS):
@@ -55,7 +54,7 @@ def test_each_episode_gets_its_own_frames_which_are_read_once(run: Run, kind: Ca
         pixels = unpack_latents(file.latents(range(steps)))[:, 0] * 255 * torch.tensor([0.229, 0.224, 0.225])
         found = (pixels + 255 * torch.tensor([0.485, 0.456, 0.406])).numpy()
         expected = np.stack([np.full(steps, number), np.arange(steps)], axis=1)
-        np.testing.assert_allclose(found[:, :2], expected, atol={"fp32": 1e-3, "bf16": 0.6, "int8": 0.6}[kind])
+        np.testing.assert_allclose(found[:, :2], expected, atol=0.6)
 
 
 def test_a_network_that_is_gone_is_no_fault_of_an_episode(run: Run, tmp_path: Path) -> None:

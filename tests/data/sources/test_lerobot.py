@@ -406,14 +406,6 @@ OVERLAPS: dict[str, tuple[dict[str, dict[int, float]], dict[str, str]]] = {
             "episode_000002": "episode_000000 and episode_000002 claim 1.66667 to 2.6 s of file-000.mp4",
         },
     ),
-    "file of another episode": (
-        {"file_index": {3: 0}},
-        {
-            "episode_000000": "episode_000000 and episode_000003 claim 0 to 0.8 s of file-000.mp4",
-            "episode_000001": "episode_000003 and episode_000001 claim 0.8 to 1 s of file-000.mp4",
-            "episode_000003": "episode_000000 and episode_000003 claim 0 to 0.8 s of file-000.mp4",
-        },
-    ),
 }  # fmt: skip
 
 

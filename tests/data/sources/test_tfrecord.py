@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tfrecords import decode_example, index_records, read_record
+from tfrecords import decode_example
 from vjepa2_ac.data.sources.tfrecord import (
     NotAnExampleError,
     decode_feature,
@@ -17,28 +17,9 @@ from vjepa2_ac.data.sources.tfrecord import (
     write_record,
 )
 
-RECORDS = [b"", b"one", bytes(1000), b"trailing zeros\0\0\0"]
-
-
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    path = tmp_path / "set.tfrecord-00000-of-00001"
-    with path.open("wb") as stream:
-        for record in RECORDS:
-            write_record(stream, record)
-    return path
-
 
 def reader_of(data: bytes) -> Callable[[int, int], bytes]:
     return lambda offset, length: data[offset : offset + length]
-
-
-def read_all(path: Path) -> list[bytes]:
-    return [read_record(span) for span in index_records(path)]
-
-
-def test_records_come_back_in_order(file: Path) -> None:
-    assert read_all(file) == RECORDS
 
 
 def test_framing_is_the_published_one(tmp_path: Path) -> None:
