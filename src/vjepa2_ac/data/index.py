@@ -136,12 +136,8 @@ class EpisodeTable(Sequence[EpisodeInfo]):
     labels: Mapping[str, Labels] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, infos: Sequence[EpisodeInfo], *, texts: Mapping[str, str] | None = None) -> EpisodeTable:
+    def of(cls, infos: Sequence[EpisodeInfo]) -> EpisodeTable:
         """Make a table without the optional columns; a given table is returned unchanged.
-
-        Args:
-            infos: Facts about the episodes.
-            texts: Small values of the whole data set.
 
         Raises:
             InputError: An identity contains a NUL character.
@@ -158,7 +154,6 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             ids=ids,
             id_hash=np.array([identity_hash(info.id) for info in infos], np.uint64),
             id_rank=np.argsort(np.argsort(ids, kind="stable")).astype(np.int32),
-            texts=dict(texts or {}),
             motion=np.array([_NO_MOTION for _ in infos], np.float32),
         )
 

@@ -123,7 +123,7 @@ class LatentFiles:
             UnreachableError: It cannot be read now.
         """
         try:
-            self._opened(_name(number, camera))
+            self.open(number, camera)
         except InputError:
             return False
         return True
@@ -142,11 +142,8 @@ class LatentFiles:
             UnreachableError: The folder cannot be listed now.
         """
         sizes = self._sizes()
-
-        def is_done(number: int, camera: str) -> bool:
-            return sizes.get(_name(number, camera), 0) > 0 or _name(number, camera, _BROKEN) in sizes
-
-        return [number for number in numbers if not all(is_done(number, camera) for camera in cameras)]
+        done = {name.rpartition(".")[0] for name, size in sizes.items() if size > 0 or name.endswith(_BROKEN)}
+        return [number for number in numbers if any(_name(number, camera, "") not in done for camera in cameras)]
 
     def is_done(self, number: int, camera: str) -> bool:
         """Return whether a file is there, or in its place the reason why it cannot be; of a URL as it is listed."""
@@ -160,11 +157,20 @@ class LatentFiles:
             InputError: It is missing, damaged, or belongs to another cache; or the episode could not be read.
             UnreachableError: It cannot be read now.
         """
-        name, note = _name(number, camera), _name(number, camera, _BROKEN)
-        if self._found(name) is None and self._found(note) is not None:
+        place, file, note = (
+            self.path(number, camera),
+            self._found(_name(number, camera)),
+            _name(number, camera, _BROKEN),
+        )
+        if file is None and self._found(note) is not None:
             found = f"no latents: it could not be read when they were encoded ({self._reason(note).rstrip('.')})"
-            raise InputError(where=self.path(number, camera), found=found)
-        return self._opened(name)
+            raise InputError(where=place, found=found)
+        if file is None:
+            raise InputError(where=place, found="no such file", needed="latents of an episode", fix=FIX)
+        if self.cache is None:
+            return EpisodeFile(place, self.key, file.size, partial(storage.read_ranges, place))
+        key = f"{place} {file.version} {file.size}"
+        return EpisodeFile(place, self.key, file.size, partial(cached_ranges, place, key=key, cache=self.cache))
 
     def write(self, number: int, encoded: EncodedEpisode, *, exact_pictures: bool = False) -> None:
         """Write the file of an episode and camera.
@@ -226,15 +232,6 @@ class LatentFiles:
 
     def _reason(self, note: str) -> str:
         return storage.read_bytes(storage.join(self.folder, note)).decode(errors="replace")
-
-    def _opened(self, name: str) -> EpisodeFile:
-        place, found = storage.join(self.folder, name), self._found(name)
-        if found is None:
-            raise InputError(where=place, found="no such file", needed="latents of an episode", fix=FIX)
-        if self.cache is None:
-            return EpisodeFile(place, self.key, found.size, partial(storage.read_ranges, place))
-        key = f"{place} {found.version} {found.size}"
-        return EpisodeFile(place, self.key, found.size, partial(cached_ranges, place, key=key, cache=self.cache))
 
 
 def _name(number: int, camera: str, ending: str = _WHOLE) -> str:

@@ -179,18 +179,13 @@ def read_key(folder: Path | str) -> CacheKey:
     return CacheKey(key)
 
 
-def read_tables(folder: Path | str, *, has_idle_rule: bool) -> tuple[EpisodeTable, StepSelection | None]:
-    """Read the episodes of a cache and, if it has an idle rule, the ranges that the rule keeps.
+def read_table(path: str, kind: type[T]) -> T:
+    """Read a table of a cache.
 
     Raises:
-        InputError: One of the files is missing or damaged.
-        UnreachableError: One cannot be read.
+        InputError: The file is missing or damaged.
+        UnreachableError: It cannot be read.
     """
-    table = _table(storage.join(folder, EPISODES), EpisodeTable)
-    return table, _table(storage.join(folder, KEPT), StepSelection) if has_idle_rule else None
-
-
-def _table(path: str, kind: type[T]) -> T:
     try:
         with storage.user_can_read(path, fix=_ENCODE):
             return kind.from_bytes(storage.read_bounded(path, _MOST_BYTES))
@@ -294,8 +289,10 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
                 differing.append(f"data.camera: {', '.join(key.cameras)}, not {camera}")
         if differing:  # of other clips than the config's
             raise another_cache(folder, differing)
-        table, kept = read_tables(folder, has_idle_rule=self._config.idle.rule != "none")
+        has_idle_rule = self._config.idle.rule != "none"
+        kept = read_table(storage.join(folder, KEPT), StepSelection) if has_idle_rule else None
         cache = fetched_data(self._config.disk_cache) if storage.is_url(folder) else None
+        table = read_table(storage.join(folder, EPISODES), EpisodeTable)
         return table, _Cache(key, LatentFiles(folder, key.digest, cache), kept)
 
 
