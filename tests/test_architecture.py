@@ -34,7 +34,7 @@ ORDERS: dict[str, list[str]] = {
         "cli",
     ],
     "data": [
-        "poses streams",
+        "poses",
         "index",
         "selection files transforms",
         "idle windows",

@@ -14,8 +14,8 @@ from clips import open_in_memory
 from failing_rows import Rows
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data import loader, streams
-from vjepa2_ac.data.streams import require_shared_memory, results_of_workers
+from vjepa2_ac.data import loader
+from vjepa2_ac.data.loader import require_shared_memory, results_of_workers
 from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.process import StopRequest
 from vjepa2_ac.training.setup import set_up
@@ -26,14 +26,14 @@ Usage = namedtuple("Usage", "free")
 @pytest.fixture
 def shared_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     """Set the free bytes of shared memory."""
-    monkeypatch.setattr(streams, "SHARED_MEMORY", tmp_path)
-    real = streams.shutil.disk_usage
+    monkeypatch.setattr(loader, "SHARED_MEMORY", tmp_path)
+    real = loader.shutil.disk_usage
 
     def set_free(free: int) -> None:
         def usage(path: object) -> Any:
             return Usage(free) if path == tmp_path else real(path)
 
-        monkeypatch.setattr(streams.shutil, "disk_usage", usage)
+        monkeypatch.setattr(loader.shutil, "disk_usage", usage)
 
     return set_free
 
@@ -44,7 +44,7 @@ def data(workers: int) -> DataConfig:
 
 @pytest.mark.parametrize(("workers", "processes"), [(4, 1), (2, 2)])
 def test_shared_memory_must_hold_the_batches_of_all_workers(shared_memory: Any, workers: int, processes: int) -> None:
-    needed = 1000 * workers * streams.PREFETCH * processes
+    needed = 1000 * workers * loader.PREFETCH * processes
     shared_memory(needed)
     require_shared_memory(data(workers), 1000, processes)
     shared_memory(needed - 1)
@@ -54,13 +54,13 @@ def test_shared_memory_must_hold_the_batches_of_all_workers(shared_memory: Any, 
 
 
 def test_a_system_without_shared_memory_is_not_checked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(streams, "SHARED_MEMORY", tmp_path / "none")
+    monkeypatch.setattr(loader, "SHARED_MEMORY", tmp_path / "none")
     require_shared_memory(data(4), 10**18)
 
 
 def test_a_run_is_refused_before_its_first_step(make_config: Any, shared_memory: Any) -> None:
     frames = 2 * 4 * 36 * 49 * 3  # a batch of two clips of 4 frames, and 49 numbers of states and actions each
-    shared_memory(2 * streams.PREFETCH * (frames + 2 * 4 * (4 * 7 + 3 * 7)) - 1)
+    shared_memory(2 * loader.PREFETCH * (frames + 2 * 4 * (4 * 7 + 3 * 7)) - 1)
     with pytest.raises(UnreachableError, match=r"2 workers x 2 batches of 0\.0427 MB"):
         set_up(make_config(data__workers=2))
     set_up(make_config(data__workers=0))
@@ -70,7 +70,7 @@ def test_a_batch_without_room_in_shared_memory_is_an_error_of_the_worker(monkeyp
     def full(_: torch.Tensor) -> torch.Tensor:
         raise RuntimeError("unable to allocate shared memory(shm)")
 
-    monkeypatch.setattr(loader, "in_worker", lambda: True)
+    monkeypatch.setattr(loader, "get_worker_info", lambda: True)
     dataset = open_in_memory(MemorySource([30] * 4))
     with contextlib.closing(loader.training_loader(dataset, seed=0, batch_size=2)) as batches:
         assert next(batches).frames.is_shared()
@@ -103,17 +103,17 @@ class Slow(Iterator[int]):
 
 
 def test_a_slow_batch_is_waited_for_unless_a_signal_has_come(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert streams._next_row(Slow(), ()) == 7
+    assert loader._next_row(Slow(), ()) == 7
     with pytest.raises(RuntimeError, match="another"):
-        streams._next_row(Slow("another"), ())
+        loader._next_row(Slow("another"), ())
     stop = StopRequest()
     stop.take(signal.SIGTERM, None)
     stop._came_at -= 100.0
-    monkeypatch.setattr(streams, "stop_request", lambda: stop)
-    assert streams._next_row(Slow(), ()) == 7, "only a wait after the signal counts"
-    monkeypatch.setattr(streams, "_GRACE_S", 0.0)
+    monkeypatch.setattr(loader, "stop_request", lambda: stop)
+    assert loader._next_row(Slow(), ()) == 7, "only a wait after the signal counts"
+    monkeypatch.setattr(loader, "_GRACE_S", 0.0)
     with pytest.raises(UnreachableError, match="no batch after SIGTERM"):
-        streams._next_row(Slow(), ())
+        loader._next_row(Slow(), ())
 
 
 # Files in the working directory that are named like modules.

@@ -249,7 +249,7 @@ def _doctor(options: argparse.Namespace) -> int:
 
     import torch
 
-    from vjepa2_ac.data.streams import require_shared_memory
+    from vjepa2_ac.data.loader import require_shared_memory
     from vjepa2_ac.distributed import slow_bf16
     from vjepa2_ac.model.checkpoints import base_sizes
     from vjepa2_ac.training.cost import USUAL_GPU, batch_bytes, estimate_memory, ways_to_fit

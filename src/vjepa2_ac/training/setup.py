@@ -17,9 +17,8 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.model import ModelSizes
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index import fingerprint_of
-from vjepa2_ac.data.loader import validation_batches
+from vjepa2_ac.data.loader import require_shared_memory, validation_batches
 from vjepa2_ac.data.selection import describe_splits, named
-from vjepa2_ac.data.streams import require_shared_memory
 from vjepa2_ac.distributed import agreed, all_gather_object, first_of_machine, first_only, make_accelerator
 from vjepa2_ac.encoding.batch import extrinsics_for
 from vjepa2_ac.encoding.encode_dataset import with_latents
