@@ -51,7 +51,7 @@ def test_indices_count_from_the_end_and_iteration_ends() -> None:
     assert names([clips[-1], clips[-10]]) == names([clips[9], clips[0]])
     assert names([clips[np.int64(3)], clips[torch.tensor(3)]]) == names([clips[3]] * 2)
     for beyond in (10, -11):
-        with pytest.raises(IndexError, match=f"clip {beyond} of 10"):
+        with pytest.raises(IndexError):
             clips[beyond]
     with pytest.raises(TypeError):
         clips[1.0]

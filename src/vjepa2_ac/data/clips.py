@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, SupportsIndex
@@ -51,10 +50,7 @@ class ClipDataset(TorchDataset[Clip]):
             IndexError: There is no such clip.
             InputError: The clip cannot be read.
         """
-        number = operator.index(index)
-        if not -self.count <= number < self.count:
-            raise IndexError(f"clip {number} of {self.count}")
-        return self.read(number % self.count)
+        return self.read(range(self.count)[index])
 
     def __getitems__(self, indices: Sequence[SupportsIndex]) -> list[Clip]:
         """Return several clips, as a DataLoader requests them; clips behind a URL are read concurrently."""

@@ -130,8 +130,6 @@ def _require_unit_quaternions(quaternions: Float[np.ndarray, "steps 4"], where: 
     if is_wrong.any():
         step = int(is_wrong.argmax())
         found = f"the quaternion {np.array2string(quaternions[step], precision=4)} of length {lengths[step]:.4g}"
-        if not np.any(quaternions[step]):
-            found += " (an empty measurement, as before the first message of a sensor)"
         raise InputError(where=f"{where}: step {step}", found=found, needed="a unit quaternion", fix=fix)
 
 

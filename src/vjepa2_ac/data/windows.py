@@ -151,8 +151,6 @@ def permuted(index: int, *, size: int, seed: int, epoch: int) -> int:
 
     A Feistel network permutes the next power of four; results outside the range are permuted again until inside.
     """
-    if not 0 <= index < size:
-        raise ValueError(f"index {index} of {size}")
     half = max(_HALF_BITS, ((size - 1).bit_length() + 1) // 2)
     keys = _round_keys(size, seed, epoch)
     index = _feistel(index, half, keys)

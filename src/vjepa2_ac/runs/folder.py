@@ -40,7 +40,7 @@ from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
 from vjepa2_ac.storage import read_bounded, try_writing_at, user_can_read, user_can_write, write_atomically
 from vjepa2_ac.storage.places import BUILTIN, is_url, literal
-from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown, utc_now
+from vjepa2_ac.storage.structured import MOST_BYTES, shown, utc_now
 
 logger = logging.getLogger(__name__)
 
@@ -239,10 +239,10 @@ def _is_without_config(path: Path) -> bool:
 def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
     try:
         with user_can_read(path):
-            starts = json_list(read_bounded(path, MOST_BYTES), where=str(path))
-    except InputError:  # there is none, or it is damaged
+            starts = json.loads(read_bounded(path, MOST_BYTES))
+    except (InputError, ValueError, RecursionError):  # there is none, or it is damaged
         return []
-    return [start for start in starts if isinstance(start, dict)]
+    return [start for start in starts if isinstance(start, dict)] if isinstance(starts, list) else []
 
 
 def with_settled_values(config: Config) -> Config:

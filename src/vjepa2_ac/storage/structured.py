@@ -55,12 +55,13 @@ def json_object(data: bytes | str, *, where: str, needed: str = "a JSON object",
     Raises:
         InputError: It is not JSON, or no object.
     """
-    return _parsed(data, dict, where=where, needed=needed, fix=fix)
-
-
-def json_list(data: bytes | str, *, where: str) -> list[Any]:
-    """Return the values of a JSON list; errors as of `json_object`."""
-    return _parsed(data, list, where=where, needed="a JSON list", fix="")
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(where=where, found=f"not JSON: {error}", needed=needed, fix=fix) from None
+    if not isinstance(value, dict):
+        raise InputError(where=where, found=f"a JSON {type(value).__name__}", needed=needed, fix=fix)
+    return value
 
 
 def read_json_object(
@@ -75,16 +76,6 @@ def read_json_object(
     with user_can_read(path, needed=needed, fix=fix):
         data = read_bounded(path, most_bytes)
     return json_object(data, where=str(path), needed=needed, fix=fix)
-
-
-def _parsed(data: bytes | str, kind: type[T], *, where: str, needed: str, fix: str) -> T:
-    try:
-        value = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise InputError(where=where, found=f"not JSON: {error}", needed=needed, fix=fix) from None
-    if not isinstance(value, kind):
-        raise InputError(where=where, found=f"a JSON {type(value).__name__}", needed=needed, fix=fix)
-    return value
 
 
 def json_text(value: Any) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vjepa2_ac import storage
+from vjepa2_ac.data.selection import named
 from vjepa2_ac.data.sources.tfrecord import Read
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.storage.structured import read_json_object
@@ -18,7 +19,6 @@ from vjepa2_ac.storage.structured import read_json_object
 NEEDED = "a TFRecord file"
 _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
-_MOST_NAMES = 5
 _MOST_EPISODES = 100_000  # of a shard; DROID's have some 50
 _WINDOW_BYTES = 1 << 15  # a read behind a URL costs as much time as so many bytes
 _WINDOWS = 8  # read last: behind the images of one record is the head of the next
@@ -60,7 +60,7 @@ def find_shards(folder: str) -> list[Shard]:
     names = [name for name, *_ in listed]
     present = {file.name: file for file in storage.list_files(folder)}
     if missing := [name for name in names if name not in present]:
-        found = f"{len(missing)} of {len(names)} shards are missing: {_shorten(missing)}"
+        found = f"{len(missing)} of {len(names)} shards are missing: {named(missing)}"
         fix = f"Download them, or rename the shards that are there as {_INFO} lists them"
         raise InputError(where=folder, found=found, needed=f"every shard that {_INFO} lists", fix=fix)
     return [
@@ -93,8 +93,8 @@ def _nothing_in(folder: str) -> str:
         return f"{folder} {'is empty' if storage.exists(folder) else 'does not exist'}"
     inner = [name for name in names if storage.exists(storage.join(storage.join(folder, name), _INFO))]
     if inner:
-        return f"no {_INFO} in {folder}; did you mean {_shorten([storage.join(folder, name) for name in inner])}?"
-    return f"no {_INFO} in {folder}, only {_shorten(names)}"
+        return f"no {_INFO} in {folder}; did you mean {named([storage.join(folder, name) for name in inner])}?"
+    return f"no {_INFO} in {folder}, only {named(names)}"
 
 
 def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int, str]]:
@@ -116,11 +116,6 @@ def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int, str
         if count:
             name = re.sub(r"\{(\w+)\}", lambda found, of=values: of.get(found[1], found[0]), template)
             yield name, count, values["SPLIT"]
-
-
-def _shorten(names: list[str]) -> str:
-    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return ", ".join(names[:_MOST_NAMES]) + more
 
 
 @contextmanager
