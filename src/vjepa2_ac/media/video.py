@@ -405,14 +405,9 @@ def write_gif(path: str | Path, frames: Sequence[Frame], *, seconds: Sequence[fl
         path: A local file; missing folders are created.
         frames: Of one size, at least one.
         seconds: How long each is shown; GIFs know hundredths.
-
-    Raises:
-        ValueError: No frames, of different sizes, or other than one duration for each.
     """
     from PIL import Image
 
-    if not frames or len({frame.shape for frame in frames}) > 1 or len(seconds) != len(frames):
-        raise ValueError(f"{len(frames)} frames of one size, and {len(seconds)} durations")
     sample = np.concatenate([frame[::_SAMPLED, ::_SAMPLED].reshape(-1, 3) for frame in frames])
     palette = Image.fromarray(sample[None]).quantize(_COLOURS)
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]

@@ -68,21 +68,12 @@ class RangedFile(io.RawIOBase):
         self._position = base + offset
         return self._position
 
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Return the next `size` bytes, fewer if the file ends; all remaining ones with -1."""
-        if self.closed:
-            raise ValueError("the file is closed")
-        start = min(self._position, self._size)
-        end = self._size if size is None or size < 0 else min(start + size, self._size)
-        data = self._range(start, end)
-        self._position += len(data)
-        return data
-
     def readinto(self, buffer: bytearray | memoryview, /) -> int:  # type: ignore[override] # any writable buffer
         """Fill a buffer with the next bytes; return how many there were."""
         view = memoryview(buffer).cast("B")
-        data = self.read(len(view))
+        data = self._range(self._position, min(self._position + len(view), self._size))
         view[: len(data)] = data
+        self._position += len(data)
         return len(data)
 
     def _range(self, start: int, end: int) -> bytes:
@@ -120,8 +111,7 @@ class DiskCache:
     Any number of threads and processes may use one folder. The file `lock` holds the total size of its entries. A
     writer adds the size of its entry to the total before it stores the entry. If the total would exceed the limit, the
     writer first scans the folder and evicts entries down to 80 % of the limit, while other writers wait. So the folder
-    exceeds the limit by at most one entry for each thread that was storing an entry during the last scan. A folder
-    that is over the limit when a process starts is reduced at the first read or write of that process.
+    exceeds the limit by at most one entry for each thread that was storing an entry during the last scan.
 
     If the folder cannot be used, all entries count as absent: that causes a warning, never an error.
 
@@ -133,13 +123,10 @@ class DiskCache:
 
     def __init__(self, folder: str | Path, limit_bytes: int | None) -> None:
         self._folder, self._limit = Path(folder), limit_bytes
-        self._is_used, self._refused = False, set[Path]()
+        self._refused = set[Path]()
 
     def read(self, key: str) -> bytes | None:
         """Return the entry of a key, or None if there is none or it is damaged; the entry counts as used now."""
-        if not self._is_used:
-            with suppress(OSError):  # usually: no such folder yet
-                self._reserve(0)
         path = self._path(key)
         try:
             content = path.read_bytes()
@@ -214,7 +201,6 @@ class DiskCache:
 
     def _reserve(self, size: int) -> None:
         """Add the size of an entry to the total of the folder, after an eviction if it does not fit."""
-        self._is_used = True
         if not self._limit:
             return
         with os.fdopen(os.open(self._folder / "lock", os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0) as lock:
