@@ -62,7 +62,7 @@ class Cameras:
             self.require_contrast(image, where=f"goal {place}")
 
     def require_contrast(self, image: Image, *, where: str) -> None:
-        """Refuse an image in which one of the cameras has no contrast; see `camera_check.is_uniform`.
+        """Refuse an image in which one of the cameras has no contrast; see `images.is_uniform`.
 
         Raises:
             InputError: One is uniform.
