@@ -39,7 +39,7 @@ TINY = "builtin:sim-tiny"
 
 
 def test_the_table_of_the_page_has_exactly_the_public_names() -> None:
-    table = PAGE.split("| name | does |")[1].split("\n\n")[0]
+    table = PAGE.split("| name | description |")[1].split("\n\n")[0]
     named = re.findall(r"^\| `(\w+)", table, flags=re.MULTILINE)
     assert sorted(named) == sorted(vjepa2_ac.__all__)
 
