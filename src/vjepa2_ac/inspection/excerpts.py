@@ -46,6 +46,7 @@ _SHIFTS = 20  # pairings with other episodes, each covering all episodes
 _FEWEST_EPISODES = 8  # with fewer, chance level is not known well enough
 _SURE = 3.0  # standard errors, or deviations of chance
 _GAIN = 0.25  # of the value above chance, that another shift must add
+_BACKWARDS = 0.25  # by which an episode's frames fit better in opposite order; share of such episodes, at most
 _ABOVE = 0.15  # minimum above chance for matching frames: 0.3 and more was measured
 
 
@@ -265,6 +266,10 @@ def _agreement(
         by = f"frames are {'at least ' * (abs(lag) == most)}{shift} ({abs(lag) / control_rate_hz:.2f} s)"
         level: Level = "error" if abs(lag) >= stride else "warning"  # an error: each action has the frames of another
         return Finding(level, "agreement", f"{by}; {text}. {fix}")
+    backwards = int((reverse - fitting > _BACKWARDS).sum())
+    if backwards > _BACKWARDS * len(pairs):
+        text = f"{backwards} of {counted(len(pairs), 'episode')} fit better with the frames in opposite order ({text})"
+        return Finding("warning", "agreement", f"{text}. Check the order in time of both")
     text += f"; it is highest for frames that are {shift}" if lag else ""
     return Finding("ok", "agreement", f"frames change when the robot moves ({text})")
 
