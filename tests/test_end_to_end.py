@@ -1,14 +1,20 @@
-"""The whole way on the command line: record, train from scratch, export, adapt with LoRA, evaluate."""
+"""The whole way on the command line: record, train from scratch or on a pretrained encoder, export, adapt, evaluate."""
 
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
-import yaml
+import torch
 
-from paths import ROOT
+from paths import GOLDEN, ROOT
+from run_fixtures import tiny_config
 from vjepa2_ac.cli import main
+from vjepa2_ac.config import ModelConfig
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.runs.subject import load_subject
 
 TINY = {
     "image_size": 48,
@@ -17,24 +23,12 @@ TINY = {
 }
 
 
-def write_config(folder: Path, name: str, **sections: object) -> str:
-    values = {
-        "run_dir": str(folder / name),
-        "data": {
-            "path": str(folder / "data"), "frames": 3, "stride": 4, "validation_share": 0.3, "test_share": 0.3,
-            "workers": 0,
-        },
-        "training": {
-            "steps": 3, "batch_size": 2, "accumulation": 1, "warmup_steps": 0, "precision": "fp32", "device": "cpu",
-            "allow_weak_base": True,
-        },
-        "validation": {"every": 3, "clips": 4, "batch_size": 2, "ranking_samples": 4},
-        "checkpoint": {"every": 3},
-        **sections,
-    }  # fmt: skip
-    path = folder / f"{name}.yaml"
-    path.write_text(yaml.safe_dump(values))
-    return str(path)
+def write_config(folder: Path, name: str, **changes: object) -> str:
+    few = {"data__frames": 3, "data__stride": 4, "data__test_share": 0.3, "training__accumulation": 1}
+    few |= {"training__steps": 3, "training__warmup_steps": 0, "checkpoint__every": 3}
+    config = tiny_config(folder / name, folder / "data", folder / "base", **(few | changes))
+    (folder / f"{name}.yaml").write_text(config_as_yaml(config))
+    return str(folder / f"{name}.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +42,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert main(["train", scratch]) == 0
     assert main(["export", str(folder / "scratch"), str(folder / "base")]) == 0
-    lora = write_config(folder, "lora", model={"base": str(folder / "base"), "dtype": "float32"})
+    lora = write_config(folder, "lora")
     assert main(["train", lora, "--check", "seed=3"]) == 0
     assert not (folder / "lora").exists()
     assert main(["train", lora]) == 0
@@ -118,3 +112,65 @@ def test_real_robot_pictures_go_the_whole_way_and_the_error_falls(shared: Path, 
     errors = [row["error_over_persistence"] for row in rows if row["kind"] == "validation"]
     assert losses[-1] < 0.95 * losses[0]
     assert errors[-1] < 0.9 * errors[0]
+
+
+# On a pretrained encoder: record, encode, train, export
+
+ENCODER = {"path": str(GOLDEN / "encoders" / "vjepa2_1_distilled.pt"), "heads": 4}
+MODEL = {
+    "base": "random",
+    "encoder": ENCODER,
+    "sizes": {"image_size": 96, "predictor": {"width": 64, "depth": 2, "heads": 4}},
+    "dtype": "float32",
+}
+
+
+def config_of_encoder(folder: Path, name: str, model: dict[str, object] = MODEL, **changes: object) -> str:
+    cache = {"data__cache": "require", "data__cache_dir": str(folder / "latents")}
+    return write_config(folder, name, model=model, **({"adapter": {"kind": "none"}} | cache | changes))
+
+
+@pytest.fixture(scope="module")
+def on_an_encoder(workshop: Path) -> Path:
+    """The same folder, after the latents of its data and a run on them."""
+    config = config_of_encoder(workshop, "whole")
+    assert main(["encode", config]) == 0
+    assert main(["train", config, "--check"]) == 0
+    assert main(["train", config]) == 0
+    return workshop
+
+
+def test_an_export_is_a_base_with_its_encoder(on_an_encoder: Path, tmp_path: Path) -> None:
+    assert main(["export", str(on_an_encoder / "whole"), str(tmp_path / "merged")]) == 0
+    assert main(["export", str(on_an_encoder / "whole"), str(tmp_path / "official.pt"), "--to", "official"]) == 0
+    run = load_subject(on_an_encoder / "whole").world_model.eval()
+    sizes = {"image_size": 96, "encoder": {"heads": 4}, "predictor": {"width": 64, "heads": 4}}
+    rng = np.random.default_rng(0)
+    frames = torch.from_numpy(rng.normal(size=(1, 2, 3, 96, 96))).float()
+    numbers = torch.from_numpy(rng.normal(size=(1, 2, 7))).float() * 0.1
+    latents = run.encode(frames)
+    expected = run.predict(latents, numbers, numbers)
+    for base in (tmp_path / "merged", tmp_path / "official.pt"):
+        told = {"base": str(base), "dtype": "float32"} | ({"sizes": sizes} if base.suffix else {})
+        model = load_base(ModelConfig.model_validate(told), seed=0)
+        assert torch.equal(model.encode(frames), latents)
+        assert torch.allclose(model.predict(latents, numbers, numbers), expected, atol=1e-6)
+    card = json.loads((tmp_path / "merged" / "config.json").read_text())
+    origin = {"file": "vjepa2_1_distilled.pt", "key": "ema_encoder", "licence": "", "heads_are_told": True}
+    assert card["encoder_origin"] == origin
+    lora = config_of_encoder(
+        on_an_encoder, "adapted", {"base": str(tmp_path / "merged"), "dtype": "float32"}, adapter={"rank": 2}
+    )
+    assert main(["train", lora, "training.steps=1"]) == 0  # on the same latents: the cache is required
+    assert main(["export", str(on_an_encoder / "adapted"), str(tmp_path / "hub"), "--to", "hub"]) == 0
+    words = "V-JEPA 2.1, 12 blocks of 64, 4 heads, each frame as a tubelet; from vjepa2_1_distilled.pt, ema_encoder"
+    assert words in (tmp_path / "hub" / "README.md").read_text()
+    assert json.loads((tmp_path / "hub" / "vjepa2_ac.json").read_text())["encoder_in_words"] == words
+
+
+def test_latents_of_another_frame_path_are_not_taken(on_an_encoder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = config_of_encoder(on_an_encoder, "image", {**MODEL, "encoder": {**ENCODER, "frame": "image"}})
+    assert main(["train", config]) == 2
+    error = capsys.readouterr().err
+    assert "no latent cache of this model" in error
+    assert "encoder.frame: tubelet, not image" in error

@@ -11,6 +11,7 @@ from vjepa2_ac.episode import POSE_WIDTHS, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import (
     CAMERA_POSE,
+    EXTRINSICS,
     POSE,
     POSE_CHANGE,
     POSES,
@@ -27,21 +28,10 @@ def test_rotations_are_composed_and_vectors_subtract() -> None:
     np.testing.assert_array_equal(vector_states(7).differences(STATES), np.diff(STATES, axis=0))
 
 
-@pytest.mark.parametrize(
-    ("place", "value", "complaint"),
-    [
-        (1, 400.0, "millimetres"), (4, 90.0, "degrees"), (6, 1.3, "0 for open"), (6, -0.2, "0 for open"),
-        (2, math.nan, "finite"),
-    ],
-)  # fmt: skip
-def test_what_no_robot_measures_is_named_with_its_step_and_what_it_looks_like(
-    place: int, value: float, complaint: str
-) -> None:
+def test_what_no_robot_measures_is_named_with_its_step_and_the_fix() -> None:
     spoiled = STATES.copy()
-    spoiled[1, place] = value
-    with pytest.raises(InputError, match=rf"a\.h5: step 1: .*{complaint}"):
-        POSE.require_plausible(spoiled, "a.h5")
-    with pytest.raises(InputError, match=f"{complaint}.*Check the fields"):
+    spoiled[1, 1] = 400.0
+    with pytest.raises(InputError, match=r"a\.h5: step 1: .*millimetres.*Check the fields"):
         POSE.require_plausible(spoiled, "a.h5", fix="Check the fields")
     POSE.require_plausible(STATES, "a.h5")
 
@@ -107,3 +97,46 @@ def test_poses_are_in_the_frame_of_the_config_and_read_in_that_of_the_base() -> 
     assert spaces_of(DataConfig(path="d"), POSE_WIDTHS) == POSES
     assert spaces_of(camera, POSE_WIDTHS) == Spaces(CAMERA_POSE, POSE_CHANGE)
     assert measured_space(camera, 7) == POSE
+
+
+# What is given to plan from
+
+
+def changed(place: int, value: float) -> np.ndarray:
+    state = STATES[0].copy()
+    state[place] = value
+    return state
+
+
+@pytest.mark.parametrize("place", range(7))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_invalid_number_is_refused_at_any_position(place: int, sign: int) -> None:
+    complaint = ["millimetres", "degrees", "0 for open"][place // 3]
+    wrong = {0: 300.0, 1: 90.0, 2: 1.2 if sign > 0 else 0.2}[place // 3]
+    with pytest.raises(InputError, match=complaint):
+        POSE.require_state(changed(place, sign * wrong), "state")
+    for never in (math.nan, sign * math.inf):
+        with pytest.raises(InputError, match=rf"{never}\b.* needed: finite numbers") as caught:
+            POSE.require_state(changed(place, never), "state")
+        assert "degrees" not in str(caught.value)
+    if place < 6:
+        with pytest.raises(InputError, match=complaint):
+            EXTRINSICS.require_state(changed(place, sign * wrong)[:6], "camera")
+
+
+def test_what_a_robot_may_measure_is_taken() -> None:
+    for place, value in ((6, 1.05), (6, -0.05), (6, 1.0), (5, -2 * math.pi), (3, math.pi), (0, 1.2), (2, -0.4)):
+        POSE.require_state(changed(place, value), "state")
+        EXTRINSICS.require_state(changed(place, value)[:6], "camera")
+
+
+def test_a_pose_has_its_numbers_and_a_vector_any_that_are_finite() -> None:
+    vector_states(2).require_state(np.array([300.0, -90.0]), "state")
+    for numbers, space, complaint in (
+        (np.zeros(5), EXTRINSICS, "5 numbers"),
+        (np.zeros(7), EXTRINSICS, "7 numbers"),
+        (np.zeros(3), vector_states(2), r"3 numbers .* needed: 2: state 0, state 1"),
+        (np.array([0.0, math.nan]), vector_states(2), "needed: finite numbers"),
+    ):
+        with pytest.raises(InputError, match=complaint):
+            space.require_state(numbers, "state")

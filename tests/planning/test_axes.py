@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from adapted_run import write_adapted_run
-from decisions import STATE, image
+from decisions import STATE, controller, image
 from tiny_models import actions, goal, scene, tiny_model
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.axes import TRIED_DEGREES, fit_axes
 from vjepa2_ac.model.state_integration import apply_actions
@@ -26,7 +26,6 @@ from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.subject import load_subject
 
 TURN = Axes(math.radians(43.0))
-QUICK = PlanningConfig(samples=24, iterations=3, horizon=2, planner={"name": "cem", "options": {"elites": 4}})
 
 
 def some(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -45,10 +44,6 @@ def write(path: Path, model: WorldModel, degrees: float = 43.0, **changes: Any) 
     }  # fmt: skip
     path.write_text(json.dumps(values | changes))
     return str(path)
-
-
-def controller(model: WorldModel, **changes: Any) -> Controller:
-    return Controller(model, QUICK.model_copy(update=changes))
 
 
 def test_turned_states_follow_from_turned_actions() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from decisions import STATE, image
+from decisions import QUICK, STATE, image
+from decisions import controller as tiny_controller
 from tiny_models import tiny_model
-from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import has_moved, is_uniform
@@ -20,13 +20,12 @@ from vjepa2_ac.simulation.arm import SimulatedArm
 from vjepa2_ac.simulation.domains import DOMAIN_A
 from vjepa2_ac.spaces import POSE, apply_action
 
-QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, planner={"name": "cem", "options": {"elites": 4}})
 MOVED = STATE + np.eye(7)[1] * 0.0055
 BLACK = np.zeros_like(image(0))
 
 
-def controller(crop: Crop = "released", **changes: object) -> Controller:
-    run = Controller(tiny_model(), QUICK.model_copy(update=changes), crop=crop)
+def controller() -> Controller:
+    run = tiny_controller()
     run.reset(image(100))
     return run
 
@@ -92,7 +91,7 @@ def test_a_pose_has_moved_by_more_than_half_a_centimetre_or_three_degrees(change
 
 
 def test_one_unusable_camera_of_two_is_enough() -> None:
-    run = Controller(tiny_model(), QUICK.model_copy(update={"views": 2}))
+    run = tiny_controller(views=2)
     two = lambda left, right: np.hstack([image(left, 48, 48) if left else BLACK[:48, :48], image(right, 48, 48)])  # noqa: E731
     run.reset(two(100, 101))
     assert why(run, two(1, 2)) == "planned"

@@ -4,22 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from decisions import STATE, image
-from tiny_models import tiny_model
-from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from decisions import STATE, controller, image, vector_controller
+from tiny_models import tiny_model, vector_model
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
 from vjepa2_ac.config.section import Component
-from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.spaces import Spaces, apply_action
-
-QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, planner={"name": "cem", "options": {"elites": 4}})
-
-
-def controller(model: WorldModel | None = None, seed: int = 0, **changes: object) -> Controller:
-    config = QUICK.model_copy(update=changes)
-    return Controller(tiny_model() if model is None else model, config, seed=seed)
+from vjepa2_ac.spaces import apply_action
 
 
 def actions(run: Controller, frames: int = 3) -> np.ndarray:
@@ -146,12 +137,7 @@ def test_a_mask_decides_what_counts_of_the_image_and_is_cropped_as_it_is() -> No
 
 @pytest.mark.parametrize("joined", ["difference", "sum", "last"])
 def test_a_model_without_states_plans_vectors_and_takes_states_of_any_width_for_changes(joined: str) -> None:
-    sizes = tiny_model(states=False).sizes
-    predictor = sizes.predictor.model_copy(update={"action_dim": 8})
-    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
-    config = QUICK.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
-    run = Controller(model, config, spaces=Spaces.of_vectors(Widths(8, 8), joined))
-    found = []
+    run, found = vector_controller(joined, states=False), []
     for width in (8, 11, 3)[: 1 if joined == "last" else None]:
         run.reset(image(100))
         found.append([run.act(image(seed), np.full(width, 0.1)) for seed in range(2)])
@@ -163,7 +149,5 @@ def test_a_model_without_states_plans_vectors_and_takes_states_of_any_width_for_
 
 
 def test_a_model_whose_states_are_no_poses_is_refused() -> None:
-    sizes = tiny_model().sizes
-    vectors = sizes.model_copy(update={"predictor": sizes.predictor.model_copy(update={"state_dim": 8})})
-    with pytest.raises(InputError, match=r"states of 8 and actions of 7 numbers\. needed: 7 and 7"):
-        controller(WorldModel.random(vectors, seed=0))
+    with pytest.raises(InputError, match=r"states of 8 and actions of 8 numbers\. needed: 7 and 7"):
+        controller(vector_model(8))

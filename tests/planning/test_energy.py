@@ -1,18 +1,22 @@
-"""The energy of actions equals the plain computation, for any batch size and with cached keys and values."""
+"""The energy of actions equals the plain computation for any batch size, and nothing waits for a device."""
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from decisions import STATE, image
-from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_model
+from decisions import STATE, controller, image
+from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_model, vector_model
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance
+from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, energy_slices
 from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.planning.search_space import pose_space
 from vjepa2_ac.registry import ENERGIES
 from vjepa2_ac.spaces import Spaces, apply_action
 
@@ -53,9 +57,7 @@ def test_predictions_are_those_of_the_plain_computation(adapted: bool, extrinsic
 @torch.no_grad()
 @pytest.mark.parametrize("joined", ["sum", "last"])
 def test_vectors_add_and_a_model_of_targets_is_given_the_states_that_changes_lead_to(joined: str) -> None:
-    sizes = tiny_model().sizes
-    predictor = sizes.predictor.model_copy(update={"state_dim": 3, "action_dim": 3})
-    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0).eval()
+    model = vector_model(3)
     model.base_predictor.action_encoder.weight.mul_(40)
     start, tried = Scene(draw(TOKENS, DIM), draw(3)), actions(2, 4)[..., :3]
     spaces = Spaces.of_vectors(Widths(3, 3), joined)
@@ -160,13 +162,81 @@ def test_an_energy_that_is_a_class_is_constructed_once_for_a_controller(monkeypa
             return (predicted - wanted).abs().mean(dim=-1)
 
     monkeypatch.setitem(ENERGIES._things, "counted", Counted)
-    energy = EnergyConfig(distance="counted", samples_at_once=3)
-    run = Controller(
-        tiny_model(),
-        PlanningConfig(samples=8, iterations=2, planner={"name": "cem", "options": {"elites": 3}}, energy=energy),
-    )
+    run = controller(horizon=1, energy=EnergyConfig(distance="counted", samples_at_once=3))
     run.reset(image(100), image(101), durations=(1,))
     for seed in range(2):
         run.act(image(seed), STATE)
     run.score(image(2), STATE, np.zeros((2, 1, 7)))
     assert len(made) == 1
+
+
+# Slices
+
+CHOSEN = torch.arange(28.0).reshape(4, 7) / 1000
+LIMITS = LimitsConfig(xyz=(0.04, 0.08, 0.0))
+
+
+def weighted(actions: Tensor) -> Tensor:
+    """Return a cost in which every number of every step counts by itself."""
+    return (actions * torch.arange(1.0, 29.0).reshape(4, 7)).sum(dim=(1, 2))
+
+
+def test_a_slice_changes_two_numbers_of_the_first_action_and_no_others() -> None:
+    slices = energy_slices(weighted, CHOSEN, pose_space(PlanningConfig(horizon=4, limits=LIMITS)), nodes=5)
+    assert tuple(one.axes for one in slices) == ((0, 1), (0, 2), (1, 2))
+    for one in slices:
+        for row, up in enumerate(one.up):
+            for column, across in enumerate(one.across):
+                changed = CHOSEN.clone()
+                changed[0, one.axes[0]], changed[0, one.axes[1]] = across, up
+                assert one.energy[row, column] == pytest.approx(float(weighted(changed[None])[0]), rel=1e-5)
+
+
+def test_a_slice_reaches_beyond_the_limits_also_along_an_axis_that_is_held() -> None:
+    slices = energy_slices(weighted, CHOSEN, pose_space(PlanningConfig(horizon=4, limits=LIMITS)), nodes=3)
+    np.testing.assert_allclose(slices[0].across, [-0.05, 0, 0.05], rtol=1e-5)
+    np.testing.assert_allclose(slices[0].up, [-0.1, 0, 0.1], rtol=1e-5)
+    np.testing.assert_allclose(slices[2].up, [-0.1, 0, 0.1], rtol=1e-5)  # dz is held: as wide as the widest
+    held = pose_space(PlanningConfig(horizon=4, limits=LimitsConfig(xyz=(0, 0, 0), rotation=0.1)))
+    np.testing.assert_allclose(energy_slices(weighted, CHOSEN, held, nodes=3)[0].up, [-0.0625, 0, 0.0625], rtol=1e-5)
+
+
+# Waiting
+
+ASKING = {
+    "_local_scalar_dense", "_to_copy", "copy_", "equal", "index", "index_put_", "is_nonzero", "lift_fresh",
+    "masked_select", "nonzero", "unique_dim", "_unique2",
+}  # fmt: skip
+"""What fetches numbers, has a result whose size depends on them, or brings a list of them to the device."""
+
+
+class Recorder(TorchDispatchMode):
+    """Records the names of all operations."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
+
+    def __torch_dispatch__(self, operation: Any, types: Any, given: Any = (), named: Any = None) -> Any:
+        self.seen.add(operation._overloadpacket.__name__)
+        return operation(*given, **(named or {}))
+
+
+def operations_of(work: Callable[[], object]) -> set[str]:
+    """Return what runs in something that was done once before."""
+    work()
+    with Recorder() as recorder:
+        work()
+    return recorder.seen
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("steps", "kind"), [("last", "l1"), ("sum", "cosine")])
+def test_energies_are_computed_without_asking_the_device(steps: str, kind: str) -> None:
+    measure, tried = cost(tiny_model(), samples_at_once=4, steps=steps, distance=kind), actions(10, 3)
+    reported: list[tuple[int, int]] = []
+    measure.progress = lambda *progress: reported.append(progress)
+    seen = operations_of(lambda: measure(tried))
+    assert reported == 2 * [(4, 10), (8, 10), (10, 10)]
+    assert "addmm" in seen
+    assert not seen & ASKING

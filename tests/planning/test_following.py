@@ -6,20 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from decisions import QUICK, STATE, image
+from decisions import STATE, image, vector_controller
+from decisions import controller as tiny_controller
 from paths import ROOT
-from tiny_models import tiny_model
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import GripperMode, SubGoal, write_goals
-from vjepa2_ac.spaces import Spaces
 
 
 def controller(**changes: object) -> Controller:
-    return Controller(tiny_model(), QUICK.model_copy(update={"horizon": 1, "iterations": 2, **changes}), seed=3)
+    return tiny_controller(seed=3, **{"horizon": 1, **changes})
 
 
 def noisy(seed: int, most: int = 6) -> np.ndarray:
@@ -125,11 +122,7 @@ def test_the_pages_example_runs(tmp_path: Path) -> None:
 
 
 def test_a_gripper_mode_needs_a_gripper_and_something_to_plan() -> None:
-    sizes = tiny_model(states=False).sizes
-    predictor = sizes.predictor.model_copy(update={"action_dim": 8})
-    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
-    config = QUICK.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
-    run = Controller(model, config, spaces=Spaces.of_vectors(Widths(8, 8), "difference"))
+    run = vector_controller("difference")
     with pytest.raises(InputError, match=r"'held' of a goal: .*vectors"):
         run.follow([SubGoal(image(100), gripper="held")])
     held = controller(limits=LimitsConfig(xyz=(0.0, 0.0, 0.0)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from decisions import STATE, image
+from decisions import STATE, controller, image
 from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.config import RldsData
@@ -22,17 +22,9 @@ from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_benchmark
 from vjepa2_ac.simulation.camera import FRAME_SIZE
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
-QUICK = PlanningConfig(
-    samples=12,
-    iterations=2,
-    horizon=2,
-    planner={"name": "cem", "options": {"elites": 4}},
-    limits=LimitsConfig(rotation=0.1),
-)
-
 
 def decided(goal: np.ndarray, frame: np.ndarray, views: int, mask: np.ndarray | None = None) -> Controller:
-    run = Controller(tiny_model(), QUICK.model_copy(update={"views": views}))
+    run = controller(views=views, limits=LimitsConfig(rotation=0.1))
     run.reset(goal, mask=mask)
     run.act(frame, STATE)
     return run

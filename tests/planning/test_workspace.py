@@ -9,11 +9,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from decisions import image
-from tiny_models import tiny_model
+from decisions import controller, image
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.search_space import Workspace, is_allowed, pose_space
 from vjepa2_ac.spaces import CAMERA_POSE, POSE, vector_states
 
@@ -65,21 +63,9 @@ def test_the_search_does_not_leave_the_box_with_its_first_decision(where) -> Non
     assert narrow.upper[1:].equal(wide.upper[1:]), "where later decisions begin is not known"
 
 
-def controller(**limits: object) -> Controller:
-    config = PlanningConfig(
-        samples=12,
-        iterations=2,
-        horizon=2,
-        planner={"name": "cem", "options": {"elites": 4}},
-        limits=LimitsConfig(**limits),
-    )
-    made = Controller(tiny_model(), config)
-    made.reset(image(100))
-    return made
-
-
 def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -> None:
-    run = controller(workspace=CORNERS)
+    run = controller(limits=LimitsConfig(workspace=CORNERS))
+    run.reset(image(100))
     action = run.act(image(0), position(0.63, 0.0, 0.3))
     assert action[0] <= -0.03 + SLACK
     action = run.act(image(1), position(0.7, 0.0, 0.3))

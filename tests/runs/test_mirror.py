@@ -7,25 +7,25 @@ import os
 import shutil
 import threading
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import BinaryIO
+from typing import Any, BinaryIO
+from unittest.mock import Mock
 
 import pytest
 
 from accidents import without_permission
 from gcs import Failure, Gcs
+from mirrors import PLACE, content, names, there, write
 from vjepa2_ac import storage
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.errors import RefusedError, UnreachableError
-from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, find_damage, write_checkpoint
+from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, find_damage
 from vjepa2_ac.runs.folder import ENVIRONMENT, HELD, open_run_folder
-from vjepa2_ac.runs.mirror import SENDING, Mirror, RemoteCheckpoints, complete
+from vjepa2_ac.runs.mirror import SENDING, Mirror, RemoteCheckpoints
 from vjepa2_ac.storage import retries, transfer
 
-PLACE = "gs://bucket/run"
-FILES = {"adapter/weights.bin", "optimizer.pt", "state.json"}
 UPLOAD = "POST /upload/"
 
 
@@ -36,17 +36,6 @@ def run(tmp_path: Path) -> Path:
     (folder / "config.yaml").write_text("seed: 0\n")
     (folder / "metrics.jsonl").write_text('{"kind": "train", "step": 1}\n')
     return folder
-
-
-def write(run: Path, step: int, state: RunState | None = None, keep: int = 3, words: str = "of step") -> Path:
-    def files(folder: Path) -> None:
-        (folder / "adapter").mkdir()
-        (folder / "adapter/weights.bin").write_bytes(f"{words} {step:04d} ".encode() * 1000)
-        (folder / "optimizer.pt").write_bytes(f"{words} {step:04d} ".encode() * 2000)
-
-    state = replace(state or RunState(step), step=step)
-    state = state if state.run_id else replace(state, run_id="mine")
-    return write_checkpoint(run / "checkpoints", state, files, keep=keep)
 
 
 def mirror_of(run: Path, place: str = PLACE, run_id: str = "mine", **checkpoint: float) -> Mirror:
@@ -68,21 +57,6 @@ def send(run: Path, **arguments: object) -> Mirror:
     return mirror
 
 
-def there(place: str = PLACE) -> list[str]:
-    return sorted(complete(RemoteCheckpoints(place).listing()))
-
-
-def names(*steps: int) -> list[str]:
-    return [checkpoint_name(step) for step in steps]
-
-
-def assert_same_files(run: Path, name: str, place: str = PLACE) -> None:
-    folder = run / "checkpoints" / name
-    local = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    remote = storage.join(place, f"checkpoints/{name}")
-    assert {file: storage.read_bytes(storage.join(remote, file)) for file in storage.file_sizes(remote)} == local
-
-
 @pytest.fixture(params=["gs", "folder", "file", "memory"])
 def place(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "gs":
@@ -93,18 +67,9 @@ def place(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     }[request.param]  # fmt: skip
 
 
-def test_a_run_is_copied_to_any_kind_of_place(run: Path, place: str, caplog: pytest.LogCaptureFixture) -> None:
-    write(run, 10)
-    send(run, place=place)
-    assert there(place) == names(10)
-    assert_same_files(run, checkpoint_name(10), place)
-    for name in ("config.yaml", "metrics.jsonl"):
-        assert storage.read_bytes(storage.join(place, name)) == (run / name).read_bytes()
-    assert not (run / HELD).exists()
-    assert not caplog.records
-
-
-def test_whose_it_is_comes_first_and_the_manifest_last(run: Path, place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_is_copied_to_any_kind_of_place_its_owner_first_and_the_manifest_last(
+    run: Path, place: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     write(run, 10)
     order, upload = [], storage.upload
     monkeypatch.setattr(
@@ -114,7 +79,9 @@ def test_whose_it_is_comes_first_and_the_manifest_last(run: Path, place: str, mo
     assert order == [
         "config.yaml", "metrics.jsonl", SENDING, "state.json", "weights.bin", "optimizer.pt", "manifest.json",
     ]  # fmt: skip
-    assert RemoteCheckpoints(place).listing()[checkpoint_name(10)].keys() == {*FILES, "manifest.json"}
+    assert content(place) == content(run)
+    assert not (run / HELD).exists()
+    assert not caplog.records
 
 
 @pytest.mark.parametrize("sent_before", [0, 2, 4, 7])
@@ -136,7 +103,7 @@ def test_what_was_sent_before_a_break_is_not_sent_again(
     monkeypatch.setattr(Gcs, "_failure_of", answer)
     bucket.forget()
     send(run)
-    assert_same_files(run, checkpoint_name(10))
+    assert content(f"{PLACE}/checkpoints/{checkpoint_name(10)}") == content(run / "checkpoints" / checkpoint_name(10))
     small = 2  # a new process does not know of them
     assert len(bucket.uploads()) == small + min(total - small, total - max(sent_before, small))
 
@@ -148,7 +115,7 @@ def test_files_of_another_checkpoint_by_the_same_name_are_not_taken_for_its_own(
     shutil.rmtree(first)
     write(run, 10, words="OF STEP")
     send(run)
-    assert_same_files(run, checkpoint_name(10))
+    assert content(f"{PLACE}/checkpoints/{checkpoint_name(10)}") == content(run / "checkpoints" / checkpoint_name(10))
 
 
 def test_the_same_are_kept_there_as_here(bucket: Gcs, run: Path) -> None:
@@ -158,8 +125,7 @@ def test_the_same_are_kept_there_as_here(bucket: Gcs, run: Path) -> None:
         write(run, step, state)
         sent(mirror)
     assert there() == names(20, 40, 50, 60) == sorted(path.name for path in (run / "checkpoints").iterdir())
-    for name in there():
-        assert_same_files(run, name)
+    assert content(f"{PLACE}/checkpoints") == content(run / "checkpoints")
     gone = [r.target for r in bucket.requests if r.target.startswith("DELETE") and checkpoint_name(10) in r.target]
     assert gone[1].endswith("manifest.json"), gone  # the first was the claim
     assert not [name for name in bucket.names("bucket") if checkpoint_name(10) in name or SENDING in name]
@@ -255,10 +221,11 @@ def test_in_the_end_the_newest_is_sent_instead_of_the_one_that_was_on_its_way(
     assert sorted(RemoteCheckpoints(PLACE).listing()) == names(20)
 
 
-def test_a_place_of_another_run_is_never_written(bucket: Gcs, run: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.usefixtures("bucket")
+def test_a_place_of_another_run_is_never_written(run: Path, caplog: pytest.LogCaptureFixture) -> None:
     write(run, 10)
     send(run)
-    before = {name: storage.read_bytes(f"gs://bucket/{name}") for name in bucket.names("bucket")}
+    before = content("gs://bucket")
     (run / "metrics.jsonl").write_text("others'")
     other = write(run, 20)
     mirror = mirror_of(run, run_id="other")
@@ -266,31 +233,29 @@ def test_a_place_of_another_run_is_never_written(bucket: Gcs, run: Path, caplog:
     sent(mirror)
     mirror.tick()
     mirror.finish(lambda: False)
-    assert {name: storage.read_bytes(f"gs://bucket/{name}") for name in bucket.names("bucket")} == before
+    assert content("gs://bucket") == before
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert f"holds a checkpoint of another run, {checkpoint_name(10)}" in caplog.text
     assert find_damage(other) is None
 
 
-@pytest.mark.usefixtures("bucket")
-def test_without_hard_links_a_checkpoint_is_copied(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_links(*_: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
+@pytest.fixture
+def _no_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file system without hard links."""
+    monkeypatch.setattr(os, "link", Mock(side_effect=PermissionError(1, "Operation not permitted")))
 
-    monkeypatch.setattr(os, "link", no_links)
+
+@pytest.mark.usefixtures("bucket", "_no_links")
+def test_without_hard_links_a_checkpoint_is_copied(run: Path) -> None:
     write(run, 10)
     send(run)
-    assert_same_files(run, checkpoint_name(10))
+    assert content(f"{PLACE}/checkpoints/{checkpoint_name(10)}") == content(run / "checkpoints" / checkpoint_name(10))
 
 
-@pytest.mark.usefixtures("bucket")
+@pytest.mark.usefixtures("bucket", "_no_links")
 def test_a_newest_checkpoint_without_permission_is_reported_and_no_older_one_is_sent_in_its_place(
-    run: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    run: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def no_links(*_: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "link", no_links)
     write(run, 10)
     newest, mirror = write(run, 20), mirror_of(run)
     with without_permission(newest / "optimizer.pt"):
@@ -315,9 +280,9 @@ def test_a_manifest_there_names_no_file_outside_its_folder(bucket: Gcs, tmp_path
 CHECKPOINT = 40_000  # bytes of one, about
 
 
-def go_on(run: Path, mirror: Mirror, *steps: int) -> None:
+def go_on(run: Path, mirror: Mirror, *steps: int, **how: Any) -> None:
     for step in steps:
-        write(run, step)
+        write(run, step, **how)
         sent(mirror)
 
 
@@ -342,27 +307,9 @@ def test_a_bucket_that_is_closed_for_a_while_costs_one_warning(
     assert len(caplog.records) == 1
 
 
-class Disk:
-    """The disk of a place, with room for so many bytes, some of which others take."""
-
-    def __init__(self, folder: Path, room: int) -> None:
-        self.folder, self.room, self.of_others = folder, room, 0
-        self.code = errno.ENOSPC
-
-    def copyfileobj(self, source: BinaryIO, target: BinaryIO) -> None:
-        used = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
-        data = source.read()
-        if used + self.of_others + len(data) > self.room:
-            raise OSError(self.code, "No room")
-        target.write(data)
-
-
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
 def test_a_place_without_room_may_have_some_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
-    def full(**_: object) -> None:
-        raise OSError(code, "No room")
-
-    monkeypatch.setattr(transfer.tempfile, "TemporaryFile", full)
+    monkeypatch.setattr(transfer.tempfile, "TemporaryFile", Mock(side_effect=OSError(code, "No room")))
     with pytest.raises(UnreachableError) as caught:
         storage.try_writing(str(tmp_path))
     assert not isinstance(caught.value, RefusedError), "training begins without it, with a warning"
@@ -372,18 +319,24 @@ def test_a_place_without_room_may_have_some_later(tmp_path: Path, monkeypatch: p
 def test_halves_of_a_full_disk_do_not_keep_it_full(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, code: int
 ) -> None:
-    place = tmp_path / "disk"
-    disk = Disk(place, room=int(4.2 * CHECKPOINT))  # three that are kept, and one that comes
-    disk.code = code
-    monkeypatch.setattr(transfer, "shutil", SimpleNamespace(copyfileobj=disk.copyfileobj, rmtree=shutil.rmtree))
+    place, room = tmp_path / "disk", int(4.2 * CHECKPOINT)  # three that are kept, and one that comes
+
+    def copy_with_room(source: BinaryIO, target: BinaryIO) -> None:
+        used = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
+        data = source.read()
+        if used + len(data) > room:
+            raise OSError(code, "No room")
+        target.write(data)
+
+    monkeypatch.setattr(transfer, "shutil", SimpleNamespace(copyfileobj=copy_with_room, rmtree=shutil.rmtree))
     mirror = mirror_of(run, str(place))
     go_on(run, mirror, 10, 20, 30, 40)
-    disk.of_others = CHECKPOINT // 2
+    room -= CHECKPOINT // 2  # others take it
     go_on(run, mirror, 50, 60, 70)
     assert there(str(place)) == names(20, 30, 40)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert "No room" in caplog.text
-    disk.of_others = 0
+    room += CHECKPOINT // 2
     go_on(run, mirror, 80)
     assert there(str(place)) == names(30, 40, 80)
     assert len(list((place / "checkpoints").iterdir())) == 3
@@ -393,16 +346,20 @@ def test_halves_of_a_full_disk_do_not_keep_it_full(
 # Two machines with one mirror: the later start keeps it, and the earlier one is warned
 
 
+@dataclass
 class Machine:
     """Trains, and lets each checkpoint be sent."""
 
-    def __init__(self, folder: Path, place: str, run_id: str) -> None:
-        self.folder, self.run_id, self.mirror = folder, run_id, mirror_of(folder, place, run_id)
+    folder: Path
+    place: str
+    run_id: str
+
+    def __post_init__(self) -> None:
+        self.mirror = mirror_of(self.folder, self.place, self.run_id)
 
     def go_on(self, *steps: int) -> None:
-        for step in steps:
-            write(self.folder, step, RunState(step, run_id=self.run_id), words=self.folder.name)
-            sent(self.mirror)
+        state = RunState(0, run_id=self.run_id)
+        go_on(self.folder, self.mirror, *steps, state=state, words=self.folder.name)
 
 
 @pytest.fixture
@@ -418,10 +375,6 @@ def machine(tmp_path: Path, disk: str, monkeypatch: pytest.MonkeyPatch, make_con
         return Machine(tmp_path / name, disk, run_id)
 
     return start
-
-
-def content(place: str) -> dict[str, bytes]:
-    return {name: storage.read_bytes(storage.join(place, name)) for name in storage.file_sizes(place)}
 
 
 def test_the_later_start_keeps_the_place_and_the_earlier_one_is_told_once(

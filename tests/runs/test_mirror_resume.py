@@ -4,7 +4,6 @@ import logging
 import os
 import shutil
 import signal
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 
 from accidents import without_permission
 from gcs import Gcs
+from mirrors import PLACE, content, names, there, write
 from run_fixtures import SilentReporter
 from same_run import assert_same_run
 from vjepa2_ac import storage
@@ -20,15 +20,13 @@ from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.process import StoppedError
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state, write_checkpoint
+from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.runs.folder import SMALL_FILES, RunLock, check_run_folder
-from vjepa2_ac.runs.mirror import Mirror, RemoteCheckpoints, complete
+from vjepa2_ac.runs.mirror import Mirror, RemoteCheckpoints
 from vjepa2_ac.runs.open_run import open_remote
 from vjepa2_ac.training.loop import train
 
-PLACE = "gs://bucket/run"
 MakeConfig = Callable[..., Config]
-STEPS = 3
 FILES = 4  # the manifest under another name, state.json and two more come before the manifest
 
 
@@ -36,29 +34,16 @@ class KilledError(BaseException):
     """Stands for SIGKILL: nobody sees to anything any more."""
 
 
-def there(place: str) -> list[str]:
-    return sorted(complete(RemoteCheckpoints(place).listing()))
-
-
 @pytest.fixture
 def config(make_config: Callable[..., Config]) -> Config:
     return make_config(checkpoint__remote=PLACE)
-
-
-def write(run: Path, step: int, run_id: str = "mine", **state: object) -> Path:
-    def files(folder: Path) -> None:
-        (folder / "adapter").mkdir()
-        (folder / "adapter/weights.bin").write_bytes(f"weights {step} ".encode() * 100)
-        (folder / "optimizer.pt").write_bytes(f"moments {step} ".encode() * 200)
-
-    return write_checkpoint(run / "checkpoints", RunState(step, run_id, clips_done=step, **state), files, keep=9)
 
 
 def run_there(gcs: Gcs, config: Config, *steps: int, run_id: str = "mine", **state: object) -> Path:
     """Put a run with these checkpoints at the place; return the folder it was put from."""
     folder = Path(config.run_dir).parent / f"elsewhere-{run_id}"
     for step in steps:
-        write(folder, step, run_id, **state)
+        write(folder, step, RunState(step, run_id, **state), keep=9)
     (folder / "config.yaml").write_text(config_as_yaml(config))
     (folder / "run_id").write_text(run_id)
     (folder / "metrics.jsonl").write_text("".join(f'{{"kind": "train", "step": {step}}}\n' for step in steps))
@@ -69,10 +54,6 @@ def run_there(gcs: Gcs, config: Config, *steps: int, run_id: str = "mine", **sta
 
 def local(config: Config) -> Path:
     return Path(config.run_dir)
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_an_empty_place_is_tried_and_left_empty(bucket: Gcs, config: Config) -> None:
@@ -90,8 +71,8 @@ def test_a_fresh_machine_gets_the_newest_checkpoint_and_the_small_files(bucket: 
     assert newest is not None
     assert newest.name == checkpoint_name(20)
     assert read_state(newest).run_id == "mine"
-    expected = {name: data for name, data in files_of(source).items() if checkpoint_name(5) not in name}
-    assert files_of(local(config)) == expected
+    expected = {name: data for name, data in content(source).items() if checkpoint_name(5) not in name}
+    assert content(local(config)) == expected
     assert reporter.notes == [
         f"{PLACE} can be written: it is brought up to date every 30 minutes, and in the end.",
         f"Fetched {checkpoint_name(20)} from {PLACE}.",
@@ -131,11 +112,11 @@ def test_a_checkpoint_there_without_permission_stops_the_start_and_is_kept(
     (place / "config.yaml").write_text(config_as_yaml(config))
     if here is not None:
         write(local(config), here)
-    before = files_of(place)
+    before = content(place)
     refused = place / "checkpoints" / checkpoint_name(20) / name
     with without_permission(refused), pytest.raises((InputError, RefusedError, PermissionError), match="Permission"):
         open_remote(config, SILENT)
-    assert files_of(place) == before
+    assert content(place) == before
     assert [path.name for path in (local(config) / "checkpoints").glob("step-*")] == [checkpoint_name(10)] * bool(here)
 
 
@@ -235,10 +216,10 @@ def test_a_folder_is_claimed_before_anything_is_fetched_into_it(bucket: Gcs, con
     run_there(bucket, config, 10)
     with RunLock(local(config)) as first, RunLock(local(config)) as second:
         first.take()
-        before = files_of(local(config))
+        before = content(local(config))
         with pytest.raises(InputError, match="being trained right now"):
             open_remote(config, SILENT, lock=second)
-        assert files_of(local(config)) == before
+        assert content(local(config)) == before
     with RunLock(local(config)) as lock:
         open_remote(config, SILENT, lock=lock)
         with RunLock(local(config)) as other, pytest.raises(InputError, match="being trained right now"):
@@ -262,16 +243,21 @@ def test_who_is_killed_while_fetching_fetches_again(
     assert newest_checkpoint(local(config) / "checkpoints") is None
     check_run_folder(config)
     open_remote(config, SILENT)
-    assert files_of(local(config)) == files_of(source)
+    assert content(local(config)) == content(source)
 
 
 # A run that goes on elsewhere
 
 
-def mirrored(make_config: MakeConfig, tmp_path: Path, machine: str, **changes: object) -> Config:
-    return make_config(
-        run_dir=str(tmp_path / machine), checkpoint__remote=PLACE, checkpoint__remote_every_minutes=0.0, **changes
-    )
+@pytest.fixture
+def config_on(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
+    """Return the config of a machine; what it writes is sent at once."""
+
+    def config(machine: str, place: str = PLACE, **changes: object) -> Config:
+        usual = {"checkpoint__remote_every_minutes": 0.0, "checkpoint__keep_best": "off"}
+        return make_config(run_dir=str(tmp_path / machine), checkpoint__remote=place, **(usual | changes))
+
+    return config
 
 
 def at_step(reporter, step: int, action: Callable[[], None]):
@@ -288,14 +274,6 @@ def at_step(reporter, step: int, action: Callable[[], None]):
     return other
 
 
-def wait_for_mirrors() -> None:
-    """Wait until what is being sent is there, and nothing is being sent."""
-    for thread in threading.enumerate():
-        if thread.name == "mirror":
-            thread.join(120)
-            assert not thread.is_alive()
-
-
 def stop_after(step: int, config: Config, reporter) -> None:
     with pytest.raises(StoppedError):
         train(config, at_step(reporter, step, lambda: os.kill(os.getpid(), signal.SIGTERM)))
@@ -303,60 +281,27 @@ def stop_after(step: int, config: Config, reporter) -> None:
 
 @pytest.mark.usefixtures("bucket", "default_signals")
 def test_after_preemption_a_fresh_machine_goes_on_as_if_nothing_had_happened(
-    make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path
+    config_on: MakeConfig, reporter, tmp_path: Path, whole_run: Path
 ) -> None:
-    stop_after(3, mirrored(make_config, tmp_path, "one"), reporter)
+    stop_after(3, config_on("one"), reporter)
     assert there(PLACE)[-1] == checkpoint_name(3), "sent before the process ends"
     shutil.rmtree(tmp_path / "one")
-    train(mirrored(make_config, tmp_path, "two"), reporter)
+    train(config_on("two"), reporter)
     assert reporter.steps == [4, 5, 6]
     assert_same_run(whole_run, tmp_path / "two")
     assert there(PLACE)[-1] == checkpoint_name(6)
-    train(mirrored(make_config, tmp_path, "three"), reporter)
+    train(config_on("three"), reporter)
     assert reporter.steps == [4, 5, 6], "a run that is done is done everywhere"
     assert_same_run(whole_run, tmp_path / "three")
 
 
 @pytest.mark.usefixtures("bucket", "default_signals")
-def test_a_machine_killed_while_sending_leaves_the_last_complete_checkpoint_to_the_next(
-    make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fourth_is_on_its_way, dead = threading.Event(), threading.Event()
-
-    real = storage.upload
-
-    def upload(source: Path, target: str) -> None:
-        if f"{checkpoint_name(4)}/optimizer.pt" in target:
-            fourth_is_on_its_way.set()
-            assert dead.wait(120)
-            raise OSError("the process is gone")
-        real(source, target)
-
-    def die() -> None:
-        assert fourth_is_on_its_way.wait(120)
-        raise KilledError
-
-    monkeypatch.setattr(storage, "upload", upload)
-    config = mirrored(make_config, tmp_path, "one", checkpoint__keep_best=False)
-    dying = at_step(reporter, 6, die)
-    stepped = dying.stepped
-    dying.stepped = lambda step, seen: (stepped(step, seen), step == 3 and wait_for_mirrors())
-    with pytest.raises(KilledError):
-        train(config, dying)
-    dead.set()
-    assert there(PLACE) == [checkpoint_name(2)]
-    train(mirrored(make_config, tmp_path, "two", checkpoint__keep_best=False), reporter)
-    assert reporter.steps == [3, 4, 5, 6]
-    assert_same_run(whole_run, tmp_path / "two")
-
-
-@pytest.mark.usefixtures("bucket", "default_signals")
 def test_a_place_that_is_down_for_the_whole_run_costs_warnings_and_no_step(
-    bucket: Gcs, make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path, caplog: pytest.LogCaptureFixture
+    bucket: Gcs, config_on: MakeConfig, reporter, tmp_path: Path, whole_run: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     bucket.fail_next(503, times=10_000)
     caplog.clear()
-    train(mirrored(make_config, tmp_path, "one"), reporter)
+    train(config_on("one"), reporter)
     assert reporter.steps == [1, 2, 3, 4, 5, 6]
     assert_same_run(whole_run, tmp_path / "one")
     warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
@@ -368,10 +313,8 @@ def test_a_place_that_is_down_for_the_whole_run_costs_warnings_and_no_step(
 
 
 @pytest.mark.usefixtures("bucket", "default_signals")
-def test_a_check_tries_the_place_and_leaves_nothing_there_or_here(
-    bucket: Gcs, make_config: MakeConfig, reporter, tmp_path: Path
-) -> None:
-    config = mirrored(make_config, tmp_path, "one")
+def test_a_check_tries_the_place_and_leaves_nothing_there_or_here(bucket: Gcs, config_on: MakeConfig, reporter) -> None:
+    config = config_on("one")
     train(config, reporter, check_only=True)
     assert [r.target for r in bucket.requests if r.target.startswith("DELETE") and ".write-check-" in r.target]
     assert bucket.names("bucket") == ["other"]
@@ -379,7 +322,7 @@ def test_a_check_tries_the_place_and_leaves_nothing_there_or_here(
     with pytest.raises(InputError, match="no permission"):
         train(config, reporter, check_only=True)
     bucket.forget()
-    stop_after(2, mirrored(make_config, tmp_path, "two"), reporter)
+    stop_after(2, config_on("two"), reporter)
     before = bucket.names("bucket")
     train(config, reporter, check_only=True)
     assert any(note.startswith("Resuming from") for note in reporter.notes)
@@ -388,18 +331,16 @@ def test_a_check_tries_the_place_and_leaves_nothing_there_or_here(
 
 
 @pytest.mark.usefixtures("bucket", "default_signals")
-def test_a_run_that_fails_sends_its_last_checkpoint(make_config: MakeConfig, reporter, tmp_path: Path) -> None:
+def test_a_run_that_fails_sends_its_last_checkpoint(config_on: MakeConfig, reporter) -> None:
     def fail() -> None:
         raise InputError(where="here", found="a loss that is not finite")
 
-    changes = {"checkpoint__remote_every_minutes": 1e6, "checkpoint__keep_best": False}
-    config = make_config(run_dir=str(tmp_path / "one"), checkpoint__remote=PLACE, **changes)
     with pytest.raises(InputError, match="not finite"):
-        train(config, at_step(reporter, 5, fail))
+        train(config_on("one", checkpoint__remote_every_minutes=1e6), at_step(reporter, 5, fail))
     assert there(PLACE)[-1] == checkpoint_name(4)
 
 
-# A machine killed in its first upload
+# A machine killed in an upload
 
 
 @pytest.fixture
@@ -407,35 +348,8 @@ def place(tmp_path: Path) -> str:
     return str(tmp_path / "disk/run")
 
 
-@pytest.fixture
-def config_on(make_config, tmp_path: Path, place: str):
-    def config(machine: str, **changes: object):
-        return make_config(
-            run_dir=str(tmp_path / machine), checkpoint__remote=place, checkpoint__remote_every_minutes=0.0,
-            checkpoint__keep_best=False, training__steps=STEPS, **changes,
-        )  # fmt: skip
-
-    return config
-
-
-@pytest.fixture
-def whole(make_config, reporter, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run that nobody killed: the same one for all tests."""
-    if not _whole:
-        folder = tmp_path_factory.mktemp("whole") / "run"
-        _whole.append(
-            train(
-                make_config(run_dir=str(folder), checkpoint__keep_best=False, training__steps=STEPS), type(reporter)()
-            )
-        )
-    return _whole[0]
-
-
-_whole: list[Path] = []
-
-
-def die_in_first_upload(config: object, reporter, monkeypatch: pytest.MonkeyPatch, *, before_file: int) -> None:
-    """Train until so many files of the first checkpoint are at the place; then nothing happens any more."""
+def die_in_upload(config: object, reporter, monkeypatch: pytest.MonkeyPatch, *, before_file: int) -> None:
+    """Train until so many files of checkpoints are at the place; then nothing happens any more."""
     sent, real = list[str](), storage.upload
 
     def upload(source: Path, target: str) -> None:
@@ -453,34 +367,48 @@ def die_in_first_upload(config: object, reporter, monkeypatch: pytest.MonkeyPatc
     assert len(sent) == before_file
 
 
-@pytest.mark.parametrize(("before_file", "machine"), [(2, "another"), (FILES, "another"), (2, "this")])
-def test_a_run_killed_in_its_first_upload_is_mirrored_by_the_next_start(
-    config_on, reporter, monkeypatch, tmp_path: Path, place: str, before_file: int, machine: str, caplog, whole: Path
+@pytest.mark.parametrize(
+    ("before_file", "machine", "complete"),
+    [(2, "another", []), (FILES, "another", []), (2, "this", []), (FILES + 3, "another", [2])],
+)
+def test_a_run_killed_in_an_upload_goes_on_from_the_last_complete_checkpoint_and_is_mirrored(
+    config_on,
+    reporter,
+    monkeypatch,
+    tmp_path: Path,
+    place: str,
+    before_file,
+    machine,
+    complete,
+    caplog,
+    whole_run: Path,
 ) -> None:
-    die_in_first_upload(config_on("this"), reporter, monkeypatch, before_file=before_file)
-    assert there(place) == []
-    train(config_on(machine), reporter)
-    assert there(place)[-1] == checkpoint_name(STEPS)
+    die_in_upload(config_on("this", place), reporter, monkeypatch, before_file=before_file)
+    assert there(place) == names(*complete)
+    next_start = type(reporter)()
+    train(config_on(machine, place), next_start)
+    assert machine == "this" or next_start.steps[0] == max(complete, default=0) + 1
+    assert there(place)[-1] == checkpoint_name(6)
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
-    assert_same_run(whole, tmp_path / machine)
+    assert_same_run(whole_run, tmp_path / machine)
 
 
 def test_half_a_checkpoint_of_another_run_is_refused_before_the_first_step(
-    config_on, reporter, monkeypatch, tmp_path: Path
+    config_on, reporter, monkeypatch, tmp_path: Path, place: str
 ) -> None:
-    die_in_first_upload(config_on("this"), reporter, monkeypatch, before_file=2)
+    die_in_upload(config_on("this", place), reporter, monkeypatch, before_file=2)
     reporter.steps.clear()
     with pytest.raises(InputError, match=r"differs in training\.learning_rate.*Set another checkpoint.remote"):
-        train(config_on("other", training__learning_rate=0.5), reporter)
+        train(config_on("other", place, training__learning_rate=0.5), reporter)
     assert not (tmp_path / "other").exists()
     assert reporter.steps == []
 
 
 def test_small_files_alone_keep_nobody_out(config_on, reporter, place: str) -> None:
     """Who removes the checkpoints of a place starts a run anew there, with another config if need be."""
-    train(config_on("this"), reporter)
+    train(config_on("this", place), reporter)
     for name in there(place):
         RemoteCheckpoints(place).remove(name)
     assert {"config.yaml", "run_id"} <= {name for name in SMALL_FILES if storage.exists(storage.join(place, name))}
-    train(config_on("other", training__learning_rate=0.5), reporter)
-    assert there(place)[-1] == checkpoint_name(STEPS)
+    train(config_on("other", place, training__learning_rate=0.5), reporter)
+    assert there(place)[-1] == checkpoint_name(6)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from installing import install
 from served import STATE, controller, image, serving, session
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.access import Access
@@ -23,14 +24,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     here = tmp_path_factory.mktemp("robot")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", here], check=True, capture_output=True)
     python = here / "bin/python"
-    # typing_extensions: the client imports it and does not ask for it.
-    pip = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--disable-pip-version-check"]
-    try:
-        done = subprocess.run([*pip, CLIENT, "typing_extensions"], capture_output=True, text=True, timeout=180)
-    except subprocess.TimeoutExpired:
-        pytest.skip(f"{CLIENT} could not be installed within 3 minutes")
-    if done.returncode:
-        pytest.skip(f"{CLIENT} cannot be installed here: {done.stderr.strip().splitlines()[-1:]}")
+    install(python, CLIENT, "typing_extensions")  # which the client imports and does not ask for
     return python
 
 

@@ -6,42 +6,20 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
 
+from decisions import STATE, controller
 from ranks import Rank
-from tiny_models import tiny_model
-from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.episode import Widths
-from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.serving.access import Access
 from vjepa2_ac.serving.server import PlanningServer
 from vjepa2_ac.serving.session import Session, SessionOptions
-from vjepa2_ac.spaces import Spaces
-
-STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
-QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, planner={"name": "cem", "options": {"elites": 4}})
 
 
 def image(seed: int, height: int = 48, width: int = 60) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
-
-
-def controller(seed: int = 0, limits: LimitsConfig | None = None, **changes: object) -> Controller:
-    config = QUICK.model_copy(update={"limits": limits or LimitsConfig(), **changes})
-    return Controller(tiny_model(), config, seed=seed)
-
-
-def vector_controller(joined: str) -> Controller:
-    """Return a controller of eight joints, whose recorded commands were joined so."""
-    sizes = tiny_model().sizes
-    predictor = sizes.predictor.model_copy(update={"action_dim": 8, "state_dim": 8})
-    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
-    config = QUICK.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
-    return Controller(model, config, spaces=Spaces.of_vectors(Widths(8, 8), joined))
 
 
 def session(options: SessionOptions | None = None, goals: dict | None = None, **changes: object) -> Session:
@@ -57,31 +35,27 @@ def request(seed: int = 0, **more: object) -> dict:
 class Running:
     """A server that listens."""
 
-    def __init__(self, url: str, server: PlanningServer) -> None:
-        self.url, self.server = url, server
-        self.http = url.replace("ws://", "http://")
+    def __init__(self, url: str) -> None:
+        self.url, self.http = url, url.replace("ws://", "http://")
 
 
 @contextmanager
-def serving(
-    load: Callable[[], Session],
-    access: Access | None = None,
-    told: dict | None = None,
-) -> Iterator[Running]:
-    """Serve in a thread as long as the context lasts."""
+def in_a_thread(
+    serve: Callable[[asyncio.Event, Callable[[str], None]], Awaitable[object]], until: str
+) -> Iterator[list[str]]:
+    """Run a server as long as the context lasts; yield the lines that it says, once one begins as told."""
     lines: list[str] = []
-    begun, loop_of, failed = threading.Event(), [], []
+    begun, of_loop, failed = threading.Event(), [], []
 
     def tell(line: str) -> None:
         lines.append(line)
-        if line.startswith("listening on "):
+        if line.startswith(until):
             begun.set()
 
-    async def run() -> bool:
+    async def run() -> None:
         stop = asyncio.Event()
-        server = PlanningServer(access or Access("127.0.0.1"), 0, tell)
-        loop_of.extend((asyncio.get_running_loop(), stop, server))
-        return await server.run(lambda: (load(), told or {}), stop)
+        of_loop.extend((asyncio.get_running_loop(), stop))
+        await serve(stop, tell)
 
     def thread() -> None:
         try:
@@ -97,13 +71,23 @@ def serving(
     if failed:
         running.join()
         raise failed[0]
-    loop, stop, server = loop_of
     try:
-        yield Running(lines[0].removeprefix("listening on "), server)
+        yield lines
     finally:
-        loop.call_soon_threadsafe(stop.set)
+        of_loop[0].call_soon_threadsafe(of_loop[1].set)
         running.join(120)
         assert not running.is_alive()
+
+
+@contextmanager
+def serving(load: Callable[[], Session], access: Access | None = None, told: dict | None = None) -> Iterator[Running]:
+    """Serve robots as long as the context lasts."""
+
+    def serve(stop: asyncio.Event, tell: Callable[[str], None]) -> Awaitable[object]:
+        return PlanningServer(access or Access("127.0.0.1"), 0, tell).run(lambda: (load(), told or {}), stop)
+
+    with in_a_thread(serve, "listening on ") as lines:
+        yield Running(lines[0].removeprefix("listening on "))
 
 
 def started(*words: str) -> tuple[Rank, str]:

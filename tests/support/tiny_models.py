@@ -33,6 +33,13 @@ def tiny_model(*, adapted: bool = False, extrinsics: bool = False, states: bool 
     return model.eval()
 
 
+def vector_model(width: int, *, states: bool = True) -> WorldModel:
+    """Return a random model of states and actions of so many numbers."""
+    sizes = tiny_model(states=states).sizes
+    predictor = sizes.predictor.model_copy(update={"action_dim": width, "state_dim": width if states else 7})
+    return WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0).eval()
+
+
 def draw(*shape: int, seed: int = 1) -> Tensor:
     """Return normal numbers."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))

@@ -1,13 +1,12 @@
 """The server of the window in a thread of the test, and a real browser in front of it."""
 
-import asyncio
 import json
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from browser import browser
+from served import in_a_thread
 from vjepa2_ac.explore.server import ExploreServer
 from vjepa2_ac.explore.views import Views
 
@@ -21,36 +20,8 @@ def header(message: Any) -> dict[str, Any]:
 @contextmanager
 def serving(views: Views, port: int = 0) -> Iterator[str]:
     """Serve as long as the context lasts; yield the page's address."""
-    ready, address, of_loop, failed = threading.Event(), [], [], []
-
-    def tell(url: str) -> None:
-        address.append(url)
-        ready.set()
-
-    async def run() -> None:
-        stop = asyncio.Event()
-        of_loop.extend((asyncio.get_running_loop(), stop))
-        await ExploreServer(views, port).run(stop, tell)
-
-    def thread() -> None:
-        try:
-            asyncio.run(run())
-        except BaseException as error:
-            failed.append(error)
-            ready.set()
-
-    running = threading.Thread(target=thread)
-    running.start()
-    assert ready.wait(120)
-    if failed:
-        running.join()
-        raise failed[0]
-    try:
-        yield address[0]
-    finally:
-        of_loop[0].call_soon_threadsafe(of_loop[1].set)
-        running.join(120)
-        assert not running.is_alive()
+    with in_a_thread(ExploreServer(views, port).run, "http") as lines:
+        yield lines[0]
 
 
 @contextmanager

@@ -1,0 +1,36 @@
+"""Runs of small files with checkpoints, and the places that they are mirrored to."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from vjepa2_ac import storage
+from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, write_checkpoint
+from vjepa2_ac.runs.mirror import RemoteCheckpoints, complete
+
+PLACE = "gs://bucket/run"
+
+
+def write(run: Path, step: int, state: RunState | None = None, keep: int = 3, words: str = "of step") -> Path:
+    """Write a checkpoint of two files; its state is of the run `mine` where it names none."""
+
+    def files(folder: Path) -> None:
+        (folder / "adapter").mkdir()
+        (folder / "adapter/weights.bin").write_bytes(f"{words} {step:04d} ".encode() * 1000)
+        (folder / "optimizer.pt").write_bytes(f"{words} {step:04d} ".encode() * 2000)
+
+    state = replace(state or RunState(step), step=step)
+    return write_checkpoint(run / "checkpoints", replace(state, run_id=state.run_id or "mine"), files, keep=keep)
+
+
+def there(place: str = PLACE) -> list[str]:
+    """Return the complete checkpoints of a place."""
+    return sorted(complete(RemoteCheckpoints(place).listing()))
+
+
+def names(*steps: int) -> list[str]:
+    return [checkpoint_name(step) for step in steps]
+
+
+def content(place: str | Path) -> dict[str, bytes]:
+    """Return all files of a place or folder."""
+    return {name: storage.read_bytes(storage.join(str(place), name)) for name in storage.file_sizes(str(place))}
