@@ -2,8 +2,7 @@
 
 import json
 import math
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,25 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from benches import imported
-
-
-@pytest.fixture
-def timing(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """How ways take turns."""
-    yield from imported("timing", monkeypatch)
-
-
-@pytest.fixture
-def rows(timing: Any) -> Any:
-    """What keeps rows."""
-    return sys.modules[timing.problem_of.__module__]
-
-
-@pytest.fixture
-def memory(timing: Any) -> Any:
-    """What measures memory."""
-    return sys.modules[timing.alloc_retries.__module__]
+Load = Callable[[str], Any]
 
 
 def options(**more: Any) -> SimpleNamespace:
@@ -39,9 +20,9 @@ def options(**more: Any) -> SimpleNamespace:
 # ---- rows ----
 
 
-def test_a_row_is_on_disk_as_soon_as_it_is_there_and_what_is_unfinished_is_marked(rows: Any, tmp_path: Path) -> None:
+def test_a_row_is_on_disk_as_soon_as_it_is_there_and_what_is_unfinished_is_marked(load: Load, tmp_path: Path) -> None:
     file = tmp_path / "results" / "rows.json"
-    table = rows.Rows(file, torch="2")
+    table = load("rows").Rows(file, torch="2")
     table.add({"way": "a", "ms": math.nan})
     assert json.loads(file.read_text()) == {"torch": "2", "rows": [{"way": "a", "ms": None}]}
     table.so_far({"way": "b"})
@@ -52,12 +33,12 @@ def test_a_row_is_on_disk_as_soon_as_it_is_there_and_what_is_unfinished_is_marke
 
 
 def test_what_fails_is_a_row_and_the_end_is_an_error_but_out_of_memory_is_a_result(
-    rows: Any, capsys: pytest.CaptureFixture[str]
+    load: Load, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def runs_out() -> None:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
-    table = rows.Rows(None)
+    table = load("rows").Rows(None)
     assert table.attempt(lambda: 3, way="a") == 3
     assert table.attempt(runs_out, way="b") is None
     table.finish()
@@ -73,7 +54,8 @@ def test_what_fails_is_a_row_and_the_end_is_an_error_but_out_of_memory_is_a_resu
 # ---- time ----
 
 
-def test_ways_take_turns_and_a_ratio_is_of_neighbours(timing: Any) -> None:
+def test_ways_take_turns_and_a_ratio_is_of_neighbours(load: Load) -> None:
+    timing = load("timing")
     calls: list[str] = []
     ways = {"plain": lambda: calls.append("p"), "ours": lambda: calls.append("o")}
     seen = [
@@ -103,7 +85,7 @@ def test_ways_take_turns_and_a_ratio_is_of_neighbours(timing: Any) -> None:
     ],
 )
 def test_on_a_cpu_a_peak_is_of_a_process_of_its_own_whatever_becomes_of_it(
-    memory: Any, program: str, peak: float | None, problem: str | None
+    load: Load, program: str, peak: float | None, problem: str | None
 ) -> None:
-    found = memory.peak_alone([].pop, ["-c", program], "cpu")
+    found = load("memory").peak_alone([].pop, ["-c", program], "cpu")
     assert found == {"peak_gb": peak, "problem": problem and f"failed: {problem}"}

@@ -2,21 +2,14 @@
 
 import json
 import re
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from benches import ELSEWHERE, imported
-
-
-@pytest.fixture
-def train_step(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The benchmark of a training step."""
-    yield from imported("train_step", monkeypatch)
+from benches import ELSEWHERE
 
 
 def rows(printed: str) -> list[tuple[str, float, str]]:
@@ -28,9 +21,9 @@ def rows(printed: str) -> list[tuple[str, float, str]]:
 
 
 def test_quick_benchmark_of_a_training_step_completes_without_the_official_code(
-    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    load: Callable[[str], Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train_step.main(
+    load("train_step").main(
         ["--quick", "--no-memory", "--encoder", "--checkpointing", "off", "on", "--official", str(tmp_path)]
     )
     printed = capsys.readouterr().out
@@ -40,9 +33,9 @@ def test_quick_benchmark_of_a_training_step_completes_without_the_official_code(
 
 
 def test_all_rows_of_a_training_step_come_from_one_command_and_what_runs_out_of_memory_says_so(
-    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    load: Callable[[str], Any], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench = sys.modules["train_step_variants"].Bench
+    bench = load("train_step_variants").Bench
     usual = bench.step
 
     def step(self: Any, setting: Any, way: str) -> Any:
@@ -52,7 +45,7 @@ def test_all_rows_of_a_training_step_come_from_one_command_and_what_runs_out_of_
 
     monkeypatch.setattr(bench, "step", step)
     file = tmp_path / "results" / "steps.json"
-    train_step.main([
+    load("train_step").main([
         "--quick", "--no-memory", "--official", str(tmp_path), "--source", "cache", "pixels", "--attention", "per_step",
         "--profile", "--cap-gb", "24", "--json", str(file),
     ])  # fmt: skip
@@ -71,11 +64,11 @@ def test_all_rows_of_a_training_step_come_from_one_command_and_what_runs_out_of_
 
 
 def test_no_ratio_is_printed_to_a_predictor_that_computes_something_else(
-    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    load: Callable[[str], Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "src" / "models").mkdir(parents=True)
     (tmp_path / "src" / "models" / "ac_predictor.py").write_text(ELSEWHERE)
-    train_step.main(["--quick", "--no-memory", "--official", str(tmp_path)])
+    load("train_step").main(["--quick", "--no-memory", "--official", str(tmp_path)])
     printed = capsys.readouterr().out
     assert "official: NO RATIO" in printed
     assert [way for way, _, _ in rows(printed)] == ["dense", "auto"]

@@ -1,31 +1,22 @@
 """The benchmark of decisions times what decides alike, each in the type and with the goal that were asked for."""
 
 import re
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benches import ELSEWHERE, imported
-
-
-@pytest.fixture
-def planning(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The benchmark; its name is that of a folder of tests, too."""
-    monkeypatch.delitem(sys.modules, "planning", raising=False)
-    yield from imported("planning", monkeypatch)
-
+from benches import ELSEWHERE
 
 DECISION = re.compile(r"^ +(\d+)  (\S+) +(\S+) +(\S+) +\S+ +(\S+)% +0 +(\S+) +(\S+)(?:  \[.*)?$", re.MULTILINE)
 """Horizon, way, seconds, the least, MFU, ratio to plain, ratio to official."""
 
 
 def test_quick_benchmark_of_a_decision_completes_without_the_official_code(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    load: Callable[[str], Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--profile"])
+    load("planning").main(["--quick", "--no-memory", "--official", str(tmp_path), "--profile", "--dtype", "bfloat16"])
     printed = capsys.readouterr().out
     assert f"official: skipped, for there is no {tmp_path}" in printed
     assert "aten::addmm" in printed
@@ -37,19 +28,6 @@ def test_quick_benchmark_of_a_decision_completes_without_the_official_code(
         assert min(float(mfu), float(of_plain)) >= 0  # rounded
         assert of_official == "-"
     assert lines[0][5] == "1.00"
-
-
-def test_no_ratio_is_printed_to_a_decision_that_comes_out_otherwise(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    poses = sys.modules["planning_variants"]._poses_one_by_one
-    monkeypatch.setattr("planning_variants._poses_one_by_one", lambda states, actions: poses(states, -3 * actions))
-    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--dtype", "bfloat16"])
-    printed = capsys.readouterr().out
-    assert re.search(r"plain: actions differ by .*: NO RATIO", printed)
-    assert [(way, of_plain) for _, way, _, _, _, of_plain, _ in DECISION.findall(printed)] == [
-        ("ours/4", "-"), ("ours/2", "-"), ("ours/4+adapter", "-"),
-    ]  # fmt: skip
 
 
 NOTEBOOK = """
@@ -73,13 +51,13 @@ class WorldModel:
 
 
 def test_no_ratio_is_printed_to_a_notebook_that_plans_otherwise(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    load: Callable[[str], Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "src" / "models").mkdir(parents=True)
     (tmp_path / "src" / "models" / "ac_predictor.py").write_text(ELSEWHERE)
     (tmp_path / "notebooks" / "utils").mkdir(parents=True)
     (tmp_path / "notebooks" / "utils" / "world_model_wrapper.py").write_text(NOTEBOOK)
-    planning.main(["--quick", "--no-memory", "--official", str(tmp_path)])
+    load("planning").main(["--quick", "--no-memory", "--official", str(tmp_path)])
     printed = capsys.readouterr().out
     assert re.search(r"official: actions differ by .*: NO RATIO", printed)
     assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/2", "ours/4+adapter"]

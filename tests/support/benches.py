@@ -1,7 +1,7 @@
-"""Benchmarks, imported as where they lie: they import each other by their bare names."""
+"""Benchmarks, imported as where they lie, for they import each other by their bare names; and a stand-in of another."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
 
@@ -58,11 +58,13 @@ class VisionTransformerPredictorAC(nn.Module):
 """Stands where the official predictor is, and computes something else."""
 
 
-def imported(name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Yield a benchmark's module; nothing of it stays."""
+@pytest.fixture
+def load(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Any]]:
+    """Import benchmarks by their names; nothing of them stays."""
     threads, before = torch.get_num_threads(), set(sys.modules)
     monkeypatch.setattr(sys, "path", [str(ROOT / "benchmarks"), *sys.path])
-    yield import_module(name)
+    monkeypatch.delitem(sys.modules, "planning", raising=False)  # a folder of tests has this name, too
+    yield import_module
     torch.set_num_threads(threads)
     own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")} | {"src", "notebooks"}
     for module in set(sys.modules) - before:

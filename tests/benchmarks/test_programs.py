@@ -1,0 +1,96 @@
+"""Programs of `benchmarks`: they run to their end, their table is complete, and commands for a GPU can be given."""
+
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from paths import ROOT
+from vjepa2_ac.config.loading import config_as_yaml, load_config
+from vjepa2_ac.model.attention import AttentionKind
+from vjepa2_ac.model.checkpoints import base_sizes
+from vjepa2_ac.model.model_files import PUBLISHED
+from vjepa2_ac.training.cost import count_parameters
+
+Load = Callable[[str], Any]
+SECTION = (ROOT / "docs/IMPLEMENTATION_NOTES.md").read_text().split("\n## On a GPU\n")[1].split("\n## ")[0]
+ENCODERS = [one for one in PUBLISHED if one.holds == "encoder"]
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "printed"),
+    [
+        ("index", "--shards 2 --in-flight 4 --latency-ms 1", "a hash's"),
+        ("loader", "--clips 4", "index of 2,000 episodes"),
+    ],
+)
+def test_it_runs_to_its_end(
+    name: str,
+    options: str,
+    printed: str,
+    load: Load,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    module = load(name)
+    if name == "index":  # it changes these itself, for a process of its own
+        monkeypatch.setattr(module.rlds_index, "_IN_FLIGHT", module.rlds_index._IN_FLIGHT)
+        monkeypatch.setenv("STORAGE_EMULATOR_HOST", "")
+    if name == "loader":
+        monkeypatch.setattr(module, "DROID_EPISODES", 2_000)
+        monkeypatch.setattr(module.measure_workers, "__defaults__", (2, 2))
+    module.main(options.split())
+    assert printed in capfd.readouterr().out
+
+
+def test_the_action_score_is_printed(make_config, tmp_path: Path, load: Load, capsys) -> None:
+    config = make_config(data__frames=4, data__test_share=0.4)
+    (tmp_path / "data.yaml").write_text(config_as_yaml(config))
+    words = [str(config.model.base), str(tmp_path / "data.yaml"), "--clips", "2", "--samples", "12"]
+    load("action_score").main(words)
+    assert capsys.readouterr().out.startswith("plans: Action Score ")
+
+
+def test_every_encoder_that_can_be_downloaded_has_a_row(load: Load) -> None:
+    rows = load("encoders").published()
+    assert {name for _, names in rows.values() for name in names} == {one.name for one in ENCODERS}
+    written = (ROOT / "benchmarks/results/encoders.md").read_text()
+    assert "](../benchmarks/results/encoders.md)" in (ROOT / "docs/encoders_reference.md").read_text()
+    assert all(f"\n| {name} | {', '.join(names)} |" in written for name, (_, names) in rows.items())
+
+
+@pytest.mark.parametrize("published", ENCODERS, ids=lambda one: one.name)
+def test_parameters_of_a_published_encoder_are_those_of_its_name(published: Any) -> None:
+    config = load_config(ROOT / "configs/scratch_vitb.yaml", [f"model.encoder.path=nowhere/{published.name}.pt"])
+    found = count_parameters(config, base_sizes(config.model)).encoder
+    assert found == pytest.approx(published.encoder.parameters, rel=0.02)
+
+
+def test_every_part_is_a_command_of_its_benchmark(load: Load) -> None:
+    on_gpu = load("on_gpu")
+    assert len({part.name for part in on_gpu.PARTS}) == len(on_gpu.PARTS)
+    for part in on_gpu.PARTS:
+        if parse := getattr(load(part.benchmark), "parse", None):
+            named = getattr(parse(part.arguments.split()), "attention", [])
+            assert {way.split("+")[0] for way in named} <= set(get_args(AttentionKind))
+
+
+def test_a_part_that_fails_is_named(tmp_path: Any) -> None:
+    command = [sys.executable, str(ROOT / "benchmarks/on_gpu.py"), "--quick", "--out", str(tmp_path), "--only"]
+    (tmp_path / "chunk.json").mkdir()  # which cannot be written
+    done = subprocess.run([*command, "chunk"], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert re.search(r"== chunk: exit 1.*ViT-B", done.stdout, re.DOTALL)
+    assert done.stderr.strip() == "failed or out of time: chunk"
+
+
+def test_commands_of_the_notes_can_be_given(load: Load) -> None:
+    commands = re.findall(r"python (benchmarks/\w+\.py[^`]*)`", SECTION)
+    assert len(commands) > 1
+    for script, *given in map(shlex.split, commands):
+        load(Path(script).stem).parse(given)
