@@ -24,7 +24,6 @@ OF_A_RUN = ("data.test_share=0.3", *FEW_STEPS.split())
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make what the commands of the page find."""
-    pytest.importorskip("mujoco", reason="no simulator")
     folder = tmp_path_factory.mktemp("troubles")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

@@ -17,8 +17,6 @@ from vjepa2_ac.config import ValidationConfig
 from vjepa2_ac.policies.action_prior import PriorOptions, train_prior
 from vjepa2_ac.simulation.record import RecordingSpec
 
-pytest.importorskip("mujoco")
-
 MODULES = (
     "environments", "methods", "prepare", "offline", "results", "measure", "tables", "selection",
     "selection_tables",

@@ -8,8 +8,6 @@ import pytest
 import yaml
 from PIL import Image
 
-pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-
 from tiny_models import tiny_model
 from vjepa2_ac.api import open_dataset
 from vjepa2_ac.cli import main

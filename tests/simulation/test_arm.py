@@ -3,11 +3,14 @@
 import sys
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
 from projections import hand_pixel
 from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.simulation.arm import ContactArm, SimulatedArm
+from vjepa2_ac.simulation.camera import View
 from vjepa2_ac.simulation.domains import (
     BLOCK_M,
     DOMAIN_A,
@@ -27,11 +30,6 @@ from vjepa2_ac.simulation.domains import (
 )
 from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ, HIGH, HOME, LOW, forward_kinematics, rest_joints
 from vjepa2_ac.spaces import matrices_from_euler
-
-mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-
-from vjepa2_ac.simulation.arm import ContactArm, SimulatedArm  # noqa: E402
-from vjepa2_ac.simulation.camera import View  # noqa: E402
 
 REACHES = HOME + np.array([[0] * 7, [0.4, 0.3, 0.0, 0.4, 0.1, 0.2, 0.5], [-0.6, 0.2, 0.3, -0.2, 0.0, -0.3, 0.0]])
 

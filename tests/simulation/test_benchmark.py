@@ -8,13 +8,9 @@ import pytest
 import torch
 import yaml
 
-pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-pytest.importorskip("av", reason="the extra `video` is not installed")
-
-from tiny_models import tiny_model
+from tiny_models import tiny_model, vector_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.media.video import read_header
-from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.simulation.benchmark import FILM, JOINT_FIELDS, BenchmarkOptions, film_frames, run_benchmark
 from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
@@ -29,19 +25,10 @@ TWICE = ["--episodes", "2", "--steps", "2", "--films", "1"]
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> str:
-    folder = tmp_path_factory.mktemp("models") / "tiny"
-    tiny_model().save_pretrained(folder)
-    return str(folder)
-
-
-@pytest.fixture(scope="module")
 def of_joints(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     """Return a model of seven joint angles and a gripper, and a config that says so."""
     folder = tmp_path_factory.mktemp("joints")
-    sizes = tiny_model().sizes
-    predictor = sizes.predictor.model_copy(update={"state_dim": 8, "action_dim": 8})
-    WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0).save_pretrained(folder / "model")
+    vector_model(8).save_pretrained(folder / "model")
     data = {"path": "none", "states": "vector", "fields": {"state": list(JOINT_FIELDS)}}
     config = {"run_dir": "none", "data": data, "model": {"base": "none", "dtype": "float32"}}
     (folder / "joints.yaml").write_text(yaml.safe_dump(config))

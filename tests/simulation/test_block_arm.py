@@ -3,15 +3,11 @@
 import numpy as np
 import pytest
 
+from vjepa2_ac.simulation.arm import ContactArm, SimulatedArm
 from vjepa2_ac.simulation.domains import BLOCK_M, DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.motion import downward_poses, poses_in_base
-from vjepa2_ac.simulation.tasks import GRASP_M, HOLDING
+from vjepa2_ac.simulation.tasks import GRASP_M, HOLDING, arm_for
 from vjepa2_ac.spaces import matrices_from_euler
-
-pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-
-from vjepa2_ac.simulation.arm import ContactArm, SimulatedArm
-from vjepa2_ac.simulation.tasks import arm_for
 
 
 @pytest.fixture

@@ -16,12 +16,9 @@ from projections import hand_pixel, pixel_of
 from run_fixtures import MakeConfig
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds import RldsSource
+from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
-
-pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-
-from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination
 from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.planning.counterfactual import named_actions

@@ -1,6 +1,9 @@
-"""Recordings read back as DROID, are consistent with the kinematics, and are reproducible."""
+"""Recordings read back as DROID, agree with the kinematics, move their block, and say how they can be made again."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,12 +12,21 @@ from synthetic import measured_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
-
-pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-
 from vjepa2_ac.simulation.arm import SimulatedArm
-from vjepa2_ac.simulation.record import RecordingSpec, record_dataset, record_episode
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, CameraPlace, DomainRanges
+from vjepa2_ac.simulation.motion import MotionRecipe, forward_kinematics
+from vjepa2_ac.simulation.policies import play
+from vjepa2_ac.simulation.record import (
+    SIMULATION_FILE,
+    RecordedSimulation,
+    RecordingSpec,
+    default_steps,
+    episode_folder,
+    read_simulation,
+    record_dataset,
+    record_episode,
+)
+from vjepa2_ac.simulation.tasks import arm_for
 
 EPISODES, STEPS = 3, 5
 
@@ -82,3 +94,114 @@ def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_w
         with pytest.raises(InputError, match=wrong):
             record_dataset(tmp_path / "x", spec, episodes=episodes)
     assert not (tmp_path / "x").exists()
+
+
+# With a block
+
+
+def blocks_of(task: str, seed: int, *, script: bool, steps: int = 41) -> np.ndarray:
+    seen, rng = [], np.random.default_rng(seed)
+    play(arm_for(task, DOMAIN_A), task, steps, rng, script=script, look=lambda arm: seen.append(arm.block))
+    return np.array(seen)
+
+
+def test_scripts_and_play_move_the_block() -> None:
+    pushed = blocks_of("push", 1, script=True)
+    assert len(pushed) == 41
+    assert np.linalg.norm(pushed[-1, :2] - pushed[0, :2]) > 0.08
+    assert blocks_of("pick", 1, script=True)[-1, 2] > 0.10
+    placed = blocks_of("place", 1, script=True, steps=default_steps("place"))
+    assert placed[:, 2].max() > 0.08
+    assert placed[-1, 2] < 0.035
+    assert np.linalg.norm(placed[-1, :2] - placed[0, :2]) > 0.06
+    played = [blocks_of("push", seed, script=False, steps=25) for seed in range(3)]
+    ways = [np.linalg.norm(blocks[-1, :2] - blocks[0, :2]) for blocks in played]
+    assert max(ways) > 0.05
+
+
+def test_measurements_follow_commands_that_are_held_for_a_model_step() -> None:
+    motion = play(arm_for("push", DOMAIN_A), "push", 9, np.random.default_rng(0), script=False)
+    for first in (0, 4):
+        np.testing.assert_array_equal(motion.commanded_joints[first : first + 4], motion.commanded_joints[[first] * 4])
+    assert (motion.commanded_joints[4] != motion.commanded_joints[3]).any()
+    to_go = [np.abs(motion.commanded_joints[0] - motion.joints[step]).max() for step in range(4)]
+    assert to_go[0] > to_go[1] > to_go[2] > to_go[3]
+
+
+def test_an_episode_with_a_block_is_consistent_and_always_the_same() -> None:
+    first, again = (record_episode(2, RecordingSpec(DOMAIN_A, 6, 1, task="pick")) for _ in range(2))
+    assert first.images == again.images
+    joints, poses = (first.arrays[f"observation/{name}_position"] for name in ("joint", "cartesian"))
+    np.testing.assert_array_equal(forward_kinematics(joints), poses)
+    assert all(len(film) == 6 for film in first.images.values())
+    assert first.language_instruction == "pick up the block"
+    other = record_episode(2, RecordingSpec(DOMAIN_A, 6, 1))
+    assert other.language_instruction != first.language_instruction
+    assert np.abs(other.arrays["action"] - first.arrays["action"]).max() > 0.01
+
+
+# The file that says how a data set was simulated
+
+SPECS = [
+    RecordingSpec("A", 5, seed=3),
+    RecordingSpec("random", 5, seed=4, cameras=3),
+    RecordingSpec(replace(DOMAIN_B, lag_s=0.1 + 0.2, camera=CameraPlace(1 / 3, 20.0, 1.2)), 5, task="push"),
+    RecordingSpec("B", 5, task="place"),
+    RecordingSpec(DomainRanges(lag_s=(0.05, 0.06)), 5, recipe=MotionRecipe(drift_m=(0.0, 0.01, 0.0))),
+]
+
+
+def written(folder: Path, spec: RecordingSpec, **changes: Any) -> Path:
+    (folder / SIMULATION_FILE).write_text(json.dumps(RecordedSimulation.of(spec, 2).as_dict() | changes))
+    return folder
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=["A", "random", "task", "place", "recipe"])
+def test_the_spec_that_is_read_is_the_one_that_was_recorded(tmp_path: Path, spec: RecordingSpec) -> None:
+    read = read_simulation(written(tmp_path, spec))
+    assert read == RecordedSimulation.of(spec, 2)
+    assert (read.worlds, read.episodes) == (spec.worlds, 2)
+
+
+def test_the_file_gives_the_recorded_episodes_again(recorded: Path) -> None:
+    source, simulation = RldsSource(DataConfig(path=str(recorded))), read_simulation(recorded)
+    numbers = [simulation.number_of(info.id) for info in source.infos()]
+    assert sorted(numbers) == [0, 1, 2]
+    again = record_episode(numbers[1], simulation)
+    assert f"{again.recording_folderpath}--{again.file_path}" == source.infos()[1].id
+
+
+def test_a_folder_without_the_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"simulation\.json: no such file: .*needed: .*simulate record.*Record it again"
+    ):
+        read_simulation(tmp_path)
+
+
+def test_episodes_of_others_are_refused(tmp_path: Path) -> None:
+    simulation = read_simulation(written(tmp_path, RecordingSpec("A", 5)))
+    ours = record_name(RecordingSpec("A", 5), 1)
+    assert simulation.number_of(ours) == 1
+    others = [record_name(RecordingSpec("A", 5), 2), record_name(RecordingSpec("A", 5, seed=1), 1)]
+    others += [record_name(RecordingSpec("B", 5), 1), "/nfs/AUTOLab/success/2023-07-07/Fri_Jul__7_09:42:23_2023/x.h5"]
+    for other in others:
+        with pytest.raises(InputError, match="not the episode"):
+            simulation.number_of(other)
+
+
+def record_name(spec: RecordingSpec, index: int) -> str:
+    return f"{episode_folder(index, spec.seed, str(spec.domain))}/trajectory.h5"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 0}, "steps: .*greater than or equal to 2"),
+        ({"ranges": {}}, "not one of the keys domain and ranges"),
+        ({"domain": None}, "not one of the keys domain and ranges"),
+        ({"task": "stack"}, "task: "),
+    ],
+)
+def test_a_damaged_file_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_simulation(written(tmp_path, RecordingSpec(DOMAIN_A, 5), **changes))

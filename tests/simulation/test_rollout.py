@@ -5,17 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
-from vjepa2_ac.simulation.tasks import RELEASED, STEPS, TaskName, arm_for, make_problem
-from vjepa2_ac.spaces import actions_from_states
-
-pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-
-from tiny_models import tiny_model
-from vjepa2_ac.planning.controller import Controller
+from decisions import controller
+from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.simulation.arm import SimulatedArm
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions, Planning, run_task
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.motion import HIGH, forward_kinematics
 from vjepa2_ac.simulation.policies import Oracle, RandomActions, ZeroActions, farthest, shortened
 from vjepa2_ac.simulation.rollout import (
@@ -27,6 +21,8 @@ from vjepa2_ac.simulation.rollout import (
     run,
     run_trials,
 )
+from vjepa2_ac.simulation.tasks import RELEASED, STEPS, TaskName, arm_for, make_problem
+from vjepa2_ac.spaces import actions_from_states
 
 LIMITS = LimitsConfig(xyz=(0.075, 0.075, 0.075))
 SMALL = LimitsConfig(xyz=(0.03, 0.03, 0.03))
@@ -154,10 +150,7 @@ def test_a_command_out_of_reach_moves_the_arm_part_of_the_way_and_is_counted(arm
 
 
 def test_a_planner_acts_within_its_limits_and_some_episodes_are_filmed(arm: SimulatedArm) -> None:
-    config = PlanningConfig(
-        samples=8, iterations=2, horizon=1, limits=SMALL, planner={"name": "cem", "options": {"elites": 3}}
-    )
-    policy, reported = Planning(Controller(tiny_model(), config), name="tiny"), []
+    policy, reported = Planning(controller(horizon=1, limits=SMALL), name="tiny"), []
     options = BenchmarkOptions("reach", DOMAIN_B, episodes=2, steps=2, films=1)
     result = run_task(options, policy, arm, lambda *numbers: reported.append(numbers))
     assert (result.policy, result.why_counts) == ("tiny", {"planned": 4})

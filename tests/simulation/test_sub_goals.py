@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-
-from decisions import QUICK
-from tiny_models import tiny_model
+from decisions import controller as tiny_controller
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.benchmark import Planning, demonstrate, demonstrated_goals
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
@@ -63,7 +59,7 @@ def test_every_step_of_a_demonstration_is_a_goal_up_to_where_it_rests() -> None:
 
 
 def test_a_planner_is_given_the_goals_of_the_trial() -> None:
-    controller = Controller(tiny_model(), QUICK.model_copy(update={"horizon": 1}))
+    controller = tiny_controller(horizon=1)
     arm = arm_for("pick", DOMAIN_A)
     goals = demonstrated_goals(trial_of("pick", DOMAIN_A, 0), arm, LIMITS, "every-step")
     episode = run(ArmEnvironment(arm), Planning(controller), trial_of("pick", DOMAIN_A, 0, goals=goals))

@@ -14,11 +14,7 @@ import pytest
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.simulation import worlds
-from vjepa2_ac.simulation.worlds import WorldProcess
-
-pytest.importorskip("av", reason="the extra `video` is not installed")
-
-from vjepa2_ac.simulation.worlds import OtherWorld, record_world
+from vjepa2_ac.simulation.worlds import OtherWorld, WorldProcess, record_world
 
 PIXELS = base64.b64encode(bytes(18)).decode()
 START = f"""

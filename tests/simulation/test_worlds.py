@@ -10,11 +10,7 @@ import numpy as np
 import pytest
 
 import fake_world
-
-pytest.importorskip("av", reason="the extra `video` is not installed")
-
 from paths import ROOT
-from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.npz import NpzSource
@@ -31,13 +27,6 @@ SMALL = ["planning.samples=6", "planning.iterations=2", "planning.planner.option
 
 def command(how: str = "") -> str:
     return shlex.join([sys.executable, fake_world.__file__, how])
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> str:
-    folder = tmp_path_factory.mktemp("models") / "tiny"
-    tiny_model().save_pretrained(folder)
-    return str(folder)
 
 
 def test_a_model_and_those_without_one_act_on_the_problems_that_the_expert_solves(
