@@ -1,15 +1,20 @@
-"""A trained model plans like its base: merged, in the type of its weights, and without being changed."""
+"""A trained model plans like its base, compiled blocks like plain ones, and the given model stays as it was."""
 
 import copy
 
 import numpy as np
 import pytest
 import torch
+from torch._dynamo.utils import counters
 
 from decisions import STATE
 from tiny_models import actions, cost, tiny_model
+from tracing import tracing
 from vjepa2_ac.config import AdapterConfig
-from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
+from vjepa2_ac.config.section import Component
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model import compilation
 from vjepa2_ac.model.lora import add_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning import controller
@@ -87,3 +92,35 @@ def test_the_given_model_is_not_changed(adapter: AdapterConfig) -> None:
     assert [value.requires_grad for value in model.parameters()] == trained
     assert model.state_dict().keys() == weights.keys()
     assert all(torch.equal(value, weights[name]) for name, value in model.state_dict().items())
+
+
+pytestmark = tracing
+
+IN_PARTS = PLAIN.model_copy(update={"samples": 11, "horizon": 3, "energy": EnergyConfig(samples_at_once=4)})
+COMPILED = IN_PARTS.model_copy(update={"compile": "blocks"})
+
+
+@pytest.fixture(autouse=True)
+def _with_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compilation, "missing_for_compilation", lambda _: None)
+
+
+@pytest.mark.usefixtures("traced")
+@pytest.mark.parametrize("adapted", [False, True])
+@pytest.mark.parametrize("planner", ["cem", "gradient"])
+def test_compiled_plans_are_the_plain_ones(adapted: bool, planner: str) -> None:
+    model, planned = tiny_model(adapted=adapted), {"planner": Component(planner)}
+    expected = decided(model, IN_PARTS.model_copy(update=planned))
+    assert not counters["stats"]
+    found = decided(model, COMPILED.model_copy(update=planned))
+    assert counters["stats"]["unique_graphs"]
+    assert not counters["graph_break"]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_what_cannot_be_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_model()
+    monkeypatch.setattr(compilation, "missing_for_compilation", lambda kind: f"no compiler for {kind}")
+    with pytest.raises(InputError, match=r"no compiler for cpu.*planning.compile=off"):
+        Controller(tiny_model(), COMPILED)
+    Controller(model, IN_PARTS)

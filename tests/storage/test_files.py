@@ -171,6 +171,19 @@ def test_a_folder_that_changed_today_names_of_others_and_links_are_left_alone(tm
     assert not storage.is_empty(tmp_path)
 
 
+@pytest.mark.parametrize("jump_s", [-86_400.0, 0.9 * 86_400.0])
+def test_what_another_machine_is_writing_stays_though_our_clock_has_jumped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jump_s: float
+) -> None:
+    path = tmp_path / ".file.abcdef01.partial"
+    path.write_bytes(b"half")
+    now = time.time()
+    os.utime(path, (now, now))
+    monkeypatch.setattr(time, "time", lambda: now + jump_s)
+    remove_abandoned(tmp_path)
+    assert path.exists()
+
+
 # ---- reading ----
 
 
