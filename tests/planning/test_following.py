@@ -1,4 +1,4 @@
-"""A controller that follows goals: which one applies, what the gripper may do, when it is done; and laws of the rule."""
+"""A controller that follows goals: which one applies, what the gripper may do, when all is done; laws of the rule."""
 
 import re
 from collections.abc import Sequence
