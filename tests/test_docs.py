@@ -1,16 +1,20 @@
-"""What the documentation shows as a complete config is one; files, modules and knobs that it names are there."""
+"""What the documentation shows works: configs, commands and loops; files, modules and keys that it names are there."""
 
-import ast
+import json
+import pkgutil
 import re
-from functools import cache
+import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
-import vjepa2_ac
+from guides import commands_of
 from paths import ROOT
-from vjepa2_ac.config.loading import all_keys, parse_config
+from vjepa2_ac.cli import main, program
+from vjepa2_ac.config.loading import all_keys, load_config, parse_config
+from vjepa2_ac.media.images import read_image
 from vjepa2_ac.registry import REGISTRIES
 
 OF_DATA = [(ROOT / f"docs/{name}.md").read_text() for name in ("data", "data_reference")]
@@ -43,33 +47,14 @@ def is_there(path: str) -> bool:
 
 def is_module_or_part_of_one(dotted: str) -> bool:
     """Whether a dotted name within the package is public, a module, or what a module defines or imports."""
-    parts = dotted.split(".")
-    if parts[0] in vjepa2_ac.__all__:
-        return True
-    for length in range(len(parts), 0, -1):
-        place = PACKAGE.joinpath(*parts[:length])
-        file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
-        if file.is_file():
-            rest = parts[length:]
-            return not rest or rest[0] in names_in(file)
-    return False
+    try:
+        pkgutil.resolve_name(f"vjepa2_ac.{dotted}")
+    except (ImportError, AttributeError):
+        return False
+    return True
 
 
 GROUPS = {one.group for one in REGISTRIES} | {"vjepa2_ac.commands"}  # entry points, which look like modules
-
-
-@cache
-def names_in(file: Path) -> frozenset[str]:
-    tree = ast.parse(file.read_text())
-    defined = {node.name for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
-    assigned = {
-        name.id for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign)
-        for name in ast.walk(node) if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
-    }  # fmt: skip
-    imported = {
-        alias.asname or alias.name for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names
-    }
-    return frozenset(defined | assigned | imported)
 
 
 def is_knob(dotted: str) -> bool:
@@ -125,3 +110,74 @@ def test_no_text_installs_the_bare_name() -> None:
     assert bare.search('pip install "vjepa2-ac[sim]"')
     assert bare.search("pip install -U vjepa2-ac\n")
     assert not bare.search('pip install "vjepa2-ac[sim] @ file:///x.whl"')
+
+
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_program_accepts_every_command_of_a_guide(page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    for line in commands_of(page.read_text()):
+        for command in re.split(r"&&|;|\|", line.partition(" > ")[0]):
+            words = re.sub(r"^\s*(\.venv/bin/)?", "", command)
+            if not words.startswith("vjepa2-ac ") or "…" in words or "$" in words:
+                continue
+            options = program.parsed(program._parser(), shlex.split(words)[1:])
+            config = str(getattr(options, "config", None))
+            if config.startswith(("builtin:", "configs/")):
+                load_config(config, getattr(options, "overrides", []))
+
+
+PLANNING = (ROOT / "docs/planning.md").read_text()
+PLANNING_REFERENCE = (ROOT / "docs/planning_reference.md").read_text()
+START = [0.498, -0.111, 0.211, 3.142, 0.0, -1.175, 0.0]
+
+
+class Robot:
+    """Stands still, and sees the goal after two commands."""
+
+    def __init__(self) -> None:
+        self.targets: list[np.ndarray] = []
+
+    def state(self) -> np.ndarray:
+        return np.array(START)
+
+    def image(self) -> np.ndarray:
+        return read_image(ROOT / f"docs/plan_{'start' if len(self.targets) < 2 else 'goal'}.png")
+
+    def move_to(self, target: np.ndarray) -> None:
+        self.targets.append(target)
+
+
+def test_the_robots_loop_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    (loop,) = re.findall(r"```python\n(.*?)```", PLANNING, flags=re.DOTALL)
+    robot = Robot()
+    monkeypatch.chdir(ROOT)
+    loop = loop.replace("samples=100", "samples=24").replace("iterations=4", "iterations=2")
+    exec(loop, {"robot": robot})  # noqa: S102 - our own page
+    assert len(robot.targets) == 2
+    moved = np.stack(robot.targets)[:, :3] - START[:3]
+    assert (np.abs(moved) <= 0.05 + 1e-9).all()
+    assert moved[0, 2] > 0  # up, where the goal is
+    assert capsys.readouterr().out.splitlines()[-1].startswith("at the goal")
+
+
+def test_the_command_runs_and_writes_what_the_page_lists(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown = PLANNING.split("```sh\n")[1].split("```")[0].replace("\\\n", " ")
+    shown = shown.replace("samples=200", "samples=12").replace("iterations=5", "iterations=1")
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr("vjepa2_ac.reports.planning_figures.plot_plan", lambda _, path, *__: path)
+    words = shlex.split(shown)
+    assert words[0] == "vjepa2-ac"
+    assert main([*words[1:], "--out", str(tmp_path), "--nodes", "3"]) == 0
+    assert "Plan of 1 model step" in capsys.readouterr().out
+    table = PLANNING_REFERENCE.split("## plan.json")[1].split("##")[0]
+    named = set(re.findall(r"`([a-z_]+)`", "\n".join(row.split("|")[1] for row in table.splitlines() if "|" in row)))
+    file = json.loads((tmp_path / "plan.json").read_text())
+    assert set(file) == named
+    for section in ("model", "energy", "seconds"):
+        (row,) = (row for row in table.splitlines() if row.startswith(f"| `{section}`"))
+        assert set(file[section]) <= set(re.findall(r"`([a-z_]+)`", row)), section
