@@ -1,5 +1,6 @@
 """Data sets in memory, single clips, and the split of a single name."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import Dataset, read_clip
 from vjepa2_ac.data.index import EpisodeTable, StepSelection, identity_hash
 from vjepa2_ac.data.selection import BrokenEpisodes
-from vjepa2_ac.episode import Clip, EpisodeSource
+from vjepa2_ac.episode import Batch, Clip, EpisodeSource
 
 
 def open_in_memory(source: Any, /, **knobs: Any) -> Dataset:
@@ -43,3 +44,15 @@ def split_of(name: str, config: DataConfig) -> Split:
     if number < config.test_share:
         return "test"
     return "validation" if number < config.test_share + config.validation_share else "train"
+
+
+def some_clips(batch: Batch, chosen: list[int]) -> Batch:
+    """Return a batch with some of its clips; the others could not be read."""
+    return replace(
+        batch,
+        frames=batch.frames[chosen],
+        states=batch.states[chosen],
+        actions=batch.actions[chosen],
+        episode_ids=tuple(batch.episode_ids[place] for place in chosen),
+        starts=tuple(batch.starts[place] for place in chosen),
+    )

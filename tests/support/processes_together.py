@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from clips import some_clips
 from run_fixtures import set_up
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.loader import training_loader
@@ -27,18 +28,6 @@ from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.training.resume import save_checkpoint
 from vjepa2_ac.training.run import Run
 from vjepa2_ac.training.step import gradients, training_step
-
-
-def some_clips(batch: Batch, chosen: list[int]) -> Batch:
-    """Return a batch with some of its clips; the others could not be read."""
-    return replace(
-        batch,
-        frames=batch.frames[chosen],
-        states=batch.states[chosen],
-        actions=batch.actions[chosen],
-        episode_ids=tuple(batch.episode_ids[place] for place in chosen),
-        starts=tuple(batch.starts[place] for place in chosen),
-    )
 
 
 def batches(run: Run, read: list[list[int]]) -> Iterator[Batch]:

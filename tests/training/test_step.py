@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from clips import some_clips
 from run_fixtures import set_up
 from vjepa2_ac.config import Config
 from vjepa2_ac.data import loader
@@ -21,18 +22,6 @@ from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import save_checkpoint
 from vjepa2_ac.training.run import Run, batches_from
 from vjepa2_ac.training.step import Gradients, gradients, training_step
-
-
-def some_clips(batch: Batch, chosen: list[int]) -> Batch:
-    """Return a batch with some of its clips; the others could not be read."""
-    return replace(
-        batch,
-        frames=batch.frames[chosen],
-        states=batch.states[chosen],
-        actions=batch.actions[chosen],
-        episode_ids=tuple(batch.episode_ids[place] for place in chosen),
-        starts=tuple(batch.starts[place] for place in chosen),
-    )
 
 
 def prepared(make_config: Any, reporter: Any, batch_size: int, accumulation: int, **changes: Any) -> Run:
