@@ -5,12 +5,11 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 
 import psutil
 import pytest
 
-from ranks import Rank
+from ranks import Rank, wait_until
 from same_run import assert_same_run
 from vjepa2_ac import process as signals
 from vjepa2_ac.config.loading import config_as_yaml
@@ -76,11 +75,8 @@ def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order
     config = make_config(run_dir=str(tmp_path / "stopped"), **changes)
     (tmp_path / "config.yaml").write_text(config_as_yaml(config))
     process = Rank(["-m", "vjepa2_ac.cli", "train", str(tmp_path / "config.yaml")], dict(os.environ))
-    deadline = time.monotonic() + 120
-    while not any(row["kind"] == "train" for row in read_metrics_log(tmp_path / "stopped/metrics.jsonl")):
-        assert process.poll() is None, process.written()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    log = tmp_path / "stopped/metrics.jsonl"
+    wait_until(lambda: any(row["kind"] == "train" for row in read_metrics_log(log)), [process])
     family = psutil.Process(process.pid).children(recursive=True)
     assert len(family) >= 3, "a fork server and two workers"
     os.killpg(process.pid, signal.SIGUSR1)

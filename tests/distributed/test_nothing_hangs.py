@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from paths import ROOT
-from ranks import Rank, finish, free_port, start_rank
+from ranks import Rank, finish, free_port, start_rank, wait_until
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.errors import InputError
@@ -40,11 +40,7 @@ def started(config: object, processes: int) -> list[Rank]:
     before = len(steps_of(run))
     path = str(run.parent / "config.yaml")
     ranks = [start_rank([*TRAINS, path], rank, processes, port) for rank in range(processes)]
-    deadline = time.monotonic() + 600
-    while len(steps_of(run)) <= before:
-        assert all(rank.poll() is None for rank in ranks), finish(ranks)
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_until(lambda: len(steps_of(run)) > before, ranks, timeout_s=600)
     return ranks
 
 

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 from itertools import chain, islice
 
 import pytest
@@ -10,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paths import ROOT
-from ranks import Rank, finish, free_port, start_rank
+from ranks import Rank, finish, free_port, start_rank, wait_until
 from same_run import assert_equal_up_to_rounding
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.loader import ProcessShare, first_clips
@@ -54,11 +53,8 @@ def test_two_processes_stopped_and_gone_on_as_one_make_the_run_of_one(without_dr
     ranks = [
         start_rank(["-m", "vjepa2_ac.cli", "train", str(tmp_path / "shared.yaml")], rank, 2, port) for rank in range(2)
     ]
-    deadline = time.monotonic() + 120
-    while not any(row["kind"] == "train" for row in read_metrics_log(tmp_path / "shared/metrics.jsonl")):
-        assert all(process.poll() is None for process in ranks), finish(ranks)
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    log = tmp_path / "shared/metrics.jsonl"
+    wait_until(lambda: any(row["kind"] == "train" for row in read_metrics_log(log)), ranks)
     ranks[1].send_signal(signal.SIGUSR1)
     (out, errors), (quiet_out, quiet_errors) = finish(ranks, EXIT_STATUS)
     assert errors.startswith("SIGUSR1: stopped after step"), "the first process says so"

@@ -5,7 +5,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,6 +13,7 @@ import psutil
 import pytest
 
 from latent_sets import contents
+from ranks import wait_until
 from run_fixtures import MakeConfig, Popen, as_yaml
 from vjepa2_ac.cli import main
 from vjepa2_ac.config.loading import config_as_dict
@@ -69,14 +69,6 @@ def start(make_config: MakeConfig, tmp_path: Path, popen: Popen) -> Callable[[st
     return starting
 
 
-def until(is_so: Callable[[], object], job: "subprocess.Popen[str]") -> None:
-    end = time.monotonic() + 240
-    while not is_so():
-        assert job.poll() is None, job.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def two_files(folder: Path) -> Callable[[], bool]:
     return lambda: len(list(folder.rglob("*.safetensors"))) >= 2
 
@@ -99,7 +91,7 @@ def test_an_interrupted_command_leaves_nothing_behind_and_a_killed_actor_loses_n
     start: Callable, make_config: MakeConfig, tmp_path: Path
 ) -> None:
     job = start("ray")
-    until(two_files(tmp_path), job)
+    wait_until(two_files(tmp_path), [job])
     started = psutil.Process(job.pid).children(recursive=True)
     assert len(started) > 2
     os.killpg(job.pid, signal.SIGINT)  # Ctrl-C
@@ -108,7 +100,7 @@ def test_an_interrupted_command_leaves_nothing_behind_and_a_killed_actor_loses_n
     assert "Traceback" not in errors
     assert not psutil.wait_procs(started, timeout=60)[1]
     job = start("ray")
-    until(lambda: actors(psutil.Process(job.pid)), job)
+    wait_until(lambda: actors(psutil.Process(job.pid)), [job])
     actors(psutil.Process(job.pid))[0].kill()
     (tmp_path / "go").touch()
     assert_finished(job, tmp_path, make_config)

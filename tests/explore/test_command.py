@@ -1,14 +1,14 @@
 """The command itself: it simulates what a model of the package lacks, says where the page is, and ends when asked."""
 
 import os
+import re
 import signal
-import time
 from pathlib import Path
 
 import pytest
 from websockets.sync.client import connect
 
-from ranks import Rank
+from ranks import Rank, wait_until
 from vjepa2_ac.cli import main
 from windows import header
 
@@ -18,12 +18,7 @@ def test_without_arguments_the_model_of_the_package_is_explored(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     process = Rank(["-m", "vjepa2_ac.cli", "explore", "--no-open", "--port", "0"], dict(os.environ))
-    until = time.monotonic() + 120
-    while "The page: " not in (said := process.written()[0]):
-        assert process.poll() is None, process.written()
-        assert time.monotonic() < until
-        time.sleep(0.05)
-    url = said.partition("The page: ")[2].split()[0]
+    (url,) = wait_until(lambda: re.findall(r"The page: (\S+)\s", process.written()[0]), [process])
     with connect(url.replace("http", "ws") + "socket", origin=url.rstrip("/"), max_size=None) as page:  # type: ignore[arg-type]
         told = header(page.recv(timeout=60))
     assert (told["subject"], told["truth"]) == ("builtin:sim-tiny", "simulated")

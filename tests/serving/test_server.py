@@ -7,7 +7,7 @@ import random
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ import websockets.asyncio.client
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from ranks import wait_until
 from served import STATE, Running, controller, image, request, serving, session
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.serving import access
@@ -42,13 +43,6 @@ def get(running: Running, path: str, **headers: str) -> tuple[int, str]:
 def connect(running: Running, **how: object) -> Iterator[websockets.sync.client.ClientConnection]:
     with websockets.sync.client.connect(running.url, compression=None, max_size=None, proxy=None, **how) as connection:
         yield connection
-
-
-def wait_for(is_so: Callable[[], bool]) -> None:
-    until = time.monotonic() + 120
-    while not is_so():
-        assert time.monotonic() < until
-        time.sleep(0.01)
 
 
 class SlowSession:
@@ -138,7 +132,7 @@ def test_a_second_robot_is_refused_by_the_name_of_the_first_until_that_leaves() 
         assert get(running, "/healthz")[0] == 200
         first.infer(request(0, goal_image=image(100)))
         first.close()
-        wait_for(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
+        wait_until(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
         with PlanningClient(running.url) as second, pytest.raises(InputError, match="no goal in this episode"):
             second.infer(request(1))
 
@@ -169,7 +163,7 @@ def test_a_client_that_leaves_ends_its_search_and_the_next_one_is_served() -> No
             assert slow.asked.wait(120)
         assert slow.left.wait(120)
         slow.go.set()
-        wait_for(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
+        wait_until(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
         with PlanningClient(running.url) as client:
             assert client.infer(request(1, goal_image=image(100)))["why"] == "planned"
 
@@ -245,7 +239,7 @@ def test_a_message_that_is_too_large_ends_the_connection_and_not_the_server() ->
             with pytest.raises(ConnectionClosed) as caught:
                 connection.recv(timeout=120)
         assert caught.value.rcvd is None or caught.value.rcvd.code == 1009
-        wait_for(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
+        wait_until(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
         with PlanningClient(running.url) as client:
             assert client.infer(request(0, goal_image=image(1)))["why"] == "planned"
 

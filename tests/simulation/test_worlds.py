@@ -6,7 +6,6 @@ import re
 import shlex
 import subprocess
 import sys
-import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 
 import fake_world
 from paths import ROOT
+from ranks import wait_until
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.npz import NpzSource
@@ -301,13 +301,6 @@ with WorldProcess(sys.argv[1]) as world:
     print(about["pid"], about["child"], flush=True)
     sys.stdin.read()
 """
-
-
-def wait_until(is_done: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
-    while not is_done():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def is_running(number: int) -> bool:

@@ -5,9 +5,13 @@ import signal
 import socket
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import killable
+
+T = TypeVar("T")
 
 
 def free_port() -> int:
@@ -76,3 +80,13 @@ def finish(processes: list, status: int = 0, timeout: float = 120.0) -> list[tup
             process.communicate()  # of those that hung; their pipes are closed so
     assert [process.returncode for process in processes] == [status] * len(processes), said
     return said
+
+
+def wait_until(happened: Callable[[], T], processes: Sequence = (), timeout_s: float = 300.0) -> T:
+    """Wait for something, and return it; none of these processes may end before."""
+    until = time.monotonic() + timeout_s
+    while not (found := happened()):
+        assert all(process.poll() is None for process in processes), finish([*processes])
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    return found

@@ -5,14 +5,13 @@ import os
 import re
 import signal
 import threading
-import time
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
 
 from decisions import STATE, controller
-from ranks import Rank
+from ranks import Rank, wait_until
 from vjepa2_ac.serving.access import Access
 from vjepa2_ac.serving.server import PlanningServer
 from vjepa2_ac.serving.session import Session, SessionOptions
@@ -93,12 +92,8 @@ def serving(load: Callable[[], Session], access: Access | None = None, told: dic
 def started(*words: str) -> tuple[Rank, str]:
     """Start a server; return it and its address."""
     process = Rank(["-m", "vjepa2_ac.cli", "serve", *words, "--port", "0"], dict(os.environ))
-    until = time.monotonic() + 120
-    while not (addresses := re.findall(r"^listening on (.+)\n", process.written()[0], re.MULTILINE)):
-        assert process.poll() is None, process.written()
-        assert time.monotonic() < until
-        time.sleep(0.02)
-    return process, addresses[0]
+    (address,) = wait_until(lambda: re.findall(r"^listening on (.+)\n", process.written()[0], re.MULTILINE), [process])
+    return process, address
 
 
 def ended(process: Rank) -> str:
