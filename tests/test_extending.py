@@ -40,13 +40,6 @@ def command(*words: str) -> subprocess.CompletedProcess[str]:
     return nursery().run("-m", "vjepa2_ac.cli", *words, folder=Path.cwd().parent)
 
 
-def test_the_map_is_read_in_an_afternoon() -> None:
-    files = re.findall(r"^\| `([a-z_/]+\.py)` \|", PAGE.split("## The map")[1].split("\n## ")[0], flags=re.MULTILINE)
-    lines = [len((ROOT / "src/vjepa2_ac" / file).read_text().splitlines()) for file in files]
-    assert len(files) == 15
-    assert sum(lines) < 4200
-
-
 def test_training_loads_the_core_only() -> None:
     code = "import sys, vjepa2_ac.training.loop; print(*(name for name in sys.modules if name.startswith('vjepa2_ac')))"
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
@@ -54,7 +47,6 @@ def test_training_loads_the_core_only() -> None:
     loaded = done.stdout.split()
     assert "vjepa2_ac.model.lora" in loaded
     rooms = {name.split(".")[1] for name in loaded if "." in name}
-    assert len(loaded) <= 120
     beside = "simulation init serving inspection calibration goals policies console cli export"
     assert not rooms & set(beside.split())
 

@@ -28,22 +28,10 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         pytest.skip("no C++ compiler")
     out = tmp_path_factory.mktemp("fake_gpu")
     runs = {
-        "quick": ["--quick", "--source", "cache", "pixels", "--attention", "dense"],
-        "wide": [
-            "--layers",
-            "2",
-            "--encoder-layers",
-            "4",
-            "--frames",
-            "8",
-            "--batch",
-            "1",
-            "--checkpointing",
-            "off",
-            "on",
-        ],
+        "quick": "--quick --source cache pixels --attention dense",
+        "wide": "--layers 2 --encoder-layers 4 --frames 8 --batch 1 --checkpointing off on",
     }
-    arguments = [[*words, "--json", str(out / name)] for name, words in runs.items()]
+    arguments = [[*words.split(), "--json", str(out / name)] for name, words in runs.items()]
     command = [sys.executable, str(ROOT / "tests/support/fake_gpu_facts.py"), str(FOLDER), json.dumps(arguments)]
     done = subprocess.run(
         command, check=False, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}

@@ -18,7 +18,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from accidents import without_permission
+from accidents import Faults, without_permission
 from run_fixtures import set_up
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.runs.checkpoint import (
@@ -195,41 +195,19 @@ def test_a_manifest_that_names_too_little_or_a_file_elsewhere_is_no_manifest(tmp
         assert words in caplog.text, text
 
 
-class Faults:
-    """Lets the n-th operation that changes a disk fail, whoever asks for it."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.done, self.fails_at, self._error = 0, -1, OSError()
-        places = [(os, name) for name in ("mkdir", "rename", "replace", "fsync")]
-        for where, name in [*places, (Path, "write_text"), (Path, "write_bytes")]:
-            monkeypatch.setattr(where, name, self._failing(getattr(where, name)))
-
-    def set(self, number: int, code: int) -> None:
-        self.done, self.fails_at, self._error = 0, number, OSError(code, os.strerror(code))
-
-    def _failing(self, real):
-        def operation(*arguments, **options):
-            self.done += 1
-            if self.done == self.fails_at:
-                raise self._error
-            return real(*arguments, **options)
-
-        return operation
-
-
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
 def test_whatever_operation_fails_older_checkpoints_stay_and_nothing_half_is_left(tmp_path, monkeypatch, code) -> None:
-    faults = Faults(monkeypatch)
+    faults, error = Faults(monkeypatch), OSError(code, os.strerror(code))
     write(tmp_path / "count", 10)
-    faults.set(-1, code)
+    faults.set()
     write(tmp_path / "count", 20)
     operations = faults.done
     assert operations > 10, "folders, files, flushes, a rename"
     for number in range(1, operations + 1):
         folder = tmp_path / str(number)
-        faults.set(-1, code)
+        faults.set()
         older = write(folder, 10)
-        faults.set(number, code)
+        faults.set(number, error)
         with pytest.raises(InputError, match=rf"{checkpoint_name(20)}: .*cannot be written \({os.strerror(code)}\)"):
             write(folder, 20)
         assert find_damage(older) is None

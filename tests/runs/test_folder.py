@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
+from accidents import Faults, KilledError
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, config_as_yaml, parse_config
@@ -43,28 +44,12 @@ sys.stdin.read()
 """
 
 
-class KilledError(BaseException):
-    """Stands for the end of the process: nothing is tidied up."""
-
-
 def test_a_start_that_was_killed_at_any_file_stands_in_nobodys_way(make_config, tmp_path, monkeypatch) -> None:
-    done, dies_at = 0, 0
-
-    def dying(real):
-        def operation(*arguments, **options):
-            nonlocal done
-            done += 1
-            if done == dies_at:
-                raise KilledError
-            return real(*arguments, **options)
-
-        return operation
-
-    for name in ("mkdir", "replace", "fsync"):
-        monkeypatch.setattr(os, name, dying(getattr(os, name)))
+    faults = Faults(monkeypatch)
     monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)
     for dies_at in range(1, 100):
-        config, done = make_config(run_dir=str(tmp_path / str(dies_at) / "run")), 0
+        config = make_config(run_dir=str(tmp_path / str(dies_at) / "run"))
+        faults.set(dies_at, KilledError())
         try:
             with RunLock(Path(config.run_dir)) as lock:
                 lock.take()
@@ -74,6 +59,7 @@ def test_a_start_that_was_killed_at_any_file_stands_in_nobodys_way(make_config, 
         else:
             break
     assert dies_at > 9, "folders, two files that are flushed and renamed"
+    faults.set()
     check_run_folder(config)
 
 

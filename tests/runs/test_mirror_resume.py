@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from accidents import without_permission
+from accidents import KilledError, without_permission
 from gcs import Gcs
 from mirrors import PLACE, content, names, there, write
 from run_fixtures import SilentReporter
@@ -28,10 +28,6 @@ from vjepa2_ac.training.loop import train
 
 MakeConfig = Callable[..., Config]
 FILES = 4  # the manifest under another name, state.json and two more come before the manifest
-
-
-class KilledError(BaseException):
-    """Stands for SIGKILL: nobody sees to anything any more."""
 
 
 @pytest.fixture

@@ -3,9 +3,10 @@
 import ctypes
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,3 +51,30 @@ def mutated(data: bytes, generator: np.random.Generator) -> bytes:
         "cut": None,
     }[str(generator.choice(["flip", "foreign", "lost", "twice", "blank", "cut"]))]
     return data[:start] if middle is None else data[:start] + middle + data[end:]
+
+
+class KilledError(BaseException):
+    """Stands for the end of the process: nothing is tidied up."""
+
+
+class Faults:
+    """Lets the n-th operation that changes a disk fail, whoever asks for it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.set()
+        places = [(os, name) for name in ("mkdir", "rename", "replace", "fsync")]
+        for where, name in [*places, (Path, "write_text"), (Path, "write_bytes")]:
+            monkeypatch.setattr(where, name, self._failing(getattr(where, name)))
+
+    def set(self, number: int = -1, error: BaseException | None = None) -> None:
+        """Count anew, and fail at an operation."""
+        self.done, self._fails_at, self._error = 0, number, error
+
+    def _failing(self, real: Callable[..., Any]) -> Callable[..., Any]:
+        def operation(*arguments: Any, **options: Any) -> Any:
+            self.done += 1
+            if self.done == self._fails_at and self._error is not None:
+                raise self._error
+            return real(*arguments, **options)
+
+        return operation

@@ -80,21 +80,17 @@ def write_v30(
     folder: str | Path,
     episodes: Sequence[Recorded],
     *,
-    episodes_per_table: int = 2,
     episodes_per_video: int = 3,
-    row_group: int | None = None,
     gop: int = 2,
     pictures: str = "video",
-    options: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write a v3.0 data set: several episodes in each Parquet file and in each video. Returns the folder."""
     root = Path(folder)
     rows: list[dict[str, Any]] = []
-    for first in range(0, len(episodes), episodes_per_table):
-        some = range(first, min(first + episodes_per_table, len(episodes)))
-        file = first // episodes_per_table
+    for file, first in enumerate(range(0, len(episodes), 2)):
+        some = range(first, min(first + 2, len(episodes)))
         table = pa.concat_tables([_rows(episodes, number, pictures) for number in some])
-        _write_table(root / _DATA_V30.format(chunk_index=0, file_index=file), table, row_group, options)
+        _write_table(root / _DATA_V30.format(chunk_index=0, file_index=file), table)
         rows += [{"data/chunk_index": 0, "data/file_index": file} for _ in some]
     if pictures == "video":
         for key in episodes[0].frames:
@@ -105,23 +101,21 @@ def write_v30(
         row |= {"dataset_from_index": start, "dataset_to_index": start + _length(episode)}
         if "is_episode_successful" in episode.columns:
             row["stats/is_episode_successful/max"] = [bool(episode.columns["is_episode_successful"].max())]
-    _write_table(root / "meta/episodes/chunk-000/file-000.parquet", pa.Table.from_pylist(rows), None, options)
+    _write_table(root / "meta/episodes/chunk-000/file-000.parquet", pa.Table.from_pylist(rows))
     tasks = sorted({episode.task for episode in episodes})
     table = pa.table({"task_index": range(len(tasks)), "__index_level_0__": tasks})
-    _write_table(root / "meta/tasks.parquet", table, None, options)
+    _write_table(root / "meta/tasks.parquet", table)
     video = _VIDEO_V30 if pictures == "video" else None
     _write_info(root, episodes, "v3.0", {"data_path": _DATA_V30, "video_path": video}, pictures)
     return root
 
 
-def write_v21(
-    folder: str | Path, episodes: Sequence[Recorded], *, gop: int = 2, chunk_episodes: int = 3, pictures: str = "video"
-) -> Path:
+def write_v21(folder: str | Path, episodes: Sequence[Recorded], *, gop: int = 2, pictures: str = "video") -> Path:
     """Write a v2.1 data set: a Parquet file and a video for each episode. Returns the folder."""
     root = Path(folder)
     for number, episode in enumerate(episodes):
-        at = {"episode_chunk": number // chunk_episodes, "episode_index": number}
-        _write_table(root / _DATA_V21.format(**at), _rows(episodes, number, pictures), None, None)
+        at = {"episode_chunk": number // 3, "episode_index": number}
+        _write_table(root / _DATA_V21.format(**at), _rows(episodes, number, pictures))
         if pictures == "video":
             for key, frames in episode.frames.items():
                 write_mp4(root / _VIDEO_V21.format(**at, video_key=key), frames, rate=FPS, gop=gop)
@@ -132,7 +126,7 @@ def write_v21(
     (root / "meta").mkdir(parents=True, exist_ok=True)
     (root / "meta/episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     paths = {"data_path": _DATA_V21, "video_path": _VIDEO_V21 if pictures == "video" else None}
-    _write_info(root, episodes, "v2.1", paths | {"chunks_size": chunk_episodes}, pictures)
+    _write_info(root, episodes, "v2.1", paths | {"chunks_size": 3}, pictures)
     return root
 
 
@@ -150,7 +144,7 @@ def change_table(path: Path, **columns: object) -> None:
         table = table.remove_column(place)
         if values is not None:
             table = table.add_column(place, name, values)
-    _write_table(path, table, None, None)
+    _write_table(path, table)
 
 
 def column_of(values: np.ndarray, *, fixed: bool = False) -> pa.Array:
@@ -197,9 +191,9 @@ def _write_shared_videos(
         write_mp4(path, frames, rate=FPS, gop=gop)
 
 
-def _write_table(path: Path, table: pa.Table, row_group: int | None, options: Mapping[str, Any] | None) -> None:
+def _write_table(path: Path, table: pa.Table) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table, path, row_group_size=row_group, **({"write_page_checksum": True} | dict(options or {})))
+    pq.write_table(table, path, write_page_checksum=True)
 
 
 def _write_info(
