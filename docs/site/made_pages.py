@@ -23,13 +23,13 @@ _REFERENCE = {  # page: what it has; below these, all that the code makes
     "made/api": "the public names of Python",
     "made/examples": "the scripts of `examples/`, whole",
     "extending": "a loss, a planner, a metric, a form of data or a robot of your own",
-    "data_reference": "forms of data in detail, caches, splits, what damage is found",
-    "training_reference": "a run's folder, checkpoints, adapters, metrics",
+    "data_reference": "data formats in detail, checks, splits, caches",
+    "training_reference": "files of a run, metrics of a step, adapters, replay, GPU options",
     "evaluation_reference": "every number, and `metrics.json`",
     "decoding_reference": "decoders, what images can show, image metrics",
     "planning_reference": "energies, solvers, axes, closed loop, `plan.json`",
     "serving_reference": "messages, access, records",
-    "encoders_reference": "costs, keys of weights, what is refused",
+    "encoders_reference": "cost of each encoder, keys of weights, what is rejected",
 }
 _PROJECT = {
     "made/results": "tables that commands of the repository write",
@@ -37,9 +37,9 @@ _PROJECT = {
     "IMPLEMENTATION_NOTES": "how it works, and how exactness is checked",
     "decisions": "what was decided, and why",
     "made/changelog": "what changed for users",
-    "made/contributing": "how to take part",
+    "made/contributing": "set-up, tests, architecture, rules",
     "releasing": "the steps of a release",
-    "made/security": "what is trusted, and what is not",
+    "made/security": "what is trusted, and how to report a vulnerability",
 }
 _BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
