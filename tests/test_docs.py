@@ -54,7 +54,7 @@ def is_module_or_part_of_one(dotted: str) -> bool:
     return True
 
 
-GROUPS = {one.group for one in REGISTRIES} | {"vjepa2_ac.commands"}  # entry points, which look like modules
+GROUPS = {one.group for one in REGISTRIES}  # entry points, which look like modules
 
 
 def is_knob(dotted: str) -> bool:

@@ -128,24 +128,6 @@ def test_an_installed_package_is_known_without_being_named(at_home: Path, make_c
     assert yaml.safe_load(done.stdout)["training"]["loss"]["options"] == {"scale": 3}
 
 
-def test_an_installed_package_adds_a_command_that_is_imported_when_it_is_asked_for(at_home: Path, make_config) -> None:
-    (at_home / "own.yaml").write_text(as_yaml(make_config()))
-    group = "[vjepa2_ac.commands]\nlongest = my_package:add_longest\n"
-    done = installed(at_home, group, recipes("A command"), "longest", "own.yaml", "--episodes", "2", "data.frames=3")
-    assert done.returncode == 0, done.stderr
-    assert len(re.findall(r"^ +\d+ steps  ", done.stdout, flags=re.MULTILINE)) == 2
-    broken = installed(at_home, group, "raise RuntimeError('boom')", "--help")
-    assert (broken.returncode, "from other packages:\n  longest   of my_package" in broken.stdout) == (0, True)
-    refused = installed(at_home, group, "raise RuntimeError('boom')", "longest")
-    assert refused.returncode == 2
-    assert "longest = my_package:add_longest cannot be imported (RuntimeError: boom; " in refused.stderr
-    ours = group.replace("longest =", "train =")
-    refused = installed(at_home, ours, recipes("A command"), "train", "own.yaml")
-    assert refused.returncode == 2
-    assert "vjepa2-ac train: a command of this package, and one of my_package" in refused.stderr
-    assert installed(at_home, ours, recipes("A command"), "--help").returncode == 0
-
-
 def test_a_form_of_data_is_found_trained_on_and_measured_by_a_metric(at_home: Path, base_folder: Path) -> None:
     data = at_home / "walls"
     data.mkdir()

@@ -83,7 +83,7 @@ def main(source: str, out: str) -> None:
     info = write_meta(Path(source), Path(out))
     write_rows(Path(source), Path(out), info)
     write_videos(Path(source), Path(out), info)
-    print(f"Next: vjepa2-ac init lerobot {out}")
+    print(f"Next: vjepa2-ac init {out}")
 
 
 if __name__ == "__main__":

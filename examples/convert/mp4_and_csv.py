@@ -257,7 +257,7 @@ def main() -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
         np.savez(out, frames=np.stack([frames[step] for step in steps]), states=states[rows[steps]], fps_hz=rate)
         print(f"{number + 1} of {len(recordings)}: {out}, {len(steps)} steps at {rate:g} per second, {rotation}")
-    print(f"Next: vjepa2-ac init npz {args.out}")
+    print(f"Next: vjepa2-ac init {args.out}")
 
 
 if __name__ == "__main__":

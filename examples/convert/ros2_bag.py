@@ -252,7 +252,7 @@ def main() -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
         np.savez(out, **arrays)
         print(f"{number + 1} of {len(bags)}: {out}, {len(arrays['states'])} steps")
-    print(f"Next: vjepa2-ac init npz {args.out}")
+    print(f"Next: vjepa2-ac init {args.out}")
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ def test_a_config_for_the_data_that_are_there(here: Path, capsys: pytest.Capture
 
 def test_a_config_that_is_there_stays(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "mine.yaml").write_text("precious")
-    words = ["init", "npz", "data/my robot/v1.0", "--model", "builtin:sim-tiny", "--out", "mine.yaml"]
+    words = ["init", "data/my robot/v1.0", "--model", "builtin:sim-tiny", "--out", "mine.yaml"]
     assert main(words) == 2
     assert (here / "mine.yaml").read_text() == "precious"
     assert "--overwrite" in capsys.readouterr().err
@@ -52,13 +52,13 @@ def test_data_that_cannot_be_trained_on_give_a_config_all_the_same_and_status_2(
     assert load_config(here / "my-robot.yaml").data.validation_share == 0.15
 
 
-@pytest.mark.parametrize("form", ["sim", "scratch"])
-def test_simulated_data_are_recorded_first(form: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["init", form]) == 0
+@pytest.mark.parametrize("name", ["sim", "scratch-sim"])
+def test_simulated_data_are_recorded_first(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init", "sim", *["--scratch"] * (name != "sim")]) == 0
     assert "vjepa2-ac simulate record demo/data" in capsys.readouterr().out
-    config = load_config(here / f"{form}.yaml")
+    config = load_config(here / f"{name}.yaml")
     assert config.data.path == "demo/data"
-    assert (config.model.encoder is not None) == (form == "scratch")
+    assert (config.model.encoder is not None) == (name != "sim")
 
 
 @pytest.mark.usefixtures("here")

@@ -20,7 +20,7 @@ from vjepa2_ac.simulation.record import RecordedSimulation, RecordingSpec
 
 
 def parse(words: list[str]) -> argparse.Namespace:
-    return parsed(_parser(words), words)
+    return parsed(_parser(), words)
 
 
 def without_words(options: argparse.Namespace) -> dict[str, object]:

@@ -100,8 +100,6 @@ def test_goals_follow_one_another(workshop: Path) -> None:
     second = ["--goal", str(workshop / "goal.png")]
     summed = ["planning.energy.steps=sum", "planning.horizon=4"]
     assert plan(workshop, *QUICK, *second, *summed)[1]["goal_of_each_step"] == [0, 0, 1, 1]
-    reported = plan(workshop, *QUICK, *second, *summed, "--durations", "1")[1]
-    assert reported["goal_of_each_step"] == [0, 1, 1, 1]
 
 
 @pytest.mark.usefixtures("no_figure")
@@ -140,8 +138,6 @@ WRONG = {
     "too few numbers": (["--state", "0.4,0,0.3"], "3 numbers in the shape (3,)"),
     "limits below zero": (["planning.limits.xyz=[-0.05,0.05,0.05]"], "planning.limits.xyz.0"),
     "a knob of training": (["training.steps=2"], "a setting that planning does not use"),
-    "durations for one goal": (["--durations", "2"], "'2' for 1 goal"),
-    "durations of nothing": (["--goal", "{here}/goal.png", "--durations", "0"], "whole numbers from 1"),
     "a camera that is not used": (["--extrinsics", "0,0,0,0,0,0"], "a camera pose exactly where the model uses it"),
     "a checkpoint of a model": (["--checkpoint", "best"], "not the folder of a run"),
     "a file in the way": (["--out", "{here}/notes.png"], "notes.png"),
@@ -154,7 +150,7 @@ def test_wrong_input_is_one_clear_error(
 ) -> None:
     out = workshop / "nothing"
     given = ["--start", str(workshop / "start.png"), "--state", STATE, "--out", str(out)]
-    goal = [] if "--goal" in more and "--durations" not in more else ["--goal", str(workshop / "goal.png")]
+    goal = [] if "--goal" in more else ["--goal", str(workshop / "goal.png")]
     words = [word.format(here=workshop) if "{here}" in word else word for word in more]
     assert main(["plan", str(workshop / "model"), *given, *goal, *QUICK, *words]) == 2
     error = capsys.readouterr().err

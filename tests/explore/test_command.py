@@ -17,7 +17,7 @@ def test_without_arguments_the_model_of_the_package_is_explored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    process = Rank(["-m", "vjepa2_ac.cli", "explore", "--no-open", "--port", "0"], dict(os.environ))
+    process = Rank(["-m", "vjepa2_ac.cli", "explore", "--port", "0"], dict(os.environ))
     (url,) = wait_until(lambda: re.findall(r"The page: (\S+)\s", process.written()[0]), [process])
     with connect(url.replace("http", "ws") + "socket", origin=url.rstrip("/"), max_size=None) as page:  # type: ignore[arg-type]
         told = header(page.recv(timeout=60))
@@ -39,5 +39,5 @@ def test_what_cannot_be_explored_is_said_at_once(
     words: list[str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["explore", "--no-open", *words]) == 2
+    assert main(["explore", *words]) == 2
     assert says in capsys.readouterr().err

@@ -89,12 +89,8 @@ def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
     goals(workshop, folder)
     start = ["plan", model, "--start", str(folder / "goal_1.png"), "--state", STATE, "--out", str(tmp_path / "plan")]
     capsys.readouterr()
-    for more, wrong in (
-        (["--goals", str(folder), "--durations", "3"], "a folder says how long its goals apply"),
-        (["--goals", str(workshop)], "goals.json: cannot be read"),
-    ):
-        assert main([*start, *more, *QUICK]) == 2
-        assert wrong in capsys.readouterr().err
+    assert main([*start, "--goals", str(workshop), *QUICK]) == 2
+    assert "goals.json: cannot be read" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         main([*start, "--goals", str(folder), "--goal", str(folder / "goal_1.png")])
     content = json.loads((folder / "goals.json").read_text())

@@ -32,8 +32,8 @@ def memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(draft, "estimate_memory", estimate)
 
 
-def of(found: FoundData = FOUND, machine: Machine = MACHINE, kind: str = "released") -> draft.Draft:
-    return make_draft(found, machine, choose_model(kind, None), run_dir="runs/mine")
+def of(found: FoundData = FOUND, machine: Machine = MACHINE, is_scratch: bool = False) -> draft.Draft:
+    return make_draft(found, machine, choose_model(None, is_scratch), run_dir="runs/mine")
 
 
 @pytest.mark.parametrize(
@@ -52,8 +52,8 @@ def test_the_batch_is_the_largest_that_fits(gigabytes: int, batch: int, checkpoi
 
 
 def test_the_text_is_the_config() -> None:
-    for kind in ("released", "scratch"):
-        made = of(kind=kind)
+    for is_scratch in (False, True):
+        made = of(is_scratch=is_scratch)
         assert parse_config(parse_yaml(made.text(FOUND, MACHINE), where="here"), where="here") == made.config
 
 
@@ -85,7 +85,7 @@ def test_without_a_gpu_the_batch_is_of_a_usual_one() -> None:
 
 @pytest.mark.parametrize(("name", "width"), [("vjepa2.1-vitb-384", 768), ("vjepa2-vitl", 1024)])
 def test_a_fresh_predictor_and_its_cache_are_as_wide_as_the_encoders_latents(name: str, width: int) -> None:
-    model = choose_model("scratch", f"checkpoints/{name}.pt")
+    model = choose_model(f"checkpoints/{name}.pt", is_scratch=True)
     made = make_draft(FOUND, MACHINE, model, run_dir="run")
     assert made.config.model.is_random
     assert made.config.model.sizes.predictor.width == width
@@ -93,16 +93,16 @@ def test_a_fresh_predictor_and_its_cache_are_as_wide_as_the_encoders_latents(nam
 
 
 @pytest.mark.parametrize("path", [None, "builtin:sim-tiny"], ids=["released", "tiny"])
-@pytest.mark.parametrize("kind", ["released", "scratch"])
+@pytest.mark.parametrize("is_scratch", [False, True])
 @pytest.mark.parametrize(
     ("gpu", "has_bf16", "precision", "why"),
     [("A100", True, "bf16", ""), ("T4", False, "fp16", "this GPU has no bf16"), (None, False, "fp32", "no GPU here")],
 )
 def test_precision_is_of_the_machine_and_the_type_of_the_weights_goes_with_it(
-    gpu: str | None, has_bf16: bool, precision: str, why: str, kind: str, path: str | None
+    gpu: str | None, has_bf16: bool, precision: str, why: str, is_scratch: bool, path: str | None
 ) -> None:
     machine = replace(MACHINE, gpu=gpu, has_bf16=has_bf16)
-    made = make_draft(FOUND, machine, choose_model(kind, path), run_dir="runs/mine")
+    made = make_draft(FOUND, machine, choose_model(path, is_scratch), run_dir="runs/mine")
     training = made.knobs["training"]
     assert isinstance(training, dict)
     dtype = "bfloat16" if precision == "bf16" and path is None else "float32"

@@ -58,22 +58,13 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
     cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
-    cli.add(
-        parser, "--domain", "the world; random: record another one in every episode (A)", choices=["A", "B", "random"]
-    )
+    cli.add(parser, "--domain", "random: record another world in each episode (A)", choices=["A", "B", "random"])
     cli.add(parser, "--episodes N", "how many (50; record: 40)", cli.count)
     cli.add(parser, "--steps N", "model steps (8; pick 12, place 18); record: control steps (41; place 81)", cli.count)
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
-    cli.add(
-        parser, "--world COMMAND", "another environment: 'PYTHON examples/worlds/robosuite.py Lift' (docs/worlds.md)"
-    )
+    cli.add(parser, "--world COMMAND", "an environment: 'PYTHON examples/worlds/robosuite.py Lift' (docs/worlds.md)")
     seconds = cli.number_between(0, 86_400, "seconds")
-    cli.add(
-        parser,
-        "--world-timeout SECONDS",
-        "longest wait for an answer; for the first one 5 times as long (120)",
-        seconds,
-    )
+    cli.add(parser, "--world-timeout SECONDS", "for an answer of it, and five times for the first (120)", seconds)
     group = parser.add_argument_group("to test a model")
     cli.add_all(group)
     cli.add_checkpoint(group, default=None)

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError, counted, shell_command
-from vjepa2_ac.reporter import INDEXING, SILENT
-from vjepa2_ac.storage.structured import json_text
-
-if TYPE_CHECKING:
-    from vjepa2_ac.episode import Progress
-    from vjepa2_ac.inspection.probe import VariantProbe
+from vjepa2_ac.reporter import INDEXING
 
 _CLIPS, _PAIRS = 64, 200  # to calibrate by: strides, axes (as the paper)
 
@@ -35,7 +28,6 @@ def _add_commands(commands: cli.Commands) -> None:
     cli.add(parser, "--limit N", "number of clips to load (32); --model uses twice as many", cli.count, default=32)
     text = "also measure with a model whether frames are shifted, mirrored, reversed or BGR, or the gripper is inverted"
     cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
-    cli.add(parser, "--json", "print one JSON object: the findings and their counts", action="store_true")
 
     parser = cli.command(commands, "inspect", _inspect, "my_robot.yaml --out inspection")
     cli.add_config(parser, such_as=such_as)
@@ -49,7 +41,6 @@ def _add_commands(commands: cli.Commands) -> None:
     cli.add(parser, "--model MODEL", "ask another than model.base: a .pt, a folder, or a run", cli.as_model)
     cli.add(parser, "--split", "of which (validation)", choices=["train", "validation", "test"], default="validation")
     cli.add(parser, "--limit N", "clips at each stride (64), or pairs of frames (200)", cli.count)
-    cli.add(parser, "--frames N", "frames of a clip (the config's, 8 at most)", cli.whole_number(2, 256))
     cli.add(parser, "--out DIR", "where files go (inspection)", cli.as_path, default=out)
 
     parser = cli.command(commands, "convert", _convert, "my_robot.yaml data/as_lerobot")
@@ -102,54 +93,43 @@ def _check(options: argparse.Namespace) -> int:
     config = cli.read_config(options.config, options.overrides)
     if options.model is not None:
         cli.require_subject(options.model)
-    return check_and_print(config, clips=options.limit, model=options.model, as_json=options.json)
+    return check_and_print(config, clips=options.limit, model=options.model)
 
 
-def check_and_print(config: Config, *, clips: int = 32, model: str | None = None, as_json: bool = False) -> int:
+def check_and_print(config: Config, *, clips: int = 32, model: str | None = None) -> int:
     """Check the data of a config and print the findings; return 1 if one of them is an error.
 
     Args:
         config: The data, and the order and size of batches.
         clips: The approximate number of clips to read; a model is measured on twice as many.
         model: A run or a model that measures the data, too.
-        as_json: Print one JSON object and nothing else, when all checks are done.
     """
     from vjepa2_ac.cli.tables import print_finding, variants_table
+    from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.check import check_data
-    from vjepa2_ac.inspection.findings import Finding, findings_as_dict, summary_of
+    from vjepa2_ac.inspection.findings import Finding, summary_of
+    from vjepa2_ac.inspection.probe import probe_config
+    from vjepa2_ac.inspection.statistics import at_some_stride
 
     findings: list[Finding] = []
 
     def add(finding: Finding) -> None:
         findings.append(finding)
-        if not as_json:
-            print_finding(finding)
+        print_finding(finding)
 
     batch_size, probe = config.training.batch_size, None
-    with contextlib.nullcontext(SILENT) if as_json else cli.reporter() as reporter:
+    with cli.reporter() as reporter:
         progress = reporter.task(INDEXING)
         for one in check_data(config.data, seed=config.seed, batch_size=batch_size, clips=clips, progress=progress):
             add(one)
         if model is not None:
-            probe = _probe(config, model, clips=2 * clips, progress=reporter.task("probing"))
+            dataset, progress = at_some_stride(open_dataset(config.data)), reporter.task("probing")
+            probe = probe_config(config, dataset, model=model, clips=2 * clips, progress=progress)
     if probe is not None:
-        if not as_json:
-            title = "One-step error / persistence of the data in variants"
-            cli.show(variants_table(title, [probe.plain, *probe.results]))
+        cli.show(variants_table("One-step error / persistence of the data in variants", [probe.plain, *probe.results]))
         add(Finding("warning" if probe.better else "ok" if probe.is_decided else "skipped", "probe", probe.verdict()))
-    if as_json:
-        print(json_text(findings_as_dict(findings) | (probe.as_dict() if probe else {})), end="")
-    else:
-        cli.show(summary_of(findings))
+    cli.show(summary_of(findings))
     return int(any(one.level == "error" for one in findings))
-
-
-def _probe(config: Config, model: str, *, clips: int, progress: Progress) -> VariantProbe:
-    from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.inspection.probe import probe_config
-    from vjepa2_ac.inspection.statistics import at_some_stride
-
-    return probe_config(config, at_some_stride(open_dataset(config.data)), model=model, clips=clips, progress=progress)
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -190,7 +170,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     from vjepa2_ac.inspection.variants import calibrate_config
 
     with cli.reporter() as reporter:
-        sample = ClipSample(options.split, options.limit or _CLIPS, options.frames)
+        sample = ClipSample(options.split, options.limit or _CLIPS)
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     path = cli.write_json(options.out / "calibration.json", calibration.as_dict())
     title = f"One-step error / persistence on {options.split} episodes, {calibration.frames} frames a clip"
@@ -202,10 +182,8 @@ def _calibrate(options: argparse.Namespace) -> int:
 
 def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
     """Fit the axes of a model; return 1 where nothing can be planned by them."""
-    for name in ("model", "frames"):
-        if getattr(options, name) is not None:
-            needed = "one of them: --model and --frames are of strides"
-            raise InputError(where=f"--{name}", found="--axes beside it", needed=needed)
+    if options.model is not None:
+        raise InputError(where="--model", found="--axes beside it", needed="one of them: --model is of strides")
     cli.require_subject(options.axes)
 
     from vjepa2_ac.planning.axes import AXES_FILE, require_axes_in
@@ -213,11 +191,10 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
     require_axes_in(config.data)
     cli.make_folder(options.out)
 
-    from vjepa2_ac.inspection.axes import calibrate_axes, plot_axes
+    from vjepa2_ac.inspection.axes import calibrate_axes
 
     with cli.reporter() as reporter:
         pairs = options.limit or _PAIRS
         fit, content = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
-    files = [cli.write_json(options.out / AXES_FILE, content), plot_axes(fit, options.out / "axes.png")]
-    cli.show(fit.words(), files=files)
+    cli.show(fit.words(), files=[cli.write_json(options.out / AXES_FILE, content)])
     return int(fit.problem is not None)

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
-import sys
 import tempfile
-import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -42,9 +39,7 @@ def add_explore(commands: cli.Commands) -> None:
     cli.add(parser, "--data CONFIG", "explore its data; needed for a model but the package's own", cli.as_local)
     cli.add(parser, "--split", "which episodes (test)", choices=["test", "validation", "train"], default="test")
     cli.add_checkpoint(parser)
-    group = parser.add_argument_group("the page")
-    cli.add(group, "--no-open", "print the page's address, and open no browser", action="store_true")
-    cli.add(group, "--port N", "0: a free one (8001)", cli.whole_number(0, 65535), default=8001)
+    cli.add(parser, "--port N", "of the page; 0: a free one (8001)", cli.whole_number(0, 65535), default=8001)
 
 
 def _explore(options: argparse.Namespace) -> int:
@@ -75,16 +70,9 @@ def _serve(views: Views, options: argparse.Namespace, about: str) -> None:
     def ready(url: str) -> None:
         Work.begin("")
         cli.show(about, f"The page: {url}   (Ctrl-C ends it)")
-        if not options.no_open and _has_window():
-            webbrowser.open(url)
 
     with contextlib.suppress(KeyboardInterrupt):
         serve_page(views, options.port, ready)
-
-
-def _has_window() -> bool:
-    """Return whether a browser would open in a window, and not in this terminal."""
-    return sys.platform in {"darwin", "win32"} or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
 @contextmanager

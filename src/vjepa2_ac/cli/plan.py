@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.errors import InputError, counted
+from vjepa2_ac.errors import counted
 from vjepa2_ac.reporter import INDEXING
 from vjepa2_ac.storage import user_can_write
 
@@ -35,9 +35,7 @@ def add_plan(commands: cli.Commands) -> None:
     cli.add(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", cli.as_path)
     cli.add(goals, "--goal-from EPISODE", "what the run's data show at its end; EPISODE:STEP: there")
     cli.add(parser, "--out FOLDER", "where both files go (plan)", cli.as_path, default=Path("plan"))
-    group = parser.add_argument_group("the goals")
-    cli.add(group, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
-    cli.add(group, "--mask IMAGE", "black where the goal image does not count, of its size", cli.as_local)
+    cli.add(parser, "--mask IMAGE", "black where the goal image does not count, of its size", cli.as_local)
     group = parser.add_argument_group("the search, and its image")
     cli.add(group, "--seed N", "of the search (the config's)", cli.whole_number(0, 2**31 - 1))
     cli.add(group, "--nodes N", "of the energy maps along each axis; 0: none (9)", cli.whole_number(0, 101), default=9)
@@ -130,35 +128,27 @@ def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _goals_of(options: argparse.Namespace, config: Config) -> tuple[SubGoal, ...]:
-    """Return the goals of a folder; or images with the durations that were given, else with equal ones."""
+    """Return the goals of a folder; or images that share the horizon equally."""
     from vjepa2_ac.media.images import read_image, require_image
     from vjepa2_ac.planning.goals import equal_durations, read_goal_folder, timed
 
     if options.goals is not None:
-        if options.durations:
-            found, needed = f"--goals {options.goals}", "--goal: a folder says how long its goals apply"
-            raise InputError(where="--durations", found=found, needed=needed)
         return read_goal_folder(options.goals)
     if options.goal_from is not None:
         from vjepa2_ac.goals.make_goals import frame_of_episode
 
         return timed([frame_of_episode(config.data, options.goal_from)], [])
-    images, count = [read_image(path) for path in options.goal], len(options.goal)
+    images = [read_image(path) for path in options.goal]
     for path, image in zip(options.goal, images, strict=True):
         require_image(image, where=f"--goal {path}", like=images[0])
-    words = (options.durations or "").replace(",", " ").split()
-    if words and (len(words) != count - 1 or not all(word.isdecimal() and int(word) for word in words)):
-        found = f"{options.durations!r} for {count} goal{'s' * (count > 1)}"
-        needed = f"{count - 1} whole numbers from 1, with commas between them: of each goal but the last"
-        raise InputError(where="--durations", found=found, needed=needed)
-    return timed(images, [int(word) for word in words] or equal_durations(config.planning.horizon, count))
+    return timed(images, equal_durations(config.planning.horizon, len(images)))
 
 
 def _goals(options: argparse.Namespace) -> None:
     """Make goals that follow one another, from a demonstration.
 
     The goals are key frames of an episode, with durations and gripper modes, in a folder that `plan --goals`
-    and `simulate --goals` take, with a contact sheet.
+    and `serve --goals` take, with a contact sheet.
     """
     from vjepa2_ac.data.windows import require_stride
 

@@ -9,7 +9,6 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 
 from vjepa2_ac import __version__, process
@@ -18,7 +17,6 @@ from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parse
 from vjepa2_ac.cli.waiting import watch_silence
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
 from vjepa2_ac.process import EXIT_STATUS, StoppedError, is_first, tidy_end
-from vjepa2_ac.registry import installed, load_installed
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     try:
-        options = parsed(_parser(words), words)
+        options = parsed(_parser(), words)
         options.words = words
         handler: Handler = options.handler
         _require_working_directory()
@@ -104,7 +102,7 @@ def _our_warnings() -> Iterator[None]:
         ours.removeHandler(handler)
 
 
-def _parser(words: Sequence[str] = ()) -> Parser:
+def _parser() -> Parser:
     parser = Parser(prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped.")
     parser.add_argument("--version", action="version", version=__version__, help="show the version")
     parser.epilog = "`vjepa2-ac COMMAND --help` begins with an example."
@@ -120,21 +118,6 @@ def _parser(words: Sequence[str] = ()) -> Parser:
             policies.add_monitor,
         ],
         "use": [plan.add_plan, plan.add_goals, policies.add_prior, closed_loop.add_serve, train.add_export],
-        "from other packages": [partial(_add_others, words)],
     }
     add_commands(parser, groups)
     return parser
-
-
-def _add_others(words: Sequence[str], commands: Commands) -> None:
-    """Add commands of installed packages, which are imported only if they are asked for."""
-    for one in installed("vjepa2_ac.commands"):
-        is_requested, is_taken = next(iter(words), None) == one.name, one.name in commands.choices
-        if is_requested and is_taken:
-            found = f"a command of this package, and one of {one.value}"
-            raise InputError(where=f"vjepa2-ac {one.name}", found=found, fix="Uninstall or rename the latter")
-        if is_requested:
-            load_installed(one)(commands)
-        elif not is_taken:
-            about = f"of {one.value.partition(':')[0]}"
-            commands.add_parser(one.name, help=about, description=about)

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Column, Table
 from rich.text import Text
 
@@ -92,17 +92,6 @@ class MetricsTable(Table):
         yield from super().__rich_console__(console, options)
 
 
-class _Words(TextColumn):
-    """A column of a progress bar, of literal text."""
-
-    def __init__(self, text_format: str, table_column: Column | None = None) -> None:
-        super().__init__(text_format, markup=False, table_column=table_column)
-
-    def render(self, task: Task) -> Text:
-        """Return the text of a task."""
-        return Text(printable(self.text_format.format(task=task)))
-
-
 console = PlainConsole()
 if not console.is_terminal:
     console.width = 120  # a log file has room
@@ -121,7 +110,7 @@ class ProgressBar:
     """
 
     def __init__(self, title: str, unit: str = "") -> None:
-        self.title, self._unit, self._total = title, unit, -1
+        self.title, self._unit, self._total = printable(title), unit, -1
         self._first, self._began, self._next_line = 0, 0.0, 0.0
         self._bar: Progress | None = None
 
@@ -134,7 +123,7 @@ class ProgressBar:
             speed = done / max(now - self._began, 1e-9)
             words = f"{speed:{'.2g' if speed < 1 else '.1f' if speed < 100 else '.0f'}} {self._unit}/s"
         if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=done, words=words, left=self._left(done, now))
+            self._bar.update(self._bar.task_ids[0], completed=done, words=printable(words), left=self._left(done, now))
         elif not console.is_terminal and (done == total or now >= self._next_line):
             self._next_line = now + _LINE_EVERY_S
             Work.lines += 1
@@ -157,11 +146,11 @@ class ProgressBar:
         if not console.is_terminal:
             return
         self._bar = Progress(
-            _Words("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=40 if console.width >= _WIDE else 6, table_column=Column(no_wrap=True)),
             MofNCompleteColumn(table_column=Column(no_wrap=True)),
-            _Words("{task.fields[left]}", table_column=Column(no_wrap=True)),
-            _Words("{task.fields[words]}", table_column=Column()),  # wraps if it does not fit
+            TextColumn("{task.fields[left]}", markup=False, table_column=Column(no_wrap=True)),
+            TextColumn("{task.fields[words]}", markup=False, table_column=Column()),  # wraps if it does not fit
             console=console,
         )
         self._bar.add_task(self.title, total=total, completed=done, words="", left="")

@@ -19,7 +19,7 @@ from vjepa2_ac import __version__
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.cli.waiting import Work
 from vjepa2_ac.config.loading import config_as_yaml, config_path, config_schema, load_config, packaged_configs
-from vjepa2_ac.errors import InputError, UnreachableError, UserError, counted, shell_command
+from vjepa2_ac.errors import InputError, UserError, counted, shell_command
 from vjepa2_ac.reporter import INDEXING
 from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.places import BUILTIN, literal
@@ -28,16 +28,8 @@ if TYPE_CHECKING:
     from vjepa2_ac.init.draft import Draft
     from vjepa2_ac.training.cost import MemoryEstimate
 
-FORMS = ("droid", "lerobot", "npz", "raw", "rlds", "sim", "scratch")
 _SIMULATED = "demo/data"
-_WITHOUT_A_PATH = {
-    "droid": "gs://gresearch/robotics/droid/1.0.1",
-    "lerobot": "hf://datasets/lerobot/droid_1.0.1",
-    "raw": "gs://gresearch/robotics/droid_raw/1.0.1",
-    "sim": _SIMULATED,
-    "scratch": _SIMULATED,
-}
-_LOOKED_AT_AS = {"droid": "rlds", "sim": "rlds", "scratch": None}
+_KNOWN = {"droid": "gs://gresearch/robotics/droid/1.0.1", "sim": _SIMULATED}
 _TRIAL_STEPS = 100
 _LEAST_SHOWN = 500_000  # bytes: less would be shown as 0.000 GB
 _UNTESTED = (
@@ -52,10 +44,10 @@ _RECORD = "simulate record {path} --domain B --episodes 60 --seed 5"
 def add_init(commands: cli.Commands) -> None:
     """Add `init` to a parser."""
     parser = cli.command(commands, "init", _init, "data/my_robot")
-    cli.add(parser, "form FORM", f"{', '.join(FORMS)} (the files tell); scratch: a new model", cli.as_place, nargs="?")
-    cli.add(parser, "path PATH", "a folder, or a URL (droid, lerobot, raw: DROID's own)", cli.as_place, nargs="?")
+    cli.add(parser, "path PATH", "a folder or a URL; or droid; or sim, the simulated arm", cli.as_place)
     cli.add(parser, "--out FILE", "the config to write (NAME.yaml, by the data's folder)", cli.as_path)
-    cli.add(parser, "--model MODEL", "another than the released; scratch: an encoder", cli.as_model)
+    cli.add(parser, "--scratch", "a fresh predictor, on the encoder --model", action="store_true")
+    cli.add(parser, "--model MODEL", "another than the released", cli.as_model)
     cli.add(parser, "--overwrite", "write over a config that is there", action="store_true")
 
 
@@ -80,7 +72,6 @@ def add_doctor(commands: cli.Commands) -> None:
     """Add `doctor` to a parser."""
     parser = cli.command(commands, "doctor", _doctor, "my_robot.yaml training.batch_size=4")
     cli.add_config(parser, such_as="training.batch_size=4", nargs="?")
-    cli.add(parser, "--report", "versions, machine and settings, for a bug report", action="store_true")
 
 
 def add_demo(commands: cli.Commands) -> None:
@@ -94,8 +85,8 @@ def _init(options: argparse.Namespace) -> int:
     Guesses are marked, the data are looked at as `data check` does (exit status as of that), and the next commands are
     printed.
     """
-    form, path = _form_and_path(options.form, options.path)
-    name = _name_of(form, path)
+    path, is_scratch = _KNOWN.get(options.path, options.path), options.scratch
+    name = "scratch-" * is_scratch + ("sim" if path == _SIMULATED else _name_of(path))
     out = options.out or Path(f"{name}.yaml")
     if out.exists() and not options.overwrite:
         fix = "--out another, or --overwrite"
@@ -107,19 +98,17 @@ def _init(options: argparse.Namespace) -> int:
     from vjepa2_ac.model.model_files import find_base, find_encoder_path
 
     if options.model is not None:
-        (find_encoder_path if form == "scratch" else find_base)(options.model)
+        (find_encoder_path if is_scratch else find_base)(options.model)
     Work.begin("looking at the data")
     is_missing = path == _SIMULATED and not Path(path).exists()
-    found = simulated(path) if is_missing else look_at(path, _LOOKED_AT_AS.get(form or "", form))
+    found = simulated(path) if is_missing else look_at(path)
 
     from vjepa2_ac.init.draft import TINY, choose_model, make_draft, this_machine
     from vjepa2_ac.init.found import guesses
 
     with cli.reporter() as reporter:
         found = found if is_missing else measured(found, reporter.task(INDEXING))
-    model_path = options.model or (TINY if path == _SIMULATED or form == "sim" else None)
-    model = choose_model("scratch" if form == "scratch" else "released", model_path)
-    machine = this_machine()
+    model, machine = choose_model(options.model or (TINY if path == _SIMULATED else None), is_scratch), this_machine()
     cli.show(f"Data: {'; '.join(found.about)}.\nMachine: {machine.about}.")
     draft = make_draft(found, machine, model, run_dir=f"runs/{name}")
     with user_can_write(f"--out {out}"):
@@ -136,27 +125,10 @@ def _init(options: argparse.Namespace) -> int:
     return status
 
 
-def _form_and_path(first: str | None, second: str | None) -> tuple[str | None, str]:
-    """Return the form, None if the files are to tell, and the place of the data."""
-    if first is None:
-        needed = f"a folder, a URL, or one of {', '.join(FORMS)}"
-        raise InputError(where="init", found="no data", needed=needed, fix="Try `vjepa2-ac init sim`")
-    if first not in FORMS:
-        if second is not None:
-            raise InputError(where="init", found=f"{first!r}, no form of data", needed=f"one of {', '.join(FORMS)}")
-        return None, first
-    if second is None and first not in _WITHOUT_A_PATH:
-        raise InputError(where=f"init {first}", found="no path", needed="the folder or the URL of the data")
-    return first, second or _WITHOUT_A_PATH[first]
-
-
-def _name_of(form: str | None, path: str) -> str:
+def _name_of(path: str) -> str:
     """Return a name for the config and the run: of the last folder that is not a version."""
-    if path == _SIMULATED:
-        return "scratch" if form == "scratch" else "sim"
     parts = [re.sub(r"\W+", "-", part).strip("-") for part in path.split("/") if not re.fullmatch(r"[\d.v]*", part)]
-    name = next((part for part in reversed(parts) if part), "own")
-    return f"scratch-{name}" if form == "scratch" else name
+    return next((part for part in reversed(parts) if part), "own")
 
 
 def _check(draft: Draft, out: Path) -> int:
@@ -240,7 +212,7 @@ def _doctor(options: argparse.Namespace) -> int:
     The memory is estimated part by part, with a training step on fake tensors: no weights are loaded. Exit status 0: it
     fits, 1: it does not, 2: something cannot be used.
     """
-    if options.report or options.config is None:
+    if options.config is None:
         for line in _report_lines():
             cli.show(line)
         return 0
@@ -249,10 +221,8 @@ def _doctor(options: argparse.Namespace) -> int:
 
     import torch
 
-    from vjepa2_ac.data.loader import require_shared_memory
-    from vjepa2_ac.distributed import slow_bf16
     from vjepa2_ac.model.checkpoints import base_sizes
-    from vjepa2_ac.training.cost import USUAL_GPU, batch_bytes, estimate_memory, ways_to_fit
+    from vjepa2_ac.training.cost import USUAL_GPU, estimate_memory, ways_to_fit
 
     sizes = base_sizes(config.model)
     gpu, available = None, USUAL_GPU
@@ -262,15 +232,7 @@ def _doctor(options: argparse.Namespace) -> int:
     estimate = estimate_memory(config, sizes)
     needed = estimate.total(checkpointing=estimate.checkpointing)
     cli.show(_verdict(needed, available, gpu, ways_to_fit(config, sizes, available)), *_memory_lines(estimate))
-    if unusual := config.adapter.out_of_line:
-        cli.show(f"Warning: {unusual}.")
-    try:
-        require_shared_memory(config.data, batch_bytes(config, sizes))
-    except UnreachableError as error:
-        cli.show(f"Warning: {error}")
-    if not torch.cuda.is_available() and config.training.precision == "bf16" and (slow := slow_bf16()):
-        cli.show(f"Without a GPU set training.precision=fp32 model.dtype=float32: in bfloat16 {slow}.")
-    cli.show(f"To check the data: {shell_command('data', 'check', options.config, *options.overrides)}")
+    cli.show(f"To check the rest: {shell_command('train', options.config, '--check', *options.overrides)}")
     return 0 if needed <= available else 1
 
 

@@ -57,13 +57,12 @@ class ClipSample:
 
     split: Split = "validation"
     clips: int = 64  # at most
-    frames: int | None = None  # of a clip; None: as the data have them, but 8 at most
     batch_size: int = 8
     strides: tuple[int, ...] = ()  # of a calibration; empty: `windows.candidate_strides`
 
     def frames_of(self, config: DataConfig) -> int:
-        """Return the frames of a clip of these data."""
-        return min(config.frames, _MOST_FRAMES) if self.frames is None else self.frames
+        """Return the frames of a clip of these data: 8 at most."""
+        return min(config.frames, _MOST_FRAMES)
 
 
 @torch.no_grad()

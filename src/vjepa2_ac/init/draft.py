@@ -110,17 +110,16 @@ class ModelChoice:
         return None
 
 
-def choose_model(kind: str, path: str | None) -> ModelChoice:
+def choose_model(path: str | None, is_scratch: bool = False) -> ModelChoice:
     """Return the model to train.
 
     Args:
-        kind: released, or scratch: a fresh predictor on an encoder.
         path: The value of `model.base` or `model.encoder.path`; None: the released one.
+        is_scratch: Train a fresh predictor on an encoder.
 
     Raises:
         InputError: The folder at the path is no model.
     """
-    is_scratch = kind == "scratch"
     path = path or (SCRATCH_ENCODER if is_scratch else RELEASED)
     config = ModelConfig(base=path)
     if is_scratch and not path.startswith(BUILTIN):

@@ -130,12 +130,8 @@ _DEEPEST = 2  # folders down, where a description may be
 _MOST_FOLDERS = 50  # looked into, of each folder
 
 
-def look_at(path: str, form: str | None = None) -> FoundData:
-    """Look at a data set.
-
-    Args:
-        path: A folder, or a URL.
-        form: rlds, lerobot, npz or raw; None: recognized by its files.
+def look_at(path: str) -> FoundData:
+    """Look at a data set in a folder or at a URL; its form is recognized by its files.
 
     Raises:
         InputError: There is nothing of that kind; says what is there, and the way to what is read.
@@ -147,11 +143,11 @@ def look_at(path: str, form: str | None = None) -> FoundData:
         fix = f"For a data set of the Hugging Face Hub: hf://datasets/{path}" if _HUB_NAME.fullmatch(path) else ""
         raise InputError(where=path, found="no such folder", needed="a folder, or a URL", fix=fix)
     with storage.user_can_read(path):
-        if form is None and (found := _of_plugins(path)):
+        if found := _of_plugins(path):
             return found
-        described = [] if form in {"npz", "raw"} else _described(path, [form] if form in _MARKS else [*_MARKS])
+        described = _described(path)
         if not described:
-            return LOOKS[form or _recognized(path)](path)
+            return LOOKS[_recognized(path)](path)
         form, newest, versions = _only_set(described, path)
         found = LOOKS[form](newest)
         version_note = f"version {_name_of(newest)}, the newest of {', '.join(versions)}"
@@ -183,7 +179,7 @@ def simulated(path: str) -> FoundData:
     )
 
 
-def _described(path: str, forms: Sequence[str]) -> list[tuple[str, str]]:
+def _described(path: str) -> list[tuple[str, str]]:
     """Return form and folder of each described set, at a path and up to two folders below, or in a version there."""
     described: dict[str, tuple[str, str]] = {}  # by the absolute path: links lead to one set by several names
     folders = [path]
@@ -192,9 +188,9 @@ def _described(path: str, forms: Sequence[str]) -> list[tuple[str, str]]:
         folders = []
         for folder, entries in listed:
             names = {entry.name for entry in entries}
-            marks = {_MARKS[form]: form for form in forms if _MARKS[form].partition("/")[0] in names}
-            if mark := next((mark for mark in marks if storage.exists(storage.join(folder, mark))), None):
-                described.setdefault(storage.absolute(folder), (marks[mark], folder))
+            marked = [form for form, mark in _MARKS.items() if mark.partition("/")[0] in names]
+            if form := next((one for one in marked if storage.exists(storage.join(folder, _MARKS[one]))), None):
+                described.setdefault(storage.absolute(folder), (form, folder))
                 continue
             inner = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
             if depth == _DEEPEST:

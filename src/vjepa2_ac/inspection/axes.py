@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,6 @@ from vjepa2_ac.evaluation.action_use import RolloutStart, start_of
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.inspection.variants import load_named
 from vjepa2_ac.intervals import Estimate, bootstrapped, ratio
-from vjepa2_ac.media.figure import BLUE, GREY, headline, written_figure
 from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.planning.axes import AXES_FORMAT, Axes, require_axes_in
@@ -227,15 +225,3 @@ def calibrate_axes(
         "version": __version__,
         "time": utc_now(),
     }
-
-
-def plot_axes(fit: AxisFit, path: Path) -> Path:
-    """Write the error at each tried angle as PNG; it is written atomically."""
-    with written_figure(path, 6.4, 3.6, dpi=110, size=9) as figure:
-        headline(figure, f"yaw {fit.yaw_degrees:.1f} degrees")
-        axes = figure.subplots()
-        axes.plot(TRIED_DEGREES, fit.by_angle, "o-", color=BLUE, markersize=3)
-        axes.axhline(1.0, color=GREY, linestyle="--")
-        axes.axvline(fit.yaw_degrees.value, color=GREY, linestyle=":")
-        axes.set(xlabel="turn about the vertical (degrees)", ylabel="squared error / that without a turn")
-    return path

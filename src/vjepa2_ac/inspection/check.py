@@ -11,7 +11,6 @@ from textwrap import shorten
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -130,11 +129,6 @@ def _check_clips(dataset: Dataset, *, seed: int, batch_size: int, clips: int) ->
     rate = sum(len(batch.starts) for batch in batches[1:]) / max(rest_s, 1e-9)
     speed = f"the first batch of {counted(batch_size, 'clip')} took {first_s:.2f} s, the next ones {rate:.1f} clips/s"
     yield Finding("ok", "timing", f"{speed} with {counted(dataset.config.workers, 'loader process')}")
-    if storage.is_url(dataset.config.path):
-        fetched = sum(batch.bytes_fetched for batch in batches)
-        count = sum(len(batch.starts) for batch in read)
-        text = f"{fetched / count / 1e3:,.0f} kB fetched per clip (mean of {counted(count, 'clip')})"
-        yield Finding("ok", "network", text)
 
 
 def batch_findings(batches: Sequence[Batch], spaces: Spaces = POSES) -> Iterator[Finding]:

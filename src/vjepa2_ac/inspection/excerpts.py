@@ -29,7 +29,7 @@ from vjepa2_ac.inspection.coverage import read_each, sample_of
 from vjepa2_ac.inspection.findings import Finding, Level
 from vjepa2_ac.spaces import POSE, StateSpace
 
-EPISODES, _EPISODES_AT_URL = 24, 12  # an episode of DROID is about 5 MB
+EPISODES, _EPISODES_AT_URL = 24, 12  # most episodes that are read; an episode of DROID is about 5 MB
 STEPS = 64
 _ROWS, _COLUMNS = 24, 32  # of a small frame: an arm is still some pixels wide, and a camera's noise is averaged out
 BLANK = 8.0  # of 255: the parts of a black or uniform frame differ by less
@@ -98,9 +98,9 @@ def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.
     return np.asarray(grey)
 
 
-def num_excerpts(dataset: Dataset) -> int:
-    """Return the number of episodes whose frames are read: fewer behind a URL."""
-    return _EPISODES_AT_URL if storage.is_url(dataset.config.path) else EPISODES
+def affordable(dataset: Dataset, episodes: int = EPISODES) -> int:
+    """Return the number of episodes to read: fewer behind a URL."""
+    return _EPISODES_AT_URL if storage.is_url(dataset.config.path) else episodes
 
 
 def check_excerpts(dataset: Dataset) -> Iterator[Finding]:
@@ -112,7 +112,7 @@ def check_excerpts(dataset: Dataset) -> Iterator[Finding]:
     if dataset.config.is_cache:
         yield Finding("skipped", "agreement", "needs frames; check the data set that this latent cache was made from")
         return
-    excerpts = list(excerpts_of(dataset, episodes=num_excerpts(dataset)))
+    excerpts = list(excerpts_of(dataset, episodes=affordable(dataset)))
     yield from excerpt_findings(excerpts, dataset.spaces.state, dataset.config.model_stride, dataset.control_rate_hz)
 
 

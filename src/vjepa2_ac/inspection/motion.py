@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from vjepa2_ac import storage
 from vjepa2_ac.config.data import RotationFormat
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import MEANS, SPANS
@@ -17,11 +16,11 @@ from vjepa2_ac.data.selection import named
 from vjepa2_ac.data.sources.indexed_source import IndexedSource
 from vjepa2_ac.errors import counted
 from vjepa2_ac.inspection.coverage import PERCENTILE, ReadEpisode, read_each, read_sample, sample_of
-from vjepa2_ac.inspection.excerpts import BLANK, is_still, num_excerpts, small_grey
+from vjepa2_ac.inspection.excerpts import BLANK, affordable, is_still, small_grey
 from vjepa2_ac.inspection.findings import Finding, duplicates_finding, first_case
 from vjepa2_ac.spaces import POSE, step_sizes
 
-_EPISODES, _EPISODES_AT_URL = 200, 12
+_EPISODES = 200
 _MIDDLES = 64  # episodes whose middle frame is read
 _MOST_FAST = 200  # episodes that are read to name their steps
 # Measured: with half of the episodes at half the scale the groups are 5.8 (BridgeData) and 9.0 (simulated arm)
@@ -53,8 +52,7 @@ def check_motion(dataset: Dataset) -> Iterator[Finding]:
         for name in ("scale", "speed", "padding", "rotation format"):
             yield Finding("skipped", name, "needs poses (data.states: pose), found vectors")
     else:
-        count = _EPISODES_AT_URL if storage.is_url(dataset.config.path) else _EPISODES
-        sample = list(read_sample(dataset, count, also=_fast_episodes(dataset)))
+        sample = list(read_sample(dataset, affordable(dataset, _EPISODES), also=_fast_episodes(dataset)))
         yield scale_finding(dataset)
         yield from _check_states(dataset, sample)
         yield from _check_rotation_format(dataset, sample)
@@ -229,7 +227,7 @@ def _check_ends(dataset: Dataset) -> Finding:
             counts.append((*count_at_end(grey, states, is_pose=is_pose), f"{episode.info.id}, the {which}"))
         return counts
 
-    chosen = sample_of(dataset, num_excerpts(dataset))
+    chosen = sample_of(dataset, affordable(dataset))
     ends = [end for _, pair in read_each(dataset, chosen, read) for end in pair]
     checked = f"up to {_END_STEPS} frames at both ends of {counted(len(ends) // 2, 'episode')} checked"
     black, frozen, example = max(ends, key=lambda end: max(end[:2]))
@@ -247,8 +245,7 @@ def _check_middles(dataset: Dataset) -> Finding:
         start, end = max(dataset.kept.of(index), key=lambda one: one[1] - one[0])
         return bool(np.ptp(small_grey(dataset.read(index).read_frames([(start + end) // 2]))) < BLANK)
 
-    count = _EPISODES_AT_URL if storage.is_url(dataset.config.path) else _MIDDLES
-    seen = dict(read_each(dataset, sample_of(dataset, count), is_blank))
+    seen = dict(read_each(dataset, sample_of(dataset, affordable(dataset, _MIDDLES)), is_blank))
     blank = [dataset.table.identity(index) for index, is_one in seen.items() if is_one]
     text = f"the middle frame is black or uniform in {len(blank)} of {counted(len(seen), 'episode')} checked"
     return first_case("blank frames", text, (bool(blank), "warning", f"{named(blank)}. {_EXCLUDE}"))

@@ -7,9 +7,8 @@ variant that is certainly better is most likely the true reading of the data.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +36,6 @@ from vjepa2_ac.inspection.variants import (
 )
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.spaces import POSE, euler_from_matrices, matrices_from_euler
-from vjepa2_ac.storage.structured import plain
 
 SHIFTS = (1, 2, 4, 8)  # control steps
 AS_THEY_ARE = "as they are"
@@ -78,10 +76,6 @@ class VariantProbe:
         if plain.ratio.value >= 1:
             return f"needs a model that predicts these data better than persistence ({text})"
         return f"{text}; no variant fits better with certainty"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the results of all variants as plain values, the unchanged data first."""
-        return {"variants": plain([asdict(one) for one in (self.plain, *self.results)])}
 
 
 def probe_config(

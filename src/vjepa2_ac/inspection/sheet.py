@@ -1,4 +1,4 @@
-"""The contact sheet of a data set: episodes as film strips and their motion, below a summary of the data set."""
+"""The contact sheet of a data set: episodes as film strips and their motion, below plots of the whole set."""
 
 from __future__ import annotations
 
@@ -21,17 +21,11 @@ from vjepa2_ac.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, In
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, written_figure
 
 _PLACES = 6000  # points of the map, at most
-_FACTS = (
-    ("episodes", "steps", "length", "success"),
-    ("cameras", "gripper", "states", "left out"),
-    ("splits", "standing still", "sample"),
-)  # of the summary, line by line
-
 _IDLE = "#c9c9c9"
 _OUTCOME = {True: ("success", GREEN), False: ("failure", "#c0392b"), None: ("", "#b5b5b5")}
 _STRIDES = ("#7fb3dd", BLUE, "#0b3558", "#7a4fa3", "#333333")
 
-_WIDTH, _LABEL, _FILM, _ROW, _PANELS = 11.0, 1.6, 9.0, 1.6, 2.5  # inches
+_WIDTH, _LABEL, _FILM, _TITLE, _ROW, _PANELS = 11.0, 1.6, 9.0, 0.5, 1.6, 2.5  # inches
 _EDGE = 0.2 / _WIDTH  # of the sheet, left and right
 _LEAST, _MOST, _PICTURE = 4, 14, 0.8  # pictures in a row, and the height in inches at which they are counted
 
@@ -109,14 +103,10 @@ def plot_contact_sheet(inspection: Inspection, strips: Sequence[Strip], path: Pa
     Its unit of motion is cm of the flange. For vectors it is the change of the number that changes most, as a
     percentage of its range; these have no positions in space.
     """
-    summary, dataset = inspection.summary, inspection.dataset
-    known = ("  ·  ".join(f"{name}: {summary[name]}" for name in line if name in summary) for line in _FACTS)
-    facts = [line for fact in known for line in textwrap.wrap(fact, 150, subsequent_indent="    ")]
-    heights = [0.7 + 0.18 * len(facts), _PANELS, *(_ROW for _ in strips)]
+    dataset, heights = inspection.dataset, [_TITLE, _PANELS, *(_ROW for _ in strips)]
     with written_figure(path, _WIDTH, sum(heights), dpi=130, layout="none", facecolor="white") as figure:
-        words, panels, *rows = figure.subfigures(len(heights), 1, height_ratios=heights)
-        words.text(_EDGE, 1 - 0.16 / heights[0], dataset.config.path, size=13, weight="bold", va="top")
-        words.text(_EDGE, 1 - 0.5 / heights[0], "\n".join(facts), size=9, va="top", linespacing=1.4)
+        title, panels, *rows = figure.subfigures(len(heights), 1, height_ratios=heights)
+        title.text(_EDGE, 0.5, dataset.config.path, size=13, weight="bold", va="center")
         _panels(panels, inspection)
         speeds = np.concatenate([strip.speed for strip in strips]) if strips else np.zeros(1)
         fastest = max(float(np.percentile(speeds, 99.5)) * 1.15, 1.0)
