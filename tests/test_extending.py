@@ -1,7 +1,6 @@
 """Every recipe of docs/extending.md as a stranger uses it: a module outside the package, YAML, and the commands."""
 
 import json
-import re
 import subprocess
 import sys
 from pathlib import Path
