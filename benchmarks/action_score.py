@@ -33,12 +33,12 @@ from vjepa2_ac.evaluation.action_use import start_of
 from vjepa2_ac.intervals import bootstrapped
 from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.model.lora import merge_adapter
-from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.search_space import GRIPPER, pose_space
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.subject import load_subject
+from vjepa2_ac.spaces import states_along
 
 STEPS = 3
 AT_ONCE = 64  # samples

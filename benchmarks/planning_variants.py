@@ -14,7 +14,9 @@ from official_planner import PLANNER, OfficialPlanner
 from official_predictor import PREDICTOR
 from random_models import add_random_adapter, no_fingerprints, random_model
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.functional import layer_norm
+from torch.utils.flop_counter import FlopCounterMode
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
@@ -26,7 +28,6 @@ from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Cost, Plan, Planner
 from vjepa2_ac.spaces import apply_action
-from vjepa2_ac.training.flops import plan_flops
 
 POSE = (0.45, 0.10, 0.35, 3.0, 0.1, -0.4, 0.3)  # of an arm that points down
 WANTED = (0.03, -0.02, 0.04, 0.0, 0.0, 0.0, 0.3)  # the action of each step that leads to the goal
@@ -139,8 +140,11 @@ class Bench:
         return self.options.samples * self.options.iterations + 1
 
     def flops(self, horizon: int) -> int:
-        """Return the model FLOPs of a decision."""
-        return self.sequences * plan_flops(self.sizes, horizon)
+        """Return the model FLOPs of a decision: PyTorch counts those of one sequence."""
+        cost = WorldModelCost(self.model, self._scene, self._goal(horizon), EnergyConfig())
+        with torch.no_grad(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+            cost.imagine(torch.tensor(WANTED).expand(1, horizon, -1))
+        return self.sequences * int(counter.get_total_flops())
 
     @torch.no_grad()
     def _reachable(self) -> Tensor:

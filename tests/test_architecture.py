@@ -56,7 +56,7 @@ ORDERS: dict[str, list[str]] = {
         "about server",
     ],
     "model": [
-        "model_files state_integration distances compilation low_rank",
+        "model_files distances compilation low_rank",
         "attention",
         "blocks",
         "encoder predictor",

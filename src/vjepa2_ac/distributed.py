@@ -16,12 +16,11 @@ import math
 import os
 import re
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
 from datetime import timedelta
 from functools import cache, lru_cache
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 import torch.distributed
@@ -30,6 +29,7 @@ from accelerate.state import AcceleratorState
 from accelerate.utils import InitProcessGroupKwargs
 from torch import Tensor, nn
 from torch.distributed.rendezvous import rendezvous
+from torch.utils.benchmark import Timer
 
 from vjepa2_ac.config import Config, ModelConfig, TrainingConfig
 from vjepa2_ac.errors import InputError, UnreachableError, UserError, in_words
@@ -39,7 +39,7 @@ _log = logging.getLogger(__name__)
 
 PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
 _BF16_FROM = (8, 0)  # compute capability; PyTorch's is_bf16_supported includes emulation, which is slower than fp32
-_CEILING_S = 0.2
+_CEILING_S = 0.2  # in which a matrix product is timed
 _CUDA_MATRIX, _CPU_MATRIX = 8192, 512
 _SLOW = 2.0  # times as long as in float32: of a CPU that computes bfloat16 without instructions for it
 
@@ -135,11 +135,8 @@ def matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
     size = _CUDA_MATRIX if device.type == "cuda" else _CPU_MATRIX
     generator = torch.Generator(device).manual_seed(0)  # its own, so that training's random numbers do not change
     matrix = torch.randn(size, size, device=device, generator=generator).to(dtype)
-    _product_s(matrix)  # warm-up
-    best, ends = math.inf, time.perf_counter() + _CEILING_S
-    while best == math.inf or time.perf_counter() < ends:
-        best = min(best, _product_s(matrix))
-    return 2 * size**3 / best
+    timer = Timer("matrix @ matrix", globals={"matrix": matrix}, num_threads=torch.get_num_threads())
+    return 2 * size**3 / min(timer.blocked_autorange(min_run_time=_CEILING_S).times)
 
 
 def has_bf16(device: torch.device | None = None) -> bool:
@@ -179,19 +176,6 @@ def _require_bf16(device: torch.device, *, where: str, found: str, fix: str) -> 
 def _warn(found: str, fix: str) -> None:
     if slow := slow_bf16():
         _log.warning("%s: %s. %s", found, slow, fix)
-
-
-def _product_s(matrix: Tensor) -> float:
-    _wait_for(matrix.device)
-    started = time.perf_counter()
-    torch.mm(matrix, matrix)
-    _wait_for(matrix.device)
-    return time.perf_counter() - started
-
-
-def _wait_for(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 # ---- processes ----
@@ -318,22 +302,15 @@ def _raise_first_of(values: Iterable[object], own: int, error: Exception | None 
             raise first
 
 
-def all_reduce_sum(accelerator: Accelerator, values: Sequence[float | int]) -> list[float]:
-    """Return the sums over all processes, bit-identical in each."""
+def all_reduce(accelerator: Accelerator, values: Sequence[float], kind: Literal["sum", "max"]) -> list[float]:
+    """Return the sum or the largest of each value over all processes, bit-identical in each."""
     if accelerator.num_processes == 1:
         return [float(value) for value in values]
-    added = torch.tensor(values, dtype=torch.float64, device=accelerator.device)
-    torch.distributed.all_reduce(added)
-    return [float(value) for value in added.tolist()]
-
-
-def all_reduce_max(accelerator: Accelerator, values: Sequence[int | bool]) -> list[int]:
-    """Return the largest of each value over all processes."""
-    if accelerator.num_processes == 1:
-        return [int(value) for value in values]
-    compared = torch.tensor(values, dtype=torch.int64, device=accelerator.device)
-    torch.distributed.all_reduce(compared, torch.distributed.ReduceOp.MAX)
-    return [int(value) for value in compared.tolist()]
+    own = torch.tensor(values, dtype=torch.float64, device=accelerator.device)
+    torch.distributed.all_reduce(
+        own, torch.distributed.ReduceOp.MAX if kind == "max" else torch.distributed.ReduceOp.SUM
+    )
+    return own.tolist()
 
 
 def all_reduce_gradients(accelerator: Accelerator, parameters: Iterable[nn.Parameter]) -> None:
@@ -377,14 +354,6 @@ def all_gather_object(accelerator: Accelerator, value: _T) -> list[_T]:
     if accelerator.num_processes > 1:
         torch.distributed.all_gather_object(values, value, group=_patient_group())
     return values
-
-
-def broadcast_tensors(accelerator: Accelerator, tensors: Iterable[Tensor]) -> None:
-    """Give every process the first one's values, in place."""
-    if accelerator.num_processes == 1:
-        return
-    for tensor in tensors:
-        torch.distributed.broadcast(tensor.detach(), 0)
 
 
 def require_same(accelerator: Accelerator, value: object, *, what: str, fix: str) -> None:

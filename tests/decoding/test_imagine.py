@@ -12,9 +12,8 @@ from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import Start, rolled_out, shown
 from vjepa2_ac.evaluation.imagined import imagine_plan
-from vjepa2_ac.model.state_integration import counterfactual_states
 from vjepa2_ac.planning.counterfactual import named_actions
-from vjepa2_ac.spaces import POSE
+from vjepa2_ac.spaces import POSE, counterfactual_states
 
 STEPS, TOKENS, DIM = 4, 4, 12
 STATE = np.array([0.4, 0.1, 0.3, 3.1, 0.0, -3.1, 0.9])

@@ -17,13 +17,13 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.axes import TRIED_DEGREES, fit_axes
-from vjepa2_ac.model.state_integration import apply_actions
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.axes import Axes
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.subject import load_subject
+from vjepa2_ac.spaces import apply_actions
 
 TURN = Axes(math.radians(43.0))
 

@@ -7,8 +7,8 @@ import pytest
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.state_integration import counterfactual_states
 from vjepa2_ac.planning.counterfactual import named_actions, read_actions
+from vjepa2_ac.spaces import counterfactual_states
 
 START = np.array([0.4, 0.1, 0.3, np.pi - 0.01, 0.02, -0.7, 0.4])
 ROWS = np.array([[0.05, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0], [0.0, -0.02, 0.01, 0.0, 0.0, 0.0, -0.75]])

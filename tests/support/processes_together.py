@@ -14,8 +14,7 @@ from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.distributed import (
     all_gather_object,
-    all_reduce_max,
-    all_reduce_sum,
+    all_reduce,
     broadcast_object,
     first_of_machine,
     first_only,
@@ -47,8 +46,8 @@ def main() -> None:
     accelerator = make_accelerator(config)
     rank = accelerator.process_index
     assert accelerator.num_processes == 2
-    assert all_reduce_sum(accelerator, [1.5, rank]) == [3.0, 1.0]
-    assert all_reduce_max(accelerator, [rank * 15, 1 - rank]) == [15, 1]
+    assert all_reduce(accelerator, [1.5, rank], "sum") == [3.0, 1.0]
+    assert all_reduce(accelerator, [rank * 15, 1 - rank], "max") == [15, 1]
     assert broadcast_object(accelerator, {"rank": rank}) == {"rank": 0}
     assert all_gather_object(accelerator, f"rank {rank}") == ["rank 0", "rank 1"]
     require_same(accelerator, "one", what="it", fix="none")

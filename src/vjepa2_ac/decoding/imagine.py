@@ -27,12 +27,11 @@ from vjepa2_ac.media.figure import FilmStrip, StripRow, draw_strip, film_frames,
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.model.lora import base_only
-from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import checkpoint_name
 from vjepa2_ac.runs.folder import IMAGINED
-from vjepa2_ac.spaces import StateSpace
+from vjepa2_ac.spaces import StateSpace, counterfactual_states, feasible_actions
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import json_text
 

@@ -28,13 +28,12 @@ from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import Models
 from vjepa2_ac.model.predictor import KeyValueCache
-from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.energy import EnergySlice, Goal, Scene, WorldModelCost, distance, energy_slices
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, until_cancelled
 from vjepa2_ac.planning.search_space import SearchSpace, search_space
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
-from vjepa2_ac.spaces import Spaces
+from vjepa2_ac.spaces import Spaces, counterfactual_states, feasible_actions
 
 MOST_STEPS = 16  # of a path: as many as the released model was trained on
 _KEPT_STEPS = 128  # of each model, for undo and for other branches

@@ -53,7 +53,7 @@ ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
 weights that were trained by gradient."""
 FIX = "`vjepa2-ac download --list` shows those that are published; the Hub has facebook/vjepa2-vitl-fpc64-256"
 
-Part = Literal["encoder", "encoder 2.1", "predictor"]
+Part = Family | Literal["predictor"]  # whose names
 Rename = Callable[[str], tuple[str, int | None]]
 """Our name of a tensor -> the file's, and which third of a fused one it is (None: all of it)."""
 
@@ -69,8 +69,8 @@ _ENCODER = [
     (r"\.attention\.proj\.", ".attn.proj."),
 ]
 _NAMES: dict[Part, list[tuple[str, str]]] = {  # ours -> Meta's, as (pattern, replacement), applied in turn
-    "encoder": [(r"^vit\.layernorm\.", "norm."), *_ENCODER],
-    "encoder 2.1": [
+    "v2": [(r"^vit\.layernorm\.", "norm."), *_ENCODER],
+    "v2.1": [
         (r"^vit\.layernorm\.", "norms_block.3."),
         (r"^vit\.level_norms\.", "norms_block."),
         (r"^vit\.embeddings\.patch_embeddings\.proj\.of_images\.", "patch_embed_img.proj."),
@@ -165,7 +165,7 @@ def to_official(model: WorldModel) -> dict[str, Any]:
         needed = f"states and actions of {POSE_WIDTHS.state} numbers: Meta's code has no other predictor"
         fix = "Export it with --to merged (WorldModel.save_pretrained), which `model.base` takes"
         raise InputError(where="the official format", found=found, needed=needed, fix=fix)
-    encoder = to_official_names(model.present_encoder.state_dict(), part_of(model.sizes.encoder.family))
+    encoder = to_official_names(model.present_encoder.state_dict(), model.sizes.encoder.family)
     return {
         "encoder": encoder,
         "target_encoder": dict(encoder),
@@ -378,7 +378,7 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
         image_size=known.image_size if known else None,
         origin=EncoderOrigin(file.path.name, key, known.licence if known else ""),
         weights=lambda: tensors,
-        rename=partial(official_name, part=part_of(family)),
+        rename=partial(official_name, part=family),
     )
 
 
@@ -502,11 +502,6 @@ class MetaFile:
         names = ", ".join(list(self.parts if part is None else self.tensors(part))[:8])
         found = f"no {what} (keys: {names})" if part is None else f"no {what} in {part} (its tensors: {names})"
         return InputError(where=str(self.path), found=found, needed=_PARTS, fix=fix)
-
-
-def part_of(family: Family) -> Part:
-    """Return the names of an encoder of a family."""
-    return "encoder" if family == "v2" else "encoder 2.1"
 
 
 def official_name(name: str, part: Part) -> tuple[str, int | None]:

@@ -10,7 +10,7 @@ import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -21,7 +21,7 @@ from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.model import PEFT_NAMES
 from vjepa2_ac.errors import InputError, quiet_imports
 from vjepa2_ac.model.low_rank import LowRankLayer, low_rank_linear
-from vjepa2_ac.model.predictor import PredictorNetwork
+from vjepa2_ac.model.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.world_model import Adaptation, WorldModel, base_weights, require_trained
 from vjepa2_ac.storage.structured import record_of, shown
 
@@ -127,7 +127,7 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     _measure_magnitudes(layers)
 
 
-def with_adapter(predictor: PredictorNetwork, config: AdapterConfig, start: bool | str = True) -> nn.Module:
+def with_adapter(predictor: ActionConditionedPredictor, config: AdapterConfig, start: bool | str = True) -> nn.Module:
     """Return a predictor with a LoRA adapter, as `add_adapter` makes it.
 
     Args:
@@ -304,7 +304,7 @@ def _can_be_read(name: str, value: object, default: object) -> bool:
     return name == "init_lora_weights" or (isinstance(value, bool | int | float) and type(value) is type(default))
 
 
-def _peft_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, Any]:
+def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig) -> dict[str, Any]:
     """Return the arguments of PEFT's LoraConfig, sets of targets replaced by their layers.
 
     Layers without input cannot have an adapter; `all` excludes layers that are trained directly.
@@ -368,9 +368,7 @@ def merge_adapter(model: WorldModel) -> None:
     never_trained = model.base_predictor.predictor_norm.weight  # beside an adapter
     dtype = (adaptation.start or {}).get("predictor_norm.weight", never_trained).dtype
     if adaptation.kind == "lora":
-        kind = model.device.type
-        has_autocast = torch.amp.is_autocast_available(kind)  # some, such as meta, have none
-        with torch.autocast(kind, enabled=False) if has_autocast else nullcontext():  # or its type would be computed in
+        with torch.autocast(model.device.type, enabled=False):  # or its type would be computed in
             model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
     model.predictor.to(dtype).requires_grad_(False)
     model.adaptation = model.fresh_heads = None

@@ -52,7 +52,13 @@ class KeyValueCache:
         return KeyValueCache(self._pieces)
 
 
-class PredictorNetwork(nn.Module):
+class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
+    """Sizes of the predictor in the form transformers stores them: those that `new_predictor` sets."""
+
+    model_type = "vjepa2_ac_predictor"
+
+
+class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # transformers has no types
     """Predicts, for every step, the latents of the next one from the latents, states and actions up to it.
 
     The tokens of a step, in order: action, (state), (extrinsics), patches. Output: patches only, not normalised.
@@ -60,13 +66,14 @@ class PredictorNetwork(nn.Module):
     Source: facebookresearch/vjepa2 @ c2963a4, src/models/ac_predictor.py, VisionTransformerPredictorAC.
     """
 
-    config: Any  # the fields of `predictor_fields`
-    attention: AttentionKind | Attend
-    gradient_checkpointing: bool  # the name transformers switches
-    has_dropout: bool  # whether blocks have dropout: recomputed blocks must then draw the same masks
+    config_class = PredictorConfig
+    base_model_prefix = "predictor"
+    main_input_name = "latents"
+    supports_gradient_checkpointing = True
+    _no_split_modules = ["Block"]  # noqa: RUF012  # transformers reads a list
 
-    def add_layers(self, config: Any) -> None:
-        """Make the layers of these sizes, uninitialised, and set the switches to their defaults."""
+    def __init__(self, config: PredictorConfig) -> None:
+        super().__init__(config)
         width = config.hidden_size
         hidden = hidden_width(width, config.mlp_ratio)
         self.predictor_embed = nn.Linear(config.latent_dim, width)
@@ -81,9 +88,10 @@ class PredictorNetwork(nn.Module):
         )
         self.predictor_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
         self.predictor_proj = nn.Linear(width, config.latent_dim)
-        self.attention = "auto"
-        self.gradient_checkpointing = False
-        self.has_dropout = False
+        self.attention: AttentionKind | Attend = "auto"
+        self.gradient_checkpointing = False  # the name transformers switches
+        self.has_dropout = False  # of blocks, which must draw the same masks when they are recomputed
+        self.post_init()
 
     @property
     def grid(self) -> int:
@@ -175,27 +183,6 @@ class PredictorNetwork(nn.Module):
         """The base's type; a directly trained head may have another."""
         return self.predictor_norm.weight.dtype
 
-
-class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
-    """Sizes of the predictor in the form transformers stores them: those of `predictor_fields`."""
-
-    model_type = "vjepa2_ac_predictor"
-
-
-class ActionConditionedPredictor(PredictorNetwork, PreTrainedModel):  # type: ignore[misc]  # transformers has no types
-    """The predictor as a transformers model, which can be stored and loaded; the forward pass is inherited."""
-
-    config_class = PredictorConfig
-    base_model_prefix = "predictor"
-    main_input_name = "latents"
-    supports_gradient_checkpointing = True
-    _no_split_modules = ["Block"]  # noqa: RUF012  # transformers reads a list
-
-    def __init__(self, config: PredictorConfig) -> None:
-        super().__init__(config)
-        self.add_layers(config)
-        self.post_init()  # type: ignore[operator]  # transformers has no types
-
     def initialise(self, generator: Generator) -> None:
         """Initialise every weight; the generator determines the values."""
         for module in self.modules():
@@ -227,16 +214,15 @@ class ActionConditionedPredictor(PredictorNetwork, PreTrainedModel):  # type: ig
         return self.gradient_checkpointing
 
 
-def predictor_fields(sizes: ModelSizes) -> dict[str, Any]:
-    """Return the sizes of the predictor of a world model, by the names of `PredictorConfig`."""
+def new_predictor(sizes: ModelSizes) -> ActionConditionedPredictor:
+    """Return the predictor of a world model of these sizes, not yet initialised."""
     own = sizes.predictor.model_dump()
     renamed = {"width": "hidden_size", "depth": "num_hidden_layers", "heads": "num_attention_heads"}
-    return {
-        "image_size": sizes.image_size,
-        "patch_size": sizes.patch_size,
-        "latent_dim": sizes.encoder.width,
-        **{renamed.get(name, name): value for name, value in own.items()},
-    }
+    fields = {renamed.get(name, name): value for name, value in own.items()}
+    config = PredictorConfig(
+        image_size=sizes.image_size, patch_size=sizes.patch_size, latent_dim=sizes.encoder.width, **fields
+    )
+    return ActionConditionedPredictor(config)
 
 
 def _in_own_type(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:

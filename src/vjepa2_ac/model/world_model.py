@@ -30,13 +30,7 @@ from vjepa2_ac.model.model_files import (
     read_encoder_origin,
     read_sizes,
 )
-from vjepa2_ac.model.predictor import (
-    ActionConditionedPredictor,
-    LatentDynamics,
-    PredictorConfig,
-    normalise_latents,
-    predictor_fields,
-)
+from vjepa2_ac.model.predictor import LatentDynamics, new_predictor, normalise_latents
 from vjepa2_ac.storage import folder_writer
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 
@@ -90,7 +84,7 @@ class WorldModel(LatentDynamics):
         super().__init__()
         self.sizes = sizes
         self.encoder: Encoder | AbsentEncoder = Encoder(sizes)
-        self.predictor: nn.Module = ActionConditionedPredictor(PredictorConfig(**predictor_fields(sizes)))
+        self.predictor: nn.Module = new_predictor(sizes)
         self.predictor.requires_grad_(False)
         self.adaptation: Adaptation | None = None
         self.fresh_heads: FreshHeads | None = None

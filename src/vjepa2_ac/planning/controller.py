@@ -18,7 +18,6 @@ from vjepa2_ac.data.sources.indexed_source import spaces_of
 from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import require_image
-from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.model.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.planning.axes import Axes, require_base_frame
 from vjepa2_ac.planning.cameras import Cameras, Fault
@@ -31,7 +30,7 @@ from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.solvers import PlanStart
 from vjepa2_ac.registry import PLANNING_FILES
 from vjepa2_ac.runs.subject import Subject
-from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
+from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces, states_along
 
 _PRIOR_STEPS = 3  # model steps in which the prior is to reach a goal that has no bound: fewer are bolder
 State = Float[np.ndarray, " numbers"]

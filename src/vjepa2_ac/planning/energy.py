@@ -18,13 +18,12 @@ from torch.utils.checkpoint import checkpoint
 from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.model.distances import absolute_difference, squared_difference
-from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.axes import Axes
 from vjepa2_ac.planning.planner import Cost, reporting
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.registry import ENERGIES
-from vjepa2_ac.spaces import POSES, Spaces
+from vjepa2_ac.spaces import POSES, Spaces, states_along
 
 Latents = Float[Tensor, "*batch tokens dim"]
 Wanted = Float[Tensor, "*wanted tokens dim"]

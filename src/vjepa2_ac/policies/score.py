@@ -20,13 +20,12 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.intervals import Estimate, mean_of, ratio, ratio_difference
-from vjepa2_ac.model.state_integration import apply_actions, states_along
 from vjepa2_ac.planning.cameras import read_views, require_views
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.runs.checkpoint import step_of
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log
-from vjepa2_ac.spaces import POSE, StateSpace
+from vjepa2_ac.spaces import POSE, StateSpace, apply_actions, states_along
 from vjepa2_ac.storage.structured import plain
 
 CHANCE = 0.5  # share of other actions with a lower energy than the true ones, for a model that ignores actions

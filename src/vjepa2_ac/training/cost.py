@@ -2,8 +2,8 @@
 
 The predictor's part is the peak of one micro-step of the run on fake tensors, through the code that trains. Calculated
 is what needs no such pass: weights and moments from the counts of parameters (bitsandbytes' kernels take no fake
-tensors), the next batch from its sizes, and the encoder at work, whose code would take seconds to import. On an H100
-the peak that PyTorch's allocator reported differed from the total by 1 %; the CUDA context was not compared.
+tensors), the next batch from its sizes, and the encoder at work. On an H100 the peak that PyTorch's allocator reported
+differed from the total by 1 %; the CUDA context was not compared.
 
 Fake tensors are on the CPU, because fake CUDA tensors need a driver; three things are then computed as on CUDA:
 autocast computes norms from a float32 copy where weights have another type than the arithmetic, a dropout mask takes
@@ -18,7 +18,6 @@ from __future__ import annotations
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -33,9 +32,9 @@ from vjepa2_ac.distributed import PRECISIONS, autocast
 from vjepa2_ac.encoding.latent_cache import FRAMES_AT_ONCE
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.attention import rotary_tables
-from vjepa2_ac.model.encoder import ENCODE_CHUNK
+from vjepa2_ac.model.encoder import ENCODE_CHUNK, Encoder
 from vjepa2_ac.model.low_rank import CastMatrices
-from vjepa2_ac.model.predictor import LatentDynamics, PredictorNetwork, predictor_fields
+from vjepa2_ac.model.predictor import LatentDynamics, new_predictor
 from vjepa2_ac.training.step import Objective
 
 Kind = Literal["cpu", "cuda"]
@@ -49,8 +48,6 @@ HALF = 2  # bfloat16 and float16
 _BLOCKS = (2, 3)  # of the models that are measured
 _BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
 _SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # of bitsandbytes
-_TUBELET = 2  # frames that the encoder's first layer takes at once
-_LEVELS = 4  # of V-JEPA 2.1, each with a norm
 _CHECKPOINTED = ", checkpointed"
 _STANDING = (  # parts that are allocated all the time
     "encoder weights", "predictor weights", "trained weights", "optimizer state", "prefetched batch", "CUDA allowance",
@@ -74,22 +71,14 @@ class StepBytes(NamedTuple):
 _measured: dict[str, StepBytes] = {}
 
 
-def meta_network(sizes: ModelSizes) -> PredictorNetwork:
-    """Return the network of a predictor on the meta device, in float32."""
-    network = PredictorNetwork()
-    network.config = SimpleNamespace(**predictor_fields(sizes))
-    with torch.device("meta"):
-        network.add_layers(network.config)
-    return network
-
-
 def meta_predictor(config: Config, sizes: ModelSizes) -> nn.Module:
     """Return the predictor with what a run trains, on the meta device, in float32; the rest is frozen.
 
     Raises:
         InputError: A key of the adapter does not fit the predictor.
     """
-    predictor = meta_network(sizes)
+    with torch.device("meta"):
+        predictor = new_predictor(sizes)
     if config.adapter.kind == "none":
         for name in predictor.unused_layers:
             predictor.get_submodule(name).requires_grad_(False)
@@ -327,18 +316,9 @@ def count_parameters(config: Config, sizes: ModelSizes) -> Parameters:
     trained = tuple(one.numel() for one in every if one.requires_grad)
     total = sum(one.numel() for one in every)
     own = total if config.adapter.kind == "none" else total - sum(trained)
-    return Parameters(_encoder_parameters(sizes), own, trained)
-
-
-def _encoder_parameters(sizes: ModelSizes) -> int:
-    """Return the encoder's parameters; of V-JEPA 2.1 both frame paths."""
-    width, hidden = sizes.encoder.width, int(sizes.encoder.width * sizes.encoder.mlp_ratio)
-    block = 4 * (width + 1) * width + 4 * width + (width + 1) * hidden + (hidden + 1) * width
-    of_a_frame = 3 * sizes.patch_size**2
-    total = sizes.encoder.depth * block + (_TUBELET * of_a_frame + 1) * width + 2 * width
-    if sizes.encoder.family == "v2":
-        return total
-    return total + (of_a_frame + 1) * width + _LEVELS * 2 * width
+    with torch.device("meta"):
+        encoder = sum(one.numel() for one in Encoder(sizes).parameters())  # of V-JEPA 2.1 both frame paths
+    return Parameters(encoder, own, trained)
 
 
 def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:

@@ -1,4 +1,4 @@
-"""Model FLOPs of one clip, one plan or one frame, by formula.
+"""Model FLOPs of one clip or one frame, by formula.
 
 PyTorch's counter gives the same numbers on fake tensors, but takes seconds at the start of every run. Only what the
 mathematics requires is counted, once. A matrix product is two operations per pair of numbers; forward, backward with
@@ -13,11 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Int64
 from torch import nn
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.training.cost import meta_network, meta_predictor
+from vjepa2_ac.model.predictor import new_predictor
+from vjepa2_ac.training.cost import meta_predictor
 
 
 @dataclass(frozen=True)
@@ -53,12 +55,6 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
     return ClipFlops(frames * frame_flops(sizes), *total.tolist())
 
 
-def plan_flops(sizes: ModelSizes, steps: int) -> int:
-    """Return the operations of predicting the result of one sequence of actions, without an adapter."""
-    passes = _Passes(sizes)
-    return int(sum(passes.over(1, keys=range(step, step + 1), fed_back=False)[0] for step in range(1, 1 + steps)))
-
-
 def frame_flops(sizes: ModelSizes) -> int:
     """Return the operations of encoding one frame."""
     encoder = sizes.encoder
@@ -72,21 +68,22 @@ _Work = Int64[np.ndarray, "2"]  # forward and backward operations
 
 
 class _Passes:
-    """Counts passes of one clip or plan through the predictor.
+    """Counts passes of one clip through the predictor.
 
     Args:
         sizes: Of the model.
-        config: What is trained; None: nothing is.
+        config: What is trained.
     """
 
-    def __init__(self, sizes: ModelSizes, config: Config | None = None) -> None:
-        network = meta_network(sizes)
-        self._sizes, self._ranks, self._whole = sizes, dict[str, int](), set[str]()
+    def __init__(self, sizes: ModelSizes, config: Config) -> None:
+        with torch.device("meta"):
+            network = new_predictor(sizes)
+        self._sizes, self._ranks, self._whole = sizes, dict[str, int](), set(config.adapter.modules_to_save)
         self._layers = {name: layer for name, layer in network.named_modules() if isinstance(layer, nn.Linear)}
-        if config is not None and config.adapter.kind == "none":
+        if config.adapter.kind == "none":
             self._whole = set(self._layers)
-        elif config is not None:
-            self._ranks, self._whole = _ranks(config, sizes), set(config.adapter.modules_to_save)
+        else:
+            self._ranks = _ranks(config, sizes)
         conditions = ("action_encoder", "state_encoder", "extrinsics_encoder")
         self._conditions = [name for name in conditions if name in self._layers and name not in network.unused_layers]
 

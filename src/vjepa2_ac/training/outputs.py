@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.distributed import agreed, all_reduce_max, broadcast_object, first_only
+from vjepa2_ac.distributed import agreed, all_reduce, broadcast_object, first_only
 from vjepa2_ac.errors import counted
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.registry import TRAINING_HOOKS
@@ -146,7 +146,8 @@ class RunOutputs:
         is_due = step % run.config.checkpoint.every == 0 or time.monotonic() - self._saved_s >= SAVE_EVERY_S
         is_due = is_due or is_best or is_done(run.config, run.state)
         is_due = is_due or (self.metrics_log is not None and self.metrics_log.is_behind)
-        self._stopped_by, due = all_reduce_max(run.accelerator, [self._stop.number, is_due])
+        stopped_by, due = all_reduce(run.accelerator, [self._stop.number, is_due], "max")
+        self._stopped_by = int(stopped_by)
         if due or self._stopped_by:
             self.save()
         if self._mirror is not None:

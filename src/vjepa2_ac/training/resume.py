@@ -9,13 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from accelerate.utils import broadcast
+
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import flat
 from vjepa2_ac.config.section import Affects, values_that_affect
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import validation_windows
-from vjepa2_ac.distributed import broadcast_object, broadcast_tensors, first_only, require_same
+from vjepa2_ac.distributed import broadcast_object, first_only, require_same
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.reporter import Reporter
@@ -93,7 +95,7 @@ def _state_of_all(run: Run, reporter: Reporter) -> RunState:
     require_same(accelerator, encoder, what="model.base", fix="Give every machine the same checkpoint")
     read = first_only(accelerator, lambda: _read_newest(run, reporter))
     state, moments = broadcast_object(accelerator, read or (RunState(step=0), None))
-    broadcast_tensors(accelerator, world_model.predictor.state_dict().values())
+    broadcast(list(world_model.predictor.state_dict().values()))  # in place
     if moments is not None and not accelerator.is_main_process:
         load_moments(run.optimizer, moments)
     return state

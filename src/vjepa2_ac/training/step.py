@@ -13,7 +13,7 @@ from torch.nn.functional import smooth_l1_loss
 
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.config.section import Positive, Section
-from vjepa2_ac.distributed import all_gather_object, all_reduce_gradients, all_reduce_sum, raise_first
+from vjepa2_ac.distributed import all_gather_object, all_reduce, all_reduce_gradients, raise_first
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError, UserError
@@ -105,7 +105,7 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
     except UserError as raised:
         error = raised
     sums = [*totals.tolist(), len(names), fetched, error is not None]  # waits for the device
-    *losses, clips, bytes_fetched, failed = all_reduce_sum(run.accelerator, sums)
+    *losses, clips, bytes_fetched, failed = all_reduce(run.accelerator, sums, "sum")
     if failed:
         raise_first(run.accelerator, error)
     expected = run.clips_per_step

@@ -9,12 +9,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.predictor import (
-    ActionConditionedPredictor,
-    KeyValueCache,
-    PredictorConfig,
-    predictor_fields,
-)
+from vjepa2_ac.model.predictor import ActionConditionedPredictor, KeyValueCache, new_predictor
 from vjepa2_ac.model.world_model import WorldModel
 
 WIDE = ModelSizes(
@@ -37,7 +32,7 @@ def test_a_prediction_depends_on_its_own_and_earlier_steps_only(model: WorldMode
 
 @pytest.mark.parametrize("by_transformers", [True, False])
 def test_output_layers_start_smaller_the_deeper_they_are(by_transformers: bool) -> None:
-    predictor = ActionConditionedPredictor(PredictorConfig(**predictor_fields(WIDE)))
+    predictor = new_predictor(WIDE)
     if not by_transformers:
         predictor.initialise(torch.Generator().manual_seed(0))
     for layer, block in enumerate(predictor.blocks, start=1):

@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from paths import GOLDEN
 from synthetic import synthetic_states
-from vjepa2_ac.model.state_integration import apply_actions, states_along
-from vjepa2_ac.spaces import actions_from_states, euler_from_matrices, matrices_from_euler
+from vjepa2_ac.spaces import actions_from_states, apply_actions, euler_from_matrices, matrices_from_euler, states_along
 
 
 def assert_same_poses(found: torch.Tensor, expected: np.ndarray, tolerance: float) -> None:
