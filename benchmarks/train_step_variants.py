@@ -41,8 +41,7 @@ from vjepa2_ac.training.cost import ALLOWANCE, estimate_memory
 from vjepa2_ac.training.cuda_graph import GraphedMicroStep
 from vjepa2_ac.training.flops import clip_flops
 from vjepa2_ac.training.optim import make_optimizer
-from vjepa2_ac.training.run import Run
-from vjepa2_ac.training.step import Objective, micro_step, training_step
+from vjepa2_ac.training.step import Objective, Run, micro_step, training_step
 
 OFFICIAL = "official"
 OFFICIAL_FULL = "official_full"  # every weight of its predictor is trained

@@ -18,7 +18,7 @@ from vjepa2_ac.process import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signal
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.run import batches_from
+from vjepa2_ac.training.step import batches_from
 
 WAITING = """
 import time

@@ -412,14 +412,9 @@ class _OthersError(Exception):
         super().__init__(str(error))
 
 
-def _place() -> tuple[int, int]:
-    """Return the rank of this process among those that share work, and how many they are."""
-    return (_sharing.process_index, _sharing.num_processes) if _sharing else (0, 1)
-
-
 def own_part(count: int, at_once: int = 1) -> range:
     """Return which of so many things this process does: neighbours, in whole batches of `at_once`."""
-    rank, processes = _place()
+    rank, processes = (_sharing.process_index, _sharing.num_processes) if _sharing else (0, 1)
     batches = math.ceil(count / at_once)
     first, last = (at_once * -(-batches * place // processes) for place in (rank, rank + 1))
     return range(first, min(count, last))
@@ -438,19 +433,18 @@ def gathered(values: Sequence[_T]) -> list[_T]:
 
 
 def shared(items: Sequence[_T], work: Callable[[_T], _Result], progress: Callable[[int, int], None]) -> list[_Result]:
-    """Return the result of some work on each item, in their order; processes that share it have every so-many-th.
+    """Return the result of some work on each item, in their order; processes that share it have a part of them each.
 
     Args:
         items: The same in all processes.
         work: What is done with one.
         progress: Called with (done, total) in those of this process.
     """
-    rank, processes = _place()
-    own, found = range(rank, len(items), processes), list[tuple[int, _Result]]()
-    for done, number in enumerate(own, start=1):
-        found.append((number, work(items[number])))
-        progress(done, len(own))
-    return [result for _, result in sorted(gathered(found), key=lambda one: one[0])]
+    own, found = own_part(len(items)), list[_Result]()
+    for number in own:
+        found.append(work(items[number]))
+        progress(len(found), len(own))
+    return gathered(found)
 
 
 # ---- a whole run ----

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from paths import ROOT
-from ranks import finish, free_port, start_rank
+from ranks import run_ranks
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 
@@ -15,10 +15,9 @@ SCRIPT = str(ROOT / "tests/support/disagreeing_ranks.py")
 
 def start_both(config: object, tmp_path: Path, happens: str, status: int) -> list[str]:
     """Start two ranks, to one of which something happens; return what each wrote."""
-    path, port = tmp_path / "config.yaml", free_port()
+    path = tmp_path / "config.yaml"
     path.write_text(config_as_yaml(config))
-    ranks = [start_rank([SCRIPT, str(path), happens], rank, 2, port) for rank in range(2)]
-    return [out for out, _ in finish(ranks, status, timeout=60)]
+    return [out for out, _ in run_ranks([SCRIPT, str(path), happens], status=status)]
 
 
 def test_ranks_whose_errors_differ_in_the_last_digits_lose_patience_together(make_config, tmp_path: Path) -> None:
@@ -49,10 +48,9 @@ def test_what_one_rank_alone_meets_ends_both_with_its_error(
 def test_a_command_of_several_processes_prints_an_error_once(make_config, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run/thesis.tex").write_text("years of work")
-    path, port = tmp_path / "config.yaml", free_port()
+    path = tmp_path / "config.yaml"
     path.write_text(config_as_yaml(make_config()))
-    ranks = [start_rank(["-m", "vjepa2_ac.cli", "train", str(path)], rank, 2, port) for rank in range(2)]
-    said = [err for _, err in finish(ranks, 2, timeout=60)]
+    said = [err for _, err in run_ranks(["-m", "vjepa2_ac.cli", "train", str(path)], status=2)]
     assert ["other things in it" in err for err in said] == [True, False]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from paths import ROOT
-from ranks import Rank, finish, free_port, start_rank, wait_until
+from ranks import Rank, finish, free_port, run_ranks, start_rank, wait_until
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.errors import InputError
@@ -97,9 +97,8 @@ def test_a_launcher_starts_all_again_and_they_go_on(make_config, tmp_path: Path,
 
 def test_an_unexpected_error_of_one_process_ends_the_others_with_one_error(make_config, tmp_path: Path) -> None:
     """A bug, or a library's error, in a single process: the others do not wait for it."""
-    path, port = tmp_path / "config.yaml", free_port()
+    path = tmp_path / "config.yaml"
     path.write_text(config_as_yaml(make_config(training__accumulation=1)))
-    ranks = [start_rank([SCRIPT, str(path), "one_has_a_bug"], rank, 2, port) for rank in range(2)]
-    (first, _), (second, _) = finish(ranks, 3, timeout=300)
+    (first, _), (second, _) = run_ranks([SCRIPT, str(path), "one_has_a_bug"], status=3)
     assert second == "ValueError: a bug\n"
     assert first.startswith("UnreachableError: another process of this run: ")

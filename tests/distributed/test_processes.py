@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paths import ROOT
-from ranks import Rank, finish, free_port, start_rank, wait_until
+from ranks import Rank, finish, free_port, run_ranks, start_rank, wait_until
 from same_run import assert_equal_up_to_rounding
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.loader import ProcessShare, first_clips
@@ -89,8 +89,7 @@ def test_two_nodes_of_torchrun_make_the_run_of_one_process(without_dropout, repo
 def test_what_processes_say_to_each_other(tmp_path, without_dropout) -> None:
     """Sums, gradients, broken episodes, a micro-batch that is empty for one process: in processes_together.py."""
     without_dropout("pair", data__broken_episodes="skip", training__max_grad_norm=None)
-    script, port = ROOT / "tests/support/processes_together.py", free_port()
-    finish([start_rank([str(script), str(tmp_path / "pair.yaml")], rank, 2, port) for rank in range(2)])
+    run_ranks([str(ROOT / "tests/support/processes_together.py"), str(tmp_path / "pair.yaml")])
 
 
 @pytest.mark.parametrize(

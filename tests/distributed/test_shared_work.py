@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from paths import ROOT
-from ranks import finish, free_port, start_rank
+from ranks import run_ranks
 from same_run import metrics
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.training.loop import train
@@ -45,9 +45,8 @@ def test_processes_that_share_an_evaluation_find_what_one_finds(make_config, tmp
     config = make_config(**data, training__steps=2, validation__batch_size=3, validation__every=2)
     run = str(train(config, reporter))
     words = [BROKEN, "evaluate", run, *PROBES, "--out"]
-    finish([start_rank([*words, str(tmp_path / "alone")], 0, 1, 0)], timeout=300)
-    port = free_port()
-    said = finish([start_rank([*words, str(tmp_path / "together")], rank, 3, port) for rank in range(3)], timeout=300)
+    run_ranks([*words, str(tmp_path / "alone")], 1)
+    said = run_ranks([*words, str(tmp_path / "together")], 3)
     assert "uses actions" in said[0][0]
     assert [out for out, _ in said[1:]] == ["", ""], "only the first process speaks"
     alone, together = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("alone", "together"))
@@ -61,16 +60,14 @@ def test_a_shared_validation_is_that_of_one_process(make_config, tmp_path: Path)
     for processes in (1, 2):
         config = make_config(**changes, run_dir=str(tmp_path / f"{processes}"))
         (tmp_path / f"{processes}.yaml").write_text(config_as_yaml(config))
-        words, port = [BROKEN, "train", str(tmp_path / f"{processes}.yaml")], free_port()
-        finish([start_rank(words, rank, processes, port) for rank in range(processes)], timeout=300)
+        run_ranks([BROKEN, "train", str(tmp_path / f"{processes}.yaml")], processes)
     first, second = ([row for row in metrics(tmp_path / one) if row["kind"] == "validation"] for one in ("1", "2"))
     np.testing.assert_array_equal(*(list(numbers_of(rows[0]).values()) for rows in (first, second)))
 
 
 def test_an_error_of_one_in_shared_work_is_raised_in_all(make_config, tmp_path: Path) -> None:
-    path, port = tmp_path / "config.yaml", free_port()
+    path = tmp_path / "config.yaml"
     path.write_text(config_as_yaml(make_config()))
     script = str(ROOT / "tests/support/disagreeing_ranks.py")
-    ranks = [start_rank([script, str(path), "one_cannot_read_a_validation_clip"], rank, 2, port) for rank in range(2)]
-    said = [out for out, _ in finish(ranks, 3, timeout=300)]
+    said = [out for out, _ in run_ranks([script, str(path), "one_cannot_read_a_validation_clip"], status=3)]
     assert said == ["InputError: episode 3: its image is damaged.\n"] * 2

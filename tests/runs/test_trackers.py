@@ -2,8 +2,6 @@
 
 import importlib.util
 import logging
-import sys
-import types
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -152,27 +150,6 @@ def test_weights_and_biases_goes_on_in_the_same_run_without_a_network(tmp_path: 
     assert written.count(b"train/loss") >= 2
     for word in (b"arms", b"training.learning_rate", b"adapter.rank"):
         assert word in written
-
-
-def test_a_tracker_is_asked_to_resume_the_run_by_its_id(tmp_path: Path, monkeypatch) -> None:
-    asked: dict[str, dict[str, Any]] = {}
-    kept = Kept()
-
-    for library in ("wandb", "trackio"):
-        module = types.ModuleType(library)
-        module.init = lambda _library=library, **given: asked.setdefault(_library, given) and kept  # type: ignore[attr-defined]
-        module.Settings = types.SimpleNamespace  # type: ignore[attr-defined]
-        monkeypatch.setitem(sys.modules, library, module)
-    config = run_config(tmp_path, wandb="online", trackio=True)
-    trackers = open_trackers(config, tmp_path, run_id="abc123", first_step=0)
-    trackers.log("train", 3, {"loss": 0.5})
-    trackers.close()
-    assert kept.rows == [(3, {"train/loss": 0.5})] * 2
-    assert kept.closed == 2
-    assert (asked["wandb"]["id"], asked["trackio"]["name"]) == ("abc123", "abc123")
-    for given in asked.values():
-        assert (given["project"], given["resume"]) == ("arms", "allow")
-        assert given["config"]["training.learning_rate"] == config.training.learning_rate
 
 
 def test_trackio_goes_on_in_the_same_run(tmp_path: Path) -> None:

@@ -53,6 +53,14 @@ def tiny_model(seed: int = 0, dtype: torch.dtype = torch.float32) -> WorldModel:
     return copy.deepcopy(_drawn(seed, dtype))
 
 
+def move_trained(model: WorldModel) -> list[Tensor]:
+    """Let every trained weight differ from its start; return these weights."""
+    generator, trained = torch.Generator().manual_seed(2), [one for one in model.parameters() if one.requires_grad]
+    for value in trained:
+        value.data += 0.05 * torch.randn(value.shape, generator=generator)
+    return trained
+
+
 @cache
 def _drawn(seed: int, dtype: torch.dtype) -> WorldModel:
     return WorldModel.random(SIZES, seed=seed, dtype=dtype)

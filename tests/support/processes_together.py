@@ -25,8 +25,7 @@ from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.training.resume import save_checkpoint
-from vjepa2_ac.training.run import Run
-from vjepa2_ac.training.step import gradients, training_step
+from vjepa2_ac.training.step import Run, gradients, training_step
 
 
 def batches(run: Run, read: list[list[int]]) -> Iterator[Batch]:

@@ -69,6 +69,12 @@ def start_rank(words: list[str], rank: int, processes: int, port: int, **more: s
     return Rank(words, environment)
 
 
+def run_ranks(words: list[str], processes: int = 2, status: int = 0, timeout: float = 300.0) -> list[tuple[str, str]]:
+    """Start all processes of a run, and wait for them; return what each wrote."""
+    port = free_port()
+    return finish([start_rank(words, rank, processes, port) for rank in range(processes)], status, timeout)
+
+
 def finish(processes: list, status: int = 0, timeout: float = 120.0) -> list[tuple[str, str]]:
     """Wait for all; return what each wrote. None is left behind."""
     try:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # the process that only hands out tests does without PyTorch,
     from accelerate import Accelerator
 
     from vjepa2_ac.model.world_model import WorldModel
-    from vjepa2_ac.training.run import Run
+    from vjepa2_ac.training.step import Run
 
 TINY = {
     "image_size": 32,

@@ -8,10 +8,10 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from paths import ROOT
+from sized_runs import built, run_config
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.config.loading import load_config, parse_config
+from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.lora import add_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.flops import clip_flops, frame_flops
 from vjepa2_ac.training.step import Objective
@@ -29,19 +29,10 @@ ADAPTERS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def run_config(adapter: dict[str, Any], **training: Any) -> Config:
-    values = {
-        "run_dir": "run", "data": {"path": "set", "frames": 6}, "adapter": adapter, "training": training,
-        "model": {"base": "base", "dtype": "float32"},
-    }  # fmt: skip
-    return parse_config(values, where="test")
-
-
 def counted(config: Config, clips: int = 2) -> tuple[int, int]:
     """Return what PyTorch counts of the objective of one clip, forward and backward."""
-    model = WorldModel.random(SIZES, seed=0)
-    add_adapter(model, config.adapter, seed=0)
-    frames, objective = config.data.frames, Objective(model.train(), config.training)
+    model = built(config, SIZES)
+    frames, objective = config.data.frames, Objective(model, config.training)
     batch = LatentBatch(
         latents=torch.randn(clips, frames, model.num_tokens, model.latent_dim), states=torch.randn(clips, frames, 7),
         actions=torch.randn(clips, frames - 1, 7), extrinsics=None, episode_ids=("a",) * clips, starts=(0,) * clips,
@@ -56,7 +47,7 @@ def counted(config: Config, clips: int = 2) -> tuple[int, int]:
 
 @pytest.mark.parametrize("adapter", ADAPTERS)
 def test_a_clip_is_what_pytorch_counts(adapter: str) -> None:
-    config = run_config(ADAPTERS[adapter], rollout_steps=3)
+    config = run_config(ADAPTERS[adapter], training__rollout_steps=3, model__dtype="float32")
     flops = clip_flops(config, SIZES)
     assert (flops.forward, flops.backward) == counted(config)
 

@@ -20,8 +20,7 @@ from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_s
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.training import outputs, validation
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.run import batches_from
-from vjepa2_ac.training.step import training_step
+from vjepa2_ac.training.step import batches_from, training_step
 
 
 def test_a_run_that_died_and_went_on_equals_the_one_that_did_not(make_config, reporter, tmp_path, whole_run) -> None:
@@ -125,12 +124,6 @@ def test_check_does_everything_but_writes_nothing(make_config, reporter) -> None
     assert not Path(config.run_dir).exists()
     with pytest.raises(InputError, match="copying the last frame"):
         train(make_config(training__allow_weak_base=False), reporter, check_only=True)
-
-
-def test_a_folder_of_another_config_is_refused_and_names_the_key(make_config, reporter) -> None:
-    train(make_config(training__steps=1), reporter)
-    with pytest.raises(InputError, match=r"training\.learning_rate"):
-        train(make_config(training__steps=1, training__learning_rate=2e-3), reporter)
 
 
 def test_an_allowed_config_change_is_written_and_reported(make_config, reporter) -> None:

@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import layer_norm, smooth_l1_loss
 
+from model_fixtures import move_trained
 from paths import GOLDEN
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes, TrainingConfig
 from vjepa2_ac.episode import LatentBatch
@@ -85,15 +86,9 @@ def trained_model(adapter: AdapterConfig, *, extrinsics: bool = False, checkpoin
     )
     model = WorldModel.random(sizes, seed=0)
     add_adapter(model, adapter, seed=0)
-    generator = torch.Generator().manual_seed(2)
-    for value in trained(model):
-        value.data += 0.05 * torch.randn(value.shape, generator=generator)
+    move_trained(model)
     model.set_gradient_checkpointing(checkpointing)
     return model.train()  # type: ignore[return-value]
-
-
-def trained(model: WorldModel) -> list[Tensor]:
-    return [value for value in model.parameters() if value.requires_grad]
 
 
 def clips(*, extrinsics: bool = False) -> LatentBatch:
@@ -119,7 +114,8 @@ def plain_losses(model: WorldModel, batch: LatentBatch, steps: int) -> tuple[Ten
 
 
 def with_gradients(model: WorldModel, losses: tuple[Tensor, Tensor]) -> list[Tensor]:
-    return [*losses, *torch.autograd.grad(losses[0] + 2.0 * losses[1], trained(model))]
+    trained = [value for value in model.parameters() if value.requires_grad]
+    return [*losses, *torch.autograd.grad(losses[0] + 2.0 * losses[1], trained)]
 
 
 @pytest.mark.parametrize("steps", [2, 6])

@@ -1,11 +1,12 @@
-"""A missing library is reported in one line, with a fix, before anything is opened, fetched or computed."""
+"""A missing library or compiler is reported in one line, with a fix, before anything is opened, fetched or computed."""
 
 import re
 import sys
 
 import pytest
 
-from vjepa2_ac.errors import UserError, pip_install
+from vjepa2_ac.errors import InputError, UserError, pip_install
+from vjepa2_ac.model import compilation
 from vjepa2_ac.training.loop import train
 
 
@@ -25,3 +26,11 @@ def test_missing_libraries_are_reported_before_mirror_or_data_are_opened(
     config = make_config(data__path="nowhere", checkpoint__remote="nothing://reads/this", **{knob: value})
     with pytest.raises(UserError, match=rf"{library}.* is not installed.*{re.escape(pip_install(extra))}"):
         train(config, reporter)
+
+
+def test_a_run_that_nothing_can_compile_is_refused_before_anything_is_loaded(
+    make_config, reporter, monkeypatch
+) -> None:
+    monkeypatch.setattr(compilation, "missing_for_compilation", lambda kind: f"no compiler for {kind}")
+    with pytest.raises(InputError, match=r"training.compile.*no compiler for cpu.*training.compile=off"):
+        train(make_config(training__compile="blocks", data__path="nowhere"), reporter)

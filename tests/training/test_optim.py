@@ -1,6 +1,5 @@
 """Learning rates and parameter groups."""
 
-import importlib.util
 import io
 import json
 from collections.abc import Callable
@@ -94,37 +93,12 @@ def test_a_run_resumes_with_the_moments_of_a_fused_and_of_a_plain_optimizer(
     torch.testing.assert_close(weights[1], weights[0], rtol=1e-5, atol=1e-7)
 
 
-with_bitsandbytes = pytest.mark.skipif(
-    importlib.util.find_spec("bitsandbytes") is None, reason="bitsandbytes (extra 8bit) is not installed"
-)
-
-
 def take_steps(module: torch.nn.Linear, optimizer: torch.optim.Optimizer, seeds: range) -> None:
     for seed in seeds:
         inputs = torch.randn(5, 128, generator=torch.Generator().manual_seed(seed))
         module(inputs).square().mean().backward()
         optimizer.step()
         optimizer.zero_grad()
-
-
-@with_bitsandbytes
-def test_the_8_bit_optimizer_resumes_exactly_and_spares_biases() -> None:
-    training = TrainingConfig(optimizer="adamw_8bit", learning_rate=1e-2)
-    module, resumed = torch.nn.Linear(128, 64), torch.nn.Linear(128, 64)
-    optimizer = make_optimizer(module, training)
-    assert [group["weight_decay"] for group in optimizer.param_groups] == [0.04, 0.0]
-    assert optimizer.param_groups[1]["params"] == [module.bias]
-    take_steps(module, optimizer, range(3))
-    assert optimizer.state[module.weight]["state1"].dtype == torch.uint8
-    kept = io.BytesIO()
-    torch.save(optimizer.state_dict(), kept)
-    resumed.load_state_dict(module.state_dict())
-    again = make_optimizer(resumed, training)
-    load_moments(again, torch.load(io.BytesIO(kept.getvalue()), weights_only=True, map_location="cpu"))
-    take_steps(module, optimizer, range(3, 6))
-    take_steps(resumed, again, range(3, 6))
-    assert torch.equal(module.weight, resumed.weight)
-    assert torch.equal(module.bias, resumed.bias)
 
 
 @pytest.mark.parametrize("changes", [{"state": {0: {"momentum": 3}}}, {}], ids=str)

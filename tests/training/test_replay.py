@@ -180,6 +180,3 @@ def test_held_out_episodes_that_would_be_replayed_are_named(replaying, reporter,
     same = {"replay__data__validation_share": 0.3, "replay__data__test_share": 0.2}
     set_up(replaying(replay__data__path=str(data_folder), **same), reporter)
     assert not [note for note in reporter.notes if "holds out" in note]
-
-
-# ---- the run's identity ----

@@ -20,8 +20,7 @@ from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import save_checkpoint
-from vjepa2_ac.training.run import Run, batches_from
-from vjepa2_ac.training.step import Gradients, gradients, training_step
+from vjepa2_ac.training.step import Gradients, Run, batches_from, gradients, training_step
 
 
 def prepared(make_config: Any, reporter: Any, batch_size: int, accumulation: int, **changes: Any) -> Run:

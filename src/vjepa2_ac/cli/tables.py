@@ -194,8 +194,6 @@ class TrainingConsole(ConsoleReporter):
         """Move the bar."""
         speed = metrics["samples_per_second"]
         words = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
-        if "bytes_per_clip" in metrics:
-            words.append(f"{metrics['bytes_per_clip'] / 1e6:.2f} MB/clip")
         if metrics.get("data_wait_share", 0.0) > _MUCH_WAITING:
             words.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
         self._bar(step, self._steps, "  ".join(word for word in words if word))

@@ -94,9 +94,7 @@ def require_base_of_run(config: ModelConfig, run: Path, command: Sequence[str] =
 def _find(name: str, where: str, needed: str, fix: str) -> Path:
     path = ASSETS / name.removeprefix(BUILTIN) if name.startswith(BUILTIN) else Path(name)
     if name.startswith(BUILTIN) and not (path / CONFIG).is_file():
-        there = ", ".join(sorted(f"{BUILTIN}{config.parent.name}" for config in ASSETS.glob(f"*/{CONFIG}")))
-        found = f"no model of that name in the package; it has {there or 'none: install it again'}"
-        raise InputError(where=where, found=found, needed=_TINY)
+        raise InputError(where=where, found="no model of that name in the package", needed=_TINY)
     if not path.exists():
         raise InputError(where=where, found="no such file or folder", needed=needed, fix=fix)
     return path
@@ -183,21 +181,6 @@ class EncoderOrigin:
     def __str__(self) -> str:
         key = f", {self.key}" if self.key else ""
         return f"{self.file}{key}{f' ({self.licence})' if self.licence else ''}"
-
-
-def beyond_tensors(sizes: EncoderSizes, *, heads_are_told: bool) -> dict[str, str | int]:
-    """Return what latents depend on and tensors do not show; nothing of V-JEPA 2's tubelets with the published heads.
-
-    Args:
-        sizes: Of the encoder.
-        heads_are_told: Whether the heads belong to it; not of a model that was made with its encoder.
-    """
-    found: dict[str, str | int] = {}
-    if sizes.family != "v2":
-        found |= {"encoder.family": sizes.family, "encoder.frame": sizes.frame}
-    if heads_are_told and HEADS.get(sizes.width) != sizes.heads:
-        found["encoder.heads"] = sizes.heads
-    return found
 
 
 # ---- published checkpoints ----

@@ -22,14 +22,7 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.blocks import initialise
 from vjepa2_ac.model.encoder import ENCODE_CHUNK, Encoder
-from vjepa2_ac.model.model_files import (
-    CONFIG,
-    FORMAT,
-    EncoderOrigin,
-    beyond_tensors,
-    read_encoder_origin,
-    read_sizes,
-)
+from vjepa2_ac.model.model_files import CONFIG, FORMAT, HEADS, EncoderOrigin, read_encoder_origin, read_sizes
 from vjepa2_ac.model.predictor import LatentDynamics, new_predictor, normalise_latents
 from vjepa2_ac.storage import folder_writer
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
@@ -225,9 +218,16 @@ class WorldModel(LatentDynamics):
 
     @property
     def encoder_beyond_tensors(self) -> dict[str, str | int]:
-        """The properties that latents depend on and tensors do not show: family, frame path and heads."""
-        origin = self.encoder_origin
-        return beyond_tensors(self.sizes.encoder, heads_are_told=origin is not None and origin.heads_are_told)
+        """The properties that latents depend on and tensors do not show.
+
+        There are none for V-JEPA 2's tubelets with the published heads, or where a model was made with its encoder.
+        """
+        sizes, origin, beyond = self.sizes.encoder, self.encoder_origin, dict[str, str | int]()
+        if sizes.family != "v2":
+            beyond |= {"encoder.family": sizes.family, "encoder.frame": sizes.frame}
+        if origin is not None and origin.heads_are_told and HEADS.get(sizes.width) != sizes.heads:
+            beyond["encoder.heads"] = sizes.heads
+        return beyond
 
     @property
     def encoder_in_words(self) -> str:

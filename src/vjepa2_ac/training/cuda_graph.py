@@ -16,8 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.training.run import Run
-from vjepa2_ac.training.step import micro_step
+from vjepa2_ac.training.step import Run, micro_step
 
 Body = Callable[[], None]
 

@@ -21,9 +21,8 @@ from vjepa2_ac.training.monitoring import Throughput, TimedBatches
 from vjepa2_ac.training.optim import require_optimizer
 from vjepa2_ac.training.outputs import RunOutputs
 from vjepa2_ac.training.resume import restore
-from vjepa2_ac.training.run import Run, batches_from
 from vjepa2_ac.training.setup import set_up
-from vjepa2_ac.training.step import gradients, training_step
+from vjepa2_ac.training.step import Run, batches_from, gradients, training_step
 from vjepa2_ac.training.validation import record, validate_base, validate_if_due
 
 _IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."

@@ -25,7 +25,7 @@ from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.monitoring import WatchedMetricsLog
 from vjepa2_ac.training.optim import describe_changed_rate
 from vjepa2_ac.training.resume import save_checkpoint
-from vjepa2_ac.training.run import Run
+from vjepa2_ac.training.step import Run
 from vjepa2_ac.training.validation import is_done
 
 if TYPE_CHECKING:

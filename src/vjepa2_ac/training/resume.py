@@ -37,7 +37,7 @@ from vjepa2_ac.runs.checkpoint import (
 from vjepa2_ac.runs.folder import run_id
 from vjepa2_ac.runs.metrics_log import warn_if_stalled
 from vjepa2_ac.training.optim import load_moments
-from vjepa2_ac.training.run import Run
+from vjepa2_ac.training.step import Run
 
 
 def save_checkpoint(run: Run, folder: Path) -> None:

@@ -36,8 +36,7 @@ from vjepa2_ac.runs.folder import CONFIG, read_run_config
 from vjepa2_ac.training.cost import batch_bytes
 from vjepa2_ac.training.cuda_graph import GraphedMicroStep
 from vjepa2_ac.training.optim import make_optimizer
-from vjepa2_ac.training.run import Run
-from vjepa2_ac.training.step import Objective, micro_step
+from vjepa2_ac.training.step import Objective, Run, micro_step
 
 _STEP_TOLERANCE = 0.01  # by which the time of a model step may differ
 _CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes

@@ -1,33 +1,101 @@
-"""One optimizer step: losses, gradients accumulated over micro-batches and processes, clipping, update."""
+"""The parts of a run, and one optimizer step: losses, gradients over micro-batches and processes, clipping, update."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import torch
+from accelerate import Accelerator
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import smooth_l1_loss
 
-from vjepa2_ac.config import TrainingConfig
+from vjepa2_ac.config import Config, TrainingConfig
 from vjepa2_ac.config.section import Positive, Section
-from vjepa2_ac.distributed import all_gather_object, all_reduce, all_reduce_gradients, raise_first
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader
+from vjepa2_ac.distributed import PRECISIONS, all_gather_object, all_reduce, all_reduce_gradients, raise_first
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.model.distances import absolute_difference
+from vjepa2_ac.model.low_rank import CastMatrices
 from vjepa2_ac.model.predictor import KeyValueCache, LatentDynamics
-from vjepa2_ac.model.world_model import seed_of
+from vjepa2_ac.model.world_model import WorldModel, seed_of
 from vjepa2_ac.registry import LOSSES
-from vjepa2_ac.storage import is_url
-from vjepa2_ac.training.optim import learning_rate_at
-from vjepa2_ac.training.run import Run
+from vjepa2_ac.runs.checkpoint import RunState
+from vjepa2_ac.training.optim import learning_rate_at, trained_parameters
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # (predicted latents, true latents) -> the loss of each element
 
 SMALLEST_LOSS_SCALE = 1.0  # fp16: if gradients still overflow, they are not finite for another reason
+
+
+@dataclass
+class Run:
+    """All parts of a run, assembled and checked by `setup.set_up`."""
+
+    config: Config  # its stride is a number
+    accelerator: Accelerator  # device, precision, and the rank of this process
+    world_model: WorldModel
+    objective: Callable[[LatentBatch], tuple[Tensor, Tensor]]  # (teacher forcing, rollout)
+    micro_step: Callable[[Run, LatentBatch, float], Tensor]  # `micro_step`, or a graph of it
+    optimizer: torch.optim.Optimizer
+    scaler: torch.amp.GradScaler  # has no effect except with fp16
+    dataset: Dataset
+    state: RunState
+    micro_batches: int  # of an optimizer step, of all processes together
+    calibration: Mapping[str, Any] | None = None  # if data.stride was auto and was chosen in this start
+    replayed: Dataset | None = None  # the second data set, if there is one
+    strip: Any = None  # the hook `validation.decoder`: decoding.imagine.ImaginedStrip
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder."""
+        return Path(self.config.run_dir)
+
+    @property
+    def datasets(self) -> list[Dataset]:
+        """The data set, and the replayed one."""
+        return [one for one in (self.dataset, self.replayed) if one is not None]
+
+    @cached_property
+    def trained(self) -> list[nn.Parameter]:
+        """The parameters of the optimizer."""
+        return list(trained_parameters(self.world_model))
+
+    @cached_property
+    def cast_matrices(self) -> CastMatrices:
+        """The adapter in the type of the computation."""
+        return CastMatrices(self.world_model.predictor, PRECISIONS[self.config.training.precision])
+
+    @property
+    def clips_per_step(self) -> int:
+        """Clips of an optimizer step, of all processes together."""
+        return self.micro_batches * self.config.training.batch_size
+
+    @property
+    def share(self) -> ProcessShare:
+        """The rank of this process among those that share the clips."""
+        return ProcessShare(self.accelerator.process_index, self.accelerator.num_processes, self.micro_batches)
+
+
+def batches_from(run: Run) -> Batches:
+    """Yield the micro-batches of this process from the current step on."""
+    replay = run.config.replay
+    return training_loader(
+        Mixed(run.dataset, run.replayed, replay.share if replay else 0.0),
+        seed=run.config.seed,
+        batch_size=run.config.training.batch_size,
+        start_position=run.state.clips_done,
+        share=run.share,
+        pinned=run.accelerator.device.type == "cuda",
+    )
 
 
 @dataclass(frozen=True)
@@ -38,7 +106,6 @@ class Gradients:
     rollout_loss: float
     norm: float  # before clipping; not finite after an overflow in fp16, which the loss scale handles
     clips: int  # number of clips that could be read
-    bytes_fetched: int
 
 
 def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_update: bool = False) -> dict[str, float]:
@@ -75,8 +142,6 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
         metrics["update_to_weight"] = update.to_weight()
     if any(data.broken_episodes == "skip" for data in run.config.data_sets):
         metrics["clips_left_out"] = float(run.clips_per_step - computed.clips)
-    if any(is_url(data.path) for data in run.config.data_sets):
-        metrics["bytes_per_clip"] = computed.bytes_fetched / max(1, computed.clips)
     if run.scaler.is_enabled():
         metrics["loss_scale"] = run.scaler.get_scale()
     return metrics
@@ -98,40 +163,39 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
     """
     if not run.world_model.training:  # after a validation
         run.world_model.train()
-    totals, names, fetched, error = torch.zeros(2), list[str](), 0, None
+    totals, names, error = torch.zeros(2), list[str](), None
     try:
         with run.cast_matrices.current():
-            totals, names, fetched = _accumulate(run, batches)
+            totals, names = _accumulate(run, batches)
     except UserError as raised:
         error = raised
-    sums = [*totals.tolist(), len(names), fetched, error is not None]  # waits for the device
-    *losses, clips, bytes_fetched, failed = all_reduce(run.accelerator, sums, "sum")
+    sums = [*totals.tolist(), len(names), error is not None]  # waits for the device
+    *losses, clips, failed = all_reduce(run.accelerator, sums, "sum")
     if failed:
         raise_first(run.accelerator, error)
     expected = run.clips_per_step
     if clips < expected:
         _share_broken_episodes(run)
     if not clips:
-        return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(bytes_fetched))
+        return Gradients(math.nan, math.nan, 0.0, clips=0)
     forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
     norm = _finish_gradients(run, factor=expected / clips)
     _refuse_not_finite(run, forced_loss + rollout_loss, norm, names)
-    return Gradients(forced_loss, rollout_loss, norm, int(clips), int(bytes_fetched))
+    return Gradients(forced_loss, rollout_loss, norm, int(clips))
 
 
-def _accumulate(run: Run, batches: Iterator[Batch]) -> tuple[Float[Tensor, 2], list[str], int]:
-    """Return this process's part of both losses, the names of its clips, and the bytes fetched for them."""
-    totals, names, fetched = torch.zeros(2, device=run.accelerator.device), list[str](), 0
+def _accumulate(run: Run, batches: Iterator[Batch]) -> tuple[Float[Tensor, 2], list[str]]:
+    """Return this process's part of both losses, and the names of its clips."""
+    totals, names = torch.zeros(2, device=run.accelerator.device), list[str]()
     for _ in run.share.own:
         batch = next(batches)
-        fetched += batch.bytes_fetched
         if not batch.starts:
             continue
         names += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
         parts = run.clips_per_step / len(batch.starts)
         losses = run.micro_step(run, encode(run, batch), parts)
         totals += losses / parts
-    return totals, names, fetched
+    return totals, names
 
 
 def encode(run: Run, batch: Batch) -> LatentBatch:

@@ -20,8 +20,7 @@ from vjepa2_ac.evaluation.result import Validation, cost_of_actions, one_step_ov
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.training.run import Run
-from vjepa2_ac.training.step import encode
+from vjepa2_ac.training.step import Run, encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
 RANK = "action_ranking_error"  # checkpoint.keep_best ranking

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch._dynamo.utils import counters
 
+from model_fixtures import move_trained
 from tracing import tracing
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.episode import LatentBatch
@@ -25,10 +26,7 @@ def adapted(sizes: ModelSizes, **changes: Any) -> WorldModel:
     """Return a model of two blocks whose adapter does something."""
     model = WorldModel.random(sizes, seed=0)
     add_adapter(model, AdapterConfig(**{"rank": 4, "alpha": 8.0, "dropout": 0.0} | changes), seed=0)
-    generator = torch.Generator().manual_seed(2)
-    for value in model.parameters():
-        if value.requires_grad:
-            value.data += 0.05 * torch.randn(value.shape, generator=generator)
+    move_trained(model)
     return model.train()  # type: ignore[return-value]
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from model_fixtures import move_trained
 from vjepa2_ac.config import AdapterConfig, ModelConfig, ModelSizes
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
@@ -50,11 +51,7 @@ def trained(widths: Widths, config: AdapterConfig) -> WorldModel:
     """A model whose every trained weight has moved."""
     model = fitted(widths)
     add_adapter(model, config, seed=0)
-    generator = torch.Generator().manual_seed(9)
-    with torch.no_grad():
-        for value in model.parameters():
-            if value.requires_grad:
-                value += 0.05 * torch.randn(value.shape, generator=generator)
+    move_trained(model)
     return model
 
 
@@ -62,17 +59,10 @@ def trained(widths: Widths, config: AdapterConfig) -> WorldModel:
 def test_only_heads_that_do_not_fit_are_replaced_and_each_is_told(widths: Widths) -> None:
     model, before = base(), base().predictor.state_dict()
     lines = fit_heads(model, widths, seed=0)
-    expected = {
-        "state encoder": (widths.state, "state_encoder"),
-        "action encoder": (widths.action, "action_encoder"),
-    }
-    told = [
-        f"{words}: {width} numbers instead of the base's 7: newly initialised"
-        for words, (width, _) in expected.items()
-        if width != 7
-    ]
-    assert sorted(lines) == sorted(told)
-    assert set(heads_to_replace(TINY, widths)) == {name for width, name in expected.values() if width != 7}
+    replaced = {name: width for name, width in zip(HEADS, widths[::-1], strict=True) if width != 7}
+    expected = [f"{name.replace('_', ' ')}: {width} numbers instead" for name, width in replaced.items()]
+    assert [line.partition(" of")[0] for line in lines] == expected
+    assert heads_to_replace(TINY, widths) == tuple(replaced)
     for name, value in model.predictor.state_dict().items():
         if name.split(".")[0] not in heads_to_replace(TINY, widths):
             assert torch.equal(value, before[name]), name

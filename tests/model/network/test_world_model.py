@@ -1,6 +1,7 @@
 """The world model, its encoder, and the initial values of a fresh predictor."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -40,38 +41,25 @@ def test_a_saved_model_is_the_same_when_it_is_loaded(model: WorldModel, tmp_path
     assert torch.equal(loaded.predict(inputs.latents, inputs.actions, inputs.states), expected)
 
 
-def break_config(folder: Path) -> None:
-    (folder / "config.json").write_text("{")
-
-
 def break_sizes(folder: Path) -> None:
     card = json.loads((folder / "config.json").read_text())
     card["sizes"]["predictor"]["depth"] = 3
     (folder / "config.json").write_text(json.dumps(card))
 
 
-def break_format(folder: Path) -> None:
-    (folder / "config.json").write_text('{"model_type": "vjepa2"}')
-
-
-def truncate_encoder(folder: Path) -> None:
-    path = folder / "encoder.safetensors"
-    path.write_bytes(path.read_bytes()[:-100])
-
-
-def remove_predictor(folder: Path) -> None:
-    (folder / "predictor" / "model.safetensors").unlink()
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (shutil.rmtree, "config.json: cannot be read: No such file or directory. needed: a folder written by"),
-        (break_config, "config.json: not JSON"),
-        (break_format, "config.json: not the config of a world model"),
+        (
+            lambda folder: (folder / "config.json").write_text('{"model_type": "vjepa2"}'),
+            "config.json: not the config of a world model",
+        ),
         (break_sizes, r"model.safetensors: 16 tensors do not fit \(missing: blocks.2.attn.k.bias"),
-        (truncate_encoder, "encoder.safetensors: not a whole safetensors file"),
-        (remove_predictor, "predictor/model.safetensors: cannot be read: No such file"),
+        (
+            lambda folder: os.truncate(folder / "encoder.safetensors", 1000),
+            "encoder.safetensors: not a whole safetensors file",
+        ),
     ],
 )
 def test_a_folder_that_is_not_a_whole_model_is_named(
