@@ -29,7 +29,6 @@ from accelerate.state import AcceleratorState
 from accelerate.utils import InitProcessGroupKwargs
 from torch import Tensor, nn
 from torch.distributed.rendezvous import rendezvous
-from torch.utils.benchmark import Timer
 
 from vjepa2_ac.config import Config, ModelConfig, TrainingConfig
 from vjepa2_ac.errors import InputError, UnreachableError, UserError, in_words
@@ -132,6 +131,8 @@ def matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
 
     Measured once per device and type in a program: load by other programs affects it.
     """
+    from torch.utils.benchmark import Timer  # many commands import this module and measure nothing
+
     size = _CUDA_MATRIX if device.type == "cuda" else _CPU_MATRIX
     generator = torch.Generator(device).manual_seed(0)  # its own, so that training's random numbers do not change
     matrix = torch.randn(size, size, device=device, generator=generator).to(dtype)
