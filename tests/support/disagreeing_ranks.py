@@ -19,7 +19,7 @@ from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.encoding import encode_dataset
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.training import loop, resume, run, setup, validation
+from vjepa2_ac.training import loop, resume, setup, step, validation
 from vjepa2_ac.training.loop import train
 
 RANK = int(os.environ["RANK"])
@@ -98,7 +98,7 @@ def each_meets_another_broken_episode() -> None:
             yield replace(batch, **{key: getattr(batch, key)[:1] for key in ("states", "actions", "frames")},
                           episode_ids=batch.episode_ids[:1], starts=batch.starts[:1])  # fmt: skip
 
-    run.training_loader = loader
+    step.training_loader = loader
 
 
 if __name__ == "__main__":
