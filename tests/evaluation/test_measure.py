@@ -1,6 +1,7 @@
 """Errors equal those computed by hand; shuffled actions are those of the clip before, for any batch size."""
 
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -80,7 +81,8 @@ def test_processes_that_share_clips_give_each_the_same_actions_whatever_clips_ar
 
         found = [torch.zeros(0, *batch.actions.shape[1:])]
         for process in range(processes):
-            monkeypatch.setattr(distributed, "_place", lambda process=process: (process, processes))
+            accelerator = SimpleNamespace(process_index=process, num_processes=processes)
+            monkeypatch.setattr(distributed, "_sharing", accelerator)
             own = own_part(7, 2)
             before = actions_before(own, range(7), read)
             found += [others for _, others in with_other_actions(read(own), before)]
