@@ -52,7 +52,6 @@ _LAUNCHER = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 _UNSET = "Unset RANK and WORLD_SIZE if you did not start several processes"
 _MEETING = timedelta(minutes=10)  # of all processes, before any work
 _PATIENCE_S = 5.0  # until the others that are waited for are reported
-LARGE = 1_000_000  # numbers of a gradient that is a message of its own
 _LONGEST_STEP = timedelta(hours=2)  # until a process is given up that does not come to a sum: its disk may have stalled
 _AS_LONG_AS_IT_TAKES = timedelta(days=7)
 
@@ -317,27 +316,21 @@ def all_reduce(accelerator: Accelerator, values: Sequence[float], kind: Literal[
 def all_reduce_gradients(accelerator: Accelerator, parameters: Iterable[nn.Parameter]) -> None:
     """Replace the gradient of each parameter by its sum over all processes; no gradient counts as zero.
 
-    Small ones go together: hundreds of messages would each wait for the network.
+    They go together: hundreds of messages would each wait for the network. Each gradient keeps its memory, to which a
+    CUDA graph writes.
     """
     if accelerator.num_processes == 1:
         return
-    small: list[Tensor] = []
-    under_way = []
+    gradients: list[Tensor] = []
     for parameter in parameters:
         if parameter.grad is None:
             parameter.grad = torch.zeros_like(parameter)
-        if parameter.numel() < LARGE:
-            small.append(parameter.grad)
-        else:
-            under_way.append(torch.distributed.all_reduce(parameter.grad, async_op=True))
-    if small:
-        together = torch.cat([gradient.flatten() for gradient in small])
-        torch.distributed.all_reduce(together)
-        parts = together.split([one.numel() for one in small])  # type: ignore[no-untyped-call]  # torch
-        for gradient, summed in zip(small, parts, strict=True):
-            gradient.copy_(summed.view_as(gradient))
-    for work in under_way:
-        work.wait()
+        gradients.append(parameter.grad)
+    together = torch.cat([gradient.flatten() for gradient in gradients])
+    torch.distributed.all_reduce(together)
+    sums = together.split([one.numel() for one in gradients])  # type: ignore[no-untyped-call]  # torch
+    for gradient, summed in zip(gradients, sums, strict=True):
+        gradient.copy_(summed.view_as(gradient))
 
 
 def broadcast_object(accelerator: Accelerator, value: _T) -> _T:

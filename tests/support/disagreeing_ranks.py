@@ -14,6 +14,7 @@ from unittest import mock
 import numpy as np
 import torch
 
+from clips import some_clips
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.encoding import encode_dataset
@@ -95,8 +96,7 @@ def each_meets_another_broken_episode() -> None:
         for batch in make(dataset, **given):  # type: ignore[arg-type]
             for number in range(2):
                 dataset.dataset.broken.met(f"episode {2 * RANK + number}", "damaged")  # type: ignore[attr-defined]
-            yield replace(batch, **{key: getattr(batch, key)[:1] for key in ("states", "actions", "frames")},
-                          episode_ids=batch.episode_ids[:1], starts=batch.starts[:1])  # fmt: skip
+            yield some_clips(batch, [0])
 
     step.training_loader = loader
 
