@@ -298,33 +298,20 @@ def test_the_stride_that_a_run_has_chosen_is_the_one_of_its_next_start(make_conf
 
 
 def test_an_older_run_keeps_its_drawn_splits_unless_the_config_says_otherwise(make_config, reporter) -> None:
-    with open_run(make_config(), reporter) as opened:
-        opened.begin(opened.config, RunState(step=0))
-    with open_run(make_config(), reporter) as opened:
-        assert opened.config.data.splits == "dataset"
-    file = Path(make_config().run_dir) / "config.yaml"
-    values = yaml.safe_load(file.read_text())
-    del values["data"]["splits"]
-    values["data"] |= OLDER
-    file.write_text(yaml.safe_dump(values))
-    assert read_run_config(file.parent).data.splits == "hash"
-    with open_run(make_config(), reporter) as opened:
-        assert opened.config.data.splits == "hash"
-    with (
-        pytest.raises(InputError, match=r"differs in data\.splits"),
-        open_run(make_config(data__splits="dataset"), reporter),
-    ):
-        pass
-
-
-def test_a_replayed_set_of_an_older_run_keeps_its_drawn_splits(make_config, reporter) -> None:
     data = {"path": make_config().data.path, "frames": 4, "stride": 2}
     config = make_config(replay={"data": data})
     with open_run(config, reporter) as opened:
         opened.begin(opened.config, RunState(step=0))
+    with open_run(config, reporter) as opened:
+        assert [one.splits for one in opened.config.data_sets] == ["dataset", "dataset"]
     file = Path(config.run_dir) / "config.yaml"
     values = yaml.safe_load(file.read_text())
+    values["data"] = {key: value for key, value in values["data"].items() if key != "splits"} | OLDER
     values["replay"]["data"] = config.replay.data.model_dump(mode="json", exclude={"splits"}) | OLDER
     file.write_text(yaml.safe_dump(values))
+    assert read_run_config(file.parent).data.splits == "hash"
     with open_run(config, reporter) as opened:
-        assert [one.splits for one in opened.config.data_sets] == ["dataset", "hash"]
+        assert [one.splits for one in opened.config.data_sets] == ["hash", "hash"]
+    other = make_config(replay={"data": data}, data__splits="dataset")
+    with pytest.raises(InputError, match=r"differs in data\.splits"), open_run(other, reporter):
+        pass
