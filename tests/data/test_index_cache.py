@@ -14,7 +14,6 @@ from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.data.index import (
     EpisodeProblem,
     EpisodeTable,
-    cached_file,
     fingerprint_of,
     get_or_build,
     index_key,
@@ -48,7 +47,7 @@ def test_a_table_is_built_once_and_again_when_that_is_asked_for(tmp_path: Path) 
         assert (ids(found), found.problems, fingerprint_of(found)) == (ids(TABLE), TABLE.problems, KEY)
         assert found.labels["task"].of_episode(2) == "push"
         assert np.array_equal(found.id_rank, TABLE.id_rank)
-    cached_file(DiskCacheConfig(dir=str(tmp_path)), KEY).unlink()
+    (tmp_path / f"index/{KEY}.index").unlink()
     assert ids(kept(tmp_path, table=EpisodeTable.of([EpisodeInfo("other", 1)]))) == ["other"]
 
 

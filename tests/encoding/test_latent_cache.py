@@ -356,7 +356,7 @@ def test_a_cache_of_other_clips_is_refused_and_the_difference_named(
     ("change", "reported"),
     [
         ({"encoder": "another"}, "encoder: numbers, not another"),
-        ({"precision": "bf16"}, r"training\.precision: fp32, not bf16"),
+        ({"training.precision": "bf16"}, r"training\.precision: fp32, not bf16"),
     ],
     ids=str,
 )
@@ -364,7 +364,7 @@ def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
     a_cache: tuple[Dataset, Dataset, Path], change: dict[str, Any], reported: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original, through, _ = a_cache
-    encoding = replace(NUMBERS, **change)
+    encoding = replace(NUMBERS, parts={**NUMBERS.parts, **change})
     monkeypatch.setattr(batch, "encoding_of", lambda model, _: model)
     with pytest.raises(InputError, match=f"no latent cache.*Other caches there: 1; .*{reported}.*vjepa2-ac encode"):
         LatentCache.of(original, encoding).opened()

@@ -23,7 +23,7 @@ from vjepa2_ac.model.world_model import WorldModel
 Frames = UInt8[np.ndarray, "frames height width 3"]
 Encode = Callable[[np.ndarray], torch.Tensor]  # cropped frames to latents
 
-NUMBERS = Encoding("numbers", 16, 8, tokens=4, dim=8, weights="float32", precision="fp32")
+NUMBERS = Encoding({"encoder": "numbers", "training.precision": "fp32"}, image_size=16, tokens=4, dim=8)
 
 
 def as_numbers(frames: np.ndarray) -> torch.Tensor:

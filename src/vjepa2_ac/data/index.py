@@ -351,11 +351,6 @@ def cache_folder(config: DiskCacheConfig) -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
 
 
-def cached_file(config: DiskCacheConfig, key: str) -> Path:
-    """Return the file that caches the index with this key."""
-    return cache_folder(config) / "index" / f"{key}.index"
-
-
 def key_of(parts: Mapping[str, object]) -> str:
     """Return a short key of everything that a cached result depends on."""
     text = json.dumps({"version": _VERSION, **parts}, sort_keys=True, default=str)
@@ -406,7 +401,7 @@ def get_or_make(config: DiskCacheConfig, key: str, make: Callable[[], T], kind: 
     Raises:
         UnreachableError: It is there and cannot be read.
     """
-    path = cached_file(config, key)
+    path = cache_folder(config) / "index" / f"{key}.index"
     try:
         with storage.user_can_read(path):
             data = path.read_bytes()

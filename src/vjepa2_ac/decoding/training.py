@@ -126,7 +126,7 @@ def _make(ready: Setup, reporter: Reporter) -> None:
     card = DecoderCard(
         format="vjepa2-ac decoder 1",
         shape=ready.shape,
-        encoder=ready.encoding.encoder,
+        encoder=ready.encoding.parts["encoder"],
         crop=config.data.crop,
         precision=config.training.precision,
         data=config.data.path,

@@ -95,16 +95,16 @@ def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
 
     Takes as long as it takes to hash the encoder's weights.
     """
-    return Encoding(
-        encoder=world_model.encoder_fingerprint(),
-        image_size=world_model.image_size,
-        patch_size=world_model.sizes.patch_size,
-        tokens=world_model.num_tokens,
-        dim=world_model.latent_dim,
-        weights=config.model.dtype,
-        precision=config.training.precision,
-        beyond=world_model.encoder_beyond_tensors,
-    )
+    parts = {
+        "encoder": world_model.encoder_fingerprint(),
+        "image_size": world_model.image_size,
+        "patch_size": world_model.sizes.patch_size,
+        "normalisation": 1,  # in `transforms.pixels_to_input`, and of features: increase it when one of them changes
+        "model.dtype": config.model.dtype,
+        "training.precision": config.training.precision,
+        **world_model.encoder_beyond_tensors,
+    }
+    return Encoding(parts, world_model.image_size, world_model.num_tokens, world_model.latent_dim)
 
 
 def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Config) -> None:

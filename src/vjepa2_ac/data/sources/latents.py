@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from vjepa2_ac.storage.structured import read_json_object
 
 FORMAT = 2  # of the files of a cache
 CACHE, EPISODES, KEPT = "cache.json", "episodes.npz", "kept.npz"  # files, see `latent_files`
-NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: increase it when one of them changes
 
 _OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # the other keys are of clips
 _NOT_OF_ENCODING = ("data", "format")  # how the names of the other parts begin
@@ -43,27 +42,10 @@ class Encoding:
     some CPUs nothing (tests/encoding/test_training_cache.py).
     """
 
-    encoder: str  # WorldModel.encoder_fingerprint
+    parts: Mapping[str, Any]  # of a key
     image_size: int
-    patch_size: int
     tokens: int
     dim: int
-    weights: str  # model.dtype
-    precision: str  # training.precision
-    beyond: Mapping[str, str | int] = field(default_factory=dict)  # WorldModel.encoder_beyond_tensors
-
-    @property
-    def parts(self) -> dict[str, Any]:
-        """The corresponding parts of a key."""
-        return {
-            "encoder": self.encoder,
-            "image_size": self.image_size,
-            "patch_size": self.patch_size,
-            "normalisation": NORMALISATION,
-            "model.dtype": self.weights,
-            "training.precision": self.precision,
-            **self.beyond,
-        }
 
 
 @dataclass(frozen=True)
