@@ -82,7 +82,7 @@ def test_an_image_that_claims_to_be_huge_is_refused_before_anything_is_made(
     huge: list[Callable[[], object]] = [
         lambda: decode_image(claimed_png(*size), "goal"),
         lambda: decode_image(claimed_jpeg(*size), "goal"),
-        lambda: jpeg.decode_jpegs([claimed_jpeg(*size)], [5], "goal"),
+        lambda: jpeg.decode_images([claimed_jpeg(*size)], [5], "goal"),
     ]
     for decode in huge:
         with pytest.raises(InputError, match=f"goal.*: 1 images of {size[0]} x {size[1]} pixels.*100 megapixels"):

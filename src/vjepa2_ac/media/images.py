@@ -79,36 +79,6 @@ def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
         raise InputError(where=where, found=found, needed=needed)
 
 
-def decode_jpegs(images: Sequence[bytes], steps: Sequence[int], where: str) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return images as RGB, bit for bit as TensorFlow's decoder.
-
-    Args:
-        images: One JPEG or more, all of one size.
-        steps: Control step of each, for messages.
-        where: File, episode and camera, for messages.
-
-    Raises:
-        InputError: An image is not a JPEG, is too large, or differs in size from the first one.
-    """
-    frames, size = np.empty(0, np.uint8), (0, 0)
-    for place, (image, step) in enumerate(zip(images, steps, strict=True)):
-        at = f"{where}: step {step}"
-        try:
-            height, width, _, _ = simplejpeg.decode_jpeg_header(image)
-            if place == 0:
-                require_bounded(height, width, at, count=len(images))
-                frames, size = np.empty((len(images), height, width, 3), np.uint8), (height, width)
-            if (height, width) != size:
-                needed = f"{size[0]}x{size[1]} as at step {steps[0]}"
-                raise InputError(where=at, found=f"an image of {height}x{width}", needed=needed)
-            # Decoded in place: stacking the images would take as long again.
-            simplejpeg.decode_jpeg(image, colorspace="RGB", fastdct=True, buffer=frames[place])
-        except ValueError as error:
-            found = f"{len(image)} bytes that are not a JPEG, starting with {bytes(image[:4])!r} ({error})"
-            raise InputError(where=at, found=found, needed="a JPEG or PNG image") from None
-    return frames
-
-
 def decode_images(
     images: Sequence[bytes], steps: Sequence[int], where: str
 ) -> UInt8[np.ndarray, "time height width 3"]:
@@ -123,10 +93,17 @@ def decode_images(
         InputError: An image is neither PNG nor JPEG, has more than 8 bits a channel, is too large, or has another size
             than the first.
     """
-    if not images[0].startswith(_PNG):
-        return decode_jpegs(images, steps, where)
-    decoded = (decode_image(image, f"{where}: step {step}") for image, step in zip(images, steps, strict=True))
+    decode = decode_image if images[0].startswith(_PNG) else _decode_as_tensorflow
+    decoded = (decode(image, f"{where}: step {step}") for image, step in zip(images, steps, strict=True))
     return stack_frames(decoded, steps, where)
+
+
+def _decode_as_tensorflow(image: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    try:
+        return _decode_jpeg(image, where, is_fast=True)
+    except ValueError as error:
+        found = f"{len(image)} bytes that are not a JPEG, starting with {bytes(image[:4])!r} ({error})"
+        raise InputError(where=where, found=found, needed="a JPEG or PNG image") from None
 
 
 def stack_frames(
@@ -186,9 +163,7 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
     """
     try:
         if data.startswith(b"\xff\xd8"):
-            height, width, _, _ = simplejpeg.decode_jpeg_header(data)
-            require_bounded(height, width, where)
-            pixels = np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB"))
+            pixels = _decode_jpeg(data, where)
             if _EXIF not in data:  # a robot's camera writes none; the search is a thousandth of the decoding
                 return pixels
             with JpegImageFile(io.BytesIO(data)) as image:  # reads the header only
@@ -200,6 +175,12 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
         found = f"{len(data)} bytes that are no image, starting with {data[:4]!r} ({error})"
         needed = "PNG or JPEG, as a camera's images are stored; depth, as TIFF, is not used"
         raise InputError(where=where, found=found, needed=needed) from None
+
+
+def _decode_jpeg(data: bytes, where: str, *, is_fast: bool = False) -> UInt8[np.ndarray, "height width 3"]:
+    height, width, _, _ = simplejpeg.decode_jpeg_header(data)
+    require_bounded(height, width, where)
+    return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB", fastdct=is_fast))
 
 
 def _upright(pixels: UInt8[np.ndarray, "height width 3"], image: Image.Image) -> UInt8[np.ndarray, "rows columns 3"]:

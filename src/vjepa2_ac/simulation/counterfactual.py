@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
+from vjepa2_ac.media.images import decode_images, encode_jpeg
 from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
 from vjepa2_ac.simulation.arm import SimulatedArm
 from vjepa2_ac.simulation.record import JPEG_QUALITY, RecordingSpec, arm_of, carry_out, read_simulation
@@ -75,7 +75,7 @@ class Resimulation:
         images, silhouettes, states = zip(*seen, strict=True)
         encoded = [encode_jpeg(image, quality=JPEG_QUALITY) for image in images]
         return Outcome(
-            frames=decode_jpegs(encoded, range(len(encoded)), "a simulated frame"),
+            frames=decode_images(encoded, range(len(encoded)), "a simulated frame"),
             silhouettes=np.stack(silhouettes),
             states=np.stack(states),
             reached=np.array(reached, bool),
@@ -180,7 +180,7 @@ class SimulatedFutures:
             reached = send_action(simulation.arm, np.array(action), self._dataset.config.model_stride)
         self._actions[episode, step] = actions
         image = encode_jpeg(simulation.arm.image(simulation.camera), quality=JPEG_QUALITY)  # as those of the data set
-        return decode_jpegs([image], [0], "a simulated frame")[0], simulation.arm.state, reached
+        return decode_images([image], [0], "a simulated frame")[0], simulation.arm.state, reached
 
     def _resimulate(self, episode: int, step: int) -> Resimulation:
         self._actions.pop((episode, step), None)

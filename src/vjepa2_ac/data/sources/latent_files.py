@@ -42,7 +42,7 @@ from torch import Tensor
 from vjepa2_ac import storage
 from vjepa2_ac.episode import Episode, StoredLatents
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
+from vjepa2_ac.media.images import decode_images, encode_jpeg
 from vjepa2_ac.storage.block_file import DiskCache, cached_ranges
 from vjepa2_ac.storage.structured import MOST_BYTES, json_object
 
@@ -320,7 +320,7 @@ class EpisodeFile:
                 return np.asarray(self._rows(["pictures"], places)[0].numpy())
             ends = [0, *self.array("picture_ends").tolist()]
             jpegs = self._pieces([stored.range_of(ends[place], ends[place + 1]) for place in places])
-        return decode_jpegs(jpegs, self.frame_steps[list(places)].tolist(), self.path)
+        return decode_images(jpegs, self.frame_steps[list(places)].tolist(), self.path)
 
     def _rows(self, names: Sequence[str], places: Sequence[int]) -> list[Tensor]:
         """Return the same rows of several tensors, which are read together."""
