@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vjepa2_ac.config.sources import RotationFormat
+from vjepa2_ac.config.data import RotationFormat
 from vjepa2_ac.data.poses import FORMATS, rotation_speeds, smoother_format
 
 MAX_RAD_S = 10.0

@@ -9,7 +9,7 @@ from random_decoder import write_decoder
 from run_fixtures import set_up
 from same_run import assert_same_run
 from vjepa2_ac.data.loader import validation_windows
-from vjepa2_ac.decoding import imagined_strip
+from vjepa2_ac.decoding import imagine
 from vjepa2_ac.decoding.decoder import load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED
 from vjepa2_ac.errors import InputError
@@ -75,7 +75,7 @@ def test_a_strip_that_fails_costs_a_warning_and_never_the_run(
     def fail(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(imagined_strip, failing, fail)
+    monkeypatch.setattr(imagine, failing, fail)
     run_folder = train(make_config(validation__decoder=decoder, training__steps=3), reporter)
     assert list((run_folder / "checkpoints").iterdir())
     assert "could not be drawn: [Errno 28] No space left" in caplog.text
