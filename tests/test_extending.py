@@ -14,7 +14,7 @@ from killable import nursery
 from paths import ROOT
 from run_fixtures import as_yaml
 
-RECIPES = ("A loss", "A planner", "An energy", "A metric", "A tracker", "A transform", "A form of data")
+RECIPES = ("A loss", "A planner", "An energy", "A metric", "A tracker", "A transform", "A data source")
 STATE = "0.4,0,0.4,3.1,0,0,0"
 PAGE = (ROOT / "docs/extending.md").read_text()
 
