@@ -33,7 +33,7 @@ _REFERENCE = {  # page: what it has; below these, all that the code makes
 }
 _PROJECT = {
     "made/results": "tables that commands of the repository write",
-    "published_figures": "commands that repeat figures of others",
+    "published_figures": "commands that reproduce published results",
     "IMPLEMENTATION_NOTES": "how it works, and how exactness is checked",
     "decisions": "what was decided, and why",
     "made/changelog": "what changed for users",
