@@ -83,7 +83,9 @@ def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order
     _, errors = process.communicate(timeout=120)
     assert process.returncode == EXIT_STATUS, errors
     assert errors.splitlines()[-1].startswith("SIGUSR1: stopped after step"), errors
-    assert len(errors.splitlines()) == 1, errors
+    assert len([line for line in errors.splitlines() if "so far" not in line]) == 1, (
+        errors
+    )  # slow machines report waits
     assert not psutil.wait_procs(family, timeout=120)[1], "a worker stayed"
     train(config, reporter)
     assert 1 < reporter.steps[0] < 40
