@@ -49,7 +49,7 @@ from simulated import clone, simulated  # noqa: E402, F401
 LONGEST = (
     "test_notebook.py", "test_quickstart.py", "test_step.py", "test_benchmark.py", "test_counterfactual.py",
     "test_page.py", "test_memory.py", "test_end_to_end.py", "test_loop.py", "test_evaluate_run.py", "test_export.py",
-    "test_real_client.py", "test_encoder_file.py", "test_pairs_of_options.py", "test_compiled_planning.py",
+    "test_real_client.py", "test_encoder_file.py", "test_pairs_of_options.py", "test_trained_planning.py",
     "test_docs_troubleshooting.py", "test_sweeps.py", "test_signals.py", "test_fake_gpu.py", "test_site.py",
     "test_wheel.py",
 )  # fmt: skip

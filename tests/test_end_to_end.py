@@ -79,13 +79,9 @@ WRONG = {
     "resume of no run": (["train", "{here}", "--resume"], "no config.yaml"),
     "resume with overrides": (["train", "{here}/lora", "--resume", "seed=3"], "differs in seed"),
     "evaluate no run": (["evaluate", "{here}"], "no config.yaml"),
-    "export over something": (["export", "{here}/lora", "{here}/base"], "something is there already"),
-    "another config": (["train", "{here}/lora.yaml", "adapter.rank=3"], "adapter.rank"),
     "no data": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.path={here}/nowhere"], "nowhere"),
-    "no model": (["train", "{here}/lora.yaml", "run_dir={here}/x", "model.base={here}/no.pt"], "vjepa2-ac download"),
     "clips longer than episodes": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.frames=16"], "61"),
     "no test episodes": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.validation_share=0.0"], "validation"),
-    "a target that is not there": (["train", "{here}/lora.yaml", "run_dir={here}/x", "adapter.targets=[qkv]"], "qkv"),
 }
 
 

@@ -1,12 +1,13 @@
 """What openpi's client sends, as it was recorded (tests/golden/openpi/make.py), is answered as our own client is."""
 
+import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from paths import ROOT
-from served import STATE, session
+from served import session
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.session import Session
 from vjepa2_ac.serving.wire import pack, unpack
@@ -15,19 +16,8 @@ FOLDER = ROOT / "tests/golden/openpi"
 FRAMES = sorted(FOLDER.glob("*.bin"))
 
 
-def picture(number: int) -> np.ndarray:
-    y, x, c = np.mgrid[:48, :60, :3]
-    return ((x * (number + 3) + y * (2 * number + 5) + 40 * c) % 256).astype(np.uint8)
-
-
-OURS = [
-    {"observation/image": picture(0), "observation/state": STATE, "goal/image": picture(9)},
-    {"observation/image": picture(1), "observation/state": STATE.astype(np.float32)},
-    {"observation/image": picture(1), "observation/state": STATE * [1, 1, 1, 60, 1, 1, 1]},
-    {"observation/image": picture(2), "observation/state": STATE, "goal/name": "cup", "reset": True},
-    {"observation/image": picture(3), "observation/state": STATE, "goal/name": "cup", "session_id": "7d7c6c0e"},
-    {"reset": True, "endpoint": "reset"},
-]
+MADE = runpy.run_path(str(FOLDER / "make.py"))
+picture = MADE["picture"]
 
 
 def answers(messages: list[bytes]) -> list[dict | str]:
@@ -37,8 +27,9 @@ def answers(messages: list[bytes]) -> list[dict | str]:
 
 
 def test_the_recorded_dialogue_is_answered_as_ours_is() -> None:
-    assert len(FRAMES) == len(OURS)
-    theirs, ours = answers([path.read_bytes() for path in FRAMES]), answers([pack(message) for message in OURS])
+    assert [path.stem for path in FRAMES] == list(MADE["DIALOGUE"])
+    theirs = answers([path.read_bytes() for path in FRAMES])
+    ours = answers([pack(message) for message in MADE["DIALOGUE"].values()])
     for path, one, other in zip(FRAMES, theirs, ours, strict=True):
         if isinstance(other, str):
             assert one == other, path.name

@@ -21,7 +21,6 @@ from vjepa2_ac.simulation.rollout import (
     Observation,
     Trial,
     run,
-    run_trials,
 )
 from vjepa2_ac.simulation.tasks import GRASP_M, HOLDING, RELEASED, STEPS, TaskName, arm_for, make_problem
 from vjepa2_ac.spaces import actions_from_states
@@ -162,29 +161,6 @@ def test_a_planner_acts_within_its_limits_and_some_episodes_are_filmed(arm: Simu
     assert [episode.frames is not None for episode in result.episodes] == [True, False]
     assert result.episodes[0].frames.shape == (3, 45, 80, 3)
     assert (result.seconds > 0).all()
-
-
-def test_an_environment_with_the_interface_of_gymnasium_is_enough() -> None:
-    class Line:
-        """A hand on a line, whose expert goes to the end of it."""
-
-        def reset(self, *, seed: int, options: dict) -> tuple[Observation, dict]:
-            self.at, self.stride = float(seed), options["stride"]
-            return self.observe()
-
-        def step(self, action: np.ndarray | None) -> tuple[Observation, float, bool, bool, dict]:
-            self.at -= self.stride * (1.0 if action is None else -action[0])
-            return self.observe()[0], 0.0, False, False, self.observe()[1]
-
-        def observe(self) -> tuple[Observation, dict]:
-            return Observation(UNSEEN, way(self.at)), {"distance_m": abs(self.at), "success": self.at == 0.0}
-
-    from vjepa2_ac.simulation.policies import Expert
-    from vjepa2_ac.simulation.rollout import Trials
-
-    trials = Trials("go", "a line", "done", 0.1, (Trial(4, 2, 2), Trial(2, 2, 2)), {})
-    assert run_trials(Line(), Expert(), trials).successes.tolist() == [True, False]
-    assert run_trials(Line(), Scripted(way(-1), way(-1)), trials).distance_cm[0].tolist() == [400.0, 200.0, 0.0]
 
 
 def fake(*distances_m: float, unreachable: int = 0) -> EpisodeResult:

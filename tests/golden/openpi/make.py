@@ -9,7 +9,6 @@ Written on 2026-11-23 with Python 3.11.7, numpy 1.26.4 and msgpack 1.2.4.
 from pathlib import Path
 
 import numpy as np
-from openpi_client import msgpack_numpy
 
 HERE = Path(__file__).parent
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
@@ -50,6 +49,8 @@ DIALOGUE = {
 }
 
 if __name__ == "__main__":
+    from openpi_client import msgpack_numpy
+
     packer = msgpack_numpy.Packer()
     for name, message in DIALOGUE.items():
         (HERE / f"{name}.bin").write_bytes(packer.pack(message))
