@@ -17,97 +17,42 @@ from paths import ROOT
 
 PACKAGE = Path(vjepa2_ac.__file__).parent
 
-# A room imports only what stands before it; those in one line do not know each other. A folder has its own order.
-ORDERS: dict[str, list[str]] = {
-    "": [  # from the ground floor up
-        "__init__ errors episode intervals process",
-        "registry reporter spaces storage",
-        "config media",
-        "data model distributed",
-        "encoding runs",
-        "decoding planning",
-        "evaluation goals policies",
-        "serving simulation",
-        "inspection",
-        "reports training",
-        "api export init explore",
-        "cli",
-    ],
-    "data": [
-        "poses",
-        "index",
-        "selection files transforms",
-        "idle windows",
-        "sources",
-        "clips",
-        "dataset",
-        "loader convert",
-    ],
-    "data.sources": [
-        "tfrecord parquet latent_files indexed_source",
-        "rlds_shards lerobot_meta",
-        "rlds_episode",
-        "rlds droid_raw lerobot npz latents",
-    ],
-    "serving": [
-        "wire access",
-        "client request recording",
-        "session",
-        "about server",
-    ],
-    "model": [
-        "model_files distances compilation low_rank",
-        "attention",
-        "blocks",
-        "encoder predictor",
-        "world_model",
-        "lora checkpoints",
-        "adapter_folder",
-    ],
-    "evaluation": [
-        "request result",
-        "measure distribution rows",
-        "action_use summary",
-        "evaluate",
-        "decoded",
-        "evaluate_run",
-        "imagined",
-    ],
-    "explore": [
-        "messages",
-        "explorer",
-        "search",
-        "views",
-        "server",
-    ],
-    "decoding": [
-        "decoder",
-        "frame_pairs imagine",
-        "training",
-    ],
-    "reports": ["metrics_json", "comparison", "evaluation_figures planning_figures", "write"],
-    "cli": [
-        "waiting",
-        "progress",
-        "options tables",
-        "train",
-        "data",
-        "evaluate explore plan policies closed_loop setup",
-        "program",
-        "__main__",
-    ],
-    "simulation": [
-        "domains droid_writer",
-        "motion camera",
-        "arm",
-        "tasks",
-        "rollout",
-        "policies",
-        "record",
-        "benchmark counterfactual",
-        "worlds",
-    ],
-}
+# A room imports only what stands before it; those between two "<" or in one line do not know each other.
+FLOORS = [  # from the ground floor up
+    "__init__ errors episode intervals process",
+    "registry reporter spaces storage",
+    "config media",
+    "data model distributed",
+    "encoding runs",
+    "decoding planning",
+    "evaluation goals policies",
+    "serving simulation",
+    "inspection",
+    "reports training",
+    "api export init explore",
+    "cli",
+]
+WITHIN = """
+data: poses < index < selection files transforms < idle windows < sources < clips < dataset < loader convert
+data.sources: tfrecord parquet latent_files indexed_source < rlds_shards lerobot_meta < rlds_episode < rlds \
+    droid_raw lerobot npz latents
+serving: wire access < client request recording < session < about server
+model: model_files distances compilation low_rank < attention < blocks < encoder predictor < world_model < lora \
+    checkpoints < adapter_folder
+evaluation: request result < measure distribution rows < action_use summary < evaluate < decoded < evaluate_run \
+    < imagined
+explore: messages < explorer < search < views < server
+decoding: decoder < frame_pairs imagine < training
+reports: metrics_json < comparison < evaluation_figures planning_figures < write
+cli: waiting < progress < options tables < train < data < evaluate explore plan policies closed_loop setup < \
+    program < __main__
+simulation: domains droid_writer < motion camera < arm < tasks < rollout < policies < record < benchmark \
+    counterfactual < worlds
+"""
+ORDERS = {"": FLOORS}
+for line in WITHIN.strip().splitlines():
+    room, _, order = line.partition(": ")
+    ORDERS[room] = order.split("<")
 
 HOMES = {
     "PIL": ["media/"],

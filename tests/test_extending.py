@@ -10,6 +10,7 @@ import pytest
 import yaml
 from PIL import Image
 
+from installing import leave_package
 from killable import nursery
 from paths import ROOT
 from run_fixtures import as_yaml
@@ -109,11 +110,7 @@ def test_the_schema_has_what_a_plug_in_brings() -> None:
 
 def installed(at_home: Path, entry_points: str, code: str, *words: str) -> subprocess.CompletedProcess[str]:
     """Run a command where a package of the user's is installed: its metadata is what an installation leaves."""
-    about = at_home / "site/my_package-1.0.dist-info"
-    about.mkdir(parents=True, exist_ok=True)
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(entry_points)
-    (at_home / "site/my_package.py").write_text(code)
+    leave_package(at_home / "site", "my_package", entry_points, code)
     program = at_home.parent / "program.py"
     program.write_text("import sys; sys.path.append('site'); from vjepa2_ac.cli import main; sys.exit(main())")
     return nursery().run(str(program), *words, folder=at_home.parent)

@@ -8,6 +8,7 @@ from typing import Literal
 
 import pytest
 
+from installing import leave_package
 from run_fixtures import as_yaml
 from vjepa2_ac import registry as doors
 from vjepa2_ac.config import DataConfig
@@ -73,16 +74,6 @@ def test_a_name_of_one_plugin_cannot_be_registered_by_another_nor_twice_in_one(w
             import_plugins([module], where="plugins")
 
 
-def install(folder: Path, package: str, entry_points: str, code: str = "thing = print\n") -> None:
-    """Leave in a folder what the installation of a package leaves."""
-    about = folder / f"{package}-1.0.dist-info"
-    about.mkdir(parents=True)
-    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(entry_points)
-    (folder / f"{package}.py").write_text(code)
-    importlib.invalidate_caches()
-
-
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
     """The folder of installed packages."""
@@ -91,8 +82,8 @@ def site(tmp_path: Path) -> Path:
 
 
 def test_an_entry_point_cannot_have_a_name_of_this_package_or_of_another(site: Path) -> None:
-    install(site, "p_a", "[vjepa2_ac.losses]\nl1 = p_a:thing\np_new = p_a:thing\n")
-    install(site, "p_b", "[vjepa2_ac.losses]\np_new = p_b:thing\n")
+    leave_package(site, "p_a", "[vjepa2_ac.losses]\nl1 = p_a:thing\np_new = p_a:thing\n")
+    leave_package(site, "p_b", "[vjepa2_ac.losses]\np_new = p_b:thing\n")
     for name, owners in (("l1", r"vjepa2_ac\.model\.distances and by p_a"), ("p_new", "p_a and by p_b")):
         with pytest.raises(InputError, match=f"loss '{name}': registered by {owners}"):
             parse_config({**VALUES, "training": {"loss": name}}, where="own.yaml")
@@ -104,7 +95,7 @@ def test_a_source_of_this_package_cannot_be_defined_again(site: Path) -> None:
         class Again(DataConfig):
             source: Literal["npz"] = "npz"
 
-    install(site, "p_npz", "[vjepa2_ac.sources]\nnpz = p_npz:thing\n")
+    leave_package(site, "p_npz", "[vjepa2_ac.sources]\nnpz = p_npz:thing\n")
     with pytest.raises(InputError, match=r"'npz': registered by vjepa2_ac\.config\.sources and by p_npz"):
         parse_config({**VALUES, "data": {"source": "npz", "path": "none"}}, where="own.yaml")
 
@@ -163,7 +154,7 @@ PWNED = "open('PWNED', 'w')\n" + REGISTERS.format(name="p_evil", function="f")
 @pytest.mark.usefixtures("_started")
 def test_the_config_of_a_run_never_imports_from_the_working_directory(write: Write) -> None:
     write("p_evil", PWNED)
-    install(Path(), "p_dist", "[vjepa2_ac.losses]\np_dist = p_dist:thing\n", PWNED)
+    leave_package(Path(), "p_dist", "[vjepa2_ac.losses]\np_dist = p_dist:thing\n", PWNED)
     Path("run").mkdir()
     config = Path("run/config.yaml")
     config.write_text(as_yaml(parse_config(VALUES, where="")).replace("plugins: []", "plugins: [p_evil]"))
@@ -184,8 +175,8 @@ def test_an_installed_module_is_not_shadowed_by_one_in_the_working_directory(wri
     sys.path.insert(0, "")
     write("p_shadowed", PWNED)
     write("p_entry", PWNED)
-    install(site, "p_shadowed", "", REGISTERS.format(name="p_shadowed", function="f"))
-    install(site, "p_entry", "[vjepa2_ac.losses]\np_entry = p_entry:thing\n")
+    leave_package(site, "p_shadowed", "", REGISTERS.format(name="p_shadowed", function="f"))
+    leave_package(site, "p_entry", "[vjepa2_ac.losses]\np_entry = p_entry:thing\n")
     import_plugins(["p_shadowed"], where="run/config.yaml", here=False)
     assert LOSSES.find("p_shadowed").__module__ == "p_shadowed"
     assert LOSSES.find("p_entry") is print
@@ -194,7 +185,7 @@ def test_an_installed_module_is_not_shadowed_by_one_in_the_working_directory(wri
 
 
 def test_an_installed_module_that_is_no_plugin_is_not_imported_for_a_run(write: Write, site: Path) -> None:
-    install(site, "p_other", "", "open('PWNED', 'w')")
+    leave_package(site, "p_other", "", "open('PWNED', 'w')")
     _ = write
     for module in ("p_other", "antigravity"):
         sys.modules.pop("p_other", None)

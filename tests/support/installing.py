@@ -1,5 +1,6 @@
-"""Packages of others that a test tries, installed for it alone."""
+"""Packages of others that a test tries, installed for it alone, and packages of a user."""
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -16,3 +17,13 @@ def install(python: str | Path, *words: str) -> None:
         pytest.skip(f"{words} could not be installed within 3 minutes")
     if done.returncode:
         pytest.skip(f"{words} cannot be installed here: {done.stderr.strip().splitlines()[-1:]}")
+
+
+def leave_package(folder: Path, package: str, entry_points: str, code: str = "thing = print\n") -> None:
+    """Leave in a folder what the installation of a package leaves."""
+    about = folder / f"{package}-1.0.dist-info"
+    about.mkdir(parents=True, exist_ok=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(entry_points)
+    (folder / f"{package}.py").write_text(code)
+    importlib.invalidate_caches()
