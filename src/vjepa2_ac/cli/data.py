@@ -186,7 +186,7 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
         raise InputError(where="--model", found="--axes beside it", needed="one of them: --model is of strides")
     cli.require_subject(options.axes)
 
-    from vjepa2_ac.planning.axes import AXES_FILE, require_axes_in
+    from vjepa2_ac.planning.settings import AXES_FILE, require_axes_in
 
     require_axes_in(config.data)
     cli.make_folder(options.out)

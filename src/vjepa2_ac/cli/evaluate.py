@@ -225,4 +225,6 @@ def _of_image(options: argparse.Namespace) -> Imagination:
 
 def _names(text: str) -> tuple[str, ...]:
     """Parse the value of --actions."""
-    return tuple(word for word in text.split(",") if word)
+    if names := tuple(word for word in text.split(",") if word):
+        return names
+    raise argparse.ArgumentTypeError("no actions; give one or more names, with commas between them")

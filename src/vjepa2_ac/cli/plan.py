@@ -157,15 +157,12 @@ def _goals(options: argparse.Namespace) -> None:
     stride = require_stride(config.data, to="make goals", fix="Say how many control steps it has: data.stride=4")
 
     from vjepa2_ac.cli.tables import goals_table
-    from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals, recording_of_episode
+    from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals
     from vjepa2_ac.reports.planning_figures import GOALS_IMAGE, plot_goals
 
-    by = "gripper" if options.every is None else "every"
-    chosen = cli.record_of_options(KeyFrameOptions, options, by=by, stride=stride)
+    chosen = cli.record_of_options(KeyFrameOptions, options, stride=stride, views=config.planning.views)
     with cli.reporter() as reporter:
-        progress, views = reporter.task(INDEXING), config.planning.views
-        recording = recording_of_episode(config.data, options.episode, progress, views=views)
-    made = make_goals(recording, chosen)
+        made = make_goals(config.data, options.episode, chosen, reporter.task(INDEXING))
     with user_can_write(options.out):
         written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
     cli.show(goals_table(made), files=written)

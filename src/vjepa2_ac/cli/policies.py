@@ -44,7 +44,7 @@ def add_monitor(commands: cli.Commands) -> None:
     share = cli.number_between(0.0, 1.0, "a share")
     cli.add(parser, "--false-alarms SHARE", "of undisturbed episodes, at most (0.05)", share, default=0.05)
     cli.add(parser, "--threshold FILE", "a monitor.json (made of the held-out episodes of the data)", cli.as_local)
-    cli.add(parser, "--out FOLDER", "where monitor.json and monitor.png go (the run's)", cli.as_path)
+    cli.add(parser, "--out FOLDER", "where monitor.json goes (the run's)", cli.as_path)
 
 
 def _score(options: argparse.Namespace) -> int:
@@ -102,16 +102,15 @@ def _monitor(options: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from vjepa2_ac.cli.tables import watched_table
-    from vjepa2_ac.goals.make_goals import number_of_episode
+    from vjepa2_ac.data.dataset import find_episode
     from vjepa2_ac.policies.monitor import MONITOR, Monitor, calibrate_monitor, watch_episodes
-    from vjepa2_ac.reports.planning_figures import MONITOR_IMAGE, most_surprising, plot_watched
 
     session = cli.load_planning_session(options)
     model, files = session.world_model, []
     with cli.reporter() as reporter:
         dataset = cli.open_data(session.config, reporter)
         seen = dataset if data is None else cli.open_data(data, reporter)
-        wanted = [number_of_episode(seen, one) for one in options.episode]
+        wanted = [find_episode(seen, one) for one in options.episode]
         if options.threshold is None:
             progress = reporter.task("held-out episodes", "episodes")
             monitor = calibrate_monitor(model, dataset, options.false_alarms, progress)
@@ -124,11 +123,6 @@ def _monitor(options: argparse.Namespace) -> int:
     of = f"{counted(len(monitor.scores), 'held-out episode')} of up to {counted(monitor.steps, 'model step')}"
     note = f"An alarm is a surprise above {monitor.threshold:.4g}, calibrated on {of}. At most"
     note += f" {monitor.false_alarms:.1%} of undisturbed episodes have an alarm."
-    if watched:
-        shown = max(watched, key=lambda one: one.scores(monitor.expected).max())
-        steps = [int(shown.steps[place]) for place in most_surprising(shown, monitor)]
-        frames = seen.source.read(shown.index).read_frames(steps)
-        files.append(plot_watched(shown, frames, monitor, session.config.data.crop, folder / MONITOR_IMAGE))
     cli.show(*([watched_table(watched, monitor)] if watched else []), note, files=files)
     return int(any(one.first_alarm(monitor) is not None for one in watched))
 

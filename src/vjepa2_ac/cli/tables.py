@@ -79,7 +79,7 @@ def plan_table(answer: PlanResult) -> Table:
 def goals_table(made: MadeGoals) -> Table:
     """Return a row for each goal."""
     columns = ["goal", "frame", "at least", "at most", "share", "gripper"]
-    table = MetricsTable(f"Goals of {made.recording.name} (at least and at most: model steps)", columns)
+    table = MetricsTable(f"Goals of {made.origin['episode']} (at least and at most: model steps)", columns)
     for place, (key, goal) in enumerate(zip(made.keys, made.goals, strict=True)):
         name = f"{place + 1} {goal.name}".strip()
         row = [name, str(key.frame), str(goal.at_least), "no limit" if goal.at_most is None else str(goal.at_most)]

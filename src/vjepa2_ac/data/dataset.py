@@ -339,6 +339,26 @@ def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "ti
     return view(dataset.source.read(episode, batch.cameras[row]).read_frames(steps), dataset.config.crop)
 
 
+def find_episode(dataset: Dataset, wanted: str) -> int:
+    """Return an episode by its name in the data, its number from 0, or a part that no other name has.
+
+    Raises:
+        InputError: There is no such episode, or there are several.
+    """
+    table = dataset.table
+    if (index := table.find(wanted)) is not None:
+        return index
+    if wanted.isdecimal() and len(wanted) < 10 and int(wanted) < len(table):
+        return int(wanted)
+    matching = [int(index) for index in dataset.episodes if wanted in table.identity(int(index))]
+    if len(matching) != 1:
+        found = f"{counted(len(matching), 'episode')} of this name in {dataset.config.path}"
+        example = table.identity((matching or dataset.episodes.tolist())[0])
+        needed = f"a name such as {example}, a part that only it has, or a number from 0 to {len(table) - 1}"
+        raise InputError(where=f"--episode {wanted}", found=found, needed=needed)
+    return matching[0]
+
+
 def widths_of(episode: Episode) -> Widths:
     """Return the widths of an episode's states and actions."""
     state = int(episode.states.shape[1])

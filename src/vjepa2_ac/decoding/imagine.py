@@ -33,7 +33,6 @@ from vjepa2_ac.runs.checkpoint import checkpoint_name
 from vjepa2_ac.runs.folder import IMAGINED
 from vjepa2_ac.spaces import StateSpace, counterfactual_states, feasible_actions
 from vjepa2_ac.storage import user_can_write, write_atomically
-from vjepa2_ac.storage.structured import json_text
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +40,7 @@ Actions = Float[np.ndarray, "steps action_dim"]
 Image = UInt8[np.ndarray, "size size 3"]  # as the encoder sees it
 Film = UInt8[np.ndarray, "steps size size 3"]
 
-STRIP, VIDEO, GIF, JSON = "imagined.png", "imagined.mp4", "imagined.gif", "imagined.json"
+STRIP, VIDEO, GIF = "imagined.png", "imagined.mp4", "imagined.gif"
 AS_RECORDED = "as recorded"
 _HAPPENS, _TITLE = "what really happens", "One frame is given, the rest is imagined"
 _MUCH_WORSE_DB = 5.0
@@ -196,7 +195,7 @@ def _short(name: str) -> str:
 
 
 def write_imagination(imagination: Imagination, folder: Path, *, reporter: Reporter = SILENT) -> list[Path]:
-    """Write image strip, video, GIF and the actions as JSON; return the files. Without PyAV a note replaces the MP4.
+    """Write image strip, video and GIF; return the files. Without PyAV a note replaces the MP4.
 
     Raises:
         InputError: The folder cannot be written.
@@ -213,22 +212,7 @@ def write_imagination(imagination: Imagination, folder: Path, *, reporter: Repor
             written.append(write_video(folder / VIDEO, np.repeat(frames, times, axis=0), rate_hz=_RATE_HZ))
         except UnreachableError as error:  # PyAV is not installed
             reporter.note(f"No {VIDEO}: {error}")
-        write_atomically(folder / JSON, json_text(_as_dict(imagination)))
-    return [*written, folder / JSON]
-
-
-def _as_dict(imagination: Imagination) -> dict[str, object]:
-    return {
-        "subject": imagination.subject,
-        "episode": imagination.episode_id,
-        "start": imagination.start,
-        "seconds_per_step": imagination.seconds_per_step,
-        "rollouts": [
-            {"model": one.model, "name": one.name, "actions": one.actions.tolist(), "truth": one.truth is not None}
-            for one in imagination.rollouts
-        ],
-        "notes": list(imagination.notes),
-    }
+    return written
 
 
 class ImaginedStrip:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,11 +25,10 @@ _ROOM = 1.25  # extent of a landscape's grid relative to the largest true action
 _AXES = slice(0, 3)  # of the grid: of poses, the position
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class RolloutStart:
     """One frame of a held-out clip, and the true next frame: the state of a planner before an action."""
 
-    clip: int = -1  # index into the evaluation's clips, once these are known
     episode_id: str
     first_step: int  # control step at which the clip begins
     frame: Float[Tensor, "tokens dim"]
@@ -69,19 +68,12 @@ def start_of(
     )
 
 
-_Start = TypeVar("_Start", bound=RolloutStart)
+def gathered_starts(starts: Sequence[RolloutStart], device: torch.device) -> list[RolloutStart]:
+    """Return the starts of all processes that share work, on the device of this one."""
+    return [_on(device, one) for one in gathered([_on("cpu", one) for one in starts])]
 
 
-def gathered_starts(
-    starts: Sequence[_Start], device: torch.device, names: Sequence[tuple[str, int]] = ()
-) -> list[_Start]:
-    """Return the starts of all processes that share work, on the device of this one, with their indices of `names`."""
-    numbers = {name: number for number, name in enumerate(names)}
-    known = gathered([_on("cpu", one) for one in starts])
-    return [replace(_on(device, one), clip=numbers.get((one.episode_id, one.first_step), -1)) for one in known]
-
-
-def _on(device: torch.device | str, start: _Start) -> _Start:
+def _on(device: torch.device | str, start: RolloutStart) -> RolloutStart:
     moved: dict[str, Any] = {name: one.to(device) for name, one in vars(start).items() if isinstance(one, Tensor)}
     return replace(start, **moved)
 
@@ -151,40 +143,38 @@ def _predict(
     return model.predict(frames, actions[:, None], start.state.expand(count, 1, -1), camera)[:, 0].float()
 
 
-@dataclass(frozen=True)
-class ActionPool:
-    """The true actions of all moves, which bound the alternatives for each of them."""
+def alternatives(
+    true: Float[np.ndarray, " action_dim"],
+    largest: Float[np.ndarray, " action_dim"],
+    space: ActionSpace,
+    probes: ProbeOptions,
+    generator: np.random.Generator,
+) -> Float[np.ndarray, "twice_samples action_dim"]:
+    """Draw actions for a move: first some that are uniform in the box, then as many on the shell.
 
-    actions: Float[np.ndarray, "count action_dim"]
-    space: ActionSpace
-    probes: ProbeOptions  # `samples` drawn per move from each source; the box extends by `reach_cm`, for poses only
+    The box: for poses (dx, dy, dz) within reach, the rest being true; for vectors every number. The shell: as long as
+    the true action, in any direction; of poses (dx, dy, dz), the rest being true. A model that only knows whether the
+    robot moves ranks the true action high in the box, and by chance on the shell. Each number of a vector is measured
+    in its largest size.
 
-    def in_box(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
-        """Draw uniformly: for poses (dx, dy, dz) in the box, the rest being true; for vectors every number."""
-        true, half = start.true, np.abs(self.actions).max(axis=0)
-        drawn = generator.uniform(-1.0, 1.0, size=(self.probes.samples, len(true)))
-        if self.space.position is None:
-            return np.asarray(drawn * half)
-        evaluated = np.tile(true, (self.probes.samples, 1))
-        evaluated[:, self.space.position] = drawn[:, self.space.position] * (self.probes.reach_cm / 100)
-        return evaluated
-
-    def on_shell(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
-        """Draw actions as long as the true one, in any direction: of poses (dx, dy, dz), the rest being true.
-
-        A model that only knows whether the robot moves ranks the true action high in the box, and by chance here. Each
-        number of a vector is measured in its largest size.
-        """
-        true, moved = start.true, self.space.sized
-        unit = np.ones(len(true))
-        if self.space.position is None:
-            unit = np.abs(self.actions).max(axis=0)
-        unit = unit[moved]
-        drawn = generator.normal(size=(self.probes.samples, len(unit))) * (unit > 0)
-        length = np.linalg.norm(true[moved] / np.where(unit > 0, unit, 1.0))
-        evaluated = np.tile(true, (self.probes.samples, 1))
-        evaluated[:, moved] = drawn * unit * length / np.maximum(np.linalg.norm(drawn, axis=1), 1e-12)[:, None]
-        return evaluated
+    Args:
+        true: The action of the move.
+        largest: The largest size of each number in all moves; of vectors it bounds the box.
+        space: Of the actions.
+        probes: Their `samples` of each kind, and `reach_cm`.
+        generator: Of the draws.
+    """
+    box, shell = (np.tile(true, (probes.samples, 1)) for _ in range(2))
+    drawn = generator.uniform(-1.0, 1.0, size=box.shape)
+    if space.position is None:
+        box, unit = drawn * largest, largest[space.sized]
+    else:
+        box[:, space.position] = drawn[:, space.position] * (probes.reach_cm / 100)
+        unit = np.ones(len(true))[space.sized]
+    drawn = generator.normal(size=(probes.samples, len(unit))) * (unit > 0)
+    length = np.linalg.norm(true[space.sized] / np.where(unit > 0, unit, 1.0))
+    shell[:, space.sized] = drawn * unit * length / np.maximum(np.linalg.norm(drawn, axis=1), 1e-12)[:, None]
+    return np.concatenate([box, shell])
 
 
 def rank_actions(
@@ -207,18 +197,18 @@ def rank_actions(
         progress: Called with the number of finished moves.
     """
     ids = tuple(move.episode_id for move in moves)
-    pool = ActionPool(np.stack([move.true for move in moves]), space, probes)
+    largest = np.abs([move.true for move in moves]).max(axis=0)
 
     def ranked(move: RolloutStart) -> tuple[float, ...]:
-        generator = move.generator(seed)
-        drawn = [move.true[None], pool.in_box(move, generator), pool.on_shell(move, generator)]
-        (true, *energies), (_, *changes) = evaluate_actions(model, move, np.concatenate(drawn), at_once=probes.at_once)
-        alternatives = np.reshape(energies, (2, -1))
-        is_same = np.abs(alternatives - true) <= SAME_ENERGY * max(abs(true), 1e-12)
+        drawn = alternatives(move.true, largest, space, probes, move.generator(seed))
+        evaluated = np.concatenate([move.true[None], drawn])
+        (true, *others), (_, *changes) = evaluate_actions(model, move, evaluated, at_once=probes.at_once)
+        energies = np.reshape(others, (2, -1))
+        is_same = np.abs(energies - true) <= SAME_ENERGY * max(abs(true), 1e-12)
         # A prediction that is not finite is the farthest: of the true action, no alternative is farther.
-        is_closer = alternatives < true if np.isfinite(true) else np.ones_like(alternatives)
+        is_closer = energies < true if np.isfinite(true) else np.ones_like(energies)
         box, shell = np.where(is_same, 0.5, is_closer).mean(axis=1)
-        return box, shell, np.mean(changes[: probes.samples]), alternatives[0].std(), move.persistence
+        return box, shell, np.mean(changes[: probes.samples]), energies[0].std(), move.persistence
 
     in_box, on_shell, change, spread, now = np.array(shared(moves, ranked, progress)).T
     ranks = (in_box + on_shell) / 2

@@ -43,6 +43,7 @@ _Key = TypeVar("_Key")
 Encode = Callable[[Images], Float[Tensor, "batch horizon tokens dim"]]
 
 
+@torch.no_grad()
 def measure_decoded(
     contenders: Sequence[Contender],
     clips: RepeatableClips,
@@ -75,7 +76,8 @@ def measure_decoded(
         for key, metric in _measured(images).items():
             values.setdefault(key, []).append(metric.double().cpu().numpy())
         if encode is not None:
-            for source, latents in {TRUE_FRAMES: batch.latents[:, 1:], **_encoded(images, encode)}.items():
+            shown_again = {name: encode(one) for name, one in images.sources.items() if name != RAW_PERSISTENCE}
+            for source, latents in {TRUE_FRAMES: batch.latents[:, 1:], **shown_again}.items():
                 features.setdefault(source, []).append(latents.mean(dim=(1, 2)).double().cpu().numpy())
         for row, clip in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             if clip in wanted:
@@ -120,7 +122,6 @@ class _Images:
         return DecodedStrip(example.why, example.episode_id, example.start, rows)
 
 
-@torch.no_grad()
 def _decoded(
     batch: LatentBatch, contenders: Sequence[Contender], trained: TrainedDecoder, frames_of_row: FramesOfRow | None
 ) -> _Images:
@@ -140,7 +141,6 @@ def _decoded(
     return _Images({**sources, RAW_PERSISTENCE: true[:, :1].expand_as(true[:, 1:])}, first, true)
 
 
-@torch.no_grad()
 def _measured(images: _Images) -> dict[tuple[str, str], Float[Tensor, "batch horizon"]]:
     """Return every metric of every source and reference.
 
@@ -158,12 +158,6 @@ def _measured(images: _Images) -> dict[tuple[str, str], Float[Tensor, "batch hor
                 found[source, f"psnr_db.{region}.{reference}"] = psnr(shown, true, where)
                 found[source, f"ssim.{region}.{reference}"] = mean_where(similar, where)
     return found
-
-
-@torch.no_grad()
-def _encoded(images: _Images, encode: Encode) -> dict[str, Tensor]:
-    """Return the latents of the decoded images."""
-    return {name: encode(one) for name, one in images.sources.items() if name != RAW_PERSISTENCE}
 
 
 def _joined(parts: Sequence[Mapping[_Key, Sequence[np.ndarray]]]) -> dict[_Key, np.ndarray]:

@@ -6,7 +6,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -102,45 +102,52 @@ def evaluate(
         probes: Options of the measurements beyond the errors.
         reporter: Shows the progress of each part of the work.
     """
-    probes, metrics, space = probes or ProbeOptions(), metrics or registered_metrics(), clips.space
+    probes, metrics = probes or ProbeOptions(), metrics or registered_metrics()
     sums = _collect(contenders, clips, probes, metrics, reporter.task("measuring"))
-    known = clips_of(
-        sums.actions, tuple(sums.ids), tuple(sums.firsts), space=space, seconds_per_step=about.seconds_per_step
-    )
+    known = clips_of(sums.actions, sums.names, space=clips.space, seconds_per_step=about.seconds_per_step)
+    width, starts = sums.actions.shape[-1], sums.starts
+    is_moving = dict(zip(sums.names, known.moving.any(axis=1), strict=True))
+    moving = [start for start in starts if is_moving[start.episode_id, start.first_step]] or starts
+    mapped = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
     models: dict[str, ModelResult] = {}
-    for contender in contenders:
-        with contender.switched():
-            models[contender.name] = _measure(contender, sums, known, probes, about.seed, reporter)
+    for one in contenders:
+        ranking, landscapes = None, None
+        with one.switched():
+            if starts:
+                task = reporter.task(f"action ranking, {one.name}")
+                ranking = rank_actions(one.model, sums.moves, clips.space, probes, seed=about.seed, progress=task)
+            if mapped and width >= 3:
+                task = reporter.task(f"energy landscapes, {one.name}")
+                landscapes = measure_landscapes(one.model, mapped, clips.space, probes, task)
+        distribution = distribution_of(sums.predicted[one.name], sums.true)
+        errors = joined(sums.errors[one.name])
+        models[one.name] = ModelResult(one.name, one.role, errors, landscapes, ranking, distribution)
     errors = next(model.errors for model in models.values() if model.role == "trained")
-    width = sums.actions.shape[-1]
-    has_no_landscape = probes.ranking_clips and probes.landscape_clips and width < 3
     note = f"No energy landscapes: an action has {width} numbers, and a landscape is over three."
     return Evaluation(
         about=about,
         clips=known,
         models=models,
         examples=_examples(contenders, clips, known, errors, probes.examples),
-        notes=(note,) if has_no_landscape else (),
+        notes=(note,) if mapped and width < 3 else (),
         metrics=metrics,
         copies=distribution_of(sums.copies, sums.true),
         fvd_of_halves=distance_of_halves(sums.true),
     )
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Collected:
-    """What all clips gave: errors, actions, sums of latents, and one frame and the next of some."""
+    """What the clips of all processes gave: errors, actions, sums of latents, and one frame and the next of some."""
 
-    space: ActionSpace
     errors: dict[str, list[PredictionErrors]]  # by model
     predicted: dict[str, LatentSums]  # rollouts with the true actions, by model
     true: LatentSums
     copies: LatentSums  # of frame 0
-    actions: Float[np.ndarray, "clips horizon action_dim"] = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    ids: list[str] = field(default_factory=list)
-    firsts: list[int] = field(default_factory=list)
-    starts: list[RolloutStart] = field(default_factory=list)
-    moves: list[RolloutStart] = field(default_factory=list)
+    actions: Float[np.ndarray, "clips horizon action_dim"]
+    names: list[ClipName]
+    starts: list[RolloutStart]
+    moves: list[RolloutStart]
 
 
 def _collect(
@@ -150,77 +157,47 @@ def _collect(
     metrics: Sequence[Metric],
     progress: Progress,
 ) -> _Collected:
-    names, space = [contender.name for contender in contenders], clips.space
     batches = with_other_actions((batch for batch, _ in clips.read(None)), clips.before)
     first = list(itertools.islice(batches, 1))
     if not (origins := gathered([batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first])):
         raise no_clips()
-    sums, errors = {name: LatentSums(origins[0]) for name in names}, {name: list[PredictionErrors]() for name in names}
-    seen = _Collected(space, errors, sums, LatentSums(origins[0]), LatentSums(origins[0]))
-    actions: list[np.ndarray] = []
+    predicted = {one.name: LatentSums(origins[0]) for one in contenders}
+    errors: dict[str, list[PredictionErrors]] = {one.name: [] for one in contenders}
+    true, copies = LatentSums(origins[0]), LatentSums(origins[0])
+    actions, names = list[np.ndarray](), list[ClipName]()
+    starts, moves = list[RolloutStart](), list[RolloutStart]()
     probed = {clips.names[place] for place in spread(len(clips.names), probes.ranking_clips)}
 
-    def add(ids: Sequence[str], name: str, way: Way, mode: Mode, predicted: torch.Tensor) -> None:
+    def add(ids: Sequence[str], name: str, way: Way, mode: Mode, latents: torch.Tensor) -> None:
         if (way, mode) == ("true", "rollout"):
-            seen.predicted[name].add(predicted, ids)
+            predicted[name].add(latents, ids)
 
     for batch, others in itertools.chain(first, batches):
-        seen.true.add(batch.latents[:, 1:], batch.episode_ids)
-        seen.copies.add(batch.latents[:, :1].expand_as(batch.latents[:, 1:]), batch.episode_ids)
+        true.add(batch.latents[:, 1:], batch.episode_ids)
+        copies.add(batch.latents[:, :1].expand_as(batch.latents[:, 1:]), batch.episode_ids)
         for contender in contenders:
             watch = partial(add, batch.episode_ids, contender.name)
             with contender.switched():
-                seen.errors[contender.name].append(measured(contender.model, batch, VALIDATED, metrics, others, watch))
+                errors[contender.name].append(measured(contender.model, batch, VALIDATED, metrics, others, watch))
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
+            names.append(name)
             if name in probed:
-                largest = int(batch.actions[row][:, space.sized].norm(dim=-1).argmax())
-                seen.starts.append(start_of(batch, row, largest))
-                seen.moves += moves_of(batch, row, space, probes.reach_cm / 100)
+                largest = int(batch.actions[row][:, clips.space.sized].norm(dim=-1).argmax())
+                starts.append(start_of(batch, row, largest))
+                moves += moves_of(batch, row, clips.space, probes.reach_cm / 100)
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
-        seen.ids += batch.episode_ids
-        seen.firsts += batch.starts
-        progress(len(seen.ids), len(clips.names))
-    return _of_all(seen, gathered(actions), clips.device)
-
-
-def _of_all(seen: _Collected, actions: Sequence[np.ndarray], device: torch.device) -> _Collected:
-    """Return what the clips of all processes that share the work gave."""
-    ids, firsts = gathered(seen.ids), gathered(seen.firsts)
-    of_starts = partial(gathered_starts, device=device, names=list(zip(ids, firsts, strict=True)))
+        progress(len(names), len(clips.names))
+    names = gathered(names)
     return _Collected(
-        space=seen.space,
-        errors={name: gathered(found) for name, found in seen.errors.items()},
-        predicted={name: LatentSums.joined(gathered([sums])) for name, sums in seen.predicted.items()},
-        true=LatentSums.joined(gathered([seen.true])),
-        copies=LatentSums.joined(gathered([seen.copies])),
-        actions=np.concatenate(actions),
-        ids=ids,
-        firsts=firsts,
-        starts=of_starts(seen.starts),
-        moves=of_starts(seen.moves),
+        errors={name: gathered(parts) for name, parts in errors.items()},
+        predicted={name: LatentSums.joined(gathered([sums])) for name, sums in predicted.items()},
+        true=LatentSums.joined(gathered([true])),
+        copies=LatentSums.joined(gathered([copies])),
+        actions=np.concatenate(gathered(actions)),
+        names=names,
+        starts=gathered_starts(starts, clips.device),
+        moves=gathered_starts(moves, clips.device),
     )
-
-
-def _measure(
-    contender: Contender,
-    seen: _Collected,
-    clips: Clips,
-    probes: ProbeOptions,
-    seed: int,
-    reporter: Reporter,
-) -> ModelResult:
-    """Measure how one model uses the actions: what is asked for, and applies."""
-    name, model, starts, space = contender.name, contender.model, seen.starts, seen.space
-    ranking, landscapes = None, None
-    if starts:
-        progress = reporter.task(f"action ranking, {name}")
-        ranking = rank_actions(model, seen.moves, space, probes, seed=seed, progress=progress)
-    if starts and probes.landscape_clips and seen.actions.shape[-1] >= 3:
-        moving = [start for start in starts if clips.moving[start.clip].any()] or starts
-        chosen = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
-        landscapes = measure_landscapes(model, chosen, space, probes, reporter.task(f"energy landscapes, {name}"))
-    distribution = distribution_of(seen.predicted[name], seen.true)
-    return ModelResult(name, contender.role, joined(seen.errors[name]), landscapes, ranking, distribution)
 
 
 @torch.no_grad()
@@ -262,8 +239,7 @@ _IDLE_SHARE = 0.1  # of the 95th percentile of the norm, where actions are no po
 
 def clips_of(
     actions: Float[np.ndarray, "clips horizon action_dim"],
-    episode_ids: tuple[str, ...],
-    starts: tuple[int, ...],
+    names: Sequence[ClipName],
     *,
     space: ActionSpace,
     seconds_per_step: float,
@@ -272,12 +248,11 @@ def clips_of(
 
     Args:
         actions: Of the space.
-        episode_ids: Of each clip.
-        starts: First control step of each.
+        names: Of each clip.
         space: Of the actions.
         seconds_per_step: Length of a model step.
     """
-    size = space.shown_size(actions)
+    size, (episode_ids, starts) = space.shown_size(actions), zip(*names, strict=True)
     if space.position is None or space.rotation is None or space.gripper is None:
         least = _IDLE_SHARE * float(np.percentile(size, 95))
         words = f"the norm of the action is {least:.3g} or more, a tenth of its 95th percentile"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.config import Config, LimitsConfig
-from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.dataset import Dataset, find_episode, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.sources.indexed_source import measured_space
 from vjepa2_ac.data.transforms import frames_as_seen, split_views, view
@@ -77,7 +77,6 @@ def imagine_image(session: Subject, asked: ImagineOptions, seen: Seen) -> Imagin
         InputError: Decoder, state or actions cannot be used.
     """
     require_one_process()
-    _require_some(asked.actions)
     model, config = session.world_model, session.config
     decoder = load_decoder(asked.decoder)
     warnings = decoder.require_fit(model, config.data, subject=session.name)
@@ -115,11 +114,6 @@ def imagine_image(session: Subject, asked: ImagineOptions, seen: Seen) -> Imagin
     )
 
 
-def _require_some(actions: Sequence[str]) -> None:
-    if not actions:
-        raise InputError(where="--actions", found="no actions", needed=f"one or more of {', '.join(ACTION_NAMES)}")
-
-
 def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None:
     """Refuse states in which actions by name mean nothing: no poses, or poses in the camera's frame."""
     if not space.is_base_pose:
@@ -128,12 +122,9 @@ def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None
 
 
 def _actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig) -> Float[np.ndarray, "steps 7"]:
-    if word in ACTION_NAMES:
-        return named_actions(word, steps, size_m=size_m, limits=limits)
     if word.lower().endswith((".npy", ".csv")):
         return read_actions(word, steps=steps)
-    needed = f"true (of a recorded clip), {', '.join(ACTION_NAMES)}, or a file"
-    raise InputError(where=f"--actions {word}", found="no such actions", needed=needed)
+    return named_actions(word, steps, size_m=size_m, limits=limits)
 
 
 def imagine_clip(
@@ -201,7 +192,6 @@ def imagine_clip(
 
 
 def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig) -> dict[str, np.ndarray]:
-    _require_some(asked.actions)
     recorded = batch.actions[0].double().numpy()
     chosen: dict[str, np.ndarray] = {}
     for word in asked.actions:
@@ -226,24 +216,13 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
             raise InputError(where="--steps", found=found, needed=f"{most} at most")
         windows = validation_windows(dataset, split, clips=_SEARCHED)
         return max(windows, key=lambda window: _motion(dataset, *window))
-    episode = _episode(dataset, asked.episode)
+    episode = find_episode(dataset, asked.episode)
     start, last = asked.start or 0, int(lengths[episode]) - clip
     if not 0 <= start <= last:
         needed = f"0 to {last}: a clip takes {counted(clip, 'control step')}" if last >= 0 else "a longer episode"
         found, fix = f"{start}, in an episode of {counted(lengths[episode], 'step')}", "Lower --steps or --start"
         raise InputError(where="--start", found=found, needed=needed, fix=fix)
     return episode, start
-
-
-def _episode(dataset: Dataset, name: str) -> int:
-    """Return an episode by its name, or by a part that no other name has."""
-    table, places = dataset.table, [int(place) for place in dataset.episodes]
-    whole = table.find(name)
-    found = [place for place in places if name in table.identity(place)] if whole is None else [whole]
-    if len(found) != 1:
-        has, example = f"{counted(len(found), 'episode')} named *{name}*", table.identity((found or places)[0])
-        raise InputError(where="--episode", found=has, needed=f"one such as {example}, or a part that only it has")
-    return found[0]
 
 
 def _motion(dataset: Dataset, episode: int, start: int) -> float:

@@ -31,7 +31,8 @@ from vjepa2_ac.inspection.variants import load_named
 from vjepa2_ac.intervals import Estimate, bootstrapped, ratio
 from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.model.lora import merge_adapter
-from vjepa2_ac.planning.axes import AXES_FORMAT, Axes, require_axes_in
+from vjepa2_ac.planning.energy import Axes
+from vjepa2_ac.planning.settings import AXES_FORMAT, require_axes_in
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.storage.structured import utc_now
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -15,7 +14,6 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.transforms import Crop, split_views, view
 from vjepa2_ac.data.windows import require_frames
-from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import (
     CameraFrame,
@@ -23,7 +21,6 @@ from vjepa2_ac.media.images import (
     is_uniform,
     newest_frames,
     require_contrast,
-    require_image,
     require_mask,
 )
 from vjepa2_ac.model.world_model import WorldModel
@@ -43,24 +40,6 @@ class Cameras:
     views: int = 1
     newest: tuple[CameraFrame, ...] = field(default=(), init=False)  # of each camera; empty after a reset
 
-    def encode(self, images: UInt8[np.ndarray, "time height width 3"]) -> Float[Tensor, "time tokens dim"]:
-        """Return the latents of images on the model's device; the tokens of several views follow one another.
-
-        Raises:
-            InputError: The width is not that of so many views.
-        """
-        return encode_frames(self.model, images, self.crop, views=self.views)
-
-    def require_goals(self, images: Sequence[np.ndarray]) -> None:
-        """Refuse goal images that are invalid, have different sizes, or have no contrast.
-
-        Raises:
-            InputError: The message names the first such image.
-        """
-        for place, image in enumerate(images):
-            require_image(image, where=f"goal {place}", like=images[0] if place else None)
-            self.require_contrast(image, where=f"goal {place}")
-
     def require_contrast(self, image: Image, *, where: str) -> None:
         """Refuse an image in which one of the cameras has no contrast; see `images.is_uniform`.
 
@@ -69,31 +48,28 @@ class Cameras:
         """
         require_contrast(self._received(image), where=where)
 
-    def newest_with(self, frame: Image, state: Float[np.ndarray, " numbers"]) -> tuple[CameraFrame, ...]:
-        """Return the newest frame of each camera once a frame has arrived."""
-        return newest_frames(split_views(frame[None], self.views), state, self.newest)
-
-    def fault(
+    def checked(
         self,
         frame: Image,
-        newest: Sequence[CameraFrame],
         state: Float[np.ndarray, " numbers"],
         space: StateSpace,
         largest: Float[np.ndarray, " numbers"],
-    ) -> Fault | None:
-        """Return why a frame must not move the robot; None: it may. One faulty camera of several is enough.
+    ) -> tuple[tuple[CameraFrame, ...], Fault | None]:
+        """Return the newest frame of each camera, and why the frame must not move the robot; None: it may.
+
+        One faulty camera of several is enough. Nothing changes: `newest` is set once the decision is made.
 
         Args:
             frame: The frame.
-            newest: The newest frame of each camera, with this one.
             state: The measured state.
             space: The meaning of its numbers.
             largest: The largest change of each number in a model step.
         """
+        newest = newest_frames(split_views(frame[None], self.views), state, self.newest)
         if any(map(is_uniform, self._received(frame))):
-            return "uniform frame"
+            return newest, "uniform frame"
         is_frozen = any(has_moved(before, state, space, largest) for _, before in newest)
-        return "frozen frame" if is_frozen else None
+        return newest, "frozen frame" if is_frozen else None
 
     def weights(self, mask: np.ndarray | None, like: Image) -> Float[Tensor, " tokens"] | None:
         """Return the weight of each patch by a mask over an image; None: no mask.

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,17 +16,17 @@ from torch import Tensor
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.sources.indexed_source import spaces_of
 from vjepa2_ac.data.transforms import Crop
+from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import require_image
-from vjepa2_ac.model.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
-from vjepa2_ac.planning.axes import Axes, require_base_frame
+from vjepa2_ac.model.world_model import Fingerprints, WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.planning.cameras import Cameras, Fault
-from vjepa2_ac.planning.energy import ChunkScores, EnergyFunction, Goal, Scene, WorldModelCost, distance
+from vjepa2_ac.planning.energy import Axes, ChunkScores, EnergyFunction, Goal, Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, require_ends, timed
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, until_cancelled
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
-from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
+from vjepa2_ac.planning.settings import read_axes, require_base_frame, warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.solvers import PlanStart
 from vjepa2_ac.registry import PLANNING_FILES
 from vjepa2_ac.runs.subject import Subject
@@ -47,20 +47,10 @@ class Surprise:
     is_alarm: bool  # the score is above the threshold
 
 
-class PlanningPrior(Protocol):
-    """A network that proposes actions, of `planning.prior`."""
-
-    def start(self, cost: WorldModelCost, wanted: Latents, remaining: int, space: SearchSpace) -> PlanStart:
-        """Return where a search towards the latents of a goal starts, with this number of model steps left."""
-        ...
-
-
-class PlanningMonitor(Protocol):
-    """A threshold for differences between predictions and frames, of `planning.monitor`."""
-
-    def compare(self, predicted: Latents, seen: Latents) -> Surprise:
-        """Return the difference."""
-        ...
+PriorStart = Callable[[WorldModelCost, Latents, int, SearchSpace], PlanStart]
+"""Returns where a search towards the latents of a goal starts, with a number of model steps left (`planning.prior`)."""
+Compare = Callable[[Latents, Latents], Surprise]
+"""Returns the difference between a predicted frame and the frame (`planning.monitor`)."""
 
 
 @dataclass(frozen=True)
@@ -142,18 +132,18 @@ class Controller:
     def _load_files(self, world_model: WorldModel) -> None:
         """Read axes, monitor and prior, which belong to one model: its weights are hashed once for all of them."""
         config, self._axes = self.config, None
-        self._monitor: PlanningMonitor | None = None
-        self._prior: PlanningPrior | None = None
-        if config.axes is None and config.monitor is None and config.prior is None:
+        self._compare: Compare | None = None
+        self._prior_start: PriorStart | None = None
+        if not (config.axes or config.monitor or config.prior):
             return
         known = world_model.fingerprints()
-        if config.axes is not None:
+        if config.axes:
             require_base_frame(f"planning.axes: {config.axes}", is_base=self.spaces.state.is_base_pose)
-            self._axes = Axes.read(config.axes, known)
-        if config.monitor is not None:
-            self._monitor = PLANNING_FILES.find("monitor")(config.monitor, known, self.cameras)
-        if config.prior is not None:
-            self._prior = PLANNING_FILES.find("prior")(config.prior, known, self.cameras)
+            self._axes = _axes_of(config.axes, known)
+        if config.monitor:
+            self._compare = PLANNING_FILES.find("monitor")(config.monitor, known, self.cameras)
+        if config.prior:
+            self._prior_start = PLANNING_FILES.find("prior")(config.prior, known, self.cameras)
 
     @classmethod
     def of_run(
@@ -247,7 +237,9 @@ class Controller:
         """
         if not goals:
             raise ValueError("no goal")
-        self.cameras.require_goals([goal.image for goal in goals])
+        for place, goal in enumerate(goals):
+            require_image(goal.image, where=f"goal {place}", like=goals[0].image if place else None)
+            self.cameras.require_contrast(goal.image, where=f"goal {place}")
         require_ends(goals)
         searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
         report, latents = until_cancelled(cancelled), []
@@ -287,8 +279,8 @@ class Controller:
             ValueError: No goal was set.
         """
         state = self._checked(frame, state)
-        newest, largest = self.cameras.newest_with(frame, state), self.space.upper[0].double().numpy()
-        fault = self.cameras.fault(frame, newest, state, self.spaces.state, largest)
+        largest = self.space.upper[0].double().numpy()
+        newest, fault = self.cameras.checked(frame, state, self.spaces.state, largest)
         if fault is None:
             decision = self._decided(self.encoded(frame), state, samples, cancelled)
             self._progress = decision.progress
@@ -360,7 +352,7 @@ class Controller:
         Raises:
             InputError: The width does not fit the number of views.
         """
-        return self.cameras.encode(image[None])[0]
+        return encode_frames(self._model, image[None], self.crop, views=self.config.views)[0]
 
     def _progressed(self, latents: Latents) -> GoalProgress:
         """Return which goal applies to the current image."""
@@ -431,20 +423,20 @@ class Controller:
     def _surprise(self, latents: Latents) -> Surprise | None:
         """Return the difference between the current frame and the prediction of the last decision."""
         before = self.decision
-        if self._monitor is None or before is None or before.cost is None or before.plan is None:
+        if self._compare is None or before is None or before.cost is None or before.plan is None:
             return None
         with torch.no_grad():
             predicted, _ = before.cost.imagine(before.plan.actions[None, :1])
-        return self._monitor.compare(predicted[0, 0], latents)
+        return self._compare(predicted[0, 0], latents)
 
     def _start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
         """Return the start of a search: from samples of a policy, the prior, or the rest of the last plan."""
         if samples is not None:
             return PlanStart.of_samples(torch.from_numpy(np.array(samples, dtype=np.float64)), self.space)
-        if self._prior is not None:
+        if self._prior_start is not None:
             bound = self._goals[progress.place].at_most
             left = _PRIOR_STEPS if bound is None else bound - (self._done - progress.since)
-            return self._prior.start(cost, self._goal_latents[progress.place], left, self.space)
+            return self._prior_start(cost, self._goal_latents[progress.place], left, self.space)
         before = None if self.decision is None else self.decision.plan
         return before.start_after() if before is not None and self.config.warm_start else None
 
@@ -484,6 +476,20 @@ class Controller:
     def _command(self, state: np.ndarray, change: np.ndarray) -> Float[np.ndarray, " action_dim"]:
         """Return the action for a change of the state: the change itself, or the resulting state."""
         return state + change if self.spaces.action.follows == "target" else change
+
+
+def _axes_of(path: str, known: Fingerprints) -> Axes:
+    """Return the axes of a file that were fitted for a model.
+
+    Raises:
+        InputError: They cannot be planned by, or are another model's.
+    """
+    axes = read_axes(path)
+    if (axes.encoder, axes.predictor) != (known.encoder, known.predictor):
+        found = f"axes that were fitted for another model, {axes.subject}"
+        fix = "Fit them anew: `vjepa2-ac data calibrate CONFIG --axes MODEL`"
+        raise InputError(where=f"planning.axes: {path}", found=found, fix=fix)
+    return Axes(math.radians(axes.yaw_degrees), axes.centre_m)
 
 
 def _require_camera_pose(model: WorldModel, extrinsics: np.ndarray | None, views: int) -> None:

@@ -60,7 +60,12 @@ def named_actions(
     if name not in _DIRECTIONS:
         raise InputError(where="actions", found=repr(name), needed=f"one of {', '.join(ACTION_NAMES)}, or a file")
     axis, sign = _DIRECTIONS[name]
-    size = _size_along(axis, size_m, limits)
+    if axis != GRIPPER:
+        size = size_m if limits is None else min(size_m, limits.xyz_m[axis])
+    elif limits is None:
+        size = GRIPPER_STEP
+    else:
+        size = 0.0 if limits.gripper_mode == "held" else limits.gripper
     if size == 0:
         key, found, needed = "gripper" if axis == GRIPPER else "xyz", "0", "a limit above 0"
         if axis == GRIPPER and limits is not None and limits.gripper_mode == "held":
@@ -106,12 +111,3 @@ def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndar
     if steps is not None and len(actions) < steps:
         raise InputError(where=str(path), found=f"{len(actions)} actions", needed=f"{steps}, one for each model step")
     return actions[:steps]
-
-
-def _size_along(axis: int, size_m: float, limits: LimitsConfig | None) -> float:
-    """Return the size of a step along an axis: metres, or change of closedness."""
-    if limits is None:
-        return GRIPPER_STEP if axis == GRIPPER else size_m
-    if axis == GRIPPER:
-        return 0.0 if limits.gripper_mode == "held" else limits.gripper
-    return min(size_m, limits.xyz_m[axis])

@@ -19,17 +19,17 @@ from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.model.distances import absolute_difference, squared_difference
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.axes import Axes
 from vjepa2_ac.planning.planner import Cost, reporting
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.registry import ENERGIES
-from vjepa2_ac.spaces import POSES, Spaces, states_along
+from vjepa2_ac.spaces import POSES, Spaces, euler_from_matrices, matrices_from_euler, states_along
 
 Latents = Float[Tensor, "*batch tokens dim"]
 Wanted = Float[Tensor, "*wanted tokens dim"]
 OfTokens = Float[Tensor, "*batch tokens"]
 OfEach = Float[Tensor, "*batch"]
 Weights = Float[Tensor, " tokens"]  # of each patch
+_POSITION, _ROTATION = slice(0, 3), slice(3, 6)  # of a pose
 SAME_ENERGY = 1e-6  # relative difference below which energies are equal: it is within rounding
 
 
@@ -74,6 +74,39 @@ def patch_weights(
     if weights.sum() <= 1e-12:
         raise ValueError("the mask leaves nothing of the image")
     return weights
+
+
+@dataclass(frozen=True)
+class Axes:
+    """A turn about a vertical axis, from the robot's axes into the model's.
+
+    Plans are searched among the robot's own actions, so limits hold for what is executed; the model is given each
+    action and state turned.
+
+    Source: arXiv 2506.09985, appendix B.4, which rotates inferred moves by a measured angle.
+    """
+
+    yaw: float  # radians, counterclockwise from above
+    centre_m: tuple[float, float] = (0.0, 0.0)  # x, y that stay where they are; the robot's base
+
+    def poses(self, poses: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch numbers"]:
+        """Return poses as the model sees them: x, y, z, three angles, and what does not turn (a gripper)."""
+        with torch.autocast(poses.device.type, enabled=False):
+            turn, centre = self._turn(poses), poses.new_tensor([*self.centre_m, 0.0])
+            rotation = euler_from_matrices(turn @ matrices_from_euler(poses[..., _ROTATION]))
+            position = (poses[..., _POSITION] - centre) @ turn.T + centre
+            return torch.cat([position, rotation, poses[..., 6:]], dim=-1)
+
+    def actions(self, actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
+        """Return actions as the model sees them: the move and the axis of the rotation are turned."""
+        with torch.autocast(actions.device.type, enabled=False):
+            turn = self._turn(actions)
+            rotation = euler_from_matrices(turn @ matrices_from_euler(actions[..., _ROTATION]) @ turn.T)
+            return torch.cat([actions[..., _POSITION] @ turn.T, rotation, actions[..., 6:]], dim=-1)
+
+    def _turn(self, like: Tensor) -> Float[Tensor, "3 3"]:
+        turn: Tensor = matrices_from_euler(like.new_tensor([0.0, 0.0, self.yaw]))
+        return turn
 
 
 @dataclass(frozen=True)

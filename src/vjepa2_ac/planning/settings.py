@@ -7,14 +7,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AliasPath, BaseModel, Field
 
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.loading import config_of_model, load_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, mark_of
+from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import CHANGES, MOVABLE, is_of_moved, is_run, read_run_config
 from vjepa2_ac.spaces import POSE, REACH_M, vector_states
@@ -57,11 +58,73 @@ def planning_settings(
         its = load_config(config, [*overrides, _ANY_TYPE])
         its = its.model_copy(update={"model": its.model.with_base(subject)})
     require_limits(its)
-    if its.planning.axes is not None:
-        from vjepa2_ac.planning.axes import require_axes
-
-        require_axes(its)
+    if (axes := its.planning.axes) is not None:
+        read_axes(axes)
+        require_base_frame(f"planning.axes: {axes}", is_base=_is_base_pose(its.data))
     return its
+
+
+# ---- calibrated axes ----
+
+AXES_FILE, AXES_FORMAT = "axes.json", 1  # the format is incremented when a reader of the file would have to change
+_FIX = "Fit them with `vjepa2-ac data calibrate CONFIG --axes MODEL`, and name the axes.json that it writes"
+
+
+class AxesFile(BaseModel):
+    """What planning needs of axes.json, which `data calibrate --axes` writes."""
+
+    format: Literal[1]
+    # About z, counterclockwise from above: what the model infers, from what was executed.
+    yaw_degrees: float = Field(validation_alias=AliasPath("yaw_degrees", "value"), allow_inf_nan=False)
+    subject: str = Field(validation_alias=AliasPath("model", "subject"))  # the model, as given
+    encoder: str = Field(validation_alias=AliasPath("model", "encoder"))  # hashes of its weights
+    predictor: str = Field(validation_alias=AliasPath("model", "predictor"))
+    problem: str | None  # why nothing can be planned by it
+    centre_m: tuple[float, float] = (0.0, 0.0)  # x, y about which is turned
+
+
+def read_axes(path: str | Path) -> AxesFile:
+    """Return calibrated axes that can be planned by.
+
+    Raises:
+        InputError: There is no such file, it is none of calibrated axes, or the fit is not good enough.
+    """
+    where, needed = f"planning.axes: {path}", f"calibrated axes of format {AXES_FORMAT}"
+    values = read_json_object(path, needed=needed, fix=_FIX)
+    axes = record_of(AxesFile, values, where=where, needed=needed, fix=_FIX)
+    if axes.problem is not None:
+        fix = "Record varied moves and fit to more pairs (--limit); or the model does not see the actions: adapt it"
+        raise InputError(where=where, found=f"axes that are {axes.problem}", fix=fix)
+    return axes
+
+
+def require_base_frame(where: str, *, is_base: bool) -> None:
+    """Refuse states that have no vertical axis to turn about.
+
+    Raises:
+        InputError: They are no poses in the robot's base frame.
+    """
+    if not is_base:
+        found = "states that are no poses in the robot's base frame"
+        needed = "data.states: pose and data.pose_frame: base, whose vertical axis moves are turned about"
+        raise InputError(where=where, found=found, needed=needed)
+
+
+def require_axes_in(data: DataConfig) -> None:
+    """Refuse data in which there are no axes to calibrate, before a model is loaded.
+
+    Raises:
+        InputError: The states are no poses in the base frame, or the stride is still to be chosen.
+    """
+    require_base_frame("data calibrate --axes", is_base=_is_base_pose(data))
+    require_stride(data, to="calibrate axes, for axes are those of a model step")
+
+
+def _is_base_pose(data: DataConfig) -> bool:
+    return data.states == "pose" and data.pose_frame == "base"
+
+
+# ---- settings and limits ----
 
 
 def _require_relevant(subject: str, overrides: Sequence[str]) -> None:

@@ -36,6 +36,7 @@ from vjepa2_ac.intervals import Estimate, ratio
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.world_model import Fingerprints, WorldModel
 from vjepa2_ac.planning.cameras import Cameras
+from vjepa2_ac.planning.controller import PriorStart
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.solvers import PlanStart
@@ -194,8 +195,8 @@ def load_prior(folder: str | Path, *, where: str) -> tuple[PriorCard, ActionPrio
     return card, prior
 
 
-def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> ActionPrior:
-    """Return the prior of `planning.prior`, on the device of the model.
+def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> PriorStart:
+    """Return the start of searches from the prior of `planning.prior`, on the device of the model.
 
     Raises:
         InputError: As `load_prior`; or the prior was trained with another encoder or crop.
@@ -205,7 +206,7 @@ def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> Actio
         if trained != model:
             found, needed = f"the prior of another {name} {trained}, not {model}", "one trained for this model"
             raise InputError(where=f"planning.prior: {path}", found=found, needed=needed, fix=_FIX)
-    return prior.to(cameras.model.device)
+    return prior.to(cameras.model.device).start
 
 
 _FIRST = 8  # batches whose actions tell how large actions are

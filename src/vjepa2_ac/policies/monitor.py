@@ -21,7 +21,7 @@ from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.world_model import Fingerprints, WorldModel
 from vjepa2_ac.planning.cameras import Cameras
-from vjepa2_ac.planning.controller import Surprise
+from vjepa2_ac.planning.controller import Compare, Surprise
 from vjepa2_ac.planning.energy import mean_difference
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
@@ -80,13 +80,13 @@ class Monitor:
         return found
 
 
-def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> Monitor:
-    """Return the monitor of `planning.monitor`.
+def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> Compare:
+    """Return the comparison of the monitor of `planning.monitor`.
 
     Raises:
         InputError: As `Monitor.read`.
     """
-    return Monitor.read(path, known, tokens=cameras.model.num_tokens, where="planning.monitor")
+    return Monitor.read(path, known, tokens=cameras.model.num_tokens, where="planning.monitor").compare
 
 
 def conformal_threshold(scores: Float[Tensor, " episodes"], false_alarms: float) -> float:
@@ -113,7 +113,6 @@ class WatchedEpisode:
     """The surprise of each model step of an episode."""
 
     name: str
-    index: int  # in the data set
     steps: Int[np.ndarray, " time"]  # control step of the frame that was predicted
     errors: Float[np.ndarray, "time tokens"]
 
@@ -156,9 +155,7 @@ def watch_episodes(
             errors.append(mean_difference(predicted[:, 0].float(), seen.latents[:, 1]).cpu())
         if errors:
             found = torch.cat(errors)
-            yield WatchedEpisode(
-                dataset.table.identity(index), index, np.array(starts) + stride, found.double().numpy()
-            )
+            yield WatchedEpisode(dataset.table.identity(index), np.array(starts) + stride, found.double().numpy())
         progress(done, len(chosen))
 
 

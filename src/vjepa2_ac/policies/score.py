@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -192,93 +192,78 @@ def score_policies(
         InputError: There is no common place, an episode or a frame is not there, the data have fewer cameras than the
             controller has views, or chunks cannot be used.
     """
-    views = controller.config.views
+    views, stride, space = controller.config.views, dataset.config.model_stride, controller.spaces.state
     require_views(dataset.config, views, to="score policies at")
     places = sorted(set.intersection(*(set(one.places) for one in policies)))
     if not places:
         raise InputError(where="--policy", found="no frame that all of them have", needed="the same places in all")
-    stride = dataset.config.model_stride
     control_steps = control_steps or stride
-    steps = min(one.chunks.shape[2] for one in policies) // control_steps
-    seen = [_Place.of(dataset, place, max(1, steps) * stride, controller) for place in places]
-    kept = [one for one in seen if one is not None]
+    ahead = max(1, min(one.chunks.shape[2] for one in policies) // control_steps) * stride
+    kept = [found for place in places if (found := _place_of(dataset, place, ahead, space)) is not None]
     if not kept:
-        needed = f"{counted(steps * stride, 'control step')} after it in the episode"
+        needed = f"{counted(ahead, 'control step')} after it in the episode"
         raise InputError(where="--policy", found="no place with a goal", needed=needed)
-    rng, energies, ids = np.random.default_rng(0), list[np.ndarray](), [one.place[0] for one in kept]
+    rng, energies, ids = np.random.default_rng(0), list[np.ndarray](), [name for (name, _), *_ in kept]
     rows = [{place: row for row, place in reversed([*enumerate(one.places)])} for one in policies]
-    for number, place in enumerate(kept):
+    for number, (place, index, state, changes) in enumerate(kept):
         others = [kept[other].changes for other in _drawn(rng, number, ids)]
         chunks = [
-            changes_of_chunks(
-                one.chunks[row[place.place]], place.state, form=form, control_steps=control_steps,
-                space=controller.spaces.state,
-            )[:, : len(place.changes)]
+            changes_of_chunks(one.chunks[row[place]], state, form=form, control_steps=control_steps, space=space)
             for one, row in zip(policies, rows, strict=True)
-        ]  # fmt: skip
-        frame, goal = place.frames(dataset, views)
+        ]
+        chunks = [one[:, : len(changes)] for one in chunks]
+        frame, goal = read_views(dataset, index, views, [place[1], place[1] + ahead])
         controller.reset(goal)
-        found = controller.score(frame, place.state, np.concatenate([place.changes[None], others, *chunks]))
-        true, rest = found.energies[0], found.energies[1 + len(others) :]
-        worse = found.energies[1 : 1 + len(others)]
+        found = controller.score(frame, state, np.concatenate([changes[None], others, *chunks]))
+        true, worse, rest = np.split(found.energies, [1, 1 + len(others)])
         by_policy = np.split(rest, np.cumsum([len(one) for one in chunks])[:-1])
         means, bests = ([float(take(one)) for one in by_policy] for take in (np.mean, np.min))
-        energies.append(np.array([found.doing_nothing, true, float((worse < true).mean()), *means, *bests]))
+        energies.append(np.array([found.doing_nothing, true[0], float((worse < true).mean()), *means, *bests]))
         progress(number + 1, len(kept))
-    return _scores(policies, np.stack(energies), ids, left_out=len(places) - len(kept))
-
-
-def _scores(
-    policies: Sequence[PolicyChunks],
-    energies: Float[np.ndarray, "places columns"],
-    ids: Sequence[str],
-    *,
-    left_out: int,
-) -> PolicyScores:
-    nothing, true, better, *of_policies = energies.T
+    nothing, demonstrated, better, *of_policies = np.stack(energies).T
     means, bests = of_policies[: len(policies)], of_policies[len(policies) :]
     order = sorted(range(len(policies)), key=lambda number: float(means[number].mean()))
-    scores = [
-        PolicyScore(
-            name=policies[number].name,
-            mean=ratio(means[number], nothing, ids),
-            best=ratio(bests[number], nothing, ids),
-            behind=None if not place else ratio_difference(
-                (means[number], nothing), (means[order[place - 1]], nothing), ids
-            ),
+    scores = []
+    for before, number in zip([None, *order], order, strict=False):
+        pair = None if before is None else ((means[number], nothing), (means[before], nothing))
+        scores.append(
+            PolicyScore(
+                name=policies[number].name,
+                mean=ratio(means[number], nothing, ids),
+                best=ratio(bests[number], nothing, ids),
+                behind=None if pair is None else ratio_difference(*pair, ids),
+            )
         )
-        for place, number in enumerate(order)
-    ]  # fmt: skip
-    counts = {"places": len(ids), "episodes": len(set(ids)), "left_out": left_out}
-    return PolicyScores(tuple(scores), ratio(true, nothing, ids), mean_of(better, ids), **counts)
+    return PolicyScores(
+        policies=tuple(scores),
+        demonstrated=ratio(demonstrated, nothing, ids),
+        others_below_true=mean_of(better, ids),
+        places=len(ids),
+        episodes=len(set(ids)),
+        left_out=len(places) - len(kept),
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
+class _Place(NamedTuple):
     """A frame of an episode, what was done there, and where it led."""
 
     place: tuple[str, int]
     index: int  # of the episode
-    ahead: int  # control steps to the goal
     state: Float[np.ndarray, " dim"]
     changes: Float[np.ndarray, "steps dim"]
 
-    @classmethod
-    def of(cls, dataset: Dataset, place: tuple[str, int], ahead: int, controller: Controller) -> _Place | None:
-        """Return a place with its goal so many control steps later; None: the episode ends before that."""
-        name, step = place
-        index = dataset.table.find(name)
-        if index is None:
-            raise InputError(where=f"--policy: episode {name}", found=f"no such episode in {dataset.config.path}")
-        episode = dataset.source.read(index)
-        if not 0 <= step < len(episode.states) - ahead:
-            return None
-        states = episode.states[step : step + ahead + 1 : dataset.config.model_stride]
-        return cls(place, index, ahead, episode.states[step], controller.spaces.state.differences(states))
 
-    def frames(self, dataset: Dataset, views: int) -> np.ndarray:
-        """Return the images of the first `views` cameras at this position, side by side, and the goal image."""
-        return read_views(dataset, self.index, views, [self.place[1], self.place[1] + self.ahead])
+def _place_of(dataset: Dataset, place: tuple[str, int], ahead: int, space: StateSpace) -> _Place | None:
+    """Return a place whose goal is so many control steps later; None: the episode ends before that."""
+    name, step = place
+    index = dataset.table.find(name)
+    if index is None:
+        raise InputError(where=f"--policy: episode {name}", found=f"no such episode in {dataset.config.path}")
+    states = dataset.source.read(index).states
+    if not 0 <= step < len(states) - ahead:
+        return None
+    way = states[step : step + ahead + 1 : dataset.config.model_stride]
+    return _Place(place, index, states[step], space.differences(way))
 
 
 def _drawn(rng: np.random.Generator, number: int, episodes: Sequence[str]) -> Int[np.ndarray, " others"]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import math
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -20,7 +19,6 @@ from vjepa2_ac.evaluation.result import (
     Evaluation,
     Example,
     Landscapes,
-    gain_over,
     one_step_over_persistence,
     over_persistence,
 )
@@ -41,7 +39,7 @@ from vjepa2_ac.media.figure import (
 )
 from vjepa2_ac.reports.comparison import Comparison
 
-_COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE, "decoded truth": GREEN, "raw persistence": RED}
+_COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE}
 _RUNS = (BLUE, ORANGE, GREEN, "#8f5bb0", RED, "#0b7f8a", "#8a6d0b", "#333333")
 _DASHES = ("-", "--", ":")  # after all colours
 _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
@@ -76,70 +74,30 @@ def plot_comparison(comparison: Comparison, path: Path) -> Path:
     return path
 
 
-class Drawing(NamedTuple):
-    """A figure of a part of the page."""
-
-    part: str
-    described: str
-    width: float  # inches
-    height: float
-    draw: Callable[[Any, Evaluation], None]  # on a figure
+Draw = Callable[[Any, Evaluation], None]  # on a figure
 
 
-def drawings(evaluation: Evaluation) -> Iterator[Drawing]:
-    """Yield the figures of an evaluation that can be drawn, by the part of the page."""
-    yield Drawing("errors", "Open-loop L1 error over persistence by horizon", 6.4, 3.6, draw_errors)
-    if evaluation.base is not None:
-        yield Drawing("base", "Gain over the base by horizon", 6.4, 3.4, _draw_gains)
-    models = evaluation.models.values()
-    if any(model.distribution and math.isfinite(model.distribution.spread[-1].value) for model in models):
-        yield Drawing("distribution", "Spread by horizon", 6.4, 3.4, _draw_spread)
-    yield Drawing("actions", "One-step error with other actions", 6.4, 3.0, draw_use_of_actions)
+def drawings(evaluation: Evaluation) -> Iterator[tuple[str, str, tuple[float, float], Draw]]:
+    """Yield the figures that can be drawn: part of the page, description, width and height in inches, and how."""
+    yield "errors", "Open-loop L1 error over persistence by horizon", (6.4, 3.6), draw_errors
+    yield "actions", "One-step error with other actions", (6.4, 3.0), draw_use_of_actions
     if clips := _landscape_clips(evaluation):
         rows = len(clips) * (2 if evaluation.base and evaluation.models[evaluation.base].landscapes else 1)
         described = "Energy around the true action: cross; lowest energy: ring"
-        yield Drawing("landscapes", described, 9.0, 2.6 * rows, _draw_landscapes)
-    if evaluation.decoded is not None:
-        yield Drawing("decoded", "PSNR by horizon", 6.4, 3.6, draw_decoded)
+        yield "landscapes", described, (9.0, 2.6 * rows), _draw_landscapes
 
 
 def draw_errors(figure: Any, evaluation: Evaluation) -> None:
     """Draw the error over persistence of every model by horizon."""
+    axes = figure.subplots()
     curves = {name: over_persistence(model.errors, "rollout") for name, model in evaluation.models.items()}
-    axes = _by_horizon(figure, evaluation, curves, level=(1.0, PERSISTENCE))
+    seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
+    drawn = _curves(axes, seconds, [(curves[name], {"color": colour}) for name, colour in _colours(curves).items()])
+    shown = seconds[:: -(-len(seconds) // 8)]
+    axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
+    axes.legend(drawn, [PERSISTENCE, *map(_short, curves)], loc="best")
     axes.set(title="L1 error by horizon, open loop (band: 95 % over episodes)", ylabel="latent error / persistence")
     axes.set_ylim(0, None)
-
-
-def _draw_gains(figure: Any, evaluation: Evaluation) -> None:
-    base = evaluation.models[str(evaluation.base)]
-    others = [model for model in evaluation.models.values() if model is not base]
-    gains = {model.name: gain_over(model.errors, base.errors) for model in others}
-    axes = _by_horizon(figure, evaluation, gains, level=(0.0, "the base"))
-    axes.set(title="Gain over the base, open loop, L1 (above 0: better)", ylabel="gain over the base")
-    axes.yaxis.set_major_formatter("{x:.0%}")
-
-
-def _draw_spread(figure: Any, evaluation: Evaluation) -> None:
-    curves = {name: one.distribution.spread for name, one in evaluation.models.items() if one.distribution is not None}
-    axes = _by_horizon(figure, evaluation, curves, level=(1.0, "the truth"))
-    axes.set(title="Spread of predicted latents, open loop (1: as varied as the truth)", ylabel="spread / the truth's")
-    axes.set_ylim(0, None)
-
-
-def draw_decoded(figure: Any, evaluation: Evaluation) -> None:
-    """Draw the PSNR of decoded rollouts by horizon: where something moves, if there are true frames."""
-    decoded = evaluation.decoded
-    assert decoded is not None  # noqa: S101  # else there is no such drawing
-    finite = {name for (_, name), curve in decoded.curves.items() if any(math.isfinite(one.value) for one in curve)}
-    names = ("psnr_db.moving.truth", "psnr_db.whole.truth", "psnr_db.whole.decoded_truth")
-    metric = max(names, key=lambda name: (name in finite, (decoded.sources[0], name) in decoded.curves))
-    curves = {source.replace("_", " "): decoded.curves[source, metric] for source in decoded.sources}
-    axes = _by_horizon(figure, evaluation, curves, level=None)
-    _, region, reference = metric.split(".")
-    where = "where something moves" if region == "moving" else "of the whole image"
-    note = "" if metric in finite else ": no finite value"
-    axes.set(title=f"PSNR {where}, against the {reference.replace('_', ' ')}{note}", ylabel="dB")
 
 
 def draw_use_of_actions(figure: Any, evaluation: Evaluation) -> None:
@@ -231,26 +189,9 @@ def _overlay(
     return np.asarray(0.35 * grey + 0.65 * error_colours(errors, frame.shape[:2], worst)).astype(np.uint8)
 
 
-def _by_horizon(
-    figure: Any, evaluation: Evaluation, curves: Mapping[str, Curve], *, level: tuple[float, str] | None
-) -> Any:
-    """Draw curves with their intervals, and a level that is none of a model, with its name; return the axes."""
-    axes = figure.subplots()
-    seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
-    styled = ((curves[name], {"color": colour}) for name, colour in _colours(curves).items())
-    drawn = _curves(axes, seconds, styled, level and level[0])
-    shown = seconds[:: -(-len(seconds) // 8)]
-    axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
-    labels = [] if level is None else [level[1]]
-    axes.legend(drawn, [*labels, *map(_short, curves)], loc="best")
-    return axes
-
-
-def _curves(
-    axes: Any, seconds: np.ndarray, curves: Iterable[tuple[Curve, dict[str, str]]], level: float | None = 1.0
-) -> list[Any]:
-    """Draw curves with their intervals, each in its style; return the lines."""
-    drawn = [] if level is None else [axes.axhline(level, color=GREY, linestyle="--")]
+def _curves(axes: Any, seconds: np.ndarray, curves: Iterable[tuple[Curve, dict[str, str]]]) -> list[Any]:
+    """Draw persistence, and curves with their intervals, each in its style; return the lines."""
+    drawn = [axes.axhline(1.0, color=GREY, linestyle="--")]
     for curve, style in curves:
         low, high = [one.low for one in curve], [one.high for one in curve]
         axes.fill_between(seconds, low, high, color=style["color"], alpha=0.15, linewidth=0)

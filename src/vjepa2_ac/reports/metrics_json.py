@@ -22,7 +22,7 @@ from vjepa2_ac.evaluation.result import L1, About, Evaluation, Way
 from vjepa2_ac.evaluation.rows import Row, rows_of
 from vjepa2_ac.evaluation.summary import Summary, summarize
 from vjepa2_ac.storage import user_can_read, write_atomically
-from vjepa2_ac.storage.structured import json_text
+from vjepa2_ac.storage.structured import json_text, message_of
 
 METRICS_FILE = "metrics.json"
 FORMAT = 6  # incremented when a reader of the file would have to change
@@ -112,7 +112,7 @@ def read_metrics(folder: Path) -> Metrics:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
-        found = f"metrics that cannot be used ({place}: {first['msg']}, found {first['input']!r:.60})"
+        found = f"metrics that cannot be used ({place}: {message_of(first)})"
         raise InputError(where=str(path), found=found, needed=f"format {FORMAT}", fix=fix) from None
     except MissingFileError:
         found = f"no {METRICS_FILE}" if folder.is_dir() else "no such folder"

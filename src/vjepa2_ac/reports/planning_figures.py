@@ -1,4 +1,4 @@
-"""Figures of planning: a plan, the goals of a demonstration, and a watched episode."""
+"""Figures of planning: a plan, and the goals of a demonstration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from vjepa2_ac.data.transforms import Crop, crop_box, view
+from vjepa2_ac.data.transforms import crop_box
 from vjepa2_ac.errors import counted
 from vjepa2_ac.media.figure import BLUE, GREY, MEANING, ORANGE, RED, Kind, headline, show_framed, written_figure
 from vjepa2_ac.planning.decision import PlanResult, summarize
@@ -21,7 +21,6 @@ if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
     from vjepa2_ac.evaluation.imagined import ImaginedPlan
     from vjepa2_ac.goals.make_goals import MadeGoals
     from vjepa2_ac.planning.planner import Plan
-    from vjepa2_ac.policies.monitor import Monitor, WatchedEpisode
 
 PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
 
@@ -179,7 +178,7 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
     """Write the contact sheet of goals as PNG; it is written atomically."""
     images = [made.first, *(goal.image for goal in made.goals)]
     rows = -(-len(images) // _ACROSS)
-    states = made.recording.states
+    states = made.states
     heights = [2.0 * rows] if states is None else [2.0 * rows, 1.4]
     options = made.options
     how = f"every {options.every} frames" if options.by == "every" else f"by {options.by}"
@@ -197,7 +196,7 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
             for key in made.keys:
                 axes.axvline(key.frame, color=GREY, linewidth=0.8, linestyle=":")
             axes.plot(states[:, POSE.gripper], color=ORANGE, linewidth=1.3)
-            axes.set(title="Gripper: 0 open, 1 closed", ylim=(-0.05, 1.05), xlim=(0, made.recording.frames - 1))
+            axes.set(title="Gripper: 0 open, 1 closed", ylim=(-0.05, 1.05), xlim=(0, made.frames - 1))
             axes.locator_params(axis="x", integer=True)
     return path
 
@@ -212,49 +211,3 @@ def _caption(made: MadeGoals, place: int) -> str:
     lines = [f"goal {place}: {goal.name}" if goal.name else f"goal {place}", f"frame {key.frame}, {steps}"]
     lines.append(f"gripper {goal.gripper or 'as planning.limits say'}")
     return "\n".join(lines)
-
-
-MONITOR_IMAGE = "monitor.png"
-_SHOWN_STEPS = 4
-
-
-def plot_watched(episode: WatchedEpisode, frames: Any, monitor: Monitor, crop: Crop, path: Path) -> Path:
-    """Write the figure of a watched episode as PNG: its scores, and where its most surprising frames are.
-
-    Args:
-        episode: Its surprise.
-        frames: The frames of its most surprising steps (`most_surprising`), uncropped.
-        monitor: What is usual, and above which surprise there is an alarm.
-        crop: As the model sees them.
-        path: The file.
-    """
-    shown, scores, threshold = most_surprising(episode, monitor), episode.scores(monitor.expected), monitor.threshold
-    excess = np.maximum(episode.errors - np.array(monitor.expected), 0.0)
-    most = max(float(excess.max()), 1e-12)
-    grid = round(episode.errors.shape[1] ** 0.5)
-    with written_figure(path, _WIDTH, 4.2, dpi=130) as figure:
-        first = episode.first_alarm(monitor)
-        headline(
-            figure, f"{episode.name}: " + ("no alarm" if first is None else f"alarm at step {episode.steps[first]}")
-        )
-        above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.2])
-        axes = above.subplots()
-        axes.plot(episode.steps, scores, color=BLUE, marker=".")
-        axes.axhline(threshold, color=RED, linestyle="--", label=f"threshold {threshold:.3g}")
-        axes.set(xlabel="control step", ylabel="surprise", ylim=(0, None))
-        axes.legend(loc="upper left")
-        for axes, place, frame in zip(below.subplots(1, len(shown), squeeze=False)[0], shown, frames, strict=True):
-            seen = view(frame[None], crop)[0]
-            height, width = seen.shape[:2]
-            axes.imshow(seen)
-            errors = excess[place].reshape(grid, grid)
-            box = (0, width, height, 0)
-            axes.imshow(errors, cmap="autumn_r", alpha=0.8 * errors / most, extent=box, vmin=0, vmax=most)
-            axes.set_title(f"step {episode.steps[place]}: {scores[place]:.3g}")
-            axes.set_axis_off()
-    return path
-
-
-def most_surprising(episode: WatchedEpisode, monitor: Monitor) -> list[int]:
-    """Return the steps of an episode that a figure shows, in their order: four at most, of the highest scores."""
-    return sorted(np.argsort(-episode.scores(monitor.expected), kind="stable")[:_SHOWN_STEPS].tolist())

@@ -131,8 +131,8 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
     for row in rows:
         of_part[next(name for name, (_, keys) in _PARTS.items() if re.match(keys, row.key))].append(row)
     images: dict[str, list[PageImage]] = {name: [] for name in _PARTS} | _clips(evaluation)
-    for one in drawings(evaluation):
-        images[one.part].append(PageImage(svg_of(one.draw, one.width, one.height, evaluation), one.described))
+    for part, described, (width, height), draw in drawings(evaluation):
+        images[part].append(PageImage(svg_of(draw, width, height, evaluation), described))
     notes = {"decoded": () if evaluation.decoded is None else evaluation.decoded.notes}
     return [
         PagePart(name, title, sections(of_part[name]), images[name], notes.get(name, ()))
