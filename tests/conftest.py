@@ -57,7 +57,7 @@ LONGEST = (
 
 SLOW = (
     "benchmarks/", "distributed/test_nothing_hangs", "distributed/test_shared_work", "explore/test_command",
-    "explore/test_page_in_browser", "judge/", "reports/test_page_in_browser", "serving/test_real_client",
+    "explore/test_page_in_browser", "judge/", "serving/test_real_client",
     "test_extending", "test_notebook", "test_quickstart", "test_site", "test_spot", "test_sweeps", "test_wheel",
     "training/test_soak",
 )  # fmt: skip

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.action_use import (
-    ActionPool,
     RolloutStart,
+    alternatives,
     evaluate_actions,
     measure_landscapes,
     moves_of,
@@ -51,8 +51,13 @@ def ranked(model: Predictor, batch: LatentBatch, samples: int = 40) -> ActionRan
     return rank_actions(model, moves(batch), POSE_CHANGE, probes, seed=0)
 
 
-def pool_of(moves: list[RolloutStart], space: ActionSpace, samples: int) -> ActionPool:
-    return ActionPool(np.stack([move.true for move in moves]), space, ProbeOptions(samples=samples))
+def drawn_for(
+    move: RolloutStart, moves: list[RolloutStart], space: ActionSpace, samples: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the alternatives in the box, and those on the shell."""
+    largest = np.abs([one.true for one in moves]).max(axis=0)
+    drawn = alternatives(move.true, largest, space, ProbeOptions(samples=samples), generator)
+    return drawn[:samples], drawn[samples:]
 
 
 def test_a_move_is_the_longest_within_reach_there_and_back() -> None:
@@ -70,7 +75,7 @@ def test_commands_that_are_no_changes_are_taken_as_they_are() -> None:
     batch.actions[:, 2] *= 3
     found = moves(batch, vector_actions(7, "target"))
     assert len(found) == CLIPS
-    assert all(torch.equal(one.action, batch.actions[one.clip, 2]) for one in found)
+    assert all(torch.equal(one.action, batch.actions[clip, 2]) for clip, one in enumerate(found))
 
 
 def test_who_knows_the_world_ranks_the_true_action_first() -> None:
@@ -133,20 +138,19 @@ def test_the_shell_tells_a_direction_from_a_distance() -> None:
 
 def test_actions_on_the_shell_are_as_long_as_the_true_one_and_go_everywhere() -> None:
     (move, _), samples = moves(line(times=10))[:2], 4000
-    pool = pool_of([move], POSE_CHANGE, samples)
-    drawn = pool.on_shell(move, np.random.default_rng(0))
+    _, drawn = drawn_for(move, [move], POSE_CHANGE, samples, np.random.default_rng(0))
     assert np.linalg.norm(drawn[:, :3], axis=1) == pytest.approx(np.full(samples, 0.07))
     assert np.abs(drawn[:, :3].mean(axis=0)).max() < 0.005
     assert np.array_equal(drawn[:, 3:], np.zeros((samples, 4)))
     still = replace(move, action=torch.zeros(7))
-    assert not pool.on_shell(still, np.random.default_rng(0)).any()
+    assert not drawn_for(still, [move], POSE_CHANGE, samples, np.random.default_rng(0))[1].any()
 
 
 def test_numbers_of_vectors_are_lengths_in_their_largest_change() -> None:
     space = vector_actions(3, "change")
     move = replace(moves(line())[0], action=torch.tensor([0.1, 0.0, 0.0]))
     others = replace(move, action=torch.tensor([0.0, 5.0, 0.0]))
-    drawn = pool_of([move, others], space, 500).on_shell(move, np.random.default_rng(0))
+    _, drawn = drawn_for(move, [move, others], space, 500, np.random.default_rng(0))
     assert np.linalg.norm(drawn[:, :2] / [0.1, 5.0], axis=1) == pytest.approx(np.ones(500))
     assert not drawn[:, 2].any(), "what never changes is not changed"
 
@@ -164,7 +168,7 @@ def test_what_others_are_drawn_does_not_depend_on_the_moves_beside_it() -> None:
 
 def starts(step: int = 0) -> list[RolloutStart]:
     batch = clips_batch(FEW)
-    return [replace(start_of(batch, clip, step), clip=clip) for clip in range(FEW)]
+    return [start_of(batch, clip, step) for clip in range(FEW)]
 
 
 def test_energy_and_change_are_the_distances_of_the_world() -> None:
@@ -186,11 +190,11 @@ def test_ranks_and_change_are_counted_by_hand() -> None:
             return super().predict(latents, actions / 3, states, extrinsics)
 
     begun, probes = starts(), ProbeOptions(samples=SAMPLES, at_once=16)
-    found, pool = rank_actions(Third(), begun, POSE_CHANGE, probes, seed=4), pool_of(begun, POSE_CHANGE, SAMPLES)
+    found = rank_actions(Third(), begun, POSE_CHANGE, probes, seed=4)
     changes, persistence = [], []
     for number, start in enumerate(begun):
-        generator, errors = start.generator(4), []
-        for drawn in (pool.in_box(start, generator), pool.on_shell(start, generator)):
+        errors = []
+        for drawn in drawn_for(start, begun, POSE_CHANGE, SAMPLES, start.generator(4)):
             true = start.action[:DIM].double().numpy()
             energies = np.abs(drawn[:, :DIM] / 3 - true).mean(axis=1)
             errors.append((energies < np.abs(true / 3 - true).mean()).mean())
@@ -203,14 +207,13 @@ def test_ranks_and_change_are_counted_by_hand() -> None:
 
 def test_the_box_moves_only_the_hand() -> None:
     begun = starts()
-    start, pool = begun[0], pool_of(begun, POSE_CHANGE, 500)
-    boxed = pool.in_box(start, np.random.default_rng(0))
+    start = begun[0]
+    boxed, _ = drawn_for(start, begun, POSE_CHANGE, 500, np.random.default_rng(0))
     assert np.array_equal(boxed[:, 3:], np.tile(start.action[3:].double().numpy(), (500, 1)))
     assert 0.07 < np.abs(boxed[:, :3]).max() <= 0.075
     assert abs(boxed[:, :3].mean()) < 0.005
-    vectors = pool_of(begun, vector_actions(7, "change"), 500)
-    drawn = vectors.in_box(start, np.random.default_rng(0))
-    assert (np.abs(drawn).max(axis=0) <= np.abs(vectors.actions).max(axis=0)).all()
+    drawn, _ = drawn_for(start, begun, vector_actions(7, "change"), 500, np.random.default_rng(0))
+    assert (np.abs(drawn).max(axis=0) <= np.abs([one.true for one in begun]).max(axis=0)).all()
     assert np.abs(drawn[:, 3:]).max() > 0.05
 
 

@@ -1,14 +1,21 @@
-"""Every number is a row, and console, page, metrics.json and comparison show the same rows."""
+"""Every number is a row, and console, page, metrics.json and comparison show the same rows, also of an added metric."""
 
 from pathlib import Path
+
+import pytest
 
 from evaluation_results import evaluation, page_of
 from vjepa2_ac.cli.progress import PlainConsole
 from vjepa2_ac.cli.tables import row_tables
-from vjepa2_ac.evaluation.result import gain_over, over_persistence, rank_difference
+from vjepa2_ac.evaluation.evaluate import Contender, evaluate
+from vjepa2_ac.evaluation.request import ProbeOptions
+from vjepa2_ac.evaluation.result import L1, L2, Evaluation, Metric, gain_over, over_persistence, rank_difference
 from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
+from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 
 WHOLE = evaluation(others=("runs/other",))
 
@@ -57,3 +64,39 @@ def test_console_page_and_file_show_the_same_rows(tmp_path: Path) -> None:
     assert found is not None
     row = next(row for row in rows if (row.key, row.model) == (found.key, found.model))
     assert Estimate(found.value or 0, found.low or 0, found.high or 0) == row.estimate
+
+
+# ---- a metric that joins the list ----
+
+LARGER = Metric("agreement", "agreement", "1 / (1 + L1)", lambda *pair: 1 / (1 + L1.of(*pair)), smaller_is_better=False)
+SMALLER = Metric("height", "height", "1 / (1 + L1), taken for an error", LARGER.of)
+PROBES = ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0)
+
+
+def evaluated(trained: object, base: object, *more: Metric) -> Evaluation:
+    contenders = [Contender("base", "base", base), Contender("adapter", "trained", trained)]  # type: ignore[arg-type]
+    return evaluate(contenders, again(clips_batch()), about(), metrics=(L1, L2, *more), probes=PROBES)
+
+
+def test_an_added_metric_appears_in_rows_verdict_and_comparison(tmp_path: Path) -> None:
+    found = evaluated(Halfway(), Copier(), LARGER)
+    rows = {(row.key, row.model): row for row in rows_of(found)}
+    ratio, gain = (rows[f"rollout.agreement.{what}.1", "adapter"] for what in ("over_persistence", "gain_over_base"))
+    assert ratio.better == gain.better == "higher"
+    assert gain.value > 0
+    for name, one in (("with", found), ("without", evaluated(Halfway(), Copier()))):
+        (tmp_path / name).mkdir()
+        write_metrics(one, tmp_path / name / METRICS_FILE)
+    both = {(row.key, row.model): row for row in compare([tmp_path / "with", tmp_path / "without"]).rows}
+    assert both["rollout.agreement.over_persistence.4", "with"].value > 1
+    assert ("rollout.agreement.over_persistence.4", "without") not in both
+    for run in ("with", "without"):
+        assert both["rollout.l2.over_persistence.4", run].value == pytest.approx(0.25)
+
+
+def test_more_is_better_where_a_metric_says_so() -> None:
+    better, worse = (evaluated(*pair, LARGER) for pair in ((Oracle(), Halfway()), (Copier(), Halfway())))
+    assert not summarize(better, rows_of(better)).predicts.reference, "it agrees with L1"
+    assert not summarize(worse, rows_of(worse)).predicts.reference
+    mistaken = evaluated(Oracle(), Halfway(), SMALLER)
+    assert "(by height " in summarize(mistaken, rows_of(mistaken)).predicts.reference

@@ -25,7 +25,7 @@ from vjepa2_ac.evaluation.result import (
     PredictionErrors,
 )
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.evaluation.summary import Summary, closed_loop, not_measured, percent, summarize, with_closed_loop
+from vjepa2_ac.evaluation.summary import Summary, closed_loop, not_measured, summarize, with_closed_loop
 from vjepa2_ac.intervals import Estimate, share_of
 from vjepa2_ac.spaces import POSE_CHANGE
 from worlds import about
@@ -67,7 +67,7 @@ def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
     actions = np.full((CLIPS, HORIZON, 7), 0.01)
     return Evaluation(
         about=about(frames=HORIZON + 1, seconds_per_step=0.5),
-        clips=clips_of(actions, ids, tuple(range(CLIPS)), space=POSE_CHANGE, seconds_per_step=0.5),
+        clips=clips_of(actions, list(zip(ids, range(CLIPS), strict=True)), space=POSE_CHANGE, seconds_per_step=0.5),
         models={each.name: each for each in models},
     )
 
@@ -134,9 +134,6 @@ def test_better_action_ranking_needs_a_lower_error_than_chance_and_the_base_mode
     ranks_actions = summary.ranks_actions
     assert (ranks_actions.conclusion, ranks_actions.compared_with) == (conclusion, compared_with)
     assert ranks_actions.value == pytest.approx(rank, abs=0.002)
-    assert ranks_actions.statement == f"action-ranking error {percent(ranks_actions.value)} %"
-    with_base = f"base model {percent(base + ranks_actions.value - rank)} %, " if base else ""
-    assert ranks_actions.reference == f"({with_base}chance 50 %)"
     if rank > 0.5:
         assert summary.uses_actions.conclusion == "no", "a model that ranks worse than chance is not sensitive to them"
         assert summary.sentence == "Action ranking is worse than chance, so the model cannot be used for planning."
@@ -256,13 +253,6 @@ def test_a_better_landscape_needs_a_nearer_minimum_than_the_base_model_and_a_ran
     assert summary.verdicts[3] == verdict
     assert (verdict.conclusion, verdict.unit, verdict.baseline) == (conclusion, "cm", 25.0)
     assert verdict.value == pytest.approx(adapter[0], abs=0.5)
-    assert verdict.statement == f"energy minimum {verdict.value:.1f} cm from the true action"
-    of_base = [] if base is None else [f"base model {verdict.value - adapter[0] + base[0]:.1f} cm", f"{base[1]:#.2g}"]
-    assert verdict.reference == (
-        f"(random point 25.0 cm; sharpness {adapter[1]:#.2g})"
-        if base is None
-        else f"({of_base[0]}; random point 25.0 cm; sharpness {adapter[1]:#.2g}, base model {of_base[1]})"
-    )
     few = summary_of(mapped(model("adapter", 0.7), *adapter, episodes=1)).landscape
     assert few is not None
     assert few.conclusion == "inconclusive"

@@ -11,7 +11,7 @@ from torch import Tensor
 from vjepa2_ac.evaluation.action_use import RolloutStart, start_of
 from vjepa2_ac.inspection.axes import AxisFit, infer_axes
 from vjepa2_ac.intervals import Estimate
-from vjepa2_ac.planning.axes import Axes
+from vjepa2_ac.planning.energy import Axes
 from worlds import TIME, Copier, Oracle, clips_batch
 
 CLIPS = 16

@@ -26,8 +26,6 @@ from vjepa2_ac.planning.goals import timed
 from vjepa2_ac.policies.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
 from vjepa2_ac.policies.monitor import Monitor
 from vjepa2_ac.runs.subject import Subject
-from vjepa2_ac.simulation.benchmark import Planning
-from vjepa2_ac.simulation.rollout import Observation, Trial, run
 
 
 def planner(name: str, **options: Any) -> dict[str, Any]:
@@ -146,42 +144,20 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
             yield Scene(model, {name: str(folder / file) for name, file in files.items()})
 
 
-FAR = {"distance_m": 0.1, "success": False}
-
-
-class StillWorld:
-    """A world that shows noise, whatever is done."""
-
-    def __init__(self, views: int) -> None:
-        self.images = [image(seed, SIDE, SIDE * views) for seed in range(4)]
-
-    def reset(self, **_: object) -> tuple[Observation, dict[str, Any]]:
-        self.left = self.images[:3]
-        return Observation(self.left.pop(), STATE), {**FAR, "goal_image": self.images[3]}
-
-    def step(self, _: object) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        return Observation(self.left.pop(), STATE), 0.0, False, False, FAR
-
-
 def tried(scene: Scene, *names: str) -> None:
-    """Take options through two decisions in closed loop, `plan` and `score`."""
+    """Take options through two decisions, `plan` and `score`."""
     config = scene.config(*names)
     planning, controller = config.planning, Controller.of_subject(Subject("tiny", config, scene.model))
-    world = StillWorld(planning.views)
-    goals = timed(world.images[2:], (1,))
+    images = [image(seed, SIDE, SIDE * planning.views) for seed in range(4)]
+    goals, chunks = timed(images[2:], (1,)), None
     mask = np.arange(SIDE * SIDE * planning.views).reshape(SIDE, -1) % 3 > 0 if "mask" in names else None
     if "samples of a policy" in names:
         chunks = np.random.default_rng(0).normal(0, 0.01, (3, planning.horizon, 7))
-        acting = controller.act
-        controller.act = lambda frame, state: acting(frame, state, samples=chunks)  # type: ignore[method-assign]
-    policy = Planning(controller)
-    if mask is not None:
-        policy.reset = lambda *_: controller.follow(goals, mask=mask)  # type: ignore[method-assign]
-    found = run(world, policy, Trial(0, steps=2, stride=1, goals=goals))
-    assert np.isfinite(found.actions).all()
-    assert np.isfinite(controller.score(world.images[0], STATE, np.full((2, 3, 7), 0.01)).energies).all()
-    planned = decide(controller, PlanRequest(world.images[0], STATE, goals, mask), nodes=0)
-    assert np.isfinite(planned.actions).all()
+    controller.follow(goals, mask=mask)
+    assert np.isfinite([controller.act(frame, STATE, samples=chunks) for frame in images[:2]]).all()
+    assert np.isfinite(controller.score(images[0], STATE, np.full((2, 3, 7), 0.01)).energies).all()
+    if chunks is None:
+        assert np.isfinite(decide(controller, PlanRequest(images[0], STATE, goals, mask), nodes=0).actions).all()
 
 
 def test_every_option_has_another_value(scene: Scene) -> None:

@@ -84,9 +84,6 @@ def test_a_model_needs_no_config_and_takes_one(make_config, base_folder: Path, t
         ({"overrides": ["training.steps=3"]}, r"training\.steps=3: a setting that planning does not use"),
         ({"overrides": ["horizon=3"]}, r"did you mean planning\.horizon"),
         ({"overrides": ["planning.horizon=0"]}, r"planning\.horizon.*greater than or equal to 1"),
-        ({"overrides": ["planning.limits.xyz=[-0.1, 0, 0]"]}, r"planning\.limits\.xyz"),
-        ({"overrides": ["planning.limits={xyz: [0, 0, 0], gripper: 0}"]}, "nothing is left to plan"),
-        ({"overrides": ["planning.horizont=3"]}, "did you mean horizon"),
         ({"checkpoint": "best"}, "not the folder of a run"),
     ],
 )

@@ -11,10 +11,10 @@ from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.imagined import ImagineOptions, Seen, imagine_image
-from vjepa2_ac.goals.make_goals import recording_of_episode
+from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.runs.subject import Subject
@@ -64,20 +64,18 @@ def test_what_cannot_be_split_is_refused() -> None:
     odd = np.zeros((64, 65, 3), dtype=np.uint8)
     with pytest.raises(InputError, match=r"65 pixels wide.* 2 views share"):
         decided(odd, odd, 2)
-    with pytest.raises(ValueError, match="views excludes axes"):
-        PlanningConfig(views=2, axes="axes.json")
 
 
 def test_goals_are_made_of_both_cameras_and_a_film_shows_both(tmp_path: Path) -> None:
     data = tmp_path / "data"
     record_dataset(data, RecordingSpec("A", 9, seed=0, cameras=2), episodes=2)
     config = RldsData(path=str(data), camera=("exterior_1_left", "exterior_2_left"))
-    one, two = (recording_of_episode(config, "0", views=views) for views in (1, 2))
-    both = two.read([0, 4])
-    np.testing.assert_array_equal(both[:, :, : both.shape[2] // 2], one.read([0, 4]))
-    assert (both[:, :, both.shape[2] // 2 :] != one.read([0, 4])).any()
+    found = [make_goals(config, "0", KeyFrameOptions(every=4, views=views)) for views in (1, 2)]
+    one, both = (np.stack([made.first, made.goals[0].image]) for made in found)
+    np.testing.assert_array_equal(both[:, :, : both.shape[2] // 2], one)
+    assert (both[:, :, both.shape[2] // 2 :] != one).any()
     with pytest.raises(InputError, match=r"data.camera: exterior_1_left. needed: 2 cameras"):
-        recording_of_episode(RldsData(path=str(data), camera="exterior_1_left"), "0", views=2)
+        make_goals(RldsData(path=str(data), camera="exterior_1_left"), "0", KeyFrameOptions(views=2))
 
     quick = ["planning.views=2", "planning.samples=8", "planning.iterations=1", "planning.planner.options.elites=2"]
     options = BenchmarkOptions(episodes=1, steps=2, films=1, sub_goals="demonstration")

@@ -141,6 +141,7 @@ def test_each_gripper_mode_does_what_it_says(mode: str, given: float, expected: 
     [
         ({"horizon": 3, "action_repeat": 2}, "multiple of action_repeat"),
         ({"samples": 5}, "more than 5 samples"),
+        ({"planner": "prior"}, "planner=prior needs prior"),
         ({"limits": {"xyz": (0.0, 0.0, 0.0), "gripper_mode": "held"}}, "nothing is left"),
         ({"limits": {"xyz": (50.0, 50.0, 50.0)}}, "less than or equal to 1"),  # millimetres
         ({"limits": {"rotation": 10.0}}, "less than or equal to 3.14"),  # degrees

@@ -11,7 +11,6 @@ from decisions import QUICK, STATE, image
 from run_fixtures import MakeConfig, SilentReporter
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
-from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.config.section import Component
 from vjepa2_ac.errors import InputError
@@ -108,20 +107,6 @@ def test_it_is_refused_for_another_encoder_and_where_a_file_is_damaged(folder: P
     (folder / WEIGHTS).write_bytes(b"no tensors")
     with pytest.raises(InputError, match=WEIGHTS):
         load_prior(folder, where="planning.prior")
-
-
-@pytest.mark.parametrize(
-    ("changes", "found"),
-    [
-        ({"planner": "prior"}, "planner=prior needs prior"),
-        ({"prior": "x", "warm_start": True}, "prior excludes warm_start"),
-        ({"prior": "x", "views": 2}, "views excludes prior"),
-    ],
-)
-def test_settings_that_contradict_are_refused(changes: dict[str, object], found: str) -> None:
-    with pytest.raises(InputError, match=found):
-        parse_config({"run_dir": "r", "data": {"path": "d"}, "model": {"base": "b"}, "planning": changes}, where="test")
-    assert PlanningConfig().prior is None
 
 
 def test_training_is_repeatable_beats_doing_nothing_and_sees_the_goal(make_config: MakeConfig, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from html.parser import HTMLParser
 from xml.etree import ElementTree as ET
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
+from browser import open_page
 from evaluation_results import decoded_strips, evaluation, page_of
 from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.evaluation.rows import rows_of
@@ -201,3 +203,31 @@ def test_images_are_described_tables_have_captions_and_headings_do_not_jump(usua
     assert re.fullmatch("1(2+3*)+", levels)
     assert all(attributes.get("alt") for tag, attributes in page.elements if tag == "img")
     assert html.count("<table>") == len(re.findall("<table><caption>[^<]", html))
+
+
+# ---- in a real browser: no errors, no requests, no scripts ----
+
+
+@cache
+def page() -> str:
+    """Return a page of everything that can be measured."""
+    return page_of(decoded_strips(evaluation(others=("a run with a rather long name/and/slashes",))))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("drawn")
+def test_the_page_opens_from_its_file_without_complaint_or_request(tmp_path) -> None:
+    (tmp_path / "report.html").write_text(page(), encoding="utf-8")
+    seen = open_page(tmp_path / "report.html", tmp_path)
+    assert (seen.console, seen.requests) == ((), ())
+    assert "What was measured" in seen.dom
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("drawn")
+def test_what_a_name_smuggles_in_is_not_run_even_if_it_were_not_escaped(tmp_path) -> None:
+    smuggled = tmp_path / "smuggled.html"
+    smuggled.write_text(page().replace("<main>", '<main><script>document.title = "run"</script>'), encoding="utf-8")
+    seen = open_page(smuggled, tmp_path)
+    assert "<title>run</title>" not in seen.dom
+    assert any("Content Security Policy" in line for line in seen.console)

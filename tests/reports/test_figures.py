@@ -1,0 +1,93 @@
+"""Figures are drawn for any names, any number of runs, and every outcome of a decision."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from decisions import asked, image
+from evaluation_results import evaluation
+from random_decoder import write_decoder
+from tiny_models import tiny_model
+from vjepa2_ac.decoding.decoder import load_decoder
+from vjepa2_ac.evaluation.imagined import imagine_plan
+from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.media.figure import side_by_side
+from vjepa2_ac.planning.decision import PlanResult
+from vjepa2_ac.reports.comparison import Comparison
+from vjepa2_ac.reports.evaluation_figures import plot_comparison, plot_evaluation
+from vjepa2_ac.reports.planning_figures import plot_plan
+
+pytestmark = pytest.mark.usefixtures("drawn")
+
+NAMES = ("runs/lora", "_hidden", r"$\frac$", *(f"run {number}" for number in range(10)))
+
+
+def test_every_run_is_drawn_under_its_own_name_and_style(tmp_path, monkeypatch) -> None:
+    drawn: list[Figure] = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), save(self, *a, **k))[1])
+    curves = {name: (Estimate(0.9, 0.8, 1.0), Estimate(0.8, 0.7, 0.9)) for name in NAMES}
+    comparison = Comparison("errors", (), np.array([0.5, 1.0]), curves, (), {}, {})
+    assert plot_comparison(comparison, tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+    (legend,) = drawn[0].legends
+    assert [text.get_text() for text in legend.get_texts()] == ["persistence", *NAMES]
+    lines = drawn[0].axes[0].get_lines()[1:]
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == len(NAMES)
+
+
+def test_names_that_look_like_formulas_and_missing_images_do_not_stop_the_image_of_an_evaluation(tmp_path) -> None:
+    one = evaluation(others=(r"$\frac$",))
+    assert plot_evaluation(one, tmp_path / "plot.png").stat().st_size > 1000
+    bare = replace(one, examples=tuple(replace(example, frames=None) for example in one.examples))
+    assert plot_evaluation(bare, tmp_path / "bare.png").stat().st_size > 1000
+    assert plot_evaluation(replace(one, examples=()), tmp_path / "none.png").stat().st_size > 1000
+
+
+def pixels_of(found: PlanResult, folder: Path) -> np.ndarray:
+    with Image.open(plot_plan(found, folder / "plan.png")) as image:
+        return np.array(image.convert("RGB"))
+
+
+def test_slices_are_a_row_of_their_own(tmp_path: Path) -> None:
+    heights = [pixels_of(found, tmp_path).shape[0] for found in (asked(), asked(start=100))]
+    assert heights == sorted(set(heights), reverse=True)
+
+
+def test_a_plan_without_energies_is_drawn_as_well(tmp_path: Path) -> None:
+    assert pixels_of(asked(broken=True), tmp_path).std() > 10
+
+
+def test_many_goals_and_a_mask_are_shown(tmp_path: Path) -> None:
+    found = asked(100, 101, 102, 103, nodes=0)
+    plain = pixels_of(found, tmp_path)
+    mask = np.zeros(image(0).shape[:2], bool)
+    mask[:30] = True
+    object.__setattr__(found.question, "mask", mask)
+    masked = pixels_of(found, tmp_path)
+    assert masked.shape == plain.shape
+    assert not np.array_equal(masked, plain)
+
+
+def test_what_was_imagined_is_a_row_of_its_own_also_of_a_decision_without_a_plan(tmp_path: Path) -> None:
+    decoder = load_decoder(write_decoder(tmp_path / "decoder", tiny_model()))
+    found, path = asked(start=100), tmp_path / "imagined.png"
+    with Image.open(plot_plan(found, path, imagine_plan(found, decoder))) as picture:
+        assert picture.height > pixels_of(found, tmp_path).shape[0] + 100
+
+
+def test_images_stand_side_by_side_below_their_words() -> None:
+    images = [np.full((20, 60, 3), shade, dtype=np.uint8) for shade in (50, 120)]
+    frame = side_by_side(images, ["a", "b"], "both")
+    body = frame[-40:]
+    assert (body[:, :120] == 50).all()
+    assert (body[:, -120:] == 120).all()
+    head = frame[:-40]
+    assert head.min() < 80 < head.max() == 255  # ink on white
+    assert (side_by_side(images, ["a", "$x_{"], "both") != frame).any()  # dollars begin no formula
+    assert (side_by_side(images, ["a", "b"], "other") != frame).any()
