@@ -106,7 +106,7 @@ def evaluate(
     sums = _collect(contenders, clips, probes, metrics, reporter.task("measuring"))
     known = clips_of(sums.actions, sums.names, space=clips.space, seconds_per_step=about.seconds_per_step)
     width, starts = sums.actions.shape[-1], sums.starts
-    is_moving = dict(zip(sums.names, known.moving.any(axis=1), strict=True))
+    is_moving = {name: bool(steps.any()) for name, steps in zip(sums.names, known.moving, strict=True)}
     moving = [start for start in starts if is_moving[start.episode_id, start.first_step]] or starts
     mapped = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
     models: dict[str, ModelResult] = {}

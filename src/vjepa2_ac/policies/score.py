@@ -199,26 +199,27 @@ def score_policies(
         raise InputError(where="--policy", found="no frame that all of them have", needed="the same places in all")
     control_steps = control_steps or stride
     ahead = max(1, min(one.chunks.shape[2] for one in policies) // control_steps) * stride
-    kept = [found for place in places if (found := _place_of(dataset, place, ahead, space)) is not None]
+    known = (_place_of(dataset, place, ahead, space) for place in places)
+    kept = [one for one in known if one is not None]
     if not kept:
         needed = f"{counted(ahead, 'control step')} after it in the episode"
         raise InputError(where="--policy", found="no place with a goal", needed=needed)
     rng, energies, ids = np.random.default_rng(0), list[np.ndarray](), [name for (name, _), *_ in kept]
     rows = [{place: row for row, place in reversed([*enumerate(one.places)])} for one in policies]
-    for number, (place, index, state, changes) in enumerate(kept):
+    for number, (place, episode, state, changes) in enumerate(kept):
         others = [kept[other].changes for other in _drawn(rng, number, ids)]
         chunks = [
             changes_of_chunks(one.chunks[row[place]], state, form=form, control_steps=control_steps, space=space)
             for one, row in zip(policies, rows, strict=True)
         ]
         chunks = [one[:, : len(changes)] for one in chunks]
-        frame, goal = read_views(dataset, index, views, [place[1], place[1] + ahead])
+        frame, goal = read_views(dataset, episode, views, [place[1], place[1] + ahead])
         controller.reset(goal)
-        found = controller.score(frame, state, np.concatenate([changes[None], others, *chunks]))
-        true, worse, rest = np.split(found.energies, [1, 1 + len(others)])
+        scored = controller.score(frame, state, np.concatenate([changes[None], others, *chunks]))
+        true, worse, rest = np.split(scored.energies, [1, 1 + len(others)])
         by_policy = np.split(rest, np.cumsum([len(one) for one in chunks])[:-1])
-        means, bests = ([float(take(one)) for one in by_policy] for take in (np.mean, np.min))
-        energies.append(np.array([found.doing_nothing, true[0], float((worse < true).mean()), *means, *bests]))
+        of_chunks = [float(take(one)) for take in (np.mean, np.min) for one in by_policy]
+        energies.append(np.array([scored.doing_nothing, true[0], float((worse < true).mean()), *of_chunks]))
         progress(number + 1, len(kept))
     nothing, demonstrated, better, *of_policies = np.stack(energies).T
     means, bests = of_policies[: len(policies)], of_policies[len(policies) :]
@@ -248,7 +249,7 @@ class _Place(NamedTuple):
     """A frame of an episode, what was done there, and where it led."""
 
     place: tuple[str, int]
-    index: int  # of the episode
+    episode: int  # index in the data set
     state: Float[np.ndarray, " dim"]
     changes: Float[np.ndarray, "steps dim"]
 
