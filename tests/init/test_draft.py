@@ -139,19 +139,11 @@ def test_vectors_train_fresh_heads() -> None:
     assert config.adapter.modules_to_save == ("state_encoder", "action_encoder")
 
 
-@pytest.mark.parametrize(("capability", "precision"), [((7, 5), "fp16"), ((8, 0), "bf16")])
-def test_a_card_has_bf16_from_ampere_on(
-    capability: tuple[int, int], precision: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_precision_of_a_card_follows_from_its_capability(monkeypatch: pytest.MonkeyPatch) -> None:
     card = SimpleNamespace(name="A card", total_memory=16 * 10**9)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _device: capability)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _device: (7, 5))
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _device: card)
-    assert this_machine().precision == precision
-
-
-def test_a_cpu_computes_in_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert this_machine().precision == "fp32"
+    assert this_machine().precision == "fp16"

@@ -88,7 +88,8 @@ def _serve(options: argparse.Namespace) -> int:
 
     key = None if options.key_file is None else read_key(options.key_file)
     access = Access(options.host, key, options.insecure, tuple(options.allow_host))
-    cli.require_goals(options.goals)
+    if options.goals is not None and not options.goals.is_dir():
+        raise InputError(where=f"--goals {options.goals}", found="no such folder", needed="a folder with goals")
     cli.require_to_plan(options)
 
     from vjepa2_ac.serving.about import read_kept_goals

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.cli.progress import ConsoleReporter
     from vjepa2_ac.data.dataset import Dataset
-    from vjepa2_ac.decoding.decoder import TrainedDecoder
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.runs.subject import Subject
 
@@ -300,13 +299,6 @@ def write_json(path: Path, values: Any) -> Path:
     return path
 
 
-def given_decoder(options: argparse.Namespace) -> TrainedDecoder | None:
-    """Load the decoder of `--decoder`, before the model that it is for."""
-    from vjepa2_ac.decoding.decoder import load_decoder
-
-    return None if options.decoder is None else load_decoder(options.decoder)
-
-
 def make_folder(folder: Path) -> None:
     """Create the folder of `--out` before any long work.
 
@@ -315,16 +307,6 @@ def make_folder(folder: Path) -> None:
     """
     with user_can_write(f"--out {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-
-
-def require_goals(folder: Path | None) -> None:
-    """Refuse a folder of `--goals` that is not there, before what takes seconds is imported.
-
-    Raises:
-        InputError: It is not.
-    """
-    if folder is not None and not folder.is_dir():
-        raise InputError(where=f"--goals {folder}", found="no such folder", needed="a folder with goals")
 
 
 def require_new_place(folder: Path) -> None:

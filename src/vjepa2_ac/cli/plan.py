@@ -68,7 +68,6 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.planning.goals import require_ends
 
     state = options.state
-    cli.require_goals(options.goals)
     config = cli.require_to_plan(options)
     measured_space(config.data, len(state)).require_state(state, "--state")  # how wide, only the model knows
     cli.make_folder(options.out)
@@ -77,12 +76,13 @@ def _plan(options: argparse.Namespace) -> int:
     start, mask = _images(options, goals[0].image)
 
     from vjepa2_ac.cli.tables import plan_table
+    from vjepa2_ac.decoding.decoder import load_decoder
     from vjepa2_ac.evaluation.imagined import imagine_plan
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
     from vjepa2_ac.reports.planning_figures import PLAN_IMAGE, plot_plan
 
-    decoder = cli.given_decoder(options)
+    decoder = None if options.decoder is None else load_decoder(options.decoder)
     session = cli.load_planning_session(options)
     if decoder is not None:
         decoder.require_fit(session.world_model, session.config.data, subject=options.subject)

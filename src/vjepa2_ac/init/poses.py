@@ -243,17 +243,9 @@ def _candidates(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
         rotations = [part for part in parts if part[0].kind != "position" and part[0].group == group]
         grippers = [one for one in all_grippers if one.group in {group, ""} or len(all_grippers) == 1]
         if rotations and grippers:
-            rotation = min(
-                rotations,
-                key=lambda part: (part[0].column != column, _is_w(part[0]), part[0].kind not in FORMATS),
-            )
+            rotation = min(rotations, key=lambda part: (part[0].column != column, part[0].kind not in FORMATS))
             gripper = min(grippers, key=lambda one: (one.group != group, one.column != column))
             yield (*position, *rotation, gripper)
-
-
-def _is_w(number: _Number) -> bool:
-    """Return whether a number is called wx, wy or wz, which may also be an angular velocity."""
-    return number.kind == "rotation_vector" and re.search(r"(?:^|_)w[xyz]$", _words(number.name)) is not None
 
 
 def _rank(candidate: _Numbers) -> tuple[bool, bool, bool, int]:
@@ -289,10 +281,9 @@ def _keys_of(
     group, is_stray = chosen[0].group, chosen[-1].group not in {chosen[0].group, ""}
     doubts = []
     why = f"by the names {', '.join(one.name for one in chosen)}"
-    if any(len(one.names) == one.width for one in unnamed):
-        why = "the names promise a quaternion, and the numbers are not of length 1; read by width"
-    elif unnamed:
-        why = "by the width of the column, whose numbers have no names; if they are joints, set states: vector"
+    if unnamed:
+        why = "by the width of the column: the numbers have no names, or are no quaternion, as their names say;"
+        why += " if they are joints, set states: vector"
     if is_stray:
         doubts.append(f"the gripper is called {chosen[-1].name}")
     if _is_not_measured(chosen):
