@@ -177,7 +177,7 @@ def test_the_command_says_what_the_file_is_and_which_knob_takes_it(
     assert main(["download", "made-up", "--url", serve(Behaviour())]) == 0
     shown = capsys.readouterr().out
     assert "made-up: encoder" in shown
-    assert "102,400 bytes, licence of the test" in shown
+    assert "102,400 bytes\nLicence of the test" in shown
     assert shown.endswith("model.encoder.path: checkpoints/made-up.pt\n")
     assert Path("checkpoints", MADE_UP.file).read_bytes() == CONTENT
 
