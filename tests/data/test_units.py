@@ -1,6 +1,5 @@
 """Positions and angles in other units: the error names the config key, and with that key they are read."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +8,9 @@ import pytest
 
 from lerobot_sets import STATE, Recorded, recorded, write_v30
 from synthetic import synthetic_states
-from vjepa2_ac.config import LeRobotData, LeRobotFields, RldsData
+from vjepa2_ac.config import LeRobotData, LeRobotFields
 from vjepa2_ac.data.poses import poses_from
 from vjepa2_ac.data.sources.lerobot import LeRobotSource
-from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.errors import InputError
 
 IN_OTHER_UNITS = {"position_unit": "mm", "rotation": "euler_xyz_degrees"}
@@ -40,20 +38,6 @@ def test_lerobot_names_the_keys_and_reads_with_them(tmp_path: Path) -> None:
         opened(position_unit="mm").infos()
     assert "millimetres" not in raised.value.fix
     np.testing.assert_allclose(opened(**IN_OTHER_UNITS).read(0).states, synthetic_states(12, seed=0), atol=1e-5)
-
-
-def test_rlds_names_the_keys_and_reads_with_them(
-    spoiled: Callable[[Callable[[dict[str, tuple[Any, Any]]], None]], Path],
-) -> None:
-    def in_other_units(features: dict[str, tuple[Any, Any]]) -> None:
-        pose = features["steps/observation/cartesian_position"][1]
-        pose[:] = (np.reshape(pose, (-1, 6)) * SCALE).ravel().tolist()
-
-    folder = spoiled(in_other_units)
-    problem = RldsSource(RldsData(path=str(folder))).infos().problems[0]
-    assert problem.fix.startswith("The positions look like millimetres: set data.fields.position_unit: mm. The angles")
-    source = RldsSource(RldsData(path=str(folder), fields=IN_OTHER_UNITS))
-    np.testing.assert_allclose(source.read(0).states, synthetic_states(13, seed=0)[:-1], atol=1e-5)
 
 
 def test_a_unit_that_the_config_names_is_not_doubted() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -215,13 +216,10 @@ class Dataset:
             return POSE_WIDTHS
         if widths := self.table.texts.get("widths"):
             return Widths(*map(int, widths.split()))
-        first_error: InputError | None = None
         for episode in self.episodes[:_MOST_EPISODES_READ].tolist():
-            try:
+            with suppress(InputError):
                 return widths_of(self.source.read(episode))
-            except InputError as error:
-                first_error = first_error or error
-        raise first_error or ValueError("a data set without episodes")
+        return widths_of(self.source.read(int(self.episodes[0])))
 
     def leave_out(self, episode: int, error: InputError) -> None:
         """Apply `data.broken_episodes` to an episode that cannot be read: record it, or stop.

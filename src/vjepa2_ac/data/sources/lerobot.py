@@ -75,7 +75,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         return Episode(
             info=info,
             read_frames=self._frames(row, key),
-            control_rate_hz=self._control_rate_hz,
+            control_rate_hz=self._info.fps,
             metadata={"language": task} if task else {},
             **content,
         )
@@ -83,10 +83,6 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
     @cached_property
     def _info(self) -> DatasetInfo:
         return read_info(self._config.path) if self._known is None else self._known[1]
-
-    @property
-    def _control_rate_hz(self) -> float:
-        return self._info.fps
 
     @cached_property
     def _parquet(self) -> ParquetRows:
@@ -158,7 +154,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             except InputError as error:
                 return EpisodeProblem.of(error, row.id)
             facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
-            return Scanned(facts, self._where(row), row.place, summary, labels, self._control_rate_hz)
+            return Scanned(facts, self._where(row), row.place, summary, labels, self._info.fps)
 
         by_file: dict[str, list[EpisodeRow]] = {}  # so that a row group is decoded once
         for row in rows:
