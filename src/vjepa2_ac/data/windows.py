@@ -111,7 +111,8 @@ def windows_of(
         found += f" Too short: {named(names, len(short))}"
         raise InputError(where=where, found=found, needed=length, fix="Lower data.frames or data.stride")
     if len(short):
-        _warn_of_short(config.path, split, config.clip_steps, count, len(short), names)
+        clip = f"a clip of {config.clip_steps} control steps and left out: {named(names, len(short))}"
+        _warn_once(f"{config.path}: {len(short)} of {count} {split} episodes are shorter than {clip}")
     own = starts.of(members[starts.episode])
     if not len(own):
         found = f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})"
@@ -120,12 +121,9 @@ def windows_of(
     return replace(own, short=tuple(short.tolist()))
 
 
-@lru_cache(maxsize=64)  # logged once: every validation uses the same windows
-def _warn_of_short(path: str, split: Split, clip_steps: int, members: int, short: int, names: tuple[str, ...]) -> None:
-    logger.warning(
-        "%s: %d of %d %s episodes are shorter than a clip of %d control steps and left out: %s",
-        path, short, members, split, clip_steps, named(names, short),
-    )  # fmt: skip
+@lru_cache(maxsize=64)  # every validation uses the same windows
+def _warn_once(text: str) -> None:
+    logger.warning("%s", text)
 
 
 @dataclass(frozen=True)
