@@ -32,9 +32,9 @@ class ServedPlanner:
         self.client.infer({"endpoint": "reset"})
         self.goal = {
             "goal/images": np.stack([goal.image for goal in trial.goals]),
-            "goal/at_least": [goal.at_least for goal in trial.goals],
-            "goal/durations": [goal.at_most for goal in trial.goals[:-1]],
-            "goal/grippers": [goal.gripper or "" for goal in trial.goals],
+            "goal/rules": [
+                {"at_least": goal.at_least, "at_most": goal.at_most, "gripper": goal.gripper} for goal in trial.goals
+            ],
         }
 
     def act(self, observation: Observation) -> np.ndarray:

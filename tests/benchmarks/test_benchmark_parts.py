@@ -1,20 +1,15 @@
-"""Rows of benchmarks outlive them, a time that does not count says so, and memory is measured alone."""
+"""Rows of benchmarks outlive them, and memory is measured alone."""
 
 import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
 Load = Callable[[str], Any]
-
-
-def options(**more: Any) -> SimpleNamespace:
-    return SimpleNamespace(**{"device": "cpu", "repeats": 2, "warm_up": 1} | more)
 
 
 # ---- rows ----
@@ -49,23 +44,6 @@ def test_what_fails_is_a_row_and_the_end_is_an_error_but_out_of_memory_is_a_resu
     said = capsys.readouterr()
     assert said.out.splitlines() == ["b, out of memory", "c, failed: IndexError: pop from empty list"]
     assert "Traceback" in said.err
-
-
-# ---- time ----
-
-
-def test_ways_take_turns_and_a_ratio_is_of_neighbours(load: Load) -> None:
-    timing = load("timing")
-    calls: list[str] = []
-    ways = {"plain": lambda: calls.append("p"), "ours": lambda: calls.append("o")}
-    seen = [
-        {way: len(turns.seconds) for way, turns in so_far.items()} for so_far in timing.rounds(ways, options(), list)
-    ]
-    assert "".join(calls) == "popopo"  # the first round warms up
-    assert seen == [{"plain": 1, "ours": 1}, {"plain": 2, "ours": 2}]
-    base, own = timing.Turns([2.0, 30.0, 8.0]), timing.Turns([1.0, 10.0, 2.0])
-    assert timing.ratio(base, own) == 3.0
-    assert (base.median_s, base.least_s) == (8.0, 2.0)
 
 
 # ---- memory ----

@@ -9,7 +9,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from paths import ROOT
@@ -55,6 +54,7 @@ def test_tables_of_the_page_are_those_of_the_stored_results(evidence: Any, store
     page = (ROOT / "docs/evidence.md").read_text()
     assert evidence.tables.summary(stored) in page
     assert evidence.tables.summary_of_tasks(stored) in page
+    assert evidence.tables.summary_of_correlations(evidence.tables.correlated_numbers(stored)) in page
     text = (evidence.results.KEPT / "methods.md").read_text()
     assert "\n\n".join(evidence.tables._rows(stored)) in text
     assert evidence.tables.goal_by_goal(stored) in text
@@ -62,32 +62,6 @@ def test_tables_of_the_page_are_those_of_the_stored_results(evidence: Any, store
     rules = "\n".join(evidence.selection_tables._rules(evidence.selection_tables.by_run(selection)))
     assert rules in (evidence.results.KEPT / "selection.md").read_text()
     assert sum(path.stat().st_size for path in evidence.results.KEPT.glob("*.json")) < 300_000
-
-
-def test_a_new_measurement_replaces_the_stored_one(evidence: Any, tmp_path: Path) -> None:
-    results = evidence.results
-    cell = {"shift": "look", "base": "none", "method": "scratch", "episodes": 20, "seed": 0}
-    results.write_all(tmp_path / "kept.json", [{"cell": cell}, {"cell": {**cell, "seed": 1}}])
-    measured = {"cell": cell, "reach": {"l1": {"distance_cm": [[20.0, 1.23456789012]], "unreachable": 0}}}
-    (tmp_path / "new").mkdir()
-    (tmp_path / "new" / "one.json").write_text(json.dumps(measured))
-    first, second = results.read_all(tmp_path / "new", tmp_path / "kept.json", results.compact, results.name_of)
-    assert first == {"cell": cell, "reach": {"l1": {"ends_cm": [1.2345679]}}}
-    assert second["cell"]["seed"] == 1
-
-
-def test_correlations_order_numbers_and_do_not_count_seeds_twice(evidence: Any) -> None:
-    correlations = evidence.offline.correlations
-    rows = [{"good": -float(one), "useless": float(one % 3), "backwards": float(one)} for one in range(24)]
-    of_rows = correlations(rows, [-float(one) for one in range(24)], range(24), draws=50)
-    assert [of_rows[name]["value"] for name in ("good", "backwards")] == pytest.approx([1.0, -1.0])
-    assert of_rows["useless"]["low"] < 0 < of_rows["useless"]["high"]
-    rng = np.random.default_rng(0)
-    numbers, missed = rng.normal(size=8), rng.normal(size=8)
-    once = correlations([{"number": one} for one in numbers], missed, range(8), draws=200)
-    five = [{"number": one} for one in numbers for _ in range(5)]
-    again = correlations(five, np.repeat(missed, 5), np.repeat(np.arange(8), 5).tolist(), draws=200)
-    assert again["number"] == pytest.approx(once["number"])
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from vjepa2_ac.serving.request import read_request
 
 OURS = {"observation/image": image(0), "observation/state": STATE}
 GOALS = np.stack([image(1), image(2)])
+RULED = {**OURS, "goal/images": GOALS}
 
 
 def test_droid_and_roboarena_and_a_plain_client_say_the_same() -> None:
@@ -40,11 +41,9 @@ def test_the_picture_may_have_another_key() -> None:
 def test_a_goal_is_a_picture_or_several_or_a_name_or_a_prompt() -> None:
     one = read_request({**OURS, "goal/image": image(1), "goal/mask": np.ones((48, 60), dtype=bool)}).goal
     assert ([rule(goal) for goal in one.goals], one.mask.shape) == ([(1, None, None, None)], (48, 60))
-    several = read_request({**OURS, "goal/images": GOALS, "goal/durations": np.array([4])}).goal
-    exact = [(4, 4, None, None), (1, None, None, None)]
-    assert [rule(goal) for goal in several.goals] == exact
-    again = read_request({**OURS, "goal/images": list(GOALS), "goal/durations": [4]}).goal
-    assert [rule(goal) for goal in again.goals] == exact
+    for images in (GOALS, list(GOALS)):
+        several = read_request({**OURS, "goal/images": images, "goal/rules": [{"at_most": 4}, {}]}).goal
+        assert [rule(goal) for goal in several.goals] == [(1, 4, None, None), (1, None, None, None)]
     assert read_request({**OURS, "goal/name": "cup"}).goal.name == "cup"
     assert read_request({**OURS, "prompt": "cup"}).goal.name == "cup"
     assert read_request({**OURS, "goal/image": image(1), "prompt": "put it there"}).goal.goals
@@ -55,15 +54,13 @@ def rule(goal: SubGoal) -> tuple:
 
 
 def test_goals_in_order_may_have_rules_of_their_own() -> None:
-    keys = {
-        "goal/images": GOALS, "goal/durations": [9], "goal/at_least": [2, 3], "goal/shares": [0.25, 0.0],
-        "goal/grippers": ["held", ""],
-    }  # fmt: skip
+    rules = [{"name": "grasp", "at_least": 2, "at_most": 9, "share": 0.25, "gripper": "held"}, {"at_least": 3}]
+    keys = {"goal/images": GOALS, "goal/rules": rules}
     found = read_request({**OURS, **keys}).goal
     assert [rule(goal) for goal in found.goals] == [(2, 9, 0.25, "held"), (3, None, None, None)]
-    free = read_request({**OURS, "goal/images": GOALS, "goal/shares": np.array([0.25, 0.5])}).goal
-    assert [rule(goal) for goal in free.goals] == [(1, None, 0.25, None), (1, None, 0.5, None)]
-    assert rule(read_request({**OURS, "goal/image": image(1), "goal/shares": [0.5]}).goal.goals[0])[2] == 0.5
+    assert [goal.name for goal in found.goals] == ["grasp", "1"]
+    one = read_request({**OURS, "goal/image": image(1), "goal/rules": [{"share": 0.5}]}).goal
+    assert rule(one.goals[0]) == (1, None, 0.5, None)
     assert read_request({**OURS, **keys}).goal.fingerprint == found.fingerprint
 
 
@@ -77,8 +74,8 @@ def test_the_same_bytes_are_the_same_goal_and_others_are_another() -> None:
     others = [
         fingerprint(goal_image=image(2)),
         fingerprint(goal_image=image(1), goal_mask=mask),
-        fingerprint(goal_images=GOALS, goal_durations=[1]),
-        fingerprint(goal_images=GOALS, goal_durations=[2]),
+        fingerprint(goal_images=GOALS),
+        fingerprint(goal_images=GOALS, goal_rules=[{"at_most": 2}, {}]),
         fingerprint(goal_image=image(1).reshape(60, 48, 3)),
         fingerprint(goal_name="1"),
     ]
@@ -127,24 +124,20 @@ WRONG = {
     "prompt: b'cup'": {**OURS, "prompt": b"cup"},
     "goal/images: an array of shape \\(48, 60, 3\\)": {**OURS, "goal/images": image(1)},
     "goal/images: \\[\\]. needed: 1 to 32 images": {**OURS, "goal/images": []},
-    "goal/images\\[1\\]: 3": {**OURS, "goal/images": [image(1), 3], "goal/durations": [1]},
-    "goal/durations: None. needed: 1 whole numbers": {**OURS, "goal/images": GOALS},
-    "goal/durations: \\[1, 2\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1, 2]},
-    "goal/durations: \\[0\\]": {**OURS, "goal/images": GOALS, "goal/durations": [0]},
-    "goal/durations: \\[\\[1\\], \\[1, 2\\]\\]": {**OURS, "goal/images": GOALS, "goal/durations": [[1], [1, 2]]},
-    "goal/durations: \\[1.5\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1.5]},
-    "goal/durations: \\[inf\\]": {**OURS, "goal/images": GOALS, "goal/durations": [np.inf]},
-    "goal/durations: \\[nan\\]": {**OURS, "goal/images": GOALS, "goal/durations": [np.nan]},
-    "goal/durations: \\[1\\]. needed: 0 whole": {**OURS, "goal/image": image(1), "goal/durations": [1]},
-    "goal/durations: 'x'": {**OURS, "goal/images": GOALS, "goal/durations": "x"},
-    "goal/at_least: \\[1\\]. needed: a whole number": {
-        **OURS, "goal/images": GOALS, "goal/durations": [1], "goal/at_least": [1],
-    },
-    "goal/shares: \\[1, 0\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1], "goal/shares": [1, 0]},
-    "goal/durations: None": {**OURS, "goal/images": GOALS, "goal/shares": [0.0, 0.5]},
-    "goal/grippers: \\['up', ''\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1], "goal/grippers": ["up", ""]},
-    "goal/grippers: 'held'": {**OURS, "goal/image": image(1), "goal/grippers": "held"},
-    "at least 3 and at most 2 steps": {**OURS, "goal/images": GOALS, "goal/durations": [2], "goal/at_least": [3, 1]},
+    "goal/images\\[1\\]: 3": {**OURS, "goal/images": [image(1), 3]},
+    "goal/rules: \\[{}\\]. needed: a map for each of 2 images: name, at_least": {**RULED, "goal/rules": [{}]},
+    "goal/rules: 'x'": {**RULED, "goal/rules": "x"},
+    "goal/rules: \\[1, 2\\]": {**RULED, "goal/rules": [1, 2]},
+    "goal/rules: \\[{'name': b": {**RULED, "goal/rules": [{"name": b"x"}, {}]},
+    "goal/rules: \\[{'at_most': array": {**RULED, "goal/rules": [{"at_most": np.ones(2)}, {}]},
+    "goal/rules\\[0\\]: at_most: .*found 1.5": {**RULED, "goal/rules": [{"at_most": 1.5}, {}]},
+    "goal/rules\\[0\\]: most: unknown": {**RULED, "goal/rules": [{"most": 1}, {}]},
+    "goal/rules\\[1\\]: gripper: .* 'up'": {**RULED, "goal/rules": [{}, {"gripper": "up"}]},
+    "at least 0": {**RULED, "goal/rules": [{"at_least": 0}, {}]},
+    "share nan": {**RULED, "goal/rules": [{"share": np.nan}, {}]},
+    "share 1.0": {**RULED, "goal/rules": [{"share": 1.0}, {}]},
+    "at least 3 and at most 2 steps": {**RULED, "goal/rules": [{"at_least": 3, "at_most": 2}, {}]},
+    "request: 'goal/durations'": {**RULED, "goal/durations": [1]},
     "goal/mask: an array of shape \\(48, 60, 3\\)": {**OURS, "goal/image": image(1), "goal/mask": image(1)},
 }  # fmt: skip
 

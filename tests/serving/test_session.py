@@ -404,7 +404,7 @@ def test_goals_are_encoded_until_the_deadline(endpoint: str, monkeypatch: pytest
     one, encoded = session(), []
     monkeypatch.setattr(one.controller, "encoded", lambda _: encoded.append(1) or torch.zeros(9, 32))
     one._clock = _OverAfter(3)
-    goals = {"goal/images": np.stack([image(seed) for seed in range(5)]), "goal/durations": [1] * 4}
+    goals = {"goal/images": np.stack([image(seed) for seed in range(5)]), "goal/rules": [{"at_most": 1}] * 4 + [{}]}
     answer = one.answer(pack(request(**goals) | {"endpoint": endpoint}))
     assert len(encoded) == 2
     if endpoint == "infer":

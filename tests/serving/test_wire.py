@@ -125,7 +125,7 @@ def test_a_message_that_is_too_large_is_not_read(monkeypatch: pytest.MonkeyPatch
 
 GOOD = pack({
     "observation/image": np.zeros((4, 4, 3), dtype=np.uint8), "observation/state": np.zeros(7), "prompt": "cup",
-    "reset": False, "goal/durations": [1, 2],
+    "reset": False, "goal/rules": [{"at_most": 1}, {}],
 })  # fmt: skip
 
 

@@ -132,14 +132,6 @@ def test_what_is_no_action_is_refused(arm: SimulatedArm) -> None:
         Oracle(LIMITS).reset(Trial(0, 1, 1), UNSEEN)
 
 
-def test_the_same_trial_has_the_same_result_whatever_was_before(arm: SimulatedArm) -> None:
-    first = run(ArmEnvironment(arm), RandomActions(SMALL), trial_of(2, steps=3))
-    run(ArmEnvironment(arm), RandomActions(SMALL, seed=1), trial_of(0, steps=3, seed=5))
-    again = run(ArmEnvironment(arm), RandomActions(SMALL), trial_of(2, steps=3))
-    np.testing.assert_array_equal(first.states, again.states)
-    np.testing.assert_array_equal(first.goal_image, again.goal_image)
-
-
 def test_a_command_out_of_reach_moves_the_arm_part_of_the_way_and_is_counted(arm: SimulatedArm) -> None:
     script = Scripted(way(0.0, 0.0, 1.6), way(0.0, 0.0, 0.05))
     result = run(ArmEnvironment(arm), script, trial_of(1, steps=2, stride=30))

@@ -17,7 +17,7 @@ from vjepa2_ac.planning.goals import GOALS_FILE, SubGoal, read_goal_folder
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.serving.session import Session
 
-PROTOCOL = 1  # incremented when a client would have to change
+PROTOCOL = 2  # incremented when a client would have to change
 _MOST_NAMES = 60  # of goals that are told
 _SIZE = 180, 320  # of a view in the picture of the first decision
 _SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])

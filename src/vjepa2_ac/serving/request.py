@@ -3,31 +3,41 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any, cast, get_args
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.goals import GripperMode, SubGoal
 from vjepa2_ac.policies.score import ChunkForm
+from vjepa2_ac.storage.structured import record_of
 
 IMAGE_KEYS = ("observation/exterior_image_1_left", "observation/exterior_image_0_left", "observation/image")
 """Where the picture of the camera is looked for: the first that is there. DROID's, RoboArena's, everybody's."""
 
 MOST_GOALS = 32  # of one request
-MOST_STEPS = 10_000  # of one goal
 
 _STATE, _POSE, _GRIPPER = "observation/state", "observation/cartesian_position", "observation/gripper_position"
 _GOAL = "goal/"
 _WAYS = ("goal/image", "goal/images", "goal/name")
-_RULES = ("goal/durations", "goal/at_least", "goal/shares", "goal/grippers", "goal/mask")
-_MODES = get_args(GripperMode)
+_MORE = ("goal/rules", "goal/mask")
 _ENDPOINTS = ("infer", "reset", "score")
 _CHUNKS, _FORM, _FORMS = "policy/chunks", "policy/form", get_args(ChunkForm)
 MOST_CHUNKS, MOST_CHUNK_STEPS = 1024, 256  # of one request; control steps of each
+
+
+@dataclass(frozen=True)
+class GoalRule:
+    """What applies to one goal image, as in goals.json; all may be left out."""
+
+    name: str = ""
+    at_least: int = 1
+    at_most: int | None = None
+    share: float | None = None
+    gripper: GripperMode | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +53,7 @@ class GivenGoal:
         """The same for the same name, or bytes: a client may send its goal with every request."""
         digest = hashlib.sha256(repr(self.name).encode())
         for goal in self.goals:
-            digest.update(repr((goal.at_least, goal.at_most, goal.share, goal.gripper)).encode())
+            digest.update(repr((goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper)).encode())
         for one in (*(goal.image for goal in self.goals), *(() if self.mask is None else (self.mask,))):
             digest.update(repr((one.shape, one.dtype.str)).encode())
             digest.update(np.ascontiguousarray(one).tobytes())
@@ -137,13 +147,15 @@ def _goal(message: Mapping[str, Any]) -> GivenGoal | None:
     """Return the goal of a request; a prompt is a goal's name, unless the request says its goal in another way."""
     given = sorted(key for key in message if key.startswith(_GOAL))
     for key in given:
-        if key not in {*_WAYS, *_RULES}:
-            raise _wrong("request", key, ", ".join(sorted((*_WAYS, *_RULES))))
+        if key not in {*_WAYS, *_MORE}:
+            raise _wrong("request", key, ", ".join(sorted((*_WAYS, *_MORE))))
     ways = [key for key in _WAYS if key in message]
     if len(ways) > 1 or (given and not ways):
         raise InputError(where="goal", found=", ".join(given), needed="one of goal/image, goal/images, goal/name")
     if ways and ways != ["goal/name"]:
-        return GivenGoal(_in_order(_images(message, ways[0]), message), _mask(message.get("goal/mask")))
+        return GivenGoal(
+            _in_order(_images(message, ways[0]), message.get("goal/rules")), _mask(message.get("goal/mask"))
+        )
     if len(given) > 1:
         found = ", ".join(given)
         raise InputError(where="goal", found=found, needed="goal/name alone: the server knows the rest")
@@ -166,56 +178,22 @@ def _images(message: Mapping[str, Any], key: str) -> tuple[np.ndarray, ...]:
     return tuple(_image(image, f"{key}[{place}]") for place, image in enumerate(rows))
 
 
-def _in_order(images: Sequence[np.ndarray], message: Mapping[str, Any]) -> tuple[SubGoal, ...]:
-    """Return goals with their rules: bounds on their steps, shares of energy, gripper modes.
-
-    Durations alone are exact; where shares or least steps are given, they are the most. They may be left out where
-    every goal but the last has a share.
-    """
-    many, steps = len(images), f"from 1 to {MOST_STEPS:,}"
-    needed = "a number below 1 for each goal; 0: none"
-    shares = _row(message, "goal/shares", many, lambda one: 0 <= one < 1, needed)
-    needed = f"a whole number {steps} for each goal: its fewest model steps"
-    least = _row(message, "goal/at_least", many, _is_steps, needed)
-    needed = f"{many - 1} whole numbers {steps}: model steps of each goal but the last"
-    most = _row(message, "goal/durations", many - 1, _is_steps, needed) or []
-    if many > 1 and not most and not (shares and all(shares[:-1])):
-        raise _wrong("goal/durations", None, needed)
-    if least is None:
-        least = [1.0] * many if shares or not most else [*most, 1.0]
-    bounds = [*map(int, most), None] if most else [None] * many
-    grippers = _grippers(message.get("goal/grippers"), many)
-    rows = zip(images, least, bounds, shares or [0.0] * many, grippers, strict=True)
-    return tuple(
-        SubGoal(image, str(place), int(fewest), bound, share or None, gripper)
-        for place, (image, fewest, bound, share, gripper) in enumerate(rows)
-    )
+def _in_order(images: Sequence[np.ndarray], rules: Any) -> tuple[SubGoal, ...]:
+    """Return images as goals with their rules; without rules none has a bound."""
+    needed = f"a map for each of {counted(len(images), 'image')}: {', '.join(field.name for field in fields(GoalRule))}"
+    rules = [{}] * len(images) if rules is None else rules
+    if not isinstance(rules, list) or len(rules) != len(images) or not all(map(_is_rule, rules)):
+        raise _wrong("goal/rules", rules, needed)
+    goals = []
+    for place, (image, values) in enumerate(zip(images, rules, strict=True)):
+        rule = record_of(GoalRule, values, where=f"goal/rules[{place}]", needed=needed)
+        name = rule.name or str(place)
+        goals.append(SubGoal(image, name, rule.at_least, rule.at_most, rule.share, rule.gripper))
+    return tuple(goals)
 
 
-def _row(
-    message: Mapping[str, Any], key: str, many: int, is_right: Callable[[float], bool], needed: str
-) -> list[float] | None:
-    found = message.get(key)
-    if found is None:
-        return None
-    numbers: list[float] = _numbers(found, key).tolist()
-    if len(numbers) != many or not all(map(is_right, numbers)):
-        raise _wrong(key, found, needed)
-    return numbers
-
-
-def _is_steps(number: float) -> bool:
-    return number.is_integer() and 1 <= number <= MOST_STEPS
-
-
-def _grippers(found: Any, many: int) -> list[GripperMode | None]:
-    if found is None:
-        return [None] * many
-    is_row = isinstance(found, list) and len(found) == many and all(isinstance(one, str) for one in found)
-    if not is_row or not all(one in {"", *_MODES} for one in found):
-        needed = f"for each goal one of {', '.join(_MODES)}; an empty text: planning.limits.gripper_mode"
-        raise _wrong("goal/grippers", found, needed)
-    return [one or None for one in found]
+def _is_rule(found: Any) -> bool:
+    return isinstance(found, dict) and all(isinstance(one, str | int | float | None) for one in found.values())
 
 
 def _mask(found: Any) -> np.ndarray | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ class Outcome:
     reached: Bool[np.ndarray, " time-1"]  # whether joint angles reach each action's target; else the arm went part way
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Resimulation:
     """A recorded episode at a control step, simulated again: every outcome begins there. `resimulate` makes one."""
 
@@ -54,6 +54,7 @@ class Resimulation:
     start: int  # control step
     camera: str  # of the simulated arm
     arm: SimulatedArm
+    done: Actions | None = None  # that led to where the arm is; None: it is elsewhere
 
     def under(self, actions: Float[np.ndarray, "steps 7"], stride: int) -> Outcome:
         """Carry out actions of model steps (legend: episode.py), each from the state that is measured then.
@@ -63,6 +64,7 @@ class Resimulation:
             stride: Control steps of a model step.
         """
         arm = self.arm
+        self.done = None
         carry_out(arm, self.number, self.spec, until=self.start)
 
         def look() -> tuple[Any, ...]:
@@ -146,9 +148,8 @@ class SimulatedFutures:
     """
 
     def __init__(self, dataset: Dataset) -> None:
-        self._dataset = dataset
-        self._resimulated = lru_cache(maxsize=_NUM_ARMS)(self._resimulate)
-        self._actions: dict[tuple[int, int], Actions] = {}  # that each arm has done
+        self._stride = dataset.config.model_stride
+        self._resimulated = lru_cache(maxsize=_NUM_ARMS)(partial(_of_dataset, dataset))
 
     @classmethod
     def of(cls, dataset: Dataset) -> SimulatedFutures | None:
@@ -170,18 +171,14 @@ class SimulatedFutures:
             SearchCancelledError: It was cancelled.
         """
         simulation = self._resimulated(episode, step)
-        is_next = bool(actions) and self._actions.pop((episode, step), None) == actions[:-1]
+        is_next, simulation.done = bool(actions) and simulation.done == actions[:-1], None
         if not is_next:
             carry_out(simulation.arm, simulation.number, simulation.spec, until=step)
         reached = True
         for action in actions[-1:] if is_next else actions:
             if cancelled():
                 raise SearchCancelledError
-            reached = send_action(simulation.arm, np.array(action), self._dataset.config.model_stride)
-        self._actions[episode, step] = actions
+            reached = send_action(simulation.arm, np.array(action), self._stride)
+        simulation.done = actions
         image = encode_jpeg(simulation.arm.image(simulation.camera), quality=JPEG_QUALITY)  # as those of the data set
         return decode_images([image], [0], "a simulated frame")[0], simulation.arm.state, reached
-
-    def _resimulate(self, episode: int, step: int) -> Resimulation:
-        self._actions.pop((episode, step), None)
-        return _of_dataset(self._dataset, episode, step)
