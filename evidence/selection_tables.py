@@ -16,11 +16,11 @@ from vjepa2_ac.intervals import share_of
 from vjepa2_ac.runs.checkpoint import RunState
 
 TITLES = {
-    "one_step": "one-step error / persistence",
-    "error": "error / persistence, last horizon",
-    "shuffled": "growth with shuffled actions, negated",
+    "one_step": "one-step error relative to persistence",
+    "error": "rollout error relative to persistence, last horizon",
+    "shuffled": "growth of the error with shuffled actions, negated",
     "ranking": "action-ranking error (selects checkpoints)",
-    "spread": "spread of the energy, negated",
+    "spread": "standard deviation of the energy, negated",
 }
 
 
@@ -59,7 +59,10 @@ def by_run(results: Sequence[Figures]) -> list[list[Figures]]:
 
 
 def _rules(runs: Sequence[list[Figures]]) -> Iterator[str]:
-    yield "| demonstrations | trained | cure | rule | steps | error | rank | goals reached | left at the end, cm |"
+    yield (
+        "| demonstrations | trained weights | remedy | selection rule | selected steps | rollout error"
+        " | action-ranking error | success rate | final distance, cm |"
+    )
     yield "|---" * 9 + "|"
     for kind, group in groupby(runs, lambda run: [run[0]["cell"][name] for name in ("motions", "method", "cure")]):
         of_kind = list(group)
@@ -89,7 +92,7 @@ def _correlations(runs: Sequence[list[Figures]]) -> Iterator[str]:
         correlations([one["offline"] for one in part], [one["left_cm"] for one in part], list(map(run_of, part)))
         for part in parts.values()
     ]
-    yield f"| offline number, over {len(results)} checkpoints | {' | '.join(parts)} |"
+    yield f"| metric, over {len(results)} checkpoints | {' | '.join(parts)} |"
     yield "|---" * (len(parts) + 1) + "|"
     for name, title in TITLES.items():
         cells = [f"{one[name]['value']:+.2f} [{one[name]['low']:+.2f}, {one[name]['high']:+.2f}]" for one in columns]
@@ -97,16 +100,17 @@ def _correlations(runs: Sequence[list[Figures]]) -> Iterator[str]:
 
 
 def draw(runs: Sequence[list[Figures]], path: Path) -> None:
-    """Plot error, ranking and closed loop over steps, a line for each seed: narrow above, varied below."""
+    """Plot error, action ranking and closed loop over steps: one line for each seed, one row for each kind of data."""
     from vjepa2_ac.media.figure import new_figure
 
     figure = new_figure(9.2, 5.4, layout="constrained")
     panels = figure.subplots(2, 3, sharex=True)
     shown = {
-        "error": "error / persistence",
+        "error": "rollout error / persistence",
         "action_ranking_error": "action-ranking error",
-        "left_cm": "cm left in closed loop",
+        "left_cm": "final distance in closed loop, cm",
     }
+    names = {"narrow": "Low-diversity data", "varied": "Diverse data", "LoRA": "LoRA", "full": "full fine-tuning"}
     for row, motions in zip(panels, ("narrow", "varied"), strict=True):
         for axes, (key, title) in zip(row, shown.items(), strict=True):
             for run in runs:
@@ -114,12 +118,12 @@ def draw(runs: Sequence[list[Figures]], path: Path) -> None:
                 if about["motions"] != motions or about["cure"]:
                     continue
                 colour = "#1f77b4" if about["method"] == "LoRA" else "#d62728"
-                label = about["method"] if about["seed"] == 0 else None
+                label = names[about["method"]] if about["seed"] == 0 else None
                 steps = [one["cell"]["step"] for one in run]
                 axes.plot(steps, [one[key] for one in run], color=colour, marker=".", alpha=0.8, label=label)
             axes.set_ylim(bottom=0)
-            axes.set_title(f"{motions} data: {title}", fontsize=10)
+            axes.set_title(f"{names[motions]}\n{title}", fontsize=11)
     for axes in panels[1]:
-        axes.set_xlabel("optimizer steps (0: the base)")
+        axes.set_xlabel("optimizer steps (0: base model)")
     panels[0][0].legend()
     figure.savefig(path, dpi=130)
