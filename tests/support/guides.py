@@ -13,7 +13,7 @@ SHORTER = {  # by the first words of a command
     "simulate record": "--episodes 10 --steps 25",
     "plan": "planning.samples=16 planning.iterations=1",
     "data calibrate": "--limit 8",
-    "simulate": "--steps 2 planning.samples=16 planning.iterations=1",
+    "simulate": "--episodes 2 --steps 2 planning.samples=16 planning.iterations=1",
 }
 
 
