@@ -10,6 +10,7 @@ import psutil
 import pytest
 
 from ranks import Rank, wait_until
+from run_fixtures import signalled_reporter
 from same_run import assert_same_run
 from vjepa2_ac import process as signals
 from vjepa2_ac.config.loading import config_as_yaml
@@ -35,18 +36,6 @@ with process.stop_on_signals() as stop:
 
 
 pytestmark = pytest.mark.usefixtures("default_signals")
-
-
-def signalled_reporter(reporter, at: int, number: int):
-    stepped = reporter.stepped
-
-    def step_and_signal(step: int, seen: dict) -> None:
-        stepped(step, seen)
-        if step == at:
-            os.kill(os.getpid(), number)
-
-    reporter.stepped = step_and_signal
-    return reporter
 
 
 @pytest.mark.parametrize(("number", "at"), [(signal.SIGTERM, 3), (signal.SIGINT, 1)])

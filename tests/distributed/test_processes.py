@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from paths import ROOT
 from ranks import Rank, finish, free_port, run_ranks, start_rank, wait_until
+from run_fixtures import signalled_reporter
 from same_run import assert_equal_up_to_rounding
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.loader import ProcessShare, first_clips
@@ -33,18 +34,6 @@ def without_dropout(make_config, tmp_path):
     return make
 
 
-def stopping_after(last_step: int, reporter):
-    stepped = reporter.stepped
-
-    def stop(step: int, seen: dict) -> None:
-        stepped(step, seen)
-        if step == last_step:
-            os.kill(os.getpid(), signal.SIGUSR1)
-
-    reporter.stepped = stop
-    return reporter
-
-
 def test_two_processes_stopped_and_gone_on_as_one_make_the_run_of_one(without_dropout, reporter, tmp_path) -> None:
     """One rank is signalled, both stop after the same step; one process goes on with all clips of a step."""
     whole = train(without_dropout("whole", training__steps=16, training__accumulation=4), type(reporter)())
@@ -64,7 +53,7 @@ def test_two_processes_stopped_and_gone_on_as_one_make_the_run_of_one(without_dr
     assert 1 <= state.step < 16
     assert (state.processes, state.clips_per_step, state.clips_done) == (2, 8, 8 * state.step)
     with pytest.raises(StoppedError):
-        train(config, stopping_after(state.step + 1, type(reporter)()))
+        train(config, signalled_reporter(type(reporter)(), state.step + 1, signal.SIGUSR1))
     train(config, reporter)  # once more: the number of processes is not another any more, and a step not the config's
     assert reporter.steps[0] == state.step + 2
     assert any("4 micro-batches of 2 in each" in note for note in reporter.notes)

@@ -1,7 +1,6 @@
 """Resuming from the mirror: another machine continues the run without a difference, whenever the first one died."""
 
 import logging
-import os
 import shutil
 import signal
 from collections.abc import Callable
@@ -12,7 +11,7 @@ import pytest
 from accidents import KilledError, without_permission
 from gcs import Gcs
 from mirrors import PLACE, content, names, there, write
-from run_fixtures import SilentReporter
+from run_fixtures import SilentReporter, at_step, signalled_reporter
 from same_run import assert_same_run
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config
@@ -256,23 +255,9 @@ def config_on(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
     return config
 
 
-def at_step(reporter, step: int, action: Callable[[], None]):
-    """Return another reporter that does something when a step is done, before its checkpoint is written."""
-    other = type(reporter)()
-    stepped = other.stepped
-
-    def then(done: int, metrics: dict) -> None:
-        stepped(done, metrics)
-        if done == step:
-            action()
-
-    other.stepped = then
-    return other
-
-
 def stop_after(step: int, config: Config, reporter) -> None:
     with pytest.raises(StoppedError):
-        train(config, at_step(reporter, step, lambda: os.kill(os.getpid(), signal.SIGTERM)))
+        train(config, signalled_reporter(type(reporter)(), step, signal.SIGTERM))
 
 
 @pytest.mark.usefixtures("bucket", "default_signals")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
@@ -58,6 +59,7 @@ class SilentReporter(Reporter):
         self.tasks: dict[str, list[tuple[int, int]]] = {}
         self.notes: list[str] = []
         self.steps: list[int] = []
+        self.actions: dict[int, Callable[[], object]] = {}  # by the step after which they are done
 
     def note(self, text: str) -> None:
         self.notes.append(text)
@@ -70,23 +72,31 @@ class SilentReporter(Reporter):
     def stepped(self, step: int, figures: object) -> None:
         del figures
         self.steps.append(step)
+        self.actions.get(step, lambda: None)()
 
 
 class KilledError(Exception):
     """Simulates the end of the process."""
 
 
+def at_step(reporter: SilentReporter, step: int, action: Callable[[], object]) -> SilentReporter:
+    """Return a reporter that does something when a step is done, before its checkpoint is written."""
+    reporter.actions[step] = action
+    return reporter
+
+
 def dying_reporter(reporter: SilentReporter, last_step: int) -> SilentReporter:
     """Return a reporter at whose step the process ends."""
-    stepped = reporter.stepped
 
-    def die(step: int, figures: object) -> None:
-        stepped(step, figures)
-        if step == last_step:
-            raise KilledError
+    def die() -> None:
+        raise KilledError
 
-    reporter.stepped = die  # type: ignore[method-assign]
-    return reporter
+    return at_step(reporter, last_step, die)
+
+
+def signalled_reporter(reporter: SilentReporter, last_step: int, number: int) -> SilentReporter:
+    """Return a reporter at whose step this process gets a signal."""
+    return at_step(reporter, last_step, lambda: os.kill(os.getpid(), number))
 
 
 def set_up(config: Config, reporter: Reporter = SILENT, accelerator: Accelerator | None = None) -> Run:
