@@ -6,15 +6,12 @@ from typing import Any
 import pytest
 
 from latent_sets import encode_for
+from run_fixtures import KilledError, dying_reporter
 from same_run import assert_same_run
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.training.loop import train
-
-
-class KilledError(Exception):
-    """Simulates the end of the process."""
 
 
 def encoded(config: Config) -> Path:
@@ -43,16 +40,8 @@ def test_training_on_an_exact_cache_is_training_on_the_fly_bit_for_bit(make_conf
 def test_a_run_on_frames_is_resumed_on_a_cache(make_config, reporter, tmp_path, whole_run) -> None:
     changes = {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches")}
     encoded(make_config(**changes))
-    dying = type(reporter)()
-
-    def die_at_three(step: int, seen: object) -> None:
-        del seen
-        if step == 3:
-            raise KilledError
-
-    dying.stepped = die_at_three
     with pytest.raises(KilledError):
-        train(make_config(run_dir=str(tmp_path / "broken"), **changes), dying)
+        train(make_config(run_dir=str(tmp_path / "broken"), **changes), dying_reporter(type(reporter)(), 3))
     cached = make_config(run_dir=str(tmp_path / "broken"), **(changes | {"data__cache": "require"}))
     train(cached, reporter, allow_config_change=True)
     assert_same_run(whole_run, tmp_path / "broken")
