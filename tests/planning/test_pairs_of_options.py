@@ -191,7 +191,7 @@ def test_every_pair_of_options_works_or_is_refused_before_the_first_decision(sce
             raise AssertionError(f"{', '.join(names)}: {scene.planning(*names)}") from error
 
 
-def covering(left: list[frozenset[str]], together: dict[str, set[str]], at_most: int = 5) -> Iterator[list[str]]:
+def covering(left: list[frozenset[str]], together: dict[str, set[str]], at_most: int = 8) -> Iterator[list[str]]:
     """Yield groups of options that go together and cover these pairs."""
     while left:
         group = sorted(left[0])
