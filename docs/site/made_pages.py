@@ -22,7 +22,7 @@ _REFERENCE = {  # page: what it has; below these, all that the code makes
     "made/configs": "the configs of the package, whole",
     "made/api": "the public names of Python",
     "made/examples": "the scripts of `examples/`, whole",
-    "extending": "a loss, a planner, a metric, a form of data or a robot of your own",
+    "extending": "how to add a loss, a planner, a metric, a data source or a robot",
     "data_reference": "data formats in detail, checks, splits, caches",
     "training_reference": "files of a run, metrics of a step, adapters, replay, GPU options",
     "evaluation_reference": "every number, and `metrics.json`",
