@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from vjepa2_ac.episode import Progress, no_progress
+if TYPE_CHECKING:
+    from vjepa2_ac.episode import Progress
 
 INDEXING, LOADING = "looking through the data set", "loading the model"  # tasks of many
 
@@ -22,7 +23,7 @@ class Reporter:
             title: What is done.
             unit: Of the total; it is then shown how many are done per second.
         """
-        return no_progress
+        return lambda _done, _total: None
 
     def started(self, done: int, total: int) -> None:
         """A training loop begins after `done` of `total` optimizer steps."""
