@@ -49,6 +49,35 @@ def test_check_prints_a_line_for_everything_and_ends_with_0(config: str, capsys:
     )
 
 
+@pytest.mark.parametrize("words", [[], ["--model", "builtin:sim-tiny"]], ids=["data", "with a model"])
+def test_check_with_json_prints_one_object_with_the_same_findings(
+    config: str, capsys: Printed, words: list[str]
+) -> None:
+    assert main(["data", "check", config, "--limit", "4", *words]) == 0
+    text = capsys.readouterr().out
+    lines, words_of_all = [line for line in text.splitlines() if line.startswith(LEVELS)], " ".join(text.split())
+    assert main(["data", "check", config, "--limit", "4", "--json", *words]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    shown = [f"{one['level']} {one['name']} {one['text']}" for one in printed["findings"]]
+    assert len(shown) == len(lines)
+    assert not [line for line in shown if line not in words_of_all and " s" not in line], "only times differ"
+    levels = [one["level"] for one in printed["findings"]]
+    assert [printed[name] for name in ("errors", "warnings", "skipped")] == [
+        levels.count(level) for level in ("error", "warning", "skipped")
+    ]
+    assert bool(printed["variants"]) == bool(words)
+    if words:
+        assert printed["variants"][0]["name"] == "as they are"
+        assert {"value", "low", "high"} == printed["variants"][1]["difference"].keys()
+
+
+def test_check_with_json_keeps_stdout_empty_where_the_data_cannot_be_read(config: str, capsys: Printed) -> None:
+    assert main(["data", "check", config, "--json", "data.camera=elsewhere"]) == 2
+    assert capsys.readouterr().out == ""
+    assert main(["data", "check", config, "--json", "--limit", "2", "data.validation_share=0"]) == 1
+    assert json.loads(capsys.readouterr().out)["errors"] == 1
+
+
 COMMANDS = ["data check", "data inspect", "data calibrate", "train", "encode", "decoder", "doctor"]
 
 

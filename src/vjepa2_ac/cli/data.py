@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+from dataclasses import asdict
 from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError, counted, shell_command
-from vjepa2_ac.reporter import INDEXING
+from vjepa2_ac.reporter import INDEXING, SILENT
+from vjepa2_ac.storage.structured import json_text, plain
 
 _CLIPS, _PAIRS = 64, 200  # to calibrate by: strides, axes (as the paper)
 
@@ -28,6 +31,7 @@ def _add_commands(commands: cli.Commands) -> None:
     cli.add(parser, "--limit N", "number of clips to load (32); --model uses twice as many", cli.count, default=32)
     text = "also measure with a model whether frames are shifted, mirrored, reversed or BGR, or the gripper is inverted"
     cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
+    cli.add(parser, "--json", "print one JSON object: the findings and their counts", action="store_true")
 
     parser = cli.command(commands, "inspect", _inspect, "my_robot.yaml --out inspection")
     cli.add_config(parser, such_as=such_as)
@@ -93,21 +97,22 @@ def _check(options: argparse.Namespace) -> int:
     config = cli.read_config(options.config, options.overrides)
     if options.model is not None:
         cli.require_subject(options.model)
-    return check_and_print(config, clips=options.limit, model=options.model)
+    return check_and_print(config, clips=options.limit, model=options.model, as_json=options.json)
 
 
-def check_and_print(config: Config, *, clips: int = 32, model: str | None = None) -> int:
+def check_and_print(config: Config, *, clips: int = 32, model: str | None = None, as_json: bool = False) -> int:
     """Check the data of a config and print the findings; return 1 if one of them is an error.
 
     Args:
         config: The data, and the order and size of batches.
         clips: The approximate number of clips to read; a model is measured on twice as many.
         model: A run or a model that measures the data, too.
+        as_json: Print one JSON object and nothing else, when all checks are done.
     """
     from vjepa2_ac.cli.tables import print_finding, variants_table
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.check import check_data
-    from vjepa2_ac.inspection.findings import Finding, summary_of
+    from vjepa2_ac.inspection.findings import Finding, findings_as_dict, summary_of
     from vjepa2_ac.inspection.probe import probe_config
     from vjepa2_ac.inspection.statistics import at_some_stride
 
@@ -115,20 +120,26 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
 
     def add(finding: Finding) -> None:
         findings.append(finding)
-        print_finding(finding)
+        if not as_json:
+            print_finding(finding)
 
     batch_size, probe = config.training.batch_size, None
-    with cli.reporter() as reporter:
+    with contextlib.nullcontext(SILENT) if as_json else cli.reporter() as reporter:
         progress = reporter.task(INDEXING)
         for one in check_data(config.data, seed=config.seed, batch_size=batch_size, clips=clips, progress=progress):
             add(one)
         if model is not None:
             dataset, progress = at_some_stride(open_dataset(config.data)), reporter.task("probing")
             probe = probe_config(config, dataset, model=model, clips=2 * clips, progress=progress)
+    variants = [] if probe is None else [probe.plain, *probe.results]
+    if variants and not as_json:
+        cli.show(variants_table("One-step error / persistence of the data in variants", variants))
     if probe is not None:
-        cli.show(variants_table("One-step error / persistence of the data in variants", [probe.plain, *probe.results]))
         add(Finding("warning" if probe.better else "ok" if probe.is_decided else "skipped", "probe", probe.verdict()))
-    cli.show(summary_of(findings))
+    if as_json:
+        print(json_text({**findings_as_dict(findings), "variants": plain([asdict(one) for one in variants])}), end="")
+    else:
+        cli.show(summary_of(findings))
     return int(any(one.level == "error" for one in findings))
 
 

@@ -44,6 +44,17 @@ def first_case(about: str, text: str, *cases: tuple[bool, Level, str]) -> Findin
     return Finding(level, about, f"{text}: {words}" if words else text)
 
 
+def findings_as_dict(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return the findings as plain values, with the number of errors, warnings and skipped checks."""
+    counts = Counter(one.level for one in findings)
+    return {
+        "findings": [{"level": one.level, "name": one.about, "text": one.text} for one in findings],
+        "errors": counts["error"],
+        "warnings": counts["warning"],
+        "skipped": counts["skipped"],
+    }
+
+
 def summary_of(findings: Sequence[Finding]) -> str:
     """Return the last line of `data check`, such as "0 errors, 1 warning, 3 skipped"."""
     counts = Counter(one.level for one in findings)
