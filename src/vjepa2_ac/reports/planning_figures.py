@@ -181,10 +181,10 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
     states = made.states
     heights = [2.0 * rows] if states is None else [2.0 * rows, 1.4]
     options = made.options
-    how = f"every {options.every} frames" if options.by == "every" else f"by {options.by}"
+    how = f"one every {options.every} frames" if options.by == "every" else "where the gripper changes or the arm stops"
     count = counted(len(made.goals), "goal")
     with written_figure(path, _WIDTH, 0.5 + sum(heights), dpi=130) as figure:
-        headline(figure, f"{count}, {how}; {options.stride} frames are a model step")
+        headline(figure, f"{count}, {how} ({options.stride} frames per model step)")
         sheet, *parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
         for place, axes in enumerate(sheet.subplots(rows, _ACROSS, squeeze=False).flat):
             axes.set_axis_off()
@@ -203,11 +203,11 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
 
 def _caption(made: MadeGoals, place: int) -> str:
     if not place:
-        return "the start, frame 0"
+        return "start, frame 0"
     goal, key = made.goals[place - 1], made.keys[place - 1]
     steps = f"{counted(goal.at_least, 'model step')} or more"
     if goal.at_most is not None:
         steps = f"{goal.at_least} to {counted(goal.at_most, 'model step')}"
     lines = [f"goal {place}: {goal.name}" if goal.name else f"goal {place}", f"frame {key.frame}, {steps}"]
-    lines.append(f"gripper {goal.gripper or 'as planning.limits say'}")
+    lines.append(f"gripper {goal.gripper or 'as in planning.limits'}")
     return "\n".join(lines)
