@@ -225,6 +225,7 @@ def chosen_names(names: str) -> list[str]:
         ("x y z qx qy qz qw vx vy vz wx wy wz gripper", "x y z qx qy qz qw gripper"),
         ("x y z rx ry rz vx vy vz wx wy wz gripper", "x y z rx ry rz gripper"),
         ("x y z wx wy wz vx vy vz gripper", ""),  # an angular velocity is no rotation
+        ("x y z wx wy wz roll pitch yaw gripper", "x y z roll pitch yaw gripper"),
         ("theta_1 theta_2 theta_3 x y z rx ry rz gripper", "x y z rx ry rz gripper"),
         ("angle1 angle2 angle3 x y z gripper", ""),
         ("x y z r1 r2 r3 r4 r5 r6 gripper", ""),  # six numbers of a rotation matrix

@@ -3,11 +3,13 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from gcs import Gcs
 from vector_sets import write_vectors
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import DataConfig, DiskCacheConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.inspection.check import batch_findings, check_data
@@ -90,12 +92,26 @@ def test_an_empty_test_split_is_an_error_line_where_one_is_asked_for_as_training
 
 
 def test_a_test_split_that_cannot_answer_is_told_the_share_that_can(tmp_path: Path) -> None:
+    few, many = (write_vectors(tmp_path / str(episodes), width=3, episodes=episodes) for episodes in (6, 45))
+    values = {"source": "npz", "states": "vector", "validation_share": 0.1, "test_share": 0.15}
+    dataset = open_dataset(knobs(many, **values))
+    tested = [dataset.table.identity(index) for index in np.flatnonzero(dataset.members("test")).tolist()]
+    unlucky = knobs(many, **values, exclude=tuple(tested[3:]))  # a hash draws 3 of 38 episodes, where the share says 5.7
     texts = {}
-    for episodes in (30, 6):
-        folder = write_vectors(tmp_path / str(episodes), width=3, episodes=episodes)
-        config = knobs(folder, source="npz", states="vector", validation_share=0.1, test_share=0.05)
-        texts[episodes] = [one.text for one in check_data(config, clips=2) if "cannot show whether" in one.text]
-    assert texts[6][0].endswith("Record more episodes")
-    share = float(re.search(r"data.test_share=([\d.]+)", texts[30][0])[1])
-    config = knobs(tmp_path / "30", source="npz", states="vector", test_share=share)
-    assert open_dataset(config).members("test").sum() >= 5
+    for config in (knobs(few, **values), unlucky):
+        (texts[config.path],) = (one.text for one in check_data(config, clips=2) if "cannot show whether" in one.text)
+    assert texts[str(few)].endswith("Record more episodes")
+    proposed = float(re.search(r"data.test_share=([\d.]+)", texts[str(many)])[1])
+    members = open_dataset(unlucky.model_copy(update={"test_share": proposed})).members("test").sum()
+    assert proposed > 0.15
+    assert members >= 5
+    assert texts[str(many)].endswith(f"the split then has {members}")
+
+
+def test_behind_a_url_the_bytes_of_a_clip_are_told(gcs: Gcs, tmp_path: Path) -> None:
+    gcs.upload(write_vectors(tmp_path / "set", width=3), "bucket/set")
+    config = knobs("gs://bucket/set", source="npz", states="vector", validation_share=0.1, test_share=0.1)
+    config = config.model_copy(update={"disk_cache": DiskCacheConfig(dir=str(tmp_path / "cache"), limit_gb=0)})
+    about = {finding.about: finding.text for finding in check_data(config, clips=2)}
+    assert re.fullmatch(r"[\d,]+ kB fetched per clip \(mean of \d+ clips\)", about["network"])
+    assert not about["network"].startswith("0 kB")

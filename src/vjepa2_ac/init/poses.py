@@ -243,9 +243,17 @@ def _candidates(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
         rotations = [part for part in parts if part[0].kind != "position" and part[0].group == group]
         grippers = [one for one in all_grippers if one.group in {group, ""} or len(all_grippers) == 1]
         if rotations and grippers:
-            rotation = min(rotations, key=lambda part: (part[0].column != column, part[0].kind not in FORMATS))
+            rotation = min(
+                rotations,
+                key=lambda part: (part[0].column != column, _may_be_rate(part[0]), part[0].kind not in FORMATS),
+            )
             gripper = min(grippers, key=lambda one: (one.group != group, one.column != column))
             yield (*position, *rotation, gripper)
+
+
+def _may_be_rate(number: _Number) -> bool:
+    """Return whether a number is called wx, wy or wz: an angular velocity, or a rotation vector if nothing else is."""
+    return re.search(r"(?:^|_)w[xyz]$", _words(number.name)) is not None
 
 
 def _rank(candidate: _Numbers) -> tuple[bool, bool, bool, int]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 from textwrap import shorten
 
 import numpy as np
 from jaxtyping import Float
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -26,7 +27,6 @@ from vjepa2_ac.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.spaces import POSE, POSES, Spaces, rotation_angles
 
-_MOST_TESTED = 0.5  # share of the episodes: more leaves too few for training
 _DARK = 8  # of 255: mean of frames that are nearly black
 _STILL_CM, _FAR_CM = 0.2, 30.0  # medians of |dxyz| per model step that are reported
 _REACH_M = 1.6  # beyond the reach of common arms
@@ -99,7 +99,7 @@ def _check_selection(dataset: Dataset) -> Iterator[Finding]:
 
 
 def _check_test_split(dataset: Dataset) -> Iterator[Finding]:
-    """Warn if the test split is too small to measure whether training helped, and name a share that should suffice."""
+    """Warn if the test split is too small to measure whether training helped, and name a share that suffices."""
     config, is_long_enough = dataset.config, dataset.table.num_steps >= dataset.config.clip_steps
     count = int((dataset.members("test") & is_long_enough).sum())
     if not 0 < count < ENOUGH_EPISODES:
@@ -108,9 +108,13 @@ def _check_test_split(dataset: Dataset) -> Iterator[Finding]:
     if "test" in held_out_by(dataset.table, config):
         yield Finding("warning", "test", f"{text}. data.splits=hash draws the test split from all episodes")
         return
-    whole = int((dataset.taking_part & is_long_enough).sum())
-    share = math.ceil(100 * (ENOUGH_EPISODES + 1) / whole) / 100
-    fix = f"Set data.test_share={share:g}" if share <= _MOST_TESTED else "Record more episodes"
+    fix = "Record more episodes"
+    for percent in range(5, 55, 5):  # tried, because a hash draws the split: its size is not exactly its share
+        other = replace(dataset, config=config.model_copy(update={"test_share": percent / 100}))
+        test, train = (int((other.members(split) & is_long_enough).sum()) for split in ("test", "train"))
+        if test >= ENOUGH_EPISODES and train > test:
+            fix = f"Set data.test_share={percent / 100:g}: the split then has {test}"
+            break
     yield Finding("warning", "test", f"{text}. {fix}")
 
 
@@ -129,6 +133,11 @@ def _check_clips(dataset: Dataset, *, seed: int, batch_size: int, clips: int) ->
     rate = sum(len(batch.starts) for batch in batches[1:]) / max(rest_s, 1e-9)
     speed = f"the first batch of {counted(batch_size, 'clip')} took {first_s:.2f} s, the next ones {rate:.1f} clips/s"
     yield Finding("ok", "timing", f"{speed} with {counted(dataset.config.workers, 'loader process')}")
+    if storage.is_url(dataset.config.path):
+        fetched = sum(batch.bytes_fetched for batch in batches)
+        count = sum(len(batch.starts) for batch in read)
+        text = f"{fetched / count / 1e3:,.0f} kB fetched per clip (mean of {counted(count, 'clip')})"
+        yield Finding("ok", "network", text)
 
 
 def batch_findings(batches: Sequence[Batch], spaces: Spaces = POSES) -> Iterator[Finding]:
