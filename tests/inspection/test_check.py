@@ -96,7 +96,9 @@ def test_a_test_split_that_cannot_answer_is_told_the_share_that_can(tmp_path: Pa
     values = {"source": "npz", "states": "vector", "validation_share": 0.1, "test_share": 0.15}
     dataset = open_dataset(knobs(many, **values))
     tested = [dataset.table.identity(index) for index in np.flatnonzero(dataset.members("test")).tolist()]
-    unlucky = knobs(many, **values, exclude=tuple(tested[3:]))  # a hash draws 3 of 38 episodes, where the share says 5.7
+    unlucky = knobs(
+        many, **values, exclude=tuple(tested[3:])
+    )  # a hash draws 3 of 38 episodes, where the share says 5.7
     texts = {}
     for config in (knobs(few, **values), unlucky):
         (texts[config.path],) = (one.text for one in check_data(config, clips=2) if "cannot show whether" in one.text)
