@@ -3,8 +3,8 @@
     python examples/train_loop.py [DATA] [STEPS]
 
 DATA is a folder in the RLDS format of DROID. Without DATA the script first records a few episodes of a simulated arm.
-The loop is that of `vjepa2-ac train` without config, processes, checkpoints and signals.
-`tests/training/test_train_loop.py` checks that both give the same weights, bit for bit on a CPU.
+The algorithm is that of `vjepa2-ac train`, without config files, several processes, checkpoints and signal handling.
+`tests/training/test_train_loop.py` checks that both compute the same weights, bit for bit on a CPU.
 """
 
 import math
@@ -30,7 +30,7 @@ BASE, SEED = "builtin:sim-tiny", 0
 FRAMES, STRIDE = 4, 4  # a clip has 4 frames, 4 control steps (0.27 s at 15 Hz) apart
 RANK, ALPHA, TARGETS = 16, 32, ["q", "k", "v", "o", "fc1", "fc2"]
 BATCH, LEARNING_RATE, WARM_UP, WEIGHT_DECAY, MAX_NORM = 6, 3e-3, 5, 0.04, 1.0
-ROLLOUT = 2  # predictions of the rollout loss
+ROLLOUT = 2  # number of predictions in the rollout loss
 
 
 def main(data: str = "", steps: str = "60") -> None:
@@ -54,23 +54,23 @@ def train(data: str, steps: int) -> tuple[WorldModel, list[float]]:
     add_lora(model)
     print("Before training:", validate(model, dataset))
 
-    matrices = [weight for weight in model.parameters() if weight.requires_grad]
-    optimizer = torch.optim.AdamW(matrices, lr=LEARNING_RATE, betas=(0.9, 0.999), weight_decay=WEIGHT_DECAY)
+    trained = [weight for weight in model.parameters() if weight.requires_grad]
+    optimizer = torch.optim.AdamW(trained, lr=LEARNING_RATE, betas=(0.9, 0.999), weight_decay=WEIGHT_DECAY)
     losses = []
     model.train()
     for step in range(1, steps + 1):
         for group in optimizer.param_groups:
             group["lr"] = learning_rate_at(step, steps)
         batch = encode(model, next(clips))  # latents [batch, time, tokens, dim], layer-normalised
-        forced, rollout = two_losses(model, batch)
-        loss = forced + rollout
+        forced_loss, rollout_loss = two_losses(model, batch)
+        loss = forced_loss + rollout_loss
         torch.autograd.backward(loss)
-        nn.utils.clip_grad_norm_(matrices, MAX_NORM)
+        nn.utils.clip_grad_norm_(trained, MAX_NORM)
         optimizer.step()
         optimizer.zero_grad()
-        losses.append(forced.item() + rollout.item())
+        losses.append(forced_loss.item() + rollout_loss.item())
         if step % 10 == 0:
-            print(f"step {step}: loss {loss:.4f} (teacher forcing {forced:.4f}, rollout {rollout:.4f})")
+            print(f"step {step}: loss {loss:.4f} (teacher forcing {forced_loss:.4f}, rollout {rollout_loss:.4f})")
     print("After training:", validate(model, dataset))
     return model, losses
 
@@ -103,8 +103,8 @@ def two_losses(model: WorldModel, batch: LatentBatch) -> tuple[Tensor, Tensor]:
     rolled = forced[:, :1]
     further = model.rollout(rolled, batch.actions[:, 1:ROLLOUT], states[:, 1:ROLLOUT], cache=cache)
     rolled = torch.cat([rolled, further], dim=1)
-    truth = batch.latents[:, 1:]
-    return (forced - truth).abs().mean(), (rolled - truth[:, :ROLLOUT]).abs().mean()
+    true_latents = batch.latents[:, 1:]
+    return (forced - true_latents).abs().mean(), (rolled - true_latents[:, :ROLLOUT]).abs().mean()
 
 
 def learning_rate_at(step: int, steps: int) -> float:

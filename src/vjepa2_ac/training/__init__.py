@@ -1,1 +1,1 @@
-"""Training: how do the weights change?"""
+"""Training: setup of a run, optimizer step, validation, checkpoints and monitoring."""

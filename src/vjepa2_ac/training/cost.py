@@ -1,16 +1,17 @@
-"""GPU memory of a run before it starts, part by part: a step on fake tensors, and arithmetic for the rest.
+"""Estimate of the GPU memory that a run needs, before it starts.
 
-The predictor's part is the peak of one micro-step of the run on fake tensors, through the code that trains. Calculated
-is what needs no such pass: weights and moments from the counts of parameters (bitsandbytes' kernels take no fake
-tensors), the next batch from its sizes, and the encoder at work. On an H100 the peak that PyTorch's allocator reported
-differed from the total by 1 %; the CUDA context was not compared.
+The predictor's part is measured: it is the peak of one micro-step on fake tensors, executed by the training code. All
+other parts are calculated: weights and optimizer moments from the parameter counts (bitsandbytes' kernels do not
+accept fake tensors), the next batch from its size, and the encoder's activations by formula. On an H100 the total
+differed by 1 % from the peak that PyTorch's allocator reported; the CUDA context was not compared.
 
-Fake tensors are on the CPU, because fake CUDA tensors need a driver; three things are then computed as on CUDA:
-autocast computes norms from a float32 copy where weights have another type than the arithmetic, a dropout mask takes
-one byte, and `auto` attention is one operation (FlexAttention) that keeps no scores.
+The fake tensors are on the CPU, because fake CUDA tensors need a driver. Three operations are replaced, so that they
+keep as much memory as on CUDA: autocast computes norms from a float32 copy if the weights have another data type than
+the arithmetic, a dropout mask takes one byte per element, and `auto` attention is one operation (FlexAttention) that
+keeps no scores.
 
-Blocks after the first are equal: models of two and of three blocks show what each further one needs, in each phase of
-the step (a prediction, the losses, the backward pass of a prediction).
+All blocks after the first need the same memory. Models with two and with three blocks show how much each further block
+needs, in each phase of the step (a prediction, the losses, the backward pass of a prediction).
 """
 
 from __future__ import annotations
@@ -45,9 +46,9 @@ USUAL_GPU = 24 * GIGABYTE
 FLOAT32 = 4
 HALF = 2  # bfloat16 and float16
 
-_BLOCKS = (2, 3)  # of the models that are measured
+_BLOCKS = (2, 3)  # numbers of blocks of the two measured models
 _BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
-_SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # of bitsandbytes
+_SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # elements, as in bitsandbytes
 _CHECKPOINTED = ", checkpointed"
 _STANDING = (  # parts that are allocated all the time
     "encoder weights", "predictor weights", "trained weights", "optimizer state", "prefetched batch", "CUDA allowance",
@@ -60,19 +61,19 @@ _WITH_EFFECT: Any = {
 
 
 class StepBytes(NamedTuple):
-    """Bytes that live at once, at most, in addition to weights, gradients and batch."""
+    """Peak bytes of a step, in addition to weights, gradients and batch."""
 
-    stored: int  # in a forward and backward pass, without checkpointing
-    checkpointed: int
-    casts: int  # matrices of adapters in the arithmetic's type, for all micro-steps
-    predicting: int  # in a prediction of all steps of a batch of validation
+    stored: int  # forward and backward pass, without gradient checkpointing
+    checkpointed: int  # forward and backward pass, with gradient checkpointing
+    casts: int  # copies of the adapter's matrices in the data type of the arithmetic, for all micro-steps
+    predicting: int  # prediction of all steps of a validation batch
 
 
 _measured: dict[str, StepBytes] = {}
 
 
 def meta_predictor(config: Config, sizes: ModelSizes) -> nn.Module:
-    """Return the predictor with what a run trains, on the meta device, in float32; the rest is frozen.
+    """Return the predictor with its adapter on the meta device, in float32; weights that are not trained are frozen.
 
     Raises:
         InputError: A key of the adapter does not fit the predictor.
@@ -99,11 +100,11 @@ def _batch(config: Config, sizes: ModelSizes, clips: int) -> LatentBatch:
 
 
 def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> StepBytes:
-    """Return what a micro-step of a run keeps in memory.
+    """Return the peak memory of a micro-step of a run.
 
     Args:
-        config: The run.
-        sizes: Of its model.
+        config: The config of the run.
+        sizes: The sizes of the model.
         device: The device type whose rules for saved tensors apply.
 
     Raises:
@@ -112,7 +113,7 @@ def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> St
     key = f"{config.model_dump_json(include=_WITH_EFFECT)} {sizes} {device}"
     if key not in _measured:
         depth = sizes.predictor.depth
-        if depth <= _BLOCKS[1] or config.adapter.peft:  # whose options may make blocks differ
+        if depth <= _BLOCKS[1] or config.adapter.peft:  # options of PEFT may make blocks differ
             peaks = _measure(config, sizes, device)
         else:
             predictors = (sizes.predictor.model_copy(update={"depth": blocks}) for blocks in _BLOCKS)
@@ -125,10 +126,10 @@ def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> St
 
 
 class LiveStorages:
-    """Counts the bytes of storages from the first sight of a tensor until nothing refers to its storage.
+    """A count of the bytes of tensor storages, from the first call of `hold` until a storage is freed.
 
     Args:
-        block: Each storage is rounded up to a multiple of this number of bytes, as an allocator does.
+        block: The size of each storage is rounded up to a multiple of this number of bytes, as an allocator does.
     """
 
     def __init__(self, block: int = 1) -> None:
@@ -137,16 +138,16 @@ class LiveStorages:
         self._sizes: dict[int, int] = {}
 
     def reset_peak(self) -> None:
-        """Let the peak be what is live now."""
+        """Set the peak to the number of bytes that are live now."""
         self.peak = self.live
 
     def forget(self) -> None:
-        """Leave out of all counts what is live now."""
+        """Exclude all storages that are live now from the counts."""
         self._sizes = dict.fromkeys(self._sizes, 0)
         self.live = self.peak = 0
 
     def hold(self, tensor: Tensor) -> None:
-        """Count the storage of a tensor, if it is new."""
+        """Count the storage of a tensor, unless it is counted already."""
         storage = tensor.untyped_storage()
         key = storage._cdata
         if key not in self._sizes:
@@ -160,7 +161,7 @@ class LiveStorages:
 
 
 class _Holding(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
-    """Counts the storages of all tensors that operations return."""
+    """A dispatch mode that counts the storages of all tensors that operations return."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]  # torch
@@ -168,7 +169,7 @@ class _Holding(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        if "out" in kwargs:  # there already; PyTorch takes milliseconds to see that it fits
+        if "out" in kwargs:  # the storage is counted already, and PyTorch takes milliseconds to check its shape
             return kwargs["out"]
         made = func(*args, **kwargs)
         for leaf in tree_leaves(made):
@@ -178,23 +179,23 @@ class _Holding(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        return False  # nothing is compiled within: it need not be imported
+        return False  # nothing is compiled inside this mode, so that torch._dynamo need not be imported
 
 
 class _FakeModel(LatentDynamics):
-    """The predictor of a run on fake tensors, in training mode; only within `FakeTensorMode`."""
+    """The predictor of a run on fake tensors, in training mode. Usable only inside `FakeTensorMode`."""
 
     def __init__(self, config: Config, predictor: nn.Module, device: Kind, storages: LiveStorages) -> None:
         super().__init__()
         self.predictor, self._storages = predictor, storages
-        self.peaks: list[int] = []  # of each phase
+        self.peaks: list[int] = []  # bytes, one per phase
         frozen = torch.bfloat16 if config.model.dtype == "bfloat16" else torch.float32
         for part in predictor.modules():
             for name, old in part.named_parameters(recurse=False):
                 is_float = old.requires_grad or config.adapter.kind == "none"
                 values = torch.empty(old.shape, dtype=torch.float32 if is_float else frozen)
                 new = nn.Parameter(values, old.requires_grad)
-                new.grad = torch.empty_like(new) if new.requires_grad else None  # of earlier micro-steps
+                new.grad = torch.empty_like(new) if new.requires_grad else None  # as after an earlier micro-step
                 part.register_parameter(name, new)
             if device == "cuda":
                 part.__class__ = _ON_CUDA.get(type(part), type(part))
@@ -202,7 +203,7 @@ class _FakeModel(LatentDynamics):
         self.set_attention(_flash if device == "cuda" and kind == "auto" else kind)
 
     def predict(self, *given: Any, **named: Any) -> Tensor:
-        """Predict; a phase ends, and another one when the gradients of all later predictions are known."""
+        """Predict and end a phase; end another phase when the backward pass reaches this prediction."""
         predicted = super().predict(*given, **named)
         self.end_phase()
         if predicted.requires_grad:
@@ -210,12 +211,12 @@ class _FakeModel(LatentDynamics):
         return predicted
 
     def end_phase(self, _: object = None) -> None:
-        """Note how much has lived at once since the phase before."""
+        """Append the peak since the previous phase to `peaks`."""
         self.peaks.append(self._storages.peak)
         self._storages.reset_peak()
 
     def run(self, config: Config, sizes: ModelSizes, clips: int, *, train: bool) -> tuple[int, ...]:
-        """Return the peak of each phase of a micro-step, or of a prediction without gradients."""
+        """Return the peak of each phase of a micro-step; with `train=False`, of a prediction without gradients."""
         batch = _batch(config, sizes, clips)
         states, cameras = batch.states[:, :-1], None if batch.extrinsics is None else batch.extrinsics[:, :-1]
         self._storages.forget()
@@ -233,9 +234,9 @@ class _FakeModel(LatentDynamics):
 
 
 def _measure(config: Config, sizes: ModelSizes, device: Kind) -> tuple[tuple[int, ...], ...]:
-    """Return the numbers of `StepBytes`, phase by phase."""
+    """Return for each field of `StepBytes` the bytes of each phase."""
     predictor = meta_predictor(config, sizes)
-    rotary_tables.cache_clear()  # tables that are cached between calls do not get in or out
+    rotary_tables.cache_clear()  # neither use real tables from earlier calls nor leave fake tables for later calls
     try:
         with FakeTensorMode(), _Holding() as holding:
             model = _FakeModel(config, predictor, device, holding.storages)
@@ -275,28 +276,28 @@ def _flash(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> T
 
 @dataclass(frozen=True)
 class Parameters:
-    """How many parameters there are, exactly."""
+    """Exact numbers of parameters."""
 
     encoder: int
-    predictor: int
-    trained_tensors: tuple[int, ...]  # elements of each: of an adapter and whole heads, or of the whole predictor
+    predictor: int  # without the trained parameters of an adapter
+    trained_tensors: tuple[int, ...]  # elements of each trained tensor: adapter and whole layers, or whole predictor
 
     @property
     def trained(self) -> int:
-        """How many are trained."""
+        """The number of trained parameters."""
         return sum(self.trained_tensors)
 
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """Bytes on the GPU, part by part. `total` is the largest of five moments: they do not occur at once."""
+    """Bytes on the GPU by part. Not all parts are allocated at once; `total` is the largest sum of those that are."""
 
     parameters: Parameters
-    checkpointing: bool  # as the config requests
-    parts: dict[str, int]  # by name, for people
+    checkpointing: bool  # training.gradient_checkpointing
+    parts: dict[str, int]  # bytes by the displayed name of the part
 
     def total(self, *, checkpointing: bool) -> int:
-        """Return the peak with or without gradient checkpointing."""
+        """Return the peak in bytes, with or without gradient checkpointing."""
         parts = self.parts
         predicting = parts["adapter copies"] + parts[f"predictor activations{_CHECKPOINTED * checkpointing}"]
         old_weights = parts["trained weights"]  # `update_to_weight` needs them on logged steps
@@ -307,17 +308,19 @@ class MemoryEstimate:
 
 
 def count_parameters(config: Config, sizes: ModelSizes) -> Parameters:
-    """Return how many parameters a model of these sizes has, and how many of them the config trains. No weight is made.
+    """Return how many parameters a model of these sizes has, and how many of them the config trains.
+
+    No weights are allocated.
 
     Raises:
         InputError: A key of the adapter does not fit the predictor.
     """
-    every = list(meta_predictor(config, sizes).parameters())
-    trained = tuple(one.numel() for one in every if one.requires_grad)
-    total = sum(one.numel() for one in every)
+    weights = list(meta_predictor(config, sizes).parameters())
+    trained = tuple(one.numel() for one in weights if one.requires_grad)
+    total = sum(one.numel() for one in weights)
     own = total if config.adapter.kind == "none" else total - sum(trained)
     with torch.device("meta"):
-        encoder = sum(one.numel() for one in Encoder(sizes).parameters())  # of V-JEPA 2.1 both frame paths
+        encoder = sum(one.numel() for one in Encoder(sizes).parameters())  # in V-JEPA 2.1 with both patch embeddings
     return Parameters(encoder, own, trained)
 
 
@@ -325,8 +328,8 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
     """Return the memory that a run needs.
 
     Args:
-        config: The run.
-        sizes: Sizes of its model, such as `model.checkpoints.base_sizes` gives.
+        config: The config of the run.
+        sizes: The sizes of the model, for example from `model.checkpoints.base_sizes`.
 
     Raises:
         InputError: A key of the adapter does not fit the predictor.
@@ -354,25 +357,27 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
 
 
 def ways_to_fit(config: Config, sizes: ModelSizes, available: int) -> list[str] | None:
-    """Return the config keys to change, one after the other, until the run fits; None if all of them do not suffice."""
-    turned, total = list[str](), _total(config, sizes)
-    for knob, changes in _knobs(config):
+    """Return the config changes after which a run fits into `available` bytes; None if all of them do not suffice."""
+    applied, total = list[str](), _total(config, sizes)
+    for override, changes in _memory_savings(config):
         if total <= available:
             break
         sections = {name: getattr(config, name).model_copy(update=values) for name, values in changes.items()}
         lighter = config.model_copy(update=sections)
         if (less := _total(lighter, sizes)) < total:
-            turned.append(f"{knob} replay.{knob}" if config.replay and knob.startswith("data.") else knob)
+            applied.append(
+                f"{override} replay.{override}" if config.replay and override.startswith("data.") else override
+            )
             config, total = lighter, less
-    return turned if total <= available else None
+    return applied if total <= available else None
 
 
 def _total(config: Config, sizes: ModelSizes) -> int:
     return estimate_memory(config, sizes).total(checkpointing=config.training.gradient_checkpointing)
 
 
-def _knobs(config: Config) -> Iterator[tuple[str, dict[str, dict[str, Any]]]]:
-    """Yield what makes a run lighter, in this order: the knob, for people, and its value by section."""
+def _memory_savings(config: Config) -> Iterator[tuple[str, dict[str, dict[str, Any]]]]:
+    """Yield the changes that save memory, preferred ones first: the text to print, and the new values by section."""
     yield "training.gradient_checkpointing=true", {"training": {"gradient_checkpointing": True}}
     yield "training.batch_size=1 (and as much more accumulation)", {"training": {"batch_size": 1}}
     bf16 = {"model": {"dtype": "bfloat16"}, "training": {"precision": "bf16"}}
@@ -387,9 +392,9 @@ def _knobs(config: Config) -> Iterator[tuple[str, dict[str, dict[str, Any]]]]:
 
 
 def _moments(config: Config, elements: int) -> int:
-    """Return the bytes of AdamW's two moments of one tensor.
+    """Return the bytes of AdamW's two moments for one tensor.
 
-    In 8 bits there is a float32 scale for every 256 elements; small tensors keep float32.
+    With `adamw_8bit` there is one float32 scale for every 256 elements; moments of small tensors stay in float32.
 
     Source: bitsandbytes 0.50, optim/optimizer.py, Optimizer2State.init_state.
     """
@@ -399,7 +404,7 @@ def _moments(config: Config, elements: int) -> int:
 
 
 def batch_bytes(config: Config, sizes: ModelSizes) -> int:
-    """Return the bytes of a batch as the loader sends it: latents, or frames, which may be larger or smaller."""
+    """Return the bytes of a batch from the loader: latents, or frames, assumed to have the model's image size."""
     frames = config.training.batch_size * config.data.frames
     if not config.data.takes_latents:
         return frames * 3 * sizes.image_size**2
@@ -411,12 +416,12 @@ def _latents(config: Config, sizes: ModelSizes, clips: int) -> int:
 
 
 def _encoding(config: Config, sizes: ModelSizes, clips: int) -> int:
-    """Return the bytes that live at once in the larger half of an encoder block, the frames, and the features."""
+    """Return the peak bytes of encoding clips: the larger half of an encoder block, the frames, and the features."""
     return 0 if config.data.takes_latents else _at_work(config, sizes, clips * config.data.frames)
 
 
 def _caching(config: Config, sizes: ModelSizes) -> int:
-    """Return the bytes of encoding a cache beside the encoder's weights; a part of an episode waits as input."""
+    """Return the peak bytes of encoding a cache, with the frames that wait as input, without the encoder's weights."""
     waiting = FRAMES_AT_ONCE * 3 * sizes.image_size**2 * (FLOAT32 + 1)
     return ALLOWANCE + waiting + _at_work(config, sizes, ENCODE_CHUNK)
 
@@ -433,10 +438,10 @@ def _at_work(config: Config, sizes: ModelSizes, frames: int) -> int:
 
 
 def _validating(config: Config, sizes: ModelSizes, step: StepBytes) -> int:
-    """Return the bytes of a batch of validation, without gradients.
+    """Return the peak bytes of a validation batch, without gradients.
 
-    Either it is encoded, or predicted: true latents, two predictions of them, and the larger of what a prediction of
-    all steps at once takes and the keys and values that the rollout keeps of all steps but the last two.
+    It is the larger of encoding and predicting. Predicting needs two predictions of all latents, and the larger of the
+    activations of one prediction of all steps and the keys and values that a rollout keeps (all steps but the last 2).
     """
     clips, predictor = config.validation.batch_size, sizes.predictor
     latents, number = _latents(config, sizes, clips), FLOAT32 if config.training.precision == "fp32" else HALF

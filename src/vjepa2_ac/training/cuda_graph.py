@@ -1,8 +1,8 @@
 """The micro-step as a CUDA graph (`training.cuda_graph`).
 
-At a few clips a GPU computes a micro-step faster than Python launches its 6,000 kernels. A CUDA graph launches all of
-them at once: it is captured from the first batch, and replayed on each batch of the same size. Batches of other sizes
-run without it.
+With few clips per micro-step, a GPU computes its 6,000 kernels faster than Python can launch them. A CUDA graph
+launches all kernels at once: it is captured with the first batch, and replayed for each batch of the same size.
+Batches of other sizes run without the graph.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from vjepa2_ac.training.step import Run, micro_step
 
 Body = Callable[[], None]
 
-_WARM_UPS = 3  # before a capture, in which nothing may be allocated for the first time: PyTorch's own advice
+_WARM_UPS = 3  # runs before a capture, as PyTorch's documentation advises: a capture may not initialise libraries
 
 
 class GraphedMicroStep:
-    """A micro-step that is captured once, and replayed where a batch has the sizes and the share of the first one.
+    """A micro-step that is captured once, and replayed for batches with the tensor sizes and `parts` of the first one.
 
     Args:
-        capture: Records a body, and returns its replay; None: `captured`.
+        capture: Captures a function and returns a function that replays it; `captured` if None.
     """
 
     def __init__(self, capture: Callable[[Body], Body] | None = None) -> None:
@@ -35,24 +35,26 @@ class GraphedMicroStep:
         self._graph: _Graph | None = None
 
     def __call__(self, run: Run, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:
-        """Do what `step.micro_step` does."""
+        """Compute the same as `step.micro_step`."""
         graph = self._graph = self._graph or self._record(run, latents, parts)
         new, static = _tensors(latents), _tensors(graph.latents)
-        if parts != graph.parts or [one.shape for one in new.values()] != [one.shape for one in static.values()]:
+        if parts != graph.parts or [tensor.shape for tensor in new.values()] != [
+            tensor.shape for tensor in static.values()
+        ]:
             return micro_step(run, latents, parts)
         for name, value in static.items():
             value.copy_(new[name])
         _restore(run.trained, graph.gradients)
         graph.replay()
-        return graph.losses.clone()  # the next replay overwrites it
+        return graph.losses.clone()  # a copy, because the next replay overwrites the tensor
 
     def _record(self, run: Run, latents: LatentBatch, parts: float) -> _Graph:
-        """Capture a micro-step on copies of these clips; gradients are as before afterwards."""
-        copies: dict[str, Any] = {name: one.clone() for name, one in _tensors(latents).items()}
+        """Capture a micro-step on copies of these clips, without changing the current gradients."""
+        copies: dict[str, Any] = {name: tensor.clone() for name, tensor in _tensors(latents).items()}
         static, losses = replace(latents, **copies), torch.zeros(2, device=latents.latents.device)
         before = [parameter.grad for parameter in run.trained]
         for parameter in run.trained:
-            parameter.grad = None  # the graph gets tensors of its own
+            parameter.grad = None  # the captured backward pass then allocates the static gradient tensors
 
         def body() -> None:
             losses.copy_(micro_step(run, static, parts))
@@ -66,7 +68,7 @@ class GraphedMicroStep:
 
 @dataclass(frozen=True)
 class _Graph:
-    """What a graph reads and writes, always at the same addresses."""
+    """A captured graph with the static tensors that it reads and writes."""
 
     latents: LatentBatch
     parts: float
@@ -79,7 +81,7 @@ def _restore(trained: Sequence[nn.Parameter], gradients: Sequence[Tensor | None]
     """Set `.grad` back to the graph's static tensors: `zero_grad` has set it to None."""
     fresh = []
     for parameter, static in zip(trained, gradients, strict=True):
-        if static is None or parameter.grad is static:  # None: no clip reaches the parameter
+        if static is None or parameter.grad is static:  # None: the loss does not depend on the parameter
             continue
         if parameter.grad is None:
             fresh.append(static)
@@ -91,7 +93,7 @@ def _restore(trained: Sequence[nn.Parameter], gradients: Sequence[Tensor | None]
 
 
 def captured(body: Body) -> Body:
-    """Record the kernels of a body, after running it a few times, and return their replay.
+    """Capture a function in a CUDA graph, after warm-up runs, and return the function that replays it.
 
     Source: PyTorch's notes on CUDA graphs, "Whole-network capture": warm-up and capture on a side stream.
     """
@@ -102,7 +104,7 @@ def captured(body: Body) -> Body:
             body()
     torch.cuda.current_stream().wait_stream(side)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # the loader's thread pins memory meanwhile
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # the loader's thread may pin memory meanwhile
         body()
     replay: Body = graph.replay
     return replay

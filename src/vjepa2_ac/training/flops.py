@@ -1,11 +1,11 @@
 """Model FLOPs of one clip or one frame, by formula.
 
-PyTorch's counter gives the same numbers on fake tensors, but takes seconds at the start of every run. Only what the
-mathematics requires is counted, once. A matrix product is two operations per pair of numbers; forward, backward with
-respect to inputs wherever a gradient has to pass, and with respect to weights only for trained ones. Not counted:
-recomputation (gradient checkpointing, the scores in a fused attention's backward pass), what is no matrix product
-(norms, activations, rotations), and the norms of weights that DoRA needs. Attention is block-causal: a token of step t
-attends to the tokens of steps up to t.
+PyTorch's counter returns the same numbers on fake tensors, but takes seconds at the start of every run. Only operations
+that the mathematics requires are counted, each once. A matrix product has two operations per multiplied pair of
+numbers. Counted are the forward pass, the backward pass with respect to inputs where a gradient has to pass, and the
+backward pass with respect to trained weights. Not counted are recomputation (gradient checkpointing, the scores in the
+backward pass of fused attention), operations other than matrix products (norms, activations, rotations), and the norms
+of weights that DoRA needs. Attention is block-causal: a token of step t attends to the tokens of steps up to t.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from vjepa2_ac.training.cost import meta_predictor
 class ClipFlops:
     """Floating-point operations of training on one clip."""
 
-    encoder: int  # the frozen encoder, forward, on every frame
-    forward: int  # of the predictor: teacher forcing and the further predictions of the rollout
-    backward: int  # of the predictor
+    encoder: int  # forward pass of the frozen encoder on all frames
+    forward: int  # forward passes of the predictor: teacher forcing, and the further predictions of the rollout
+    backward: int  # backward passes of the predictor
 
     @property
     def predictor(self) -> int:
-        """The work if the latents are cached."""
+        """The operations without the encoder, which is not needed with cached latents."""
         return self.forward + self.backward
 
     @property
     def total(self) -> int:
-        """Everything, from pixels to gradients."""
+        """The operations of encoder and predictor."""
         return self.encoder + self.predictor
 
 
 def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
-    """Return the operations of one clip of a run.
+    """Return the operations of training on one clip.
 
     Args:
-        config: What is trained, frames and rollout.
-        sizes: Sizes of its model, such as `model.checkpoints.base_sizes` gives.
+        config: The config of the run; used are the adapter, the frames per clip and the rollout steps.
+        sizes: The sizes of the model, for example from `model.checkpoints.base_sizes`.
     """
     passes, frames = _Passes(sizes, config), config.data.frames
     total = passes.over(frames - 1, keys=range(1, frames), fed_back=False)
@@ -59,7 +59,7 @@ def frame_flops(sizes: ModelSizes) -> int:
     """Return the operations of encoding one frame."""
     encoder = sizes.encoder
     tokens, width, hidden = sizes.tokens_per_frame, encoder.width, int(encoder.width * encoder.mlp_ratio)
-    embedding = 2 * tokens * 3 * sizes.patch_size**2 * width  # the frames of a tubelet are one
+    embedding = 2 * tokens * 3 * sizes.patch_size**2 * width  # one frame: the two of a tubelet are the same image
     linear = 2 * tokens * (4 * width**2 + 2 * width * hidden)
     return embedding + encoder.depth * (linear + 4 * tokens**2 * width)
 
@@ -68,11 +68,11 @@ _Work = Int64[np.ndarray, "2"]  # forward and backward operations
 
 
 class _Passes:
-    """Counts passes of one clip through the predictor.
+    """A counter of the operations of passes of one clip through the predictor.
 
     Args:
-        sizes: Of the model.
-        config: What is trained.
+        sizes: The sizes of the model.
+        config: The config of the run, whose adapter determines the trained layers.
     """
 
     def __init__(self, sizes: ModelSizes, config: Config) -> None:
@@ -88,12 +88,12 @@ class _Passes:
         self._conditions = [name for name in conditions if name in self._layers and name not in network.unused_layers]
 
     def over(self, steps: int, *, keys: range, fed_back: bool) -> _Work:
-        """Return the work of a pass.
+        """Return the operations of a pass.
 
         Args:
-            steps: Steps whose tokens are computed.
-            keys: For each of them, the number of steps that its tokens attend to.
-            fed_back: Whether its latents are predictions, through which gradients flow.
+            steps: Number of steps whose tokens are computed.
+            keys: For each of these steps, the number of steps that its tokens attend to.
+            fed_back: Whether the input latents are predictions, through which gradients flow.
         """
         patches = steps * self._sizes.tokens_per_frame
         work = self._linear("predictor_embed", patches, into=fed_back)
@@ -101,13 +101,13 @@ class _Passes:
             work += self._linear(name, steps, into=False)
         flowing = fed_back or any(self._changes(name) for name in ("predictor_embed", *self._conditions))
         per_step = self._sizes.tokens_per_frame + len(self._conditions)
-        product = 2 * per_step**2 * sum(keys) * self._sizes.predictor.width  # of queries and keys, or of values
+        product = 2 * per_step**2 * sum(keys) * self._sizes.predictor.width  # queries by keys, or weights by values
         for block in (f"blocks.{index}" for index in range(self._sizes.predictor.depth)):
             projections = [f"{block}.attn.{name}" for name in ("q", "k", "v")]
             for name in projections:
                 work += self._linear(name, steps * per_step, into=flowing)
             query, key, value = (flowing or self._changes(name) for name in projections)
-            # Forward: scores, values by weights. Backward: of values, of weights, and through them of queries and keys.
+            # Forward: scores, weighted values. Backward: gradients of values and weights, then of queries and keys.
             work += [2 * product, (value + (query or key) + query + key) * product]
             flowing = query or key or value
             for name in (f"{block}.attn.o", f"{block}.mlp.fc1", f"{block}.mlp.fc2"):
@@ -117,7 +117,7 @@ class _Passes:
         return work
 
     def _linear(self, name: str, tokens: int, *, into: bool) -> _Work:
-        """Return the work of a linear layer with its adapter; `into`: its input needs a gradient."""
+        """Return the operations of a linear layer and its adapter; `into` is whether the input needs a gradient."""
         layer = self._layers[name]
         product = 2 * tokens * layer.in_features * layer.out_features
         work = np.array([product, product * (into + (name in self._whole))])

@@ -29,12 +29,12 @@ _IN_PLACE = "Everything is in place: data, model, validation and gradients were 
 
 
 def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
-    """Train by a config, from the newest checkpoint of its run folder if there is one.
+    """Train as a config describes, and resume from the newest checkpoint in the run folder if there is one.
 
     Args:
-        config: The run.
+        config: The config of the run.
         reporter: Shows progress.
-        check_only: Do everything that can fail, and stop before the first step and before anything is written.
+        check_only: Run all checks, then stop before the first step without writing anything.
         allow_config_change: Continue with this config if the run folder has another one, and report the changes.
 
     Returns:
@@ -45,14 +45,14 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
         StoppedError: A signal asked the run to stop between its first and last step; see `process`.
     """
     changes = {"check_only": check_only, "allow_config_change": allow_config_change}
-    with contextlib.ExitStack() as closing, joined(config) as accelerator:
+    with contextlib.ExitStack() as exit_stack, joined(config) as accelerator:
         require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
         require_optimizer(config.training)
         reporter = reporter if accelerator.is_main_process else SILENT
-        outputs = RunOutputs(config, reporter, accelerator, closing, **changes)
+        outputs = RunOutputs(config, reporter, accelerator, exit_stack, **changes)
         if not outputs.has_ended:
             run = restore(set_up(outputs.config, reporter, accelerator, **changes), reporter)
-            base = validate_base(run, reporter)
+            base_validation = validate_base(run, reporter)
             outputs.report_changes(run)
             if check_only:
                 reporter.task("computing one optimizer step")
@@ -60,8 +60,8 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
                 reporter.note(_IN_PLACE)
             else:
                 outputs.begin(run)
-                if base is not None and record(run, base, outputs.metrics_log):
-                    outputs.save()  # the base: nothing that is worse is ever selected
+                if base_validation is not None and record(run, base_validation, outputs.metrics_log):
+                    outputs.save()  # the untrained state, so that no checkpoint that is worse is ever selected as best
                 _optimize(run, outputs, reporter)
     leave_processes()
     return Path(outputs.config.run_dir)

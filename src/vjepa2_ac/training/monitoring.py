@@ -1,16 +1,16 @@
-"""What is watched while a run trains: its speed, and whether it diverges.
+"""Monitoring of a training run: throughput, and warnings when training diverges.
 
 Metrics of one optimizer step, for the metrics log and the console:
 
-update_to_weight    norm of the update over the norm of the weights before it, of all that is trained together
+update_to_weight    norm of the update divided by the norm of the weights before it, over all trained parameters
 data_wait_share     share of the step's wall time spent waiting for the loader; on CUDA only the device's idle time,
-                    since it computes queued work while the host waits
-samples_per_second  clips, of all processes
-mfu                 model FLOPs per second (`training.flops`) over the ceiling: the rate of this device in a large
+                    because the device computes queued work while the host waits
+samples_per_second  clips per second, summed over all processes
+mfu                 model FLOPs per second (`training.flops`) divided by the ceiling: the rate of this device in a large
                     matrix product in the run's precision, measured for a fraction of a second at the start. NaN (null)
                     above 1: other programs used the device during that measurement, so the ceiling is not usable
-ceiling_tflops      this ceiling in 10^12 FLOPs per second, of all processes
-memory_gb           peak so far in 10^9 bytes: of PyTorch's allocator on CUDA, resident elsewhere
+ceiling_tflops      this ceiling in 10^12 FLOPs per second, summed over all processes
+memory_gb           peak so far in 10^9 bytes: PyTorch's allocator on CUDA, resident memory on other devices
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, Trackers, read_metri
 from vjepa2_ac.training.flops import clip_flops
 
 MEASURED = frozenset({"data_wait_share", "samples_per_second", "mfu", "ceiling_tflops", "memory_gb"})
-"""Metrics of the machine: they differ between identical runs."""
+"""Metrics that depend on the machine and therefore differ between identical runs."""
 
 _ERRORS = {
     "error_over_persistence": "one-step error",
     "rollout_over_persistence_last": "rollout error at the last horizon",
 }
-_NOISE = 1.01  # validation clips are always the same; smaller changes mean nothing
+_NOISE = 1.01  # factor; smaller increases of a validation error are ignored
 _LOSSES = 10  # number of `train` rows whose median is compared
 _FEWEST_LOSSES = 5
-_FAR_ABOVE = 2.0  # times the lowest such median
+_FAR_ABOVE = 2.0  # a median above this multiple of the lowest median causes a warning
 
 
 class WatchedMetricsLog(MetricsLog):
-    """A metrics log that warns, in it and on the console, when its rows show that training diverges.
+    """A metrics log that adds a warning to its rows and to the console when the metrics show that training diverges.
 
-    Only the rows are used, so that a resumed run neither loses nor repeats a warning.
+    Warnings depend only on the rows of the log, so that a resumed run neither loses nor repeats a warning.
 
     Args:
-        config: The run.
+        config: The config of the run.
         reporter: Receives messages for the user.
         first_step: As for `MetricsLog`.
         trackers: As for `MetricsLog`.
@@ -67,7 +67,7 @@ class WatchedMetricsLog(MetricsLog):
             self._watch(str(row.get("kind")), row["step"], row)
 
     def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
-        """Append a row, and a warning if it shows one."""
+        """Append a row, and a warning if the row shows that training diverges."""
         super().write(kind, step, metrics)
         if text := self._watch(kind, step, metrics):
             super().write(WARNING, step, {"text": text})
@@ -75,17 +75,17 @@ class WatchedMetricsLog(MetricsLog):
 
 
 class Watch:
-    """Checks the rows of a metrics log one after the other; each cause is reported once."""
+    """A check of the rows of a metrics log in their order; each cause is reported only once."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self._reported: set[str] = set()
-        self._at_start: Mapping[str, Any] = {}  # the validation of the base
+        self._at_start: Mapping[str, Any] = {}  # metrics of the validation before the first step
         self._losses: deque[float] = deque(maxlen=_LOSSES)
         self._lowest = math.inf
 
     def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> str:
-        """Return the warning of a row; empty if it is fine or the cause was reported before."""
+        """Return the warning for a row; empty if there is no cause, or if the cause was reported before."""
         causes: Iterable[tuple[str, str]] = ()
         if kind == "train":
             causes = self._of_loss(_number(metrics, "loss"))
@@ -121,7 +121,7 @@ class Watch:
             yield "rank", f"{text}. `vjepa2-ac data check` measures how diverse the motions of the data are"
 
     def _of_loss(self, loss: float) -> Iterator[tuple[str, str]]:
-        if not math.isfinite(loss):  # a step without clips, or one that was refused
+        if not math.isfinite(loss):  # a step without readable clips
             return
         self._losses.append(loss)
         typical = statistics.median(self._losses)
@@ -132,13 +132,13 @@ class Watch:
 
 
 class TimedBatches(Iterator[Batch]):
-    """Passes on batches, and measures how long the loader was waited for.
+    """An iterator over batches that measures the time spent waiting for the loader.
 
-    On CUDA only the idle time of the device counts: from the end of its queued work to the next work.
+    On CUDA only the idle time of the device counts, from the end of the queued work to the next work.
 
     Args:
-        batches: The loader's.
-        device: Of the run.
+        batches: The batches from the loader.
+        device: The device of the run.
     """
 
     def __init__(self, batches: Iterator[Batch], device: torch.device) -> None:
@@ -148,7 +148,7 @@ class TimedBatches(Iterator[Batch]):
 
     @property
     def waited_s(self) -> float:
-        """Waiting time in seconds; what the device has not reached yet counts later. Does not synchronize."""
+        """The waiting time in seconds, up to the last event that the device has reached; does not synchronize."""
         while self._spans and self._spans[0][1].query():
             began, ended = self._spans.popleft()
             self._waited_s += began.elapsed_time(ended) / 1000
@@ -167,7 +167,7 @@ class TimedBatches(Iterator[Batch]):
                 self._spans.append((on_device, self._timestamp()))
 
     def _timestamp(self) -> Any:
-        """Enqueue an event with time on a CUDA device, and return it; None for another device."""
+        """Record and return a CUDA event with timing; return None on other devices."""
         if self._device.type != "cuda":
             return None
         event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]  # torch
@@ -177,7 +177,7 @@ class TimedBatches(Iterator[Batch]):
 
 @dataclass(frozen=True)
 class Throughput:
-    """Turns a step's clips and seconds into metrics."""
+    """The constants needed to compute the throughput metrics of a step."""
 
     flops_per_clip: int
     ceiling: float  # FLOPs per second of all processes
@@ -185,7 +185,10 @@ class Throughput:
 
     @classmethod
     def of(cls, config: Config, sizes: ModelSizes, accelerator: Accelerator) -> Throughput:
-        """Measure the ceiling, once per device, precision and program; the encoder counts unless latents are cached."""
+        """Measure the ceiling (once per process, device and precision), and count the FLOPs of a clip.
+
+        The FLOPs include the encoder unless latents are cached.
+        """
         device = accelerator.device
         ceiling = accelerator.num_processes * matmul_speed(device, PRECISIONS[config.training.precision])
         flops = clip_flops(config, sizes)
@@ -195,9 +198,9 @@ class Throughput:
         """Return the metrics of one step.
 
         Args:
-            clips: Of all processes.
-            seconds: The step's wall time.
-            waited_s: The part of it spent waiting for the loader.
+            clips: Number of clips, summed over all processes.
+            seconds: The wall time of the step.
+            waited_s: The part of this time spent waiting for the loader.
         """
         mfu = clips * self.flops_per_clip / seconds / self.ceiling
         if self.device.type == "cuda":
@@ -214,6 +217,6 @@ class Throughput:
 
 
 def _number(metrics: Mapping[str, Any], key: str) -> float:
-    """Return a number; NaN for one that is absent, or that JSON could not hold."""
+    """Return a metric as a float; NaN if it is absent or None (JSON has no NaN)."""
     value = metrics.get(key)
     return float(value) if isinstance(value, int | float) else math.nan

@@ -1,4 +1,4 @@
-"""The optimizer: trained parameters, update rule, and learning rate schedule."""
+"""Optimizer, parameter groups and learning rate schedule."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _BETAS = (0.9, 0.999)
 
 
 def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, object]]:
-    """Split the trained parameters into matrices, which decay, and biases and norms, which do not.
+    """Split the trained parameters into matrices, with weight decay, and biases and norms, without weight decay.
 
     Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/utils.py, init_opt.
     """
@@ -28,13 +28,13 @@ def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, o
 
 
 def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.Optimizer:
-    """Return the optimizer of the trained parameters. The learning rate is set before every step.
+    """Return the optimizer for the trained parameters. The training loop sets the learning rate before every step.
 
-    AdamW on CUDA is fused: one kernel updates many tensors, and after an overflow in fp16 it updates none without
-    involving the host. It rounds differently than on a CPU.
+    AdamW on CUDA is fused: one kernel updates many tensors, and skips the update after an fp16 overflow without
+    synchronizing with the host. Its rounding differs from that on a CPU.
 
     Raises:
-        UnreachableError: It needs a library that is not installed.
+        UnreachableError: The optimizer needs a library that is not installed.
     """
     groups = parameter_groups(module, training.weight_decay)
     if training.optimizer == "adamw_8bit":
@@ -44,10 +44,10 @@ def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.O
 
 
 def require_optimizer(training: TrainingConfig) -> None:
-    """Check that the optimizer is installed.
+    """Check that the library of the optimizer is installed.
 
     Raises:
-        UnreachableError: It needs a library that is not installed.
+        UnreachableError: The library is not installed.
     """
     if training.optimizer == "adamw_8bit":
         _adamw_8bit()
@@ -63,23 +63,25 @@ def _adamw_8bit() -> Any:
 
 
 def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Restore the state of an optimizer of the same kind; weight decay and betas keep their current values.
+    """Restore the moments of an optimizer of the same kind; weight decay and betas keep their current values.
 
-    The same holds for `fused`, by which PyTorch decides on the device of the step counts.
+    `fused` also keeps its current value, because PyTorch chooses the device of the step counts by it.
 
     Raises:
-        ValueError: The state is of another kind of optimizer, or of other parameters.
+        ValueError: The state belongs to another kind of optimizer, or to other parameters.
     """
-    is_adamw = isinstance(optimizer, torch.optim.AdamW)  # bitsandbytes gives its moments other names
+    is_adamw = isinstance(optimizer, torch.optim.AdamW)  # bitsandbytes uses other names for the moments
     if any(("exp_avg" in moments) != is_adamw for moments in state["state"].values()):
         raise ValueError("its moments are of another training.optimizer")
-    own = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
-    groups = [group | settings for group, settings in zip(state["param_groups"], own, strict=True)]
+    current_settings = [
+        {name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups
+    ]
+    groups = [group | settings for group, settings in zip(state["param_groups"], current_settings, strict=True)]
     optimizer.load_state_dict({**state, "param_groups": groups})
 
 
 def learning_rate_at(step: int, training: TrainingConfig) -> float:
-    """Return the learning rate of optimizer step 1..steps: a pure function, so there is no scheduler to save.
+    """Return the learning rate of an optimizer step in 1..steps. A pure function: there is no scheduler state to save.
 
     Source: warmup_stable_decay is facebookresearch/vjepa2 @ c2963a4, src/utils/schedulers.py, WSDSchedule.
     """
@@ -96,12 +98,12 @@ def learning_rate_at(step: int, training: TrainingConfig) -> float:
 
 
 def describe_changed_rate(step: int, before: TrainingConfig, now: TrainingConfig) -> str:
-    """Return the learning rate at which a resumed run continues, in words; empty if its config changes no rate.
+    """Describe the learning rate at which a resumed run continues; empty if the config change does not affect it.
 
     Args:
-        step: The last step that was done.
-        before: The config until then.
-        now: The config from then on.
+        step: The last completed step.
+        before: The config up to this step.
+        now: The config for the following steps.
     """
     if not 0 < step < now.steps or learning_rate_at(step + 1, before) == (rate := learning_rate_at(step + 1, now)):
         return ""
@@ -114,5 +116,5 @@ def describe_changed_rate(step: int, before: TrainingConfig, now: TrainingConfig
 
 
 def trained_parameters(module: nn.Module) -> Iterable[nn.Parameter]:
-    """Return the parameters of the optimizer."""
+    """Return the trained parameters of a module."""
     return (parameter for parameter in module.parameters() if parameter.requires_grad)

@@ -1,4 +1,4 @@
-"""The outputs of a run: its folder, metrics log, checkpoints and mirror, and the signals that stop it."""
+"""Outputs of a training run: run folder, metrics log, checkpoints and mirror. Also handles the signals that stop it."""
 
 from __future__ import annotations
 
@@ -35,18 +35,20 @@ SAVE_EVERY_S = 15 * 60.0  # in addition to checkpoint.every
 
 
 class RunOutputs:
-    """What the training loop calls after each step. Only the first process writes; all processes decide together.
+    """The outputs of a run, updated by the training loop after each step.
+
+    Only the first process writes; all processes decide together when to save and when to stop.
 
     Args:
-        config: The run.
+        config: The config of the run.
         reporter: Receives messages.
         accelerator: The processes of the run.
-        closing: Closes everything that is opened here.
-        check_only: Nothing is written.
-        allow_config_change: The run in the folder may have another config.
+        closing: An exit stack that closes everything that is opened here.
+        check_only: Write nothing.
+        allow_config_change: Accept that the run in the folder has another config.
 
     Raises:
-        InputError: As `open_run`.
+        InputError: See `open_run`.
     """
 
     def __init__(
@@ -76,7 +78,7 @@ class RunOutputs:
         self.has_ended = bool(broadcast_object(accelerator, has_ended))
 
     def _finish_ended(self) -> bool:
-        """Return whether the run ended in an earlier start; if so, write the config and finish the mirror."""
+        """Return whether the run has ended already; if so, write the config and finish the mirror."""
         newest = newest_checkpoint(Path(self.config.run_dir, CHECKPOINTS))
         if newest is None or not asks_nothing_new(self.config) or not is_done(self.config, state := read_state(newest)):
             return False
@@ -88,7 +90,7 @@ class RunOutputs:
         return True
 
     def report_changes(self, run: Run) -> None:
-        """Print the settings that differ from those of the last start, and a learning rate that follows from them."""
+        """Print the config changes since the last start, and the learning rate if they change it."""
         if self._opened is None:
             return
         changes = config_changes(run.config)
@@ -99,7 +101,7 @@ class RunOutputs:
             self._reporter.note(rate)
 
     def begin(self, run: Run) -> None:
-        """Open the metrics log, the trackers and the mirror, and handle signals."""
+        """Open the metrics log, the trackers and the mirror, and install the signal handlers."""
         self._run, self._saved_step, self._saved_s = run, run.state.step, time.monotonic()
         agreed(run.accelerator, self._begin)
         self._stop = self._closing.enter_context(stop_on_signals())
@@ -140,7 +142,7 @@ class RunOutputs:
     def save_if_due(self, *, is_best: bool) -> None:
         """Save a checkpoint if it is due or a signal was received, and start an upload if the mirror is due.
 
-        All processes agree on it. The signal is read once: a later signal takes effect at the next step.
+        All processes decide together. The signal is read once: a later signal takes effect at the next step.
         """
         run, step = self._run, self._run.state.step
         is_due = step % run.config.checkpoint.every == 0 or time.monotonic() - self._saved_s >= SAVE_EVERY_S
@@ -154,7 +156,7 @@ class RunOutputs:
             self._mirror.tick()
 
     def save(self) -> None:
-        """Save a checkpoint, after the metrics that lead to it."""
+        """Save a checkpoint, after the metrics of all steps up to it."""
 
         def write() -> None:
             with self.metrics_log.before_a_checkpoint() if self.metrics_log else contextlib.nullcontext():
@@ -164,7 +166,7 @@ class RunOutputs:
         self._saved_s, self._saved_step = time.monotonic(), self._run.state.step
 
     def stops_without_data(self) -> bool:
-        """Return whether to stop: data cannot be reached and a signal was received. Then save unsaved steps first."""
+        """Return whether to stop because a signal was received while the data cannot be reached; save unsaved steps."""
         if not self._stop.number or self._run.accelerator.num_processes > 1:
             return False
         self._stopped_by = self._stop.number
@@ -173,10 +175,10 @@ class RunOutputs:
         return True
 
     def finish(self) -> None:
-        """Wait for the mirror.
+        """Finish the uploads of the mirror.
 
         Raises:
-            StoppedError: A signal has stopped the run before its last step.
+            StoppedError: A signal stopped the run before its last step.
         """
         run = self._run
         has_ended = is_done(run.config, run.state)
@@ -187,7 +189,7 @@ class RunOutputs:
             if self._mirror is not None:
                 self._mirror.finish(lambda: not has_ended or bool(self._stop.number))
 
-        agreed(run.accelerator, finish_mirror)  # all wait: the launcher ends all processes when the first exits
+        agreed(run.accelerator, finish_mirror)  # all processes wait, because the launcher ends all when one exits
         if not has_ended:
             raise StoppedError(run.folder, run.state.step, signal.Signals(self._stopped_by).name)
 

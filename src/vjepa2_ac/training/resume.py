@@ -1,4 +1,4 @@
-"""Checkpoints of a run: written, and resumed from exactly, on any number of processes."""
+"""Save and restore checkpoints of a run. Resuming is exact, also with another number of processes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from vjepa2_ac.training.step import Run
 
 
 def save_checkpoint(run: Run, folder: Path) -> None:
-    """Write the state of the run into its folder (see `runs.checkpoint`). All processes call this; the first writes.
+    """Save a checkpoint into the run folder (see `runs.checkpoint`). All processes call this; only the first writes.
 
     Raises:
         InputError: The checkpoint cannot be written; raised in the first process only.
@@ -68,10 +68,10 @@ def save_checkpoint(run: Run, folder: Path) -> None:
 
 
 def restore(run: Run, reporter: Reporter) -> Run:
-    """Restore the newest checkpoint of a run, in every process.
+    """Restore the newest checkpoint of a run in all processes.
 
     Raises:
-        InputError: The processes have different bases, or the checkpoint is not of this run.
+        InputError: The processes have different base models, or the checkpoint does not fit this run.
     """
     state = _state_of_all(run, reporter)
     if state.loss_scale is not None and run.scaler.is_enabled():
@@ -89,12 +89,12 @@ def restore(run: Run, reporter: Reporter) -> Run:
 
 
 def _state_of_all(run: Run, reporter: Reporter) -> RunState:
-    """Restore weights and moments in every process: the first process reads them and sends them to the others."""
+    """Restore weights and moments in all processes: the first process reads them and sends them to the others."""
     accelerator, world_model = run.accelerator, run.world_model
     encoder = world_model.adaptation.encoder if world_model.adaptation else ""
     require_same(accelerator, encoder, what="model.base", fix="Give every machine the same checkpoint")
-    read = first_only(accelerator, lambda: _read_newest(run, reporter))
-    state, moments = broadcast_object(accelerator, read or (RunState(step=0), None))
+    newest = first_only(accelerator, lambda: _read_newest(run, reporter))
+    state, moments = broadcast_object(accelerator, newest or (RunState(step=0), None))
     broadcast(list(world_model.predictor.state_dict().values()))  # in place
     if moments is not None and not accelerator.is_main_process:
         load_moments(run.optimizer, moments)
@@ -118,7 +118,7 @@ def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any]
 
 
 def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
-    """Return the settings and clips that determine the metrics of a validation, by readable names."""
+    """Return the config values, and the hash of the clips, that determine the metrics of a validation."""
     settings = {key: json.dumps(value) for key, value in flat(values_that_affect(Affects.MEASURED, config)).items()}
     windows = validation_windows(dataset, "validation", clips=config.validation.clips)
     clips = [(dataset.table.identity(episode), int(start)) for episode, start in windows]
@@ -126,10 +126,10 @@ def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
 
 
 def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> RunState:
-    """Return the state to resume from; a best validation that was measured differently is dropped, with a message.
+    """Return the state to resume from, without its best validation if that was measured differently than now.
 
-    Errors are comparable only for the same clips, time span and latents. Settings that only one of the two records has
-    are ignored.
+    Errors are comparable only for the same clips, time span and latents. Settings that only one of the two records
+    contains are ignored.
     """
     before = state.measured_on or {}
     differing = sorted(key for key in before.keys() & now if before[key] != now[key])
@@ -144,28 +144,28 @@ def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> 
 
 
 def micro_batches_of(config: Config, state: RunState, processes: int, reporter: Reporter) -> int:
-    """Return the number of micro-batches of a step, of all processes.
+    """Return the number of micro-batches per step, summed over all processes.
 
-    At the first start, or if batch_size * accumulation was changed, the config determines it. Otherwise it keeps the
-    number of clips per step, for any number of processes and restarts. If it is not a multiple of the number of
-    processes, some processes have one micro-batch more than others.
+    At the first start, or after a change of batch_size * accumulation, the config determines the number. Otherwise the
+    number of clips per step stays the same, with any number of processes. If the number of micro-batches is not a
+    multiple of the number of processes, some processes have one micro-batch more than others.
 
     Raises:
         InputError: There are more processes than micro-batches.
     """
     batch_size, accumulation = config.training.batch_size, config.training.accumulation
-    asked = accumulation * processes
+    configured = accumulation * processes
     if state.clips_per_step is None or state.clips_asked != batch_size * accumulation:
-        return asked
+        return configured
     micro_batches = state.clips_per_step // batch_size
     if micro_batches < processes:
         found = f"{counted(processes, 'process')}, of which each computes {counted(batch_size, 'clip')} at once"
         needed = f"{micro_batches} at most, for the {counted(state.clips_per_step, 'clip')} of a step of this run"
         fix = "Start fewer; or set training.batch_size and training.accumulation to what each is to do, with"
         raise InputError(where="training.batch_size", found=found, needed=needed, fix=f"{fix} --allow-config-change")
-    if micro_batches != asked:
-        least, rest = divmod(micro_batches, processes)
-        each = f"{least} or {least + 1}" if rest else f"{least}"
+    if micro_batches != configured:
+        fewest, remainder = divmod(micro_batches, processes)
+        each = f"{fewest} or {fewest + 1}" if remainder else f"{fewest}"
         reporter.note(
             f"{counted(processes, 'process')}, before {state.processes}: {each} micro-batches of {batch_size} in each."
             f" A step has {counted(state.clips_per_step, 'clip')}, as before."

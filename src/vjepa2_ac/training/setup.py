@@ -38,8 +38,8 @@ from vjepa2_ac.training.cuda_graph import GraphedMicroStep
 from vjepa2_ac.training.optim import make_optimizer
 from vjepa2_ac.training.step import Objective, Run, micro_step
 
-_STEP_TOLERANCE = 0.01  # by which the time of a model step may differ
-_CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes
+_STEP_TOLERANCE = 0.01  # relative difference allowed between the model steps (in seconds) of data and replay
+_CLIPS_TRIED = 8  # more than one, because data.broken_episodes=skip may skip some of them
 
 
 def set_up(
@@ -50,27 +50,27 @@ def set_up(
     check_only: bool = False,
     allow_config_change: bool = False,
 ) -> Run:
-    """Return a run before step 1: its data, and its model with an adapter; data are encoded if `data.cache` says so.
+    """Return a run before step 1, with data and adapted model; encode the data if `data.cache` requests it.
 
-    The base chooses the stride where that is auto. A clip of each split is read before a model is loaded.
+    With `data.stride=auto` the base model chooses the stride. A clip of each split is read before a model is loaded.
 
     Args:
-        config: The run.
+        config: The config of the run.
         reporter: Receives messages, and the progress of indexing and encoding.
-        accelerator: The result of `make_accelerator` for this config; None: it is created here.
+        accelerator: The result of `make_accelerator` for this config; created here if None.
         check_only: Encode nothing, and report the amount of data to encode.
-        allow_config_change: The run in the folder may have begun with other data sets.
+        allow_config_change: Accept other data sets than those with which the run in the folder was started.
 
     Raises:
-        InputError: A part of the run cannot be used; says which.
+        InputError: A part of the run cannot be used; names that part.
     """
     accelerator = accelerator or make_accelerator(config)
     if config.training.compile == "blocks":
         require_compiler(accelerator.device.type, where="training.compile")
     strip = TRAINING_HOOKS.find("validation.decoder")(config) if config.validation.decoder is not None else None
 
-    # The other processes of a machine wait for the first process, and then read the index that it has written.
-    dataset, *others = first_of_machine(accelerator, lambda: open_data_sets(config, reporter))
+    # The other processes of a machine wait for the first process, and then read the index that the first one wrote.
+    dataset, *replay_datasets = first_of_machine(accelerator, lambda: open_data_sets(config, reporter))
     for warning in TRAINING_HOOKS.find("motion")(dataset):
         reporter.note(f"Warning: {warning.text}.")
     _check_heads(config, dataset)
@@ -80,9 +80,9 @@ def set_up(
         config, dataset = config.with_stride(calibration.stride), dataset.with_stride(calibration.stride)
     splits: tuple[Split, ...] = ("train", "validation", "test") if config.data.test_share else ("train", "validation")
     clip, *_ = [first_clip(dataset, split) for split in splits]  # fails early: an empty split, a broken clip
-    require_fitting_clips(dataset, others)
+    require_fitting_clips(dataset, replay_datasets)
     if not allow_config_change:
-        first_only(accelerator, lambda: require_same_data(config, (dataset, *others)))
+        first_only(accelerator, lambda: require_same_data(config, (dataset, *replay_datasets)))
 
     reporter.task(LOADING)
     base = world_model or load_base(config.model, seed=config.seed)
@@ -91,12 +91,12 @@ def set_up(
     if strip is not None:
         strip.require_fit(base, config)
     _require_shared_memory(config, clip, base.sizes, accelerator)
-    for replayed in others:
+    for replayed in replay_datasets:
         extrinsics_for(base, first_clip(replayed))
-    use = partial(with_latents, model=base, accelerator=accelerator, reporter=reporter, check_only=check_only)
-    dataset = use(config, dataset)
-    others = [use(config.for_replay(), replayed) for replayed in others]
-    require_fitting_clips(dataset, others)
+    cache_latents = partial(with_latents, model=base, accelerator=accelerator, reporter=reporter, check_only=check_only)
+    dataset = cache_latents(config, dataset)
+    replay_datasets = [cache_latents(config.for_replay(), replayed) for replayed in replay_datasets]
+    require_fitting_clips(dataset, replay_datasets)
     _make_trainable(base, config, dataset, reporter)
     base.to(accelerator.device)
     return Run(
@@ -111,7 +111,7 @@ def set_up(
         state=RunState(step=0),
         micro_batches=config.training.accumulation * accelerator.num_processes,
         calibration=None if calibration is None else calibration.as_dict(),
-        replayed=others[0] if others else None,
+        replayed=replay_datasets[0] if replay_datasets else None,
         strip=strip,
     )
 
@@ -124,15 +124,15 @@ def _require_shared_memory(config: Config, clip: Batch, sizes: ModelSizes, accel
 
 
 def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
-    """Fit the heads to the data, add an adapter, and apply the options of `training` for the computation."""
+    """Fit the input layers to the data, add an adapter, and apply the `training` options that concern computation."""
     _fit_heads(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed)
     reporter.note(str(trainable_report(world_model)))
-    if unusual := config.adapter.out_of_line:
-        reporter.note(f"Warning: {unusual}.")
+    if problem := config.adapter.out_of_line:
+        reporter.note(f"Warning: {problem}.")
     copies = config.model.is_random
-    if copies and (narrow := world_model.sizes.too_narrow_to_copy):
-        reporter.note(f"Warning: {narrow}.")
+    if copies and (reason := world_model.sizes.too_narrow_to_copy):
+        reporter.note(f"Warning: {reason}.")
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
     world_model.set_attention(config.training.attention)
     world_model.set_compiled("with gradients" if config.training.compile == "blocks" else "never")
@@ -141,11 +141,11 @@ def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, r
 
 
 def _check_heads(config: Config, dataset: Dataset) -> None:
-    """Refuse, before the model is loaded, data whose widths differ from the base's if no layer is trained on them.
+    """Refuse, before loading the model, data of other widths than the base model's if the new layers are not trained.
 
     Raises:
-        InputError: A new head would not be trained; or the stride is to be chosen by the base, which cannot predict
-            from this data.
+        InputError: A new input layer would not be trained; or `data.stride` is auto, although the base model cannot
+            predict from this data.
     """
     heads, widths = heads_to_replace(base_sizes(config.model), dataset.widths), dataset.widths
     if heads and config.data.stride == "auto":
@@ -156,7 +156,7 @@ def _check_heads(config: Config, dataset: Dataset) -> None:
 
 
 def _fit_heads(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
-    """Replace the input heads of a base that do not fit the widths of the data, and report the new heads."""
+    """Replace the input layers of a base model that do not fit the widths of the data, and report the new layers."""
     heads = heads_to_replace(world_model.sizes, dataset.widths)
     for line in fit_heads(world_model, dataset.widths, config.seed):
         reporter.note(line)
@@ -170,14 +170,14 @@ def _fit_heads(world_model: WorldModel, config: Config, dataset: Dataset, report
             )
 
 
-# ---- data sets: whether their clips can be in one batch, and whether they are those of earlier starts ----
+# ---- data sets: check that their clips fit into one batch, and that a resumed run uses the same data ----
 
 
 def open_data_sets(config: Config, reporter: Reporter) -> list[Dataset]:
-    """Open the data set of a run, and that of `replay` where there is one.
+    """Open the data set of a run and, if `replay` is configured, the replay data set.
 
     Raises:
-        InputError: A data set cannot be opened; or both differ in their spaces, or in the duration of a model step.
+        InputError: A data set cannot be opened; or the two differ in action space, or in the duration of a model step.
     """
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     if splits := describe_splits(dataset.table, config.data):
@@ -189,12 +189,12 @@ def _open_replay(replay: ReplayConfig, dataset: Dataset, reporter: Reporter) -> 
     replayed = open_dataset(replay.data, progress=reporter.task(INDEXING))
     if replayed.widths != dataset.widths or replayed.spaces != dataset.spaces:
         found, needed = (
-            f"states of {one.widths.state} and actions of {one.widths.action} numbers ({one.config.states})"
-            for one in (replayed, dataset)
+            f"states of {opened.widths.state} and actions of {opened.widths.action} numbers ({opened.config.states})"
+            for opened in (replayed, dataset)
         )
         where, fix = f"replay.data.path: {replayed.config.path}", "Replay a data set of the same kind of robot"
         raise InputError(where=where, found=found, needed=f"{needed}, as data have them", fix=fix)
-    found_s, needed_s = (one.config.model_stride / one.control_rate_hz for one in (replayed, dataset))
+    found_s, needed_s = (opened.config.model_stride / opened.control_rate_hz for opened in (replayed, dataset))
     if not math.isclose(found_s, needed_s, rel_tol=_STEP_TOLERANCE):  # data sets have different control rates
         found = f"{replayed.config.stride}: model steps of {found_s:.3g} s"
         needed = f"{needed_s:.3g} s, as those of data (stride {dataset.config.stride})"
@@ -203,8 +203,8 @@ def _open_replay(replay: ReplayConfig, dataset: Dataset, reporter: Reporter) -> 
     windows = replayed.windows("train")
     reporter.note(f"Replay: {replay.share:.0%} of the clips are from {replay.data.path}, which has {len(windows):,}.")
     hashes = dataset.table.id_hash[dataset.taking_part & ~dataset.members("train")]
-    places = np.flatnonzero(replayed.members("train") & np.isin(replayed.table.id_hash, hashes))
-    if held_out := sorted(replayed.table.identity(int(place)) for place in places):
+    indices = np.flatnonzero(replayed.members("train") & np.isin(replayed.table.id_hash, hashes))
+    if held_out := sorted(replayed.table.identity(int(index)) for index in indices):
         reporter.note(
             f"Warning: {counted(len(held_out), 'episode')} that the first data set holds out are replayed in training:"
             f" {named(held_out)}. Add them to replay.data.exclude."
@@ -218,12 +218,12 @@ def first_clip(dataset: Dataset, split: Split = "train") -> Batch:
 
 
 def require_fitting_clips(first: Dataset, others: Sequence[Dataset]) -> None:
-    """Refuse a second data set whose clips cannot be in one batch with those of the first.
+    """Refuse a replay data set whose clips cannot be in one batch with those of the first data set.
 
-    Data sets that are still to be encoded are accepted.
+    Data sets that are not encoded yet are accepted.
 
     Raises:
-        InputError: Frames differ in size, or latents in type; says how they differ.
+        InputError: Frames differ in size, or latents in type; the message describes both.
     """
     for replayed in others:
         if any(one.config.takes_latents and not one.config.is_cache for one in (first, replayed)):
@@ -236,30 +236,36 @@ def require_fitting_clips(first: Dataset, others: Sequence[Dataset]) -> None:
 
 
 def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
-    """Refuse to resume a run with other data sets than it was started with.
+    """Refuse to resume a run with other data sets than those it was started with.
 
-    A data set at the same path may have changed, which is reported. A data set at another path must be the same.
+    A data set that changed at the same path is accepted; `resume.restore` reports a changed number of clips. A data set
+    at another path must have the same content.
 
     Raises:
-        InputError: A data set at another path differs.
+        InputError: A data set at another path has other content.
     """
     folder = Path(config.run_dir)
     if not (folder / CONFIG).is_file() or (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is None:
         return
-    keys, seen = ("data.path", "replay.data.path"), written_state(checkpoint).data
-    began = read_run_config(folder).data_sets
-    for key, dataset, old, now, before in zip(keys, datasets, began, config.data_sets, seen, strict=False):
-        if old.path != now.path and before.fingerprint != fingerprint_of(dataset.table):
-            found, needed = "other episodes or files than the run has seen", f"the data set that was at {old.path}"
+    keys, states = ("data.path", "replay.data.path"), written_state(checkpoint).data
+    earlier_configs = read_run_config(folder).data_sets
+    for key, dataset, old_config, new_config, state in zip(
+        keys, datasets, earlier_configs, config.data_sets, states, strict=False
+    ):
+        if old_config.path != new_config.path and state.fingerprint != fingerprint_of(dataset.table):
+            found, needed = (
+                "other episodes or files than the run has seen",
+                f"the data set that was at {old_config.path}",
+            )
             fix = f"Set {key} to where that is now; where the change is meant, add --allow-config-change"
-            raise InputError(where=f"{key}: {now.path}", found=found, needed=needed, fix=fix)
+            raise InputError(where=f"{key}: {new_config.path}", found=found, needed=needed, fix=fix)
 
 
 def require_same_base(config: Config, model: WorldModel) -> None:
-    """Refuse a base at another path than before if it is not the base that the run was trained on.
+    """Refuse to resume with another base model than the one that the run was started with; its path may change.
 
     Raises:
-        InputError: The base is another one.
+        InputError: The base model differs.
     """
     folder = Path(config.run_dir)
     is_moved = (folder / CONFIG).is_file() and read_run_config(folder).model != config.model

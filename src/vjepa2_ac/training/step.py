@@ -40,53 +40,53 @@ SMALLEST_LOSS_SCALE = 1.0  # fp16: if gradients still overflow, they are not fin
 class Run:
     """All parts of a run, assembled and checked by `setup.set_up`."""
 
-    config: Config  # its stride is a number
+    config: Config  # `data.stride` is a number here, never auto
     accelerator: Accelerator  # device, precision, and the rank of this process
     world_model: WorldModel
     objective: Callable[[LatentBatch], tuple[Tensor, Tensor]]  # (teacher forcing, rollout)
-    micro_step: Callable[[Run, LatentBatch, float], Tensor]  # `micro_step`, or a graph of it
+    micro_step: Callable[[Run, LatentBatch, float], Tensor]  # the function `micro_step`, or its CUDA graph
     optimizer: torch.optim.Optimizer
-    scaler: torch.amp.GradScaler  # has no effect except with fp16
+    scaler: torch.amp.GradScaler  # only active with fp16
     dataset: Dataset
     state: RunState
-    micro_batches: int  # of an optimizer step, of all processes together
-    calibration: Mapping[str, Any] | None = None  # if data.stride was auto and was chosen in this start
-    replayed: Dataset | None = None  # the second data set, if there is one
+    micro_batches: int  # number per optimizer step, summed over all processes
+    calibration: Mapping[str, Any] | None = None  # how the stride was chosen; None unless data.stride was auto
+    replayed: Dataset | None = None  # the replay data set
     strip: Any = None  # the hook `validation.decoder`: decoding.imagine.ImaginedStrip
 
     @property
     def folder(self) -> Path:
-        """The run's folder."""
+        """The path of the run folder."""
         return Path(self.config.run_dir)
 
     @property
     def datasets(self) -> list[Dataset]:
-        """The data set, and the replayed one."""
-        return [one for one in (self.dataset, self.replayed) if one is not None]
+        """The data set and, if configured, the replay data set."""
+        return [self.dataset] if self.replayed is None else [self.dataset, self.replayed]
 
     @cached_property
     def trained(self) -> list[nn.Parameter]:
-        """The parameters of the optimizer."""
+        """The trained parameters."""
         return list(trained_parameters(self.world_model))
 
     @cached_property
     def cast_matrices(self) -> CastMatrices:
-        """The adapter in the type of the computation."""
+        """Copies of the adapter's matrices in the data type of the computation."""
         return CastMatrices(self.world_model.predictor, PRECISIONS[self.config.training.precision])
 
     @property
     def clips_per_step(self) -> int:
-        """Clips of an optimizer step, of all processes together."""
+        """The number of clips per optimizer step, summed over all processes."""
         return self.micro_batches * self.config.training.batch_size
 
     @property
     def share(self) -> ProcessShare:
-        """The rank of this process among those that share the clips."""
+        """The micro-batches of a step that this process computes."""
         return ProcessShare(self.accelerator.process_index, self.accelerator.num_processes, self.micro_batches)
 
 
 def batches_from(run: Run) -> Batches:
-    """Yield the micro-batches of this process from the current step on."""
+    """Return an iterator over the micro-batches of this process, starting at the current step."""
     replay = run.config.replay
     return training_loader(
         Mixed(run.dataset, run.replayed, replay.share if replay else 0.0),
@@ -102,7 +102,7 @@ def batches_from(run: Run) -> Batches:
 class Gradients:
     """The gradients of one optimizer step, over all processes."""
 
-    forced_loss: float  # mean over the clips; NaN where there is none
+    forced_loss: float  # mean over the clips; NaN without clips
     rollout_loss: float
     norm: float  # before clipping; not finite after an overflow in fp16, which the loss scale handles
     clips: int  # number of clips that could be read
@@ -150,8 +150,8 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
 def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
     """Accumulate and clip the gradients of the next micro-batches of all processes; the weights are unchanged.
 
-    Loss and gradient are means over the clips of the step. If clips are skipped (`data.broken_episodes`: skip),
-    they are means over the remaining clips, which all have the same weight, whatever micro-batch a clip is in.
+    Loss and gradient are means over the clips of the step. If clips are skipped (`data.broken_episodes=skip`), they
+    are means over the remaining clips. All clips have the same weight, also if micro-batches differ in size.
 
     Args:
         run: The run.
@@ -169,7 +169,7 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
             totals, names = _accumulate(run, batches)
     except UserError as raised:
         error = raised
-    sums = [*totals.tolist(), len(names), error is not None]  # waits for the device
+    sums = [*totals.tolist(), len(names), error is not None]  # `tolist` synchronizes with the device
     *losses, clips, failed = all_reduce(run.accelerator, sums, "sum")
     if failed:
         raise_first(run.accelerator, error)
@@ -185,7 +185,7 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
 
 
 def _accumulate(run: Run, batches: Iterator[Batch]) -> tuple[Float[Tensor, 2], list[str]]:
-    """Return this process's part of both losses, and the names of its clips."""
+    """Return this process's share of both losses, and the names of its clips."""
     totals, names = torch.zeros(2, device=run.accelerator.device), list[str]()
     for _ in run.share.own:
         batch = next(batches)
@@ -205,7 +205,7 @@ def encode(run: Run, batch: Batch) -> LatentBatch:
 
 
 def micro_step(run: Run, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:
-    """Return (teacher forcing, rollout), each a mean over these clips; add the gradient of their sum / `parts`."""
+    """Add the gradient of (both losses / `parts`); return (teacher forcing, rollout), each a mean over these clips."""
     with run.accelerator.autocast():
         forced, rollout = run.objective(latents)
     run.scaler.scale((forced + rollout) / parts).backward()  # type: ignore[no-untyped-call]  # torch
@@ -213,7 +213,7 @@ def micro_step(run: Run, latents: LatentBatch, parts: float) -> Float[Tensor, 2]
 
 
 class Objective:
-    """The loss of a world model on latents: `prediction_losses` with the settings of `training`."""
+    """The loss of a world model on latents: `prediction_losses` with the `training` options of the config."""
 
     def __init__(self, world_model: LatentDynamics, training: TrainingConfig) -> None:
         self.world_model, self.rollout_steps = world_model, training.rollout_steps
@@ -227,16 +227,16 @@ class Objective:
 def prediction_losses(
     world_model: LatentDynamics, batch: LatentBatch, rollout_steps: int, distance: Distance = absolute_difference
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Return (teacher forcing, rollout) of one batch, each a mean over all elements.
+    """Return the losses (teacher forcing, rollout) for one batch, each a mean over all elements.
 
-    Teacher forcing predicts frames 2..T from the true frames 1..T-1. The rollout starts at frame 1: the first
+    Teacher forcing predicts frames 2..T from the true frames 1..T-1. The rollout starts at frame 1: its first
     prediction is that of teacher forcing, and each further prediction is made from the predictions before it. States
     and actions are always the true ones. The rollout reuses the keys and values that teacher forcing computed for the
-    first step. Loss and gradient equal those of recomputing everything. With dropout both parts share the masks of the
-    first step, which changes the expectation of neither.
+    first step; losses and gradients are the same as without reuse. With dropout both losses share the masks of the
+    first step, which leaves their expectations unchanged.
 
     Raises:
-        ValueError: A rollout longer than the clip.
+        ValueError: The rollout is longer than the clip.
 
     Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/train.py, forward_predictions and loss_fn.
     """
@@ -276,7 +276,7 @@ class SmoothL1:
 
 
 def _finish_gradients(run: Run, factor: float) -> float:
-    """Turn the scaled sums of all processes into the gradient of the mean, clip it; return the norm before clipping."""
+    """Sum the gradients of all processes, unscale, multiply by `factor` and clip; return the norm before clipping."""
     all_reduce_gradients(run.accelerator, run.trained)
     run.scaler.unscale_(run.optimizer)
     if factor != 1:
@@ -288,7 +288,7 @@ def _finish_gradients(run: Run, factor: float) -> float:
 
 
 def _share_broken_episodes(run: Run) -> None:
-    """Share the broken episodes among all processes: the allowed share is that of the whole run.
+    """Exchange the lists of broken episodes between all processes, because their limit applies to the whole run.
 
     Raises:
         InputError: There are too many broken episodes; raised in all processes.
@@ -310,7 +310,7 @@ def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> 
 
 
 class Update:
-    """The size of an optimizer step's update. Holds a copy of the weights until the size is read.
+    """The size of an optimizer step's update, computed from a copy of the weights before the step.
 
     Args:
         parameters: The parameters of the optimizer, before the step.
@@ -321,8 +321,8 @@ class Update:
         self._before = [parameter.detach().clone() for parameter in self._parameters]
 
     def to_weight(self) -> float:
-        """Return the norm of the update / the norm of the weights before, over all tensors together; call it once."""
+        """Return norm(update) / norm(weights before), over all tensors together. May be called only once."""
         weight = float(torch.nn.utils.get_total_norm(self._before))
         for before, parameter in zip(self._before, self._parameters, strict=True):
-            before -= parameter.detach()  # in the copy's own memory
+            before -= parameter.detach()  # in place, to need no further memory
         return float(torch.nn.utils.get_total_norm(self._before)) / weight if weight else math.nan

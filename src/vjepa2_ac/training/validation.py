@@ -1,4 +1,4 @@
-"""Validation of a run on held-out clips, and the check that its base is worth adapting."""
+"""Validation of a run on held-out clips, and the check that the base model is better than persistence."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from vjepa2_ac.training.step import Run, encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
 RANK = "action_ranking_error"  # checkpoint.keep_best ranking
-USED = 0.02  # a model that uses its actions has an error at least this share higher with shuffled actions
-RANKING_REACH_CM = 7.5  # half the width of the box of other actions: as far as plans should move in a model step
-_AT_ONCE = 64  # samples per batch: as many tokens as the clips of a small micro-batch
+USED = 0.02  # relative increase of the one-step error with shuffled actions, below which a model ignores its actions
+RANKING_REACH_CM = 7.5  # half the width of the box of alternative actions: the motion of a plan in one model step
+_AT_ONCE = 64  # alternative actions per batch, about as many tokens as in a small micro-batch
 _BASE_NOT_CHECKED = (
     "Base compared with persistence: skipped; needs trained input layers, found new ones (the data have other widths"
     " than the base)."
@@ -34,20 +34,20 @@ _BASE_NOT_CHECKED = (
 
 
 def validate_if_due(run: Run, metrics_log: MetricsLog | None, reporter: Reporter) -> bool:
-    """Measure and log the validation, if it is due; return whether it is the best so far."""
+    """Run and log the validation if it is due; return whether its result is the best so far."""
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
         return False
-    found = validate(run, reporter)
+    result = validate(run, reporter)
     is_first = step - config.validation.every < max(1, config.training.warmup_steps) <= step
-    if (is_first or step == config.training.steps) and (said := unused_actions(found)):
-        reporter.note(said)
-    return record(run, found, metrics_log)
+    if (is_first or step == config.training.steps) and (warning := unused_actions(result)):
+        reporter.note(warning)
+    return record(run, result, metrics_log)
 
 
-def unused_actions(found: Validation) -> str:
-    """Return a warning if the model hardly uses the actions; an empty string if it does use them."""
-    cost = cost_of_actions(found.errors, "shuffled").value
+def unused_actions(validation: Validation) -> str:
+    """Return a warning if the predictions hardly depend on the actions, otherwise an empty string."""
+    cost = cost_of_actions(validation.errors, "shuffled").value
     if cost >= USED:
         return ""
     return (
@@ -57,9 +57,9 @@ def unused_actions(found: Validation) -> str:
     )
 
 
-def record(run: Run, found: Validation, metrics_log: MetricsLog | None) -> bool:
-    """Log a validation; return whether it is the best so far, by `checkpoint.keep_best`."""
-    metrics = validation_metrics(found)
+def record(run: Run, validation: Validation, metrics_log: MetricsLog | None) -> bool:
+    """Log a validation; return whether its result is the best so far, as `checkpoint.keep_best` defines it."""
+    metrics = validation_metrics(validation)
     if metrics_log is not None:
         metrics_log.write("validation", run.state.step, metrics)
         if run.strip is not None:
@@ -74,7 +74,7 @@ def record(run: Run, found: Validation, metrics_log: MetricsLog | None) -> bool:
 
 
 def is_done(config: Config, state: RunState) -> bool:
-    """Return whether training ends: all steps are done, or `training.patience` validations brought no better one."""
+    """Return whether training ends: all steps are done, or the last `training.patience` validations were not better."""
     training = config.training
     if state.step >= training.steps:
         return True
@@ -83,9 +83,9 @@ def is_done(config: Config, state: RunState) -> bool:
     return state.step - state.best_step >= training.patience * config.validation.every
 
 
-def validation_metrics(found: Validation) -> dict[str, Any]:
+def validation_metrics(validation: Validation) -> dict[str, Any]:
     """Return the metrics of a validation for the metrics log."""
-    errors, by_horizon = found.errors, over_persistence(found.errors, "rollout")
+    errors, by_horizon = validation.errors, over_persistence(validation.errors, "rollout")
     metrics: dict[str, Any] = {
         "error_over_persistence": one_step_over_persistence(errors).value,
         "error_over_persistence_zero_actions": one_step_over_persistence(errors, "zero").value,
@@ -93,44 +93,46 @@ def validation_metrics(found: Validation) -> dict[str, Any]:
         "rollout_over_persistence": [r.value for r in by_horizon],
         "rollout_over_persistence_last": by_horizon[-1].value,
     }
-    if (ranking := found.ranking) is not None:
-        of = {RANK: ranking.rank, f"{RANK}_box": ranking.box, f"{RANK}_shell": ranking.shell}
-        for name, one in {**of, "energy_spread": ranking.spread}.items():
-            metrics |= {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
+    if (ranking := validation.ranking) is not None:
+        ranking_errors = {RANK: ranking.rank, f"{RANK}_box": ranking.box, f"{RANK}_shell": ranking.shell}
+        for name, estimate in {**ranking_errors, "energy_spread": ranking.spread}.items():
+            metrics |= {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
     return metrics
 
 
 def validate(run: Run, reporter: Reporter) -> Validation:
-    """Measure the held-out clips, and rank the true actions of moves in some of them.
+    """Measure the prediction errors on held-out clips, and the action-ranking error on some of them.
 
-    For the ranking, clips that cannot be read are replaced by other clips, in a fixed order. The processes share the
-    clips. The first process computes the result, and all others receive it: results that differ in the last digits
-    could otherwise let processes stop at different steps.
+    In the ranking, clips that cannot be read are replaced by other clips, in a fixed order. The clips are divided
+    among the processes. All processes receive the result of the first one: results that differ in the last digits
+    could otherwise make processes stop at different steps.
     """
     run.world_model.eval()
     with run.accelerator.autocast(), sharing(run.accelerator):
-        found = _measured(run)
-    found = broadcast_object(run.accelerator, found)
-    reporter.validated(run.state.step, found)
-    return found
+        validation = _measure(run)
+    validation = broadcast_object(run.accelerator, validation)
+    reporter.validated(run.state.step, validation)
+    return validation
 
 
-def _measured(run: Run) -> Validation:
+def _measure(run: Run) -> Validation:
     windows = validation_windows(run.dataset, "validation", clips=run.config.validation.clips)
-    own = own_part(len(windows), run.config.validation.batch_size)
+    windows_range = own_part(len(windows), run.config.validation.batch_size)
     read = partial(batches_of, run.dataset, batch_size=run.config.validation.batch_size, may_be_none=True)
-    batches, moves = read(windows[own.start : own.stop]), list[RolloutStart]()
+    batches, moves = read(windows[windows_range.start : windows_range.stop]), list[RolloutStart]()
     names = [(run.dataset.table.identity(episode), start) for episode, start in windows]
-    chosen = {names[place] for place in spread(len(names), run.config.validation.ranking_clips or 0)}
+    chosen = {names[index] for index in spread(len(names), run.config.validation.ranking_clips or 0)}
     encoded = _encoded(run, batches, chosen, moves)
-    errors = prediction_errors(run.world_model, encoded, before=actions_before(own, windows, read))
+    errors = prediction_errors(run.world_model, encoded, before=actions_before(windows_range, windows, read))
     for name, reason in gathered(list(run.dataset.broken.reasons.items())):
         run.dataset.broken.met(name, reason)
     config, space = run.config.validation, run.dataset.spaces.action
     moves = gathered_starts(moves, run.accelerator.device)
     missing = len(chosen) - len({(move.episode_id, move.first_step) for move in moves})
-    others = [window for window, name in zip(windows, names, strict=True) if name not in chosen] if missing else []
-    for batch in islice(batches_of(run.dataset, others, batch_size=1, may_be_none=True), missing):
+    replacements = (
+        [window for window, name in zip(windows, names, strict=True) if name not in chosen] if missing else []
+    )
+    for batch in islice(batches_of(run.dataset, replacements, batch_size=1, may_be_none=True), missing):
         moves += moves_of(encode(run, batch), 0, space, RANKING_REACH_CM / 100)
     if not moves:
         return Validation(errors, None)
@@ -141,7 +143,7 @@ def _measured(run: Run) -> Validation:
 def _encoded(
     run: Run, batches: Iterable[Batch], chosen: Container[tuple[str, int]], moves: list[RolloutStart]
 ) -> Iterator[LatentBatch]:
-    """Yield the latents of batches, and append the moves of the clips that are chosen for the ranking."""
+    """Yield the latents of batches, and append the moving steps of the clips in `chosen` to `moves`."""
     for batch in batches:
         latents = encode(run, batch)
         if run.strip is not None:
@@ -153,25 +155,25 @@ def _encoded(
 
 
 def validate_base(run: Run, reporter: Reporter) -> Validation | None:
-    """Measure a run before its first step, and refuse a base that is no better than copying the last frame.
+    """Validate before the first step, and refuse a base model that is not better than copying the last frame.
 
     Returns None for a run that resumes.
 
     Raises:
-        InputError: The base is not better, and `training.allow_weak_base` is off.
+        InputError: The base model is not better, and `training.allow_weak_base` is off.
     """
     if run.state.step:
         return None
     reporter.task("measuring the model before the first step")
-    found = validate(run, reporter)
-    config, error = run.config, one_step_over_persistence(found.errors).value
+    validation = validate(run, reporter)
+    config, error = run.config, one_step_over_persistence(validation.errors).value
     if error < 1.0 or config.training.allow_weak_base or config.model.is_random:
-        return found
+        return validation
     if run.world_model.fresh_heads is not None:
         reporter.note(_BASE_NOT_CHECKED)
-        return found
-    said = f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame"
+        return validation
+    description = f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame"
     needed = "a base model that is better than persistence (below 1)"
     fix = "Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction;"
     fix += " to adapt it anyway, set training.allow_weak_base=true"
-    raise InputError(where="model.base", found=said, needed=needed, fix=fix)
+    raise InputError(where="model.base", found=description, needed=needed, fix=fix)
