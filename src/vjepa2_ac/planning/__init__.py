@@ -1,1 +1,1 @@
-"""Planning: solvers that know no model, and the energy of actions in a world model."""
+"""Planning: model-independent solvers, and the energy of action sequences in a world model."""

@@ -1,4 +1,4 @@
-"""Cameras: the part of an image that the model receives, its latents, and images by which nothing can be planned."""
+"""Cameras: the part of an image that the model receives, patch weights of a mask, and detection of faulty frames."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class Cameras:
     newest: tuple[CameraFrame, ...] = field(default=(), init=False)  # of each camera; empty after a reset
 
     def require_contrast(self, image: Image, *, where: str) -> None:
-        """Refuse an image in which one of the cameras has no contrast; see `images.is_uniform`.
+        """Refuse an image in which the view of a camera has no contrast; see `images.is_uniform`.
 
         Raises:
-            InputError: One is uniform.
+            InputError: The view of a camera is uniform.
         """
         require_contrast(self._received(image), where=where)
 
@@ -56,14 +56,14 @@ class Cameras:
         space: StateSpace,
         largest: Float[np.ndarray, " numbers"],
     ) -> tuple[tuple[CameraFrame, ...], Fault | None]:
-        """Return the newest frame of each camera, and why the frame must not move the robot; None: it may.
+        """Return the newest frame of each camera, and the fault for which the robot must not move; None: no fault.
 
-        One faulty camera of several is enough. Nothing changes: `newest` is set once the decision is made.
+        A fault of one camera is enough. This method does not set `newest`; the controller sets it after the decision.
 
         Args:
-            frame: The frame.
+            frame: The current frame, with the views of all cameras side by side.
             state: The measured state.
-            space: The meaning of its numbers.
+            space: The meaning of the state's numbers.
             largest: The largest change of each number in a model step.
         """
         newest = newest_frames(split_views(frame[None], self.views), state, self.newest)
@@ -73,10 +73,10 @@ class Cameras:
         return newest, "frozen frame" if is_frozen else None
 
     def weights(self, mask: np.ndarray | None, like: Image) -> Float[Tensor, " tokens"] | None:
-        """Return the weight of each patch by a mask over an image; None: no mask.
+        """Return the weight of each patch for a mask over an image; None: no mask.
 
         Raises:
-            InputError: The mask is invalid, or leaves nothing of what the model receives.
+            InputError: The mask is invalid, or is empty in the part of the image that the model receives.
         """
         if mask is None:
             return None
@@ -96,10 +96,10 @@ class Cameras:
 
 
 def require_views(config: DataConfig, views: int, *, to: str = "make goals of") -> None:
-    """Refuse data without frames, or of fewer cameras than are seen side by side.
+    """Refuse data without frames, or with fewer cameras than the model receives side by side.
 
     Raises:
-        InputError: They are.
+        InputError: The data have no frames or too few cameras.
     """
     require_frames(config, to=to)
     if len(config.cameras) < views:
@@ -110,7 +110,7 @@ def require_views(config: DataConfig, views: int, *, to: str = "make goals of") 
 def read_views(
     dataset: Dataset, index: int, views: int, frames: Sequence[int]
 ) -> UInt8[np.ndarray, "frames height width 3"]:
-    """Return frames of an episode, with so many of its cameras side by side, from the first on.
+    """Return frames of an episode, with the images of its first `views` cameras side by side.
 
     Raises:
         InputError: The episode cannot be read.

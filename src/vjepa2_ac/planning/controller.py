@@ -32,7 +32,7 @@ from vjepa2_ac.registry import PLANNING_FILES
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces, states_along
 
-_PRIOR_STEPS = 3  # model steps in which the prior is to reach a goal that has no bound: fewer are bolder
+_PRIOR_STEPS = 3  # model steps left for the prior's input if a goal has no `at_most`; fewer give larger motions
 State = Float[np.ndarray, " numbers"]
 Latents = Float[Tensor, "tokens dim"]
 Why = Literal["planned", "out of time", "at the goal", "no finite energy", "outside the workspace", Fault]
@@ -55,21 +55,21 @@ Compare = Callable[[Latents, Latents], Surprise]
 
 @dataclass(frozen=True)
 class Decision:
-    """The decision, and its reason."""
+    """An action for the next model step, and the reason for it."""
 
     action: Float[np.ndarray, " dim"]  # for the next model step; zero for some values of `why`
-    # out of time: the best plan so far. With all others but `planned` the action is zero. uniform frame: an image of a
-    # camera has no contrast. frozen frame: an image equals the last one, although the robot has moved
+    # "out of time": the best plan so far. The action is zero for all other values except "planned". "uniform frame":
+    # the image of a camera has no contrast. "frozen frame": an image equals the previous one, although the robot moved.
     why: Why
-    energy_now: float  # of the current image, if nothing changed: to compare with the plan's; NaN for a faulty frame
-    goals: tuple[int, ...]  # index of the goal that applies now, and after each model step of a plan
-    progress: GoalProgress  # which goal that is, since when, and why it changed
+    energy_now: float  # energy if the image stayed as it is, to compare with the plan's; NaN for a faulty frame
+    goals: tuple[int, ...]  # index of the goal that applies in each model step of a plan
+    progress: GoalProgress  # the goal that applies, since when, and why it changed
     plan: Plan | None = None  # None if the goal is reached, or the robot is outside the workspace
     states: Float[np.ndarray, "time dim"] | None = None  # states predicted along the plan, the current state first
-    cost: WorldModelCost | None = None  # to evaluate other actions
+    cost: WorldModelCost | None = None  # evaluates other actions
     done: bool = False  # the last goal is reached: no motion
-    from_samples: bool = False  # the search started from what a policy would do
-    surprise: Surprise | None = None  # None: no monitor, or nothing was predicted
+    from_samples: bool = False  # the search started from actions that a policy proposed
+    surprise: Surprise | None = None  # None: no monitor, or no prediction for this frame
 
 
 class Controller:
@@ -97,19 +97,19 @@ class Controller:
         """Create a controller.
 
         Args:
-            world_model: A base or merged model, which is put into eval mode; or a trained one, of which a merged copy
-                plans (see `planning.model_setup`).
+            world_model: A base or merged model, which is put into eval mode; or a model with an adapter, of which a
+                merged copy is used (see `planning.model_setup`).
             config: Planning settings; None: the defaults.
             seed: Seed of all decisions.
             crop: As in training (`data.crop`).
             extrinsics: Pose of the camera, if the model uses it.
-            spaces: What its states and actions are.
+            spaces: Meaning of the model's states and actions.
 
         Raises:
-            InputError: The widths of the model's states and actions do not fit `spaces`; or it is not known which state
-                follows from an action; or a camera pose is missing or not used; or the blocks cannot be compiled; or
-                limits for vectors are missing; or a workspace is set for vectors; or `planning.axes` belong to another
-                model.
+            InputError: The widths of the model's states and actions do not fit `spaces`; or the effect of an action on
+                the state is unknown; or a camera pose is missing or not used; or the blocks cannot be compiled; or
+                limits for vectors are missing; or a workspace is set for vectors; or `planning.axes` were fitted for
+                another model.
         """
         self.config = config or PlanningConfig()
         self.seed, self.crop, self.spaces = seed, crop, spaces
@@ -127,10 +127,10 @@ class Controller:
         self._goals: tuple[SubGoal, ...] = ()
         self._progress: GoalProgress | None = None  # at the last usable frame
         self._done = 0
-        self.decision: Decision | None = None  # the last one
+        self.decision: Decision | None = None  # the latest decision
 
     def _load_files(self, world_model: WorldModel) -> None:
-        """Read axes, monitor and prior, which belong to one model: its weights are hashed once for all of them."""
+        """Read axes, monitor and prior, and check that they were made for this model: its weights are hashed once."""
         config, self._axes = self.config, None
         self._compare: Compare | None = None
         self._prior_start: PriorStart | None = None
@@ -154,7 +154,7 @@ class Controller:
         seed: int | None = None,
         extrinsics: Float[np.ndarray, " 6"] | None = None,
     ) -> Controller:
-        """Return the controller of a trained run: with its crop and, unless others are given, its settings and seed.
+        """Return the controller of a trained run, with the crop of the run; `config` and `seed` default to the run's.
 
         Limits beyond the motions in the training data, and low-diversity data, are logged as warnings.
 
@@ -174,7 +174,7 @@ class Controller:
 
         Args:
             subject: The model; its config gives the settings, crop and spaces.
-            seed: Of all decisions; None: the config's.
+            seed: Seed of all decisions; None: the config's.
             extrinsics: Pose of the camera, if the model uses it.
 
         Raises:
@@ -192,12 +192,12 @@ class Controller:
 
     @property
     def device(self) -> torch.device:
-        """Where the model is."""
+        """Device of the model."""
         return self._model.device
 
     @property
     def shown_axes(self) -> tuple[int, ...]:
-        """The numbers to show, three at most: of a pose the position, else the first that may change."""
+        """Indices of the numbers to show, at most three: the position of a pose, or the first free numbers."""
         return (0, 1, 2) if self.spaces.state.is_pose else tuple(self.space.free[:3].tolist())
 
     def reset(self, *goals: np.ndarray, durations: tuple[int, ...] = (), mask: np.ndarray | None = None) -> None:
@@ -206,7 +206,7 @@ class Controller:
         Args:
             goals: RGB images, height x width x 3, uint8, all of one size.
             durations: Model steps for which each goal but the last applies.
-            mask: Region of the image that counts: height x width, true or 1 where it does; None: all.
+            mask: Region of the image that counts towards the energy: height x width, true or 1 inside it; None: all.
 
         Raises:
             InputError: An image is invalid, sizes differ, or the mask is empty.
@@ -217,34 +217,34 @@ class Controller:
     def follow(
         self, goals: Sequence[SubGoal], *, mask: np.ndarray | None = None, cancelled: Cancelled = lambda: False
     ) -> None:
-        """Set goals that take their turns by their own rules, and forget all observations.
+        """Set goals that apply one after another, each until its own rule is met, and forget all observations.
 
-        A goal gives way to the next one after its `at_least` steps at the earliest and its `at_most` at the latest, in
-        between as soon as the energy of the current image is below its share of what that was when the goal began.
-        There is no way back. The last one is reached by the same rule of energy: then nothing is done until the next
-        reset.
+        A goal applies for at least `at_least` and at most `at_most` model steps. Between these bounds the next goal
+        follows as soon as the energy of the current image is below `share` times its energy when the goal began.
+        An earlier goal never applies again. The same energy rule decides when the last goal is reached; from then on
+        the action is zero until the next reset.
 
         Args:
             goals: In order; images of one size.
-            mask: As of `reset`.
-            cancelled: Asked before each goal is encoded.
+            mask: As for `reset`.
+            cancelled: Called before each goal is encoded; returns whether to stop.
 
         Raises:
-            SearchCancelledError: It was cancelled; the goals of before apply.
+            SearchCancelledError: `cancelled` returned true; the previous goals still apply.
             InputError: An image is invalid, sizes differ, the mask is empty, a goal would never end, the last one has a
-                bound, or a gripper mode is given for a robot whose states are vectors, or leaves nothing to plan.
+                bound, or a gripper mode is set for a robot whose states are vectors, or leaves no free component.
             ValueError: No goals.
         """
         if not goals:
             raise ValueError("no goal")
-        for place, goal in enumerate(goals):
-            require_image(goal.image, where=f"goal {place}", like=goals[0].image if place else None)
-            self.cameras.require_contrast(goal.image, where=f"goal {place}")
+        for index, goal in enumerate(goals):
+            require_image(goal.image, where=f"goal {index}", like=goals[0].image if index else None)
+            self.cameras.require_contrast(goal.image, where=f"goal {index}")
         require_ends(goals)
         searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
         report, latents = until_cancelled(cancelled), []
-        for place, goal in enumerate(goals):
-            report(place, len(goals))
+        for index, goal in enumerate(goals):
+            report(index, len(goals))
             latents.append(self.encoded(goal.image))
         weights = self.cameras.weights(mask, goals[0].image)
         self._goals, self._goal_latents, self._patch_weights = tuple(goals), torch.stack(latents), weights
@@ -259,23 +259,22 @@ class Controller:
         samples: Float[np.ndarray, "samples steps dim"] | None = None,
         cancelled: Cancelled = lambda: False,
     ) -> Float[np.ndarray, " dim"]:
-        """Return the action of the next model step: dx, dy, dz, three rotations, gripper (see `vjepa2_ac.episode`).
+        """Return the action for the next model step: dx, dy, dz, three rotations, gripper (see `vjepa2_ac.episode`).
 
-        For vector states: the change of each number of the state; targets if the model was trained on recorded targets.
-
-        Call it once per model step. `decision` then holds the reason.
+        For vector states the action is the change of each number of the state, or the target state if the model was
+        trained on recorded targets. Call this method once per model step. `decision` then holds the reason.
 
         Args:
             frame: The current camera image, with the size of the goal image.
-            state: Measured: pose and gripper, or the vector; a vector of any width where the model has no states and an
-                action is a change.
+            state: The measured state: pose and gripper, or a vector; a vector of any width if the model has no state
+                input and an action is a change of the state.
             samples: Actions that a policy proposes, as changes of each model step (`policies.score`): the search starts
                 from their mean and standard deviation. None: from `planning.prior`, if any.
             cancelled: Called before every iteration; returns whether the action is no longer needed.
 
         Raises:
             InputError: The image or the state cannot be used.
-            SearchCancelledError: It was cancelled. After any error nothing has changed.
+            SearchCancelledError: `cancelled` returned true. After any error the controller is unchanged.
             ValueError: No goal was set.
         """
         state = self._checked(frame, state)
@@ -286,7 +285,7 @@ class Controller:
             self._progress = decision.progress
         else:
             decision = self._faulty(state, fault)
-        # after an error nothing has changed
+        # Set after all calls that can raise, so that an error leaves the controller unchanged.
         self.cameras.newest, self._done, self.decision = newest, self._done + 1, decision
         return decision.action
 
@@ -305,14 +304,14 @@ class Controller:
         the limits may be unreliable.
 
         Args:
-            frame: As of `act`.
-            state: As of `act`.
-            chunks: Changes of each model step (`policies.score.changes_of_chunks`), any number of steps.
-            cancelled: Asked after every `planning.energy.samples_at_once` chunks.
+            frame: As for `act`.
+            state: As for `act`.
+            chunks: Changes of the state in each model step (`policies.score.changes_of_chunks`), any number of steps.
+            cancelled: Called after every `planning.energy.samples_at_once` chunks; returns whether to stop.
 
         Raises:
-            InputError: As of `act`; or the frame has no contrast, or the chunks have another shape.
-            SearchCancelledError: It was cancelled.
+            InputError: As for `act`; or the frame has no contrast, or the chunks have another shape.
+            SearchCancelledError: `cancelled` returned true.
             ValueError: No goal was set.
         """
         state = self._checked(frame, state)
@@ -341,13 +340,13 @@ class Controller:
         return state
 
     def _faulty(self, state: np.ndarray, why: Fault) -> Decision:
-        """Return the decision to do nothing; goals make no progress, since the frame shows nothing about them."""
+        """Return a zero action for a faulty frame; the goal stays, since the frame does not show if it is reached."""
         progress = self._progress or GoalProgress(0, 0, math.nan)
-        places, command = (progress.place,) * self.space.steps, self._command(state, np.zeros(len(state)))
-        return Decision(command, why, math.nan, places, replace(progress, changed=""), done=progress.done)
+        goals, command = (progress.place,) * self.space.steps, self._command(state, np.zeros(len(state)))
+        return Decision(command, why, math.nan, goals, replace(progress, changed=""), done=progress.done)
 
     def encoded(self, image: UInt8[np.ndarray, "height width 3"]) -> Latents:
-        """Return the latents of an image on the model's device; those of several views follow one another.
+        """Return the latents of an image on the model's device; the latents of several views are concatenated.
 
         Raises:
             InputError: The width does not fit the number of views.
@@ -355,31 +354,31 @@ class Controller:
         return encode_frames(self._model, image[None], self.crop, views=self.config.views)[0]
 
     def _progressed(self, latents: Latents) -> GoalProgress:
-        """Return which goal applies to the current image."""
+        """Return the progress through the goals at the current image."""
 
-        def energy(place: int) -> float:
-            return float(distance(latents, self._goal_latents[place], self._energy, self._patch_weights))
+        def energy(index: int) -> float:
+            return float(distance(latents, self._goal_latents[index], self._energy, self._patch_weights))
 
         if self._progress is None:
             return GoalProgress(0, 0, energy(0))
         return self._progress.after(self._goals, self._done, energy)
 
-    def _goal_from(self, place: int) -> Goal:
-        """Return a goal and the goals that follow it after at most a given number of steps, for longer plans."""
+    def _goal_from(self, index: int) -> Goal:
+        """Return a goal and the later goals that a long plan can reach, with `at_most` as the durations."""
         durations: list[int] = []
-        for goal in self._goals[place:-1]:
+        for goal in self._goals[index:-1]:
             if goal.at_most is None:
                 break
             durations.append(goal.at_most)
-        return Goal(self._goal_latents[place : place + len(durations) + 1], tuple(durations), self._patch_weights)
+        return Goal(self._goal_latents[index : index + len(durations) + 1], tuple(durations), self._patch_weights)
 
     def _still(
         self, latents: Latents, progress: GoalProgress, steps: int
     ) -> tuple[Float[Tensor, " steps"], tuple[int, ...]]:
-        """Return the distance of the current image from the goal of each of the next steps, and these goals."""
+        """Return the distance of the current image from the goal of each of the next steps, and the goals' indices."""
         goal, done = self._goal_from(progress.place), self._done - progress.since
-        wanted = goal.ahead(done, steps)
-        still = distance(latents.expand_as(wanted), wanted, self._energy, goal.weights)
+        goal_latents = goal.ahead(done, steps)
+        still = distance(latents.expand_as(goal_latents), goal_latents, self._energy, goal.weights)
         return still, tuple(progress.place + goal.place(done + step) for step in range(steps))
 
     def _cost(self, latents: Latents, state: State, progress: GoalProgress) -> WorldModelCost:
@@ -398,20 +397,20 @@ class Controller:
         cancelled: Cancelled,
     ) -> Decision:
         progress = self._progressed(latents)
-        still, places = self._still(latents, progress, self.config.horizon)
+        still, goal_indices = self._still(latents, progress, self.config.horizon)
         energy = self._over_steps(still)
         command = self._command(state, np.zeros(len(state)))
-        nothing = Decision(command, "at the goal", energy, places, progress, surprise=self._surprise(latents))
+        zero_action = Decision(command, "at the goal", energy, goal_indices, progress, surprise=self._surprise(latents))
         if progress.done or float(still.max()) <= REACHED:
-            return replace(nothing, done=progress.place == len(self._goals) - 1)
+            return replace(zero_action, done=progress.place == len(self._goals) - 1)
         if self._workspace is not None and not is_allowed(self._workspace.way_back(state[:3]), self.config.limits):
-            return replace(nothing, why="outside the workspace")
+            return replace(zero_action, why="outside the workspace")
         self.space = self._searched[self._goals[progress.place].gripper]
         cost = self._cost(latents, state, progress)
         plan = self._planned(state, cost, self._start(cost, progress, samples), cancelled)
         why: Why = "planned" if plan.stopped == "finished" else plan.stopped
         return replace(
-            nothing,
+            zero_action,
             action=self._command(state, plan.actions[0].double().numpy()),
             why=why,
             plan=plan,
@@ -430,18 +429,18 @@ class Controller:
         return self._compare(predicted[0, 0], latents)
 
     def _start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
-        """Return the start of a search: from samples of a policy, the prior, or the rest of the last plan."""
+        """Return the start of a search: from a policy's samples, the action prior, or the rest of the last plan."""
         if samples is not None:
             return PlanStart.of_samples(torch.from_numpy(np.array(samples, dtype=np.float64)), self.space)
         if self._prior_start is not None:
             bound = self._goals[progress.place].at_most
-            left = _PRIOR_STEPS if bound is None else bound - (self._done - progress.since)
-            return self._prior_start(cost, self._goal_latents[progress.place], left, self.space)
-        before = None if self.decision is None else self.decision.plan
-        return before.start_after() if before is not None and self.config.warm_start else None
+            steps_left = _PRIOR_STEPS if bound is None else bound - (self._done - progress.since)
+            return self._prior_start(cost, self._goal_latents[progress.place], steps_left, self.space)
+        last_plan = None if self.decision is None else self.decision.plan
+        return last_plan.start_after() if last_plan is not None and self.config.warm_start else None
 
     def _planned(self, state: np.ndarray, cost: WorldModelCost, start: PlanStart | None, cancelled: Cancelled) -> Plan:
-        """Return the plan of a search, inside the workspace if there is one; with the energy of the final actions."""
+        """Return the plan of a search, kept inside the workspace if there is one, with the energy of its actions."""
         generator, box = torch.Generator().manual_seed(self.seed + self._done), self._workspace
         space = self.space if box is None else box.narrowed(self.space, state)
         plan = self.planner.plan(cost, generator, start, cancelled, space)
@@ -458,7 +457,7 @@ class Controller:
         """Return the search space of a gripper mode.
 
         Raises:
-            InputError: Nothing is left to plan, or the gripper is not known.
+            InputError: No component is free, or the index of the gripper is unknown.
         """
         if gripper is None:
             return self._searched[None]
@@ -479,10 +478,10 @@ class Controller:
 
 
 def _axes_of(path: str, known: Fingerprints) -> Axes:
-    """Return the axes of a file that were fitted for a model.
+    """Read calibrated axes, and check that they were fitted for this model.
 
     Raises:
-        InputError: They cannot be planned by, or are another model's.
+        InputError: Planning cannot use the axes, or they were fitted for another model.
     """
     axes = read_axes(path)
     if (axes.encoder, axes.predictor) != (known.encoder, known.predictor):

@@ -1,6 +1,6 @@
-"""Actions that were not taken, named or of a file, and the states to which they lead.
+"""Counterfactual actions, named (`up`, `close`) or read from a file: actions that the robot did not execute.
 
-They need no simulator: a model can predict under them from any start of recorded robot data.
+No simulator is needed: a model can predict their outcome from any frame of recorded robot data.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from vjepa2_ac.planning.search_space import GRIPPER
 from vjepa2_ac.spaces import POSE_CHANGE
 
 STEP_M, GRIPPER_STEP = 0.05, 0.75
-"""Metres, and change of closedness, of a named step: the largest that upstream plans (`planning.limits`). A run may
-have been taught less; what a model predicts for longer steps than it was taught means nothing."""
+"""Size of a named action in one model step, in metres and in closedness: upstream's planning limits. If the training
+data contain only smaller motions, predictions for this size are unreliable."""
 
 _DIRECTIONS: dict[str, tuple[int, float]] = {  # in the robot base frame: x to the front, y to the left, z up
     "up": (2, 1.0), "down": (2, -1.0),
@@ -34,20 +34,21 @@ _LARGEST = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, closedn
 def named_actions(
     name: str, steps: int, *, size_m: float = STEP_M, limits: LimitsConfig | None = None
 ) -> Float[np.ndarray, "steps 7"]:
-    """Return the same action for every model step (legend: episode.py).
+    """Return the action of a name, repeated for every model step (conventions: episode.py).
 
-    `open` and `close` go on changing a gripper at its end, as `planning.limits.gripper_mode: close` does: a real one
-    lags behind. Give a model `feasible_actions` of them.
+    `open` and `close` command further change after the gripper is fully open or closed, as
+    `planning.limits.gripper_mode: close` does, because a real gripper lags behind. Pass the result through
+    `feasible_actions` before a model predicts from it.
 
     Args:
-        name: What happens.
-        steps: Model steps.
-        size_m: Length of each step in metres, if the limits allow it.
-        limits: The largest actions, at best those that the data taught (`planning.limits.xyz: data`, resolved). None:
-            `size_m` counts alone, and the gripper changes as upstream's.
+        name: One of `ACTION_NAMES`.
+        steps: Number of model steps.
+        size_m: Length of each step in metres; clipped to the limits.
+        limits: The largest actions, ideally those of the training data (`planning.limits.xyz: data`, resolved). None:
+            `size_m` is not clipped, and the gripper changes by `GRIPPER_STEP`.
 
     Raises:
-        InputError: No such name, one that the limits hold still, or no length.
+        InputError: The name is unknown, the limits fix the component that it changes, or the length is not positive.
         ValueError: No steps.
     """
     if steps < 1:
@@ -77,17 +78,17 @@ def named_actions(
 
 
 def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndarray, "steps 7"]:
-    """Read actions of poses (legend: episode.py), one for each model step, from a `.npy` or `.csv` file.
+    """Read pose actions (conventions: episode.py), one for each model step, from a `.npy` or `.csv` file.
 
-    A CSV may begin with a line of names; empty lines do not count.
+    A CSV file may begin with a line of names; empty lines are ignored.
 
     Args:
         path: The file.
-        steps: How many are needed; None: any number. Further ones of the file are left out.
+        steps: Number of actions to return; None: all. Additional rows of the file are ignored.
 
     Raises:
-        InputError: It cannot be read, a row has not 7 finite numbers in metres, radians and closedness, or there are
-            too few rows.
+        InputError: The file cannot be read, a row does not have 7 finite numbers in metres, radians and closedness, or
+            there are too few rows.
     """
     needed = f"one line of {ACTION_DIM} numbers for each model step: {', '.join(POSE_CHANGE.names)}"
     fix = "In metres, radians, and closedness from -1 to 1; a .npy of NumPy, or a .csv with commas"

@@ -1,4 +1,4 @@
-"""A planning decision: one planned action, with all data needed to judge it."""
+"""A planning decision: one planned action, with the energies of alternatives to assess it."""
 
 from __future__ import annotations
 
@@ -29,15 +29,16 @@ class PlanRequest:
     """The observation and the goal."""
 
     start: UInt8[np.ndarray, "height width 3"]
-    state: Float[np.ndarray, " numbers"]  # measured; a pose is refused or taken by the controller
+    state: Float[np.ndarray, " numbers"]  # measured; the controller checks it
     goals: tuple[SubGoal, ...]  # in order; the first one applies
-    mask: np.ndarray | None = None  # region of the image that counts: height x width
+    mask: np.ndarray | None = None  # region of the image that counts towards the energy: height x width
 
     @property
     def durations(self) -> list[int]:
-        """Model steps of each goal but the last, if they are fixed; else none."""
-        first = self.goals[:-1]
-        return [goal.at_least for goal in first] if all(goal.at_least == goal.at_most for goal in first) else []
+        """Number of model steps of each goal but the last, if all these numbers are fixed; else empty."""
+        all_but_last = self.goals[:-1]
+        is_fixed = all(goal.at_least == goal.at_most for goal in all_but_last)
+        return [goal.at_least for goal in all_but_last] if is_fixed else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +48,11 @@ class PlanResult:
     question: PlanRequest
     controller: Controller
     decision: Decision
-    actions: Float[np.ndarray, "steps dim"]  # changes of the state; zero where the decision is to do nothing
-    states: Float[np.ndarray, "steps+1 dim"]  # predicted states along them
-    doing_nothing: float  # predicted energy of no motion; NaN if it was not computed
+    actions: Float[np.ndarray, "steps dim"]  # changes of the state; zero if there is no plan
+    states: Float[np.ndarray, "steps+1 dim"]  # predicted states before and after these actions
+    doing_nothing: float  # predicted energy of the zero action; NaN if it was not computed
     slices: tuple[EnergySlice, ...]  # empty if there is no plan, or none were requested
-    seconds: dict[str, float]  # of encoding the goals, of the decision with encoding the start, of the slices
+    seconds: dict[str, float]  # for encoding the goals, the decision (with encoding the start), and the slices
 
     @property
     def space(self) -> SearchSpace:
@@ -60,19 +61,19 @@ class PlanResult:
 
     @property
     def state_space(self) -> StateSpace:
-        """What the numbers of a state are."""
+        """Meaning of the numbers of a state."""
         return self.controller.spaces.state
 
     @property
     def worse_than(self) -> dict[str, str]:
-        """A sentence on each energy below the one predicted for the plan: of the zero action, of the current frame."""
+        """A sentence for each reference (zero action, current frame) whose energy is below the plan's prediction."""
         energy = math.nan if self.decision.plan is None else self.decision.plan.energy
-        others = {"zero action": self.doing_nothing, "current frame": self.decision.energy_now}
-        said = "The plan is predicted to be worse than the {}: energy {:.4f} against {:.4f}{}."
+        references = {"zero action": self.doing_nothing, "current frame": self.decision.energy_now}
+        sentence = "The plan is predicted to be worse than the {}: energy {:.4f} against {:.4f}{}."
         return {
-            name: said.format(name, energy, other, _change(energy, other))
-            for name, other in others.items()
-            if energy > other + SAME_ENERGY * abs(other)
+            name: sentence.format(name, energy, reference, _change(energy, reference))
+            for name, reference in references.items()
+            if energy > reference + SAME_ENERGY * abs(reference)
         }
 
 
@@ -80,10 +81,10 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0, rep
     """Make one decision, and evaluate its alternatives.
 
     Args:
-        controller: The planner; it is reset.
+        controller: The controller that plans; its goals are replaced by those of the request.
         question: The observation and the goal.
-        nodes: Of an energy slice along each axis; below 3: no slices.
-        reporter: Shows the progress of the slices. (The search has the controller's.)
+        nodes: Number of points of an energy slice along each axis; below 3: no slices.
+        reporter: Shows the progress of the slices. The search reports through the controller's planner.
 
     Raises:
         InputError: An image, the state or the mask is invalid.
@@ -121,9 +122,9 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0, rep
 
 
 PLAN_FILE = "plan.json"
-FORMAT = 1  # goes up when a reader of the file would have to change
+FORMAT = 1  # incremented when a reader of the file would have to change
 
-_AT_LIMIT = 0.98  # share of a limit from which an action is said to be at it
+_AT_LIMIT = 0.98  # an action counts as being at its limit from this share of it
 
 
 def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
@@ -140,10 +141,10 @@ def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path
     recorded = ("samples", "finite", "lowest", "mean", "std", "seconds")
     energy = {"now": decision.energy_now, "began": progress.began, "doing_nothing": answer.doing_nothing}
     slices = []
-    for one in answer.slices:
-        across, up = (names[axis] for axis in one.axes)
-        slices.append({"across": across, "up": up, across: one.across, up: one.up, "energy": one.energy})
-    found = {
+    for part in answer.slices:
+        across, up = (names[axis] for axis in part.axes)
+        slices.append({"across": across, "up": up, across: part.across, up: part.up, "energy": part.energy})
+    content = {
         "format": FORMAT,
         "in_words": summarize(answer),
         **about,
@@ -157,20 +158,20 @@ def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path
         "actions": answer.actions,
         "states": answer.states,
         "goal_of_each_step": decision.goals,
-        "sub_goals": [{name: getattr(one, name) for name in rules} for one in question.goals],
+        "sub_goals": [{name: getattr(goal, name) for name in rules} for goal in question.goals],
         "since": progress.since,
         "changed": progress.changed,
         "done": decision.done,
         "energy": energy | {"plan": None if plan is None else plan.energy},
         "evaluations": 0 if plan is None else plan.evaluations,
         "iterations": [
-            {name: getattr(one, name) for name in recorded} | {"elites_mean": one.elite_energy}
-            for one in (() if plan is None else plan.iterations)
+            {name: getattr(iteration, name) for name in recorded} | {"elites_mean": iteration.elite_energy}
+            for iteration in (() if plan is None else plan.iterations)
         ],
         "slices": slices,
         "seconds": {**answer.seconds, "search": 0.0 if plan is None else plan.seconds},
     }
-    write_atomically(path, json_text({name: plain(value) for name, value in found.items()}))
+    write_atomically(path, json_text({name: plain(value) for name, value in content.items()}))
     return path
 
 
@@ -191,20 +192,20 @@ def summarize(answer: PlanResult) -> str:
         )
     rounds = len(plan.iterations)
     searched = f"{counted(plan.evaluations, 'action sequence')} in {counted(rounds, 'iteration')}"
-    found = [
+    sentences = [
         _motion(answer),
         f"Energy {now:.4f} now, {plan.energy:.4f} predicted for the plan{_change(plan.energy, now)},",
         f"{answer.doing_nothing:.4f} predicted for the zero action.",
         f"Planner {plan.planner}, seed {plan.seed}: {searched}, {answer.seconds['decision']:.2f} s.",
     ]
     if plan.stopped == "out of time":
-        found.append(
+        sentences.append(
             f"Time was up after {rounds} of {answer.controller.config.iterations} iterations: the best so far."
         )
     if at_limit := axes_at_limit(answer):
-        knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
-        found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
-    return " ".join(found)
+        key = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
+        sentences.append(f"The first action is at its limit along {', '.join(at_limit)} ({key}).")
+    return " ".join(sentences)
 
 
 def _change(energy: float, reference: float) -> str:
@@ -227,7 +228,7 @@ def _motion(answer: PlanResult) -> str:
 
 
 def axes_at_limit(answer: PlanResult) -> list[str]:
-    """Return the numbers, of a position or of a vector, whose first change is at its limit."""
+    """Return the names of the components of the first action that are at their limits (position or vector)."""
     upper, space = answer.space.upper[0].numpy(), answer.state_space
     numbers = answer.controller.shown_axes if space.is_pose else range(len(space))
     return [

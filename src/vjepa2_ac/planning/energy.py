@@ -25,17 +25,17 @@ from vjepa2_ac.registry import ENERGIES
 from vjepa2_ac.spaces import POSES, Spaces, euler_from_matrices, matrices_from_euler, states_along
 
 Latents = Float[Tensor, "*batch tokens dim"]
-Wanted = Float[Tensor, "*wanted tokens dim"]
+Target = Float[Tensor, "*target tokens dim"]
 OfTokens = Float[Tensor, "*batch tokens"]
 OfEach = Float[Tensor, "*batch"]
 Weights = Float[Tensor, " tokens"]  # of each patch
 _POSITION, _ROTATION = slice(0, 3), slice(3, 6)  # of a pose
-SAME_ENERGY = 1e-6  # relative difference below which energies are equal: it is within rounding
+SAME_ENERGY = 1e-6  # energies with a smaller relative difference are equal up to rounding
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Goal latents in order: each applies for its number of model steps, the last one without end."""
+    """Goal latents in order: each applies for its number of model steps, the last one without a bound."""
 
     latents: Float[Tensor, "goals tokens dim"]
     durations: tuple[int, ...] = ()  # model steps of each goal but the last
@@ -43,19 +43,19 @@ class Goal:
 
     def place(self, step: int) -> int:
         """Return the index of the goal that applies after this many model steps since the start."""
-        for place, duration in enumerate(self.durations):
+        for index, duration in enumerate(self.durations):
             step -= duration
             if step < 0:
-                return place
+                return index
         return len(self.latents) - 1
 
     def ahead(self, done: int, steps: int) -> Float[Tensor, "steps tokens dim"]:
-        """Return the goal latents after each of the next steps, when some are done.
+        """Return the latents of the goal that applies in each of the next steps, after `done` steps.
 
         The frame after a goal's last step is still compared with that goal.
         """
-        places = [self.place(done + step) for step in range(steps)]
-        return torch.stack([self.latents[place] for place in places])  # a list as an index would wait for the device
+        indices = [self.place(done + step) for step in range(steps)]
+        return torch.stack([self.latents[index] for index in indices])  # a list as an index would wait for the device
 
 
 def patch_weights(
@@ -64,7 +64,7 @@ def patch_weights(
     """Return the weight of each patch: the mean of a mask over the patch, patches row by row, view after view.
 
     Args:
-        mask: Mask over the cropped image, of any resolution; 1 for pixels that count, else 0.
+        mask: Mask over the cropped image, at any resolution; 1 for pixels that count, else 0.
         grid: Patches along one side.
 
     Raises:
@@ -78,19 +78,19 @@ def patch_weights(
 
 @dataclass(frozen=True)
 class Axes:
-    """A turn about a vertical axis, from the robot's axes into the model's.
+    """A rotation about a vertical axis, from the robot's axes to the model's.
 
-    Plans are searched among the robot's own actions, so limits hold for what is executed; the model is given each
-    action and state turned.
+    The search is over actions in the robot's axes, so the limits hold for the executed actions. The model receives each
+    action and state rotated.
 
     Source: arXiv 2506.09985, appendix B.4, which rotates inferred moves by a measured angle.
     """
 
-    yaw: float  # radians, counterclockwise from above
-    centre_m: tuple[float, float] = (0.0, 0.0)  # x, y that stay where they are; the robot's base
+    yaw: float  # radians, counterclockwise seen from above
+    centre_m: tuple[float, float] = (0.0, 0.0)  # x, y of the rotation axis; default: the robot's base
 
     def poses(self, poses: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch numbers"]:
-        """Return poses as the model sees them: x, y, z, three angles, and what does not turn (a gripper)."""
+        """Return rotated poses: x, y, z and three angles; further numbers, such as the gripper, are unchanged."""
         with torch.autocast(poses.device.type, enabled=False):
             turn, centre = self._turn(poses), poses.new_tensor([*self.centre_m, 0.0])
             rotation = euler_from_matrices(turn @ matrices_from_euler(poses[..., _ROTATION]))
@@ -98,7 +98,7 @@ class Axes:
             return torch.cat([position, rotation, poses[..., 6:]], dim=-1)
 
     def actions(self, actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
-        """Return actions as the model sees them: the move and the axis of the rotation are turned."""
+        """Return rotated actions: the translation and the axis of the rotation are rotated."""
         with torch.autocast(actions.device.type, enabled=False):
             turn = self._turn(actions)
             rotation = euler_from_matrices(turn @ matrices_from_euler(actions[..., _ROTATION]) @ turn.T)
@@ -111,36 +111,36 @@ class Axes:
 
 @dataclass(frozen=True)
 class Scene:
-    """The input of a decision: the current frame, of several views one after another, and the state."""
+    """The input of a decision: latents of the current frame (views concatenated), and the state."""
 
     latents: Float[Tensor, "tokens dim"]
     state: Float[Tensor, " state_dim"]
-    extrinsics: Float[Tensor, " 6"] | None = None  # of the camera, which does not move
-    axes: Axes | None = None  # the model's, where they are not the robot's
+    extrinsics: Float[Tensor, " 6"] | None = None  # pose of the camera, which is fixed
+    axes: Axes | None = None  # rotation to the model's axes; None: they equal the robot's
     views: int = 1
 
     def seen(
         self, actions: Float[Tensor, "*batch action_dim"], states: Float[Tensor, "*batch state_dim"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch state_dim"]]:
-        """Return actions and states as the model receives them: rotated by the calibrated axes, if there are any."""
+        """Return actions and states as the model receives them: rotated to the calibrated axes, if there are any."""
         return (actions, states) if self.axes is None else (self.axes.actions(actions), self.axes.poses(states))
 
     @property
     def camera(self) -> Float[Tensor, " 6"] | None:
-        """The camera's pose as the model receives it."""
+        """Pose of the camera as the model receives it."""
         return self.extrinsics if self.axes is None or self.extrinsics is None else self.axes.poses(self.extrinsics)
 
 
 @dataclass(frozen=True)
 class EnergyFunction:
-    """The distance between latents that a config names; an energy that is a class is constructed once for it."""
+    """The distance between latents that a config names. If the registered energy is a class, it is constructed once."""
 
     config: EnergyConfig
     by_token: Callable[[Tensor, Tensor], Tensor]
 
     @classmethod
     def of(cls, energy: EnergyConfig | EnergyFunction) -> EnergyFunction:
-        """Return the function of a config; one that is there already is returned unchanged."""
+        """Return the function that a config names; an `EnergyFunction` is returned unchanged."""
         if isinstance(energy, EnergyFunction):
             return energy
         return cls(energy, ENERGIES.make(energy.distance.name, energy.distance.options))
@@ -159,16 +159,16 @@ class WorldModelCost:
         done: int = 0,
         spaces: Spaces = POSES,
     ) -> None:
-        """Compute what all samples share.
+        """Move everything that all samples share to the model's device.
 
         Args:
             world_model: In eval mode: dropout would make energies differ from call to call.
-            scene: The start of the actions.
-            goal: Their target.
+            scene: The frame and state before the first action.
+            goal: The goal latents.
             energy: The distance, and the number of samples per batch.
             done: Model steps since the goal was set: selects the goal that applies.
-            spaces: What the model's states and actions are. What is evaluated are changes of the state; where actions
-                are targets, the model is given the states that they lead to.
+            spaces: Meaning of the model's states and actions. The evaluated actions are changes of the state; if the
+                model's actions are targets, the model receives the resulting states.
 
         Raises:
             ValueError: The model is in training mode.
@@ -182,20 +182,22 @@ class WorldModelCost:
         self._frame, self._state = scene.latents.to(device), scene.state.to(device)
         self._camera = None if scene.camera is None else scene.camera.to(device)
         self._seen, self.views = scene.seen, scene.views
-        self.progress: Progress = no_progress  # after each part; it does not wait for the device
+        self.progress: Progress = no_progress  # called after each part, without waiting for the device
 
     def __call__(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
-        """Return energies on the device of the actions; gradients flow to the actions if requested.
+        """Return energies on the device of the actions; gradients flow to the actions if gradients are enabled.
 
-        With gradients, predictions of each part but the only one are recomputed in the backward pass, so that memory is
-        bounded as well.
+        With gradients and more than one part, the predictions of each part are recomputed in the backward pass, so that
+        memory is bounded.
         """
         parts = actions.to(self._model.device).split(self._energy.config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
-        again = torch.is_grad_enabled() and len(parts) > 1
+        recompute = torch.is_grad_enabled() and len(parts) > 1
         energies: list[Tensor] = []
         done = 0
         for part in parts:
-            energies.append(checkpoint(self._energies, part, use_reentrant=False) if again else self._energies(part))
+            energies.append(
+                checkpoint(self._energies, part, use_reentrant=False) if recompute else self._energies(part)
+            )
             done += len(part)
             self.progress(done, len(actions))
         return torch.cat(energies).to(actions.device)
@@ -208,105 +210,105 @@ class WorldModelCost:
     def imagine(
         self, actions: Float[Tensor, "samples steps action_dim"]
     ) -> tuple[Float[Tensor, "samples steps tokens dim"], Float[Tensor, "samples steps+1 state_dim"]]:
-        """Return the latents after each action, and the states before and after them. All samples at once."""
+        """Return the predicted latents after each action, and the states before and after it, in one batch."""
         samples, steps = actions.shape[:2]
         actions = actions.to(self._state)
         states = states_along(self._state, actions, self._spaces.state)
-        given = states[:, 1:] if self._spaces.action.follows == "target" else actions
+        inputs = states[:, 1:] if self._spaces.action.follows == "target" else actions
         camera = None if self._camera is None else self._camera.expand(samples, steps, -1)
         dim = self._frame.shape[-1]
         views = self._frame.reshape(1, self.views, -1, dim)
         frame = views.expand(samples, -1, -1, -1).flatten(0, 1)[:, None]
-        given, before = (one.repeat_interleave(self.views, dim=0) for one in self._seen(given, states[:, :-1]))
-        predicted = self._model.rollout(frame, given, before, camera)
+        inputs, before = (values.repeat_interleave(self.views, dim=0) for values in self._seen(inputs, states[:, :-1]))
+        predicted = self._model.rollout(frame, inputs, before, camera)
         return predicted.reshape(samples, self.views, steps, -1, dim).transpose(1, 2).flatten(2, 3), states
 
     def _energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
         predicted, _ = self.imagine(actions)
-        wanted = self._goal.ahead(self._done, actions.shape[1])
+        target = self._goal.ahead(self._done, actions.shape[1])
         if self._energy.config.steps == "last":
-            predicted, wanted = predicted[:, -1:], wanted[-1:]
-        far = distance(predicted, wanted, self._energy, self._goal.weights)
-        return far.sum(dim=1)
+            predicted, target = predicted[:, -1:], target[-1:]
+        distances = distance(predicted, target, self._energy, self._goal.weights)
+        return distances.sum(dim=1)
 
 
 def distance(
-    predicted: Latents, wanted: Wanted, energy: EnergyConfig | EnergyFunction, weights: Weights | None = None
+    predicted: Latents, target: Target, energy: EnergyConfig | EnergyFunction, weights: Weights | None = None
 ) -> OfEach:
-    """Return the distance between latents that a config names, over patches by weight (None: equal weights).
+    """Return the distance between latents that a config names, averaged over patches (weights None: equal weights).
 
-    For several calls give the function, so that an energy that is a class is constructed once.
+    For several calls pass an `EnergyFunction`, so that an energy that is a class is constructed once.
     """
-    by_token = EnergyFunction.of(energy).by_token(predicted, wanted)
+    by_token = EnergyFunction.of(energy).by_token(predicted, target)
     return by_token.mean(dim=-1) if weights is None else (by_token * (weights / weights.sum())).sum(dim=-1)
 
 
-def mean_difference(predicted: Latents, wanted: Wanted) -> OfTokens:
+def mean_difference(predicted: Latents, target: Target) -> OfTokens:
     """Return the mean absolute difference of each token.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, l1.
     """
-    return absolute_difference(predicted, wanted).mean(dim=-1)
+    return absolute_difference(predicted, target).mean(dim=-1)
 
 
-def mean_square(predicted: Latents, wanted: Wanted) -> OfTokens:
+def mean_square(predicted: Latents, target: Target) -> OfTokens:
     """Return the mean squared difference of each token."""
-    return squared_difference(predicted, wanted).mean(dim=-1)
+    return squared_difference(predicted, target).mean(dim=-1)
 
 
-def one_minus_cosine(predicted: Latents, wanted: Wanted) -> OfTokens:
+def one_minus_cosine(predicted: Latents, target: Target) -> OfTokens:
     """Return 1 - cosine of each token."""
-    return 1 - cosine_similarity(predicted, wanted, dim=-1)
+    return 1 - cosine_similarity(predicted, target, dim=-1)
 
 
 @dataclass(frozen=True)
 class ChunkScores:
-    """Energies of chunks towards a goal: lower is better."""
+    """Energies of action chunks towards a goal; lower is better."""
 
-    energies: Float[np.ndarray, " chunks"]  # predicted, of each chunk
+    energies: Float[np.ndarray, " chunks"]  # predicted energy of each chunk
     doing_nothing: float  # predicted energy of the zero action for the same number of steps
     now: float  # energy of the current image
     goal: int  # index of the goal that applies
 
     @property
     def order(self) -> Int[np.ndarray, " chunks"]:
-        """The chunks, best first; equal chunks keep their order."""
+        """Indices of the chunks, lowest energy first; chunks of equal energy keep their order."""
         return np.argsort(self.energies, kind="stable")
 
     @property
     def best(self) -> int:
-        """The chunk of lowest energy."""
+        """Index of the chunk with the lowest energy."""
         return int(self.order[0])
 
     @property
     def tied(self) -> int:
-        """How many chunks share the lowest energy, up to rounding."""
+        """Number of chunks that share the lowest energy, up to rounding."""
         lowest = self.energies.min()
         return int((self.energies <= lowest + SAME_ENERGY * abs(lowest)).sum())
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the energies over the energy now; 0: the model predicts no difference."""
+        """Standard deviation of the energies, divided by the current energy; 0: the model predicts no difference."""
         return float(self.energies.std() / max(self.now, 1e-12))
 
     def as_dict(self, *, is_blind: bool) -> dict[str, Any]:
-        """Return plain values; no best chunk for a model that cannot rank actions."""
+        """Return plain values for JSON; `best` is None for a model that cannot rank actions (`is_blind`)."""
         values = {name: getattr(self, name) for name in ("energies", "doing_nothing", "now", "spread", "tied")}
         return {**values, "best": None if is_blind else self.best, "is_blind": is_blind}
 
 
-_BEYOND = 1.25  # how far a slice reaches beyond the limits
-_LEAST = 0.05  # metres: half the width of a slice along an axis that is held
+_BEYOND = 1.25  # half-width of a slice, relative to the limit
+_LEAST = 0.05  # metres; smallest half-width of a slice along a fixed axis
 
 
 @dataclass(frozen=True)
 class EnergySlice:
-    """Energies over two numbers of the first action, all other components of the plan unchanged."""
+    """Energies over two components of the first action; all other components of the plan are unchanged."""
 
-    axes: tuple[int, int]  # which they are
-    across: Float[np.ndarray, " nodes"]  # values along the first of them
-    up: Float[np.ndarray, " nodes"]
-    energy: Float[np.ndarray, "nodes nodes"]  # [up, across]; NaN where the model gives none
+    axes: tuple[int, int]  # indices of the two components
+    across: Float[np.ndarray, " nodes"]  # values of the first component
+    up: Float[np.ndarray, " nodes"]  # values of the second component
+    energy: Float[np.ndarray, "nodes nodes"]  # [up, across]; NaN where the prediction is not finite
 
 
 def energy_slices(
@@ -318,16 +320,17 @@ def energy_slices(
     nodes: int,
     progress: Progress = no_progress,
 ) -> tuple[EnergySlice, ...]:
-    """Return the energy around a plan's first action: over each pair of some numbers of it, such as dx and dy.
+    """Return the energy around a plan's first action, over each pair of its components in `axes`, such as dx and dy.
 
-    Limits are ignored, to show what is beyond them. A first action that is repeated changes as one.
+    The slices reach beyond the limits, to show the energy there. If the first action is repeated, all repetitions
+    change together.
 
     Args:
         cost: The energy of action sequences.
         actions: The plan.
-        space: Its limits say how far the slices reach.
-        axes: The numbers.
-        nodes: Along each axis, three or more.
+        space: Its limits set the width of the slices.
+        axes: Indices of the components.
+        nodes: Number of values along each axis, three or more.
         progress: Called with the number of evaluated action sequences.
     """
     total, slices = comb(len(axes), 2) * nodes**2, []
@@ -350,4 +353,4 @@ def _slice(cost: Cost, actions: Tensor, space: SearchSpace, axes: tuple[int, int
 
 def _half_width(space: SearchSpace, axis: int, axes: Sequence[int]) -> float:
     reach = float(torch.maximum(space.upper[0, axis].abs(), space.lower[0, axis].abs()))
-    return reach or max(*(float(space.upper[0, one]) for one in axes), _LEAST)
+    return reach or max(*(float(space.upper[0, number]) for number in axes), _LEAST)

@@ -1,6 +1,6 @@
-"""Goals: images that a plan aims at, when each takes its turn, and folders of them: goals.json and an image for each.
+"""Goal images, the rules for switching from one goal to the next, and folders of goals (goals.json with images).
 
-Such a folder is written by `vjepa2-ac goals`, or by a person. PyTorch is not imported.
+Such a folder is written by `vjepa2-ac goals` or by hand. PyTorch is not imported.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ GripperMode = Literal["rounded", "free", "held", "open", "close"]
 
 @dataclass(frozen=True, eq=False)
 class SubGoal:
-    """A goal image, how long it applies, and what the gripper may do meanwhile.
+    """A goal image, how long it applies, and the gripper mode for this time.
 
     Raises:
         InputError: The numbers contradict each other.
     """
 
-    image: np.ndarray  # RGB, height x width x 3, uint8; checked where it is used
+    image: np.ndarray  # RGB, height x width x 3, uint8; not checked here
     name: str = ""
     at_least: int = 1  # model steps
-    at_most: int | None = None  # likewise; None: no bound, and always of the last goal
-    share: float | None = None  # the next goal follows below this share of the energy at the beginning; None: by count
+    at_most: int | None = None  # model steps; None: no bound, as required for the last goal
+    share: float | None = None  # the next goal follows when energy < share x energy at the start; None: by steps only
     gripper: GripperMode | None = None  # None: planning.limits.gripper_mode
 
     def __post_init__(self) -> None:
@@ -50,7 +50,7 @@ class SubGoal:
             raise InputError(where=where, found=f"share {self.share}", needed="a number between 0 and 1, or none")
 
     def why_reached(self, energy: float, began: float) -> str:
-        """Return why an energy is low enough, by what it was when the goal began; empty: it is not, as for NaN."""
+        """Return why the goal counts as reached at an energy (`began`: its energy at the start); empty: not reached."""
         if self.share is None:
             return ""
         if energy < self.share * began:
@@ -59,15 +59,15 @@ class SubGoal:
 
 
 def equal_durations(horizon: int, goals: int) -> tuple[int, ...]:
-    """Return the steps of each goal but the last, if a plan's are divided equally; the last one takes the rest."""
+    """Return equal durations, in model steps, for all goals of a plan but the last, which gets the rest."""
     return (max(1, horizon // goals),) * (goals - 1)
 
 
 def timed(images: Sequence[np.ndarray], durations: Sequence[int]) -> tuple[SubGoal, ...]:
-    """Return images as goals that apply for so many model steps each, the last one without end.
+    """Return goals that apply for fixed numbers of model steps; the last goal has no duration.
 
     Raises:
-        ValueError: No images, or the number of durations is not theirs minus one, or one is below 1.
+        ValueError: No images, or the number of durations is not the number of images minus one, or one is below 1.
     """
     if not images or len(durations) != len(images) - 1 or min(durations, default=1) < 1:
         raise ValueError(f"no goal, or {len(images)} goals with durations {durations}: one for each but the last")
@@ -76,7 +76,7 @@ def timed(images: Sequence[np.ndarray], durations: Sequence[int]) -> tuple[SubGo
 
 
 def require_ends(goals: Sequence[SubGoal], *, first: int = 0) -> None:
-    """Refuse goals of which one would never end, or the last one has a bound.
+    """Refuse goals that would never end (neither `at_most` nor `share`), or a last goal with a bound.
 
     Args:
         goals: In order.
@@ -85,40 +85,40 @@ def require_ends(goals: Sequence[SubGoal], *, first: int = 0) -> None:
     Raises:
         InputError: Names the goal.
     """
-    *before, last = goals
-    for place, goal in enumerate(before, start=first):
+    *all_but_last, last = goals
+    for number, goal in enumerate(all_but_last, start=first):
         if goal.at_most is None and goal.share is None:
-            raise InputError(where=f"goal {place}", found="a goal that would never end", needed="at_most or share")
+            raise InputError(where=f"goal {number}", found="a goal that would never end", needed="at_most or share")
     if last.at_most is not None:
         found = f"at_most {last.at_most} of the last goal, after which there is none"
-        raise InputError(where=f"goal {len(before) + first}", found=found, needed="null: no bound")
+        raise InputError(where=f"goal {len(all_but_last) + first}", found=found, needed="null: no bound")
 
 
 @dataclass(frozen=True)
 class GoalProgress:
-    """Which goal applies at a decision, and since when. It never goes back to an earlier goal.
+    """The goal that applies at a decision, and since when. The index never decreases.
 
-    Source of the rule: zcczhang/UVD @ e7d657a, uvd/envs/evaluator/inference_wrapper.py: energy relative to that at the
-    beginning of the sub-goal, within bounds on the number of steps.
+    Source of the rule: zcczhang/UVD @ e7d657a, uvd/envs/evaluator/inference_wrapper.py: energy relative to the energy
+    at the beginning of the sub-goal, within bounds on the number of steps.
     """
 
     place: int  # index of the goal
-    since: int  # model step, counted from the reset, at which it began
-    began: float  # energy of the image to it at that time
-    changed: str = ""  # why it is another one than before, or why the last one is reached; empty: nothing changed
-    done: bool = False  # the last goal is reached; it stays so
+    since: int  # model step, counted from the reset, at which the goal began
+    began: float  # energy between the image at that step and the goal
+    changed: str = ""  # why the goal changed, or why the last goal is reached; empty: nothing changed
+    done: bool = False  # whether the last goal has been reached
 
     def after(self, goals: Sequence[SubGoal], step: int, energy: Callable[[int], float]) -> GoalProgress:
         """Return the progress at a later decision: the same goal, or the next one.
 
         Args:
-            goals: In order. The rule of the last one says when it is reached, by energy only.
-            step: Model steps done since the reset.
-            energy: Of the current image to the goal of an index.
+            goals: In order. The last goal is reached by its energy rule only.
+            step: Number of model steps since the reset.
+            energy: Returns the energy between the current image and the goal with an index.
         """
-        goal, steps, stays = goals[self.place], step - self.since, replace(self, changed="")
+        goal, steps, unchanged = goals[self.place], step - self.since, replace(self, changed="")
         if self.done or steps < goal.at_least:
-            return stays
+            return unchanged
         now, is_last = energy(self.place), self.place == len(goals) - 1
         why = goal.why_reached(now, self.began)
         if not why and goal.at_most is not None and steps >= goal.at_most and not is_last:
@@ -126,7 +126,7 @@ class GoalProgress:
             if self.began > 0 and math.isfinite(now):
                 why += f", {now / self.began:.0%} of {self.began:.4g}"
         if not why:
-            return stays
+            return unchanged
         name = f"Goal {self.place + 1} ({goal.name})" if goal.name else f"Goal {self.place + 1}"
         text = f"{name}, after {counted(steps, 'step')}: {why}."
         if is_last:
@@ -136,7 +136,7 @@ class GoalProgress:
 
 @dataclass(frozen=True)
 class GoalEntry:
-    """What goals.json says of one goal; all but its file may be left out."""
+    """The entry of one goal in goals.json; only `file` is required."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
@@ -146,45 +146,45 @@ class GoalEntry:
     at_most: int | None = None
     share: float | None = None
     gripper: GripperMode | None = None
-    frame: int | None = None  # of the demonstration
-    began: float | None = None  # of older versions
+    frame: int | None = None  # index of the frame in the demonstration
+    began: float | None = None  # written by older versions; not used
 
 
 @dataclass(frozen=True)
 class _GoalsFile:
-    format: Literal[1]  # goes up when a reader of the file would have to change
+    format: Literal[1]  # incremented when a reader of the file would have to change
     goals: Annotated[list[GoalEntry], Field(min_length=1, max_length=256)]
-    noise: dict[str, Any] | None = None  # of older versions
+    noise: dict[str, Any] | None = None  # written by older versions; not used
     origin: dict[str, Any] = field(default_factory=dict)
 
 
 def read_goal_folder(folder: Path) -> tuple[SubGoal, ...]:
-    """Return the goals of a folder.
+    """Read the goals of a folder.
 
     Raises:
-        InputError: There is no goals.json, it says something else, or a file is not in the folder, has no contrast, or
-            is not an image with the size of the first image.
+        InputError: There is no goals.json, or it is invalid; or an image is not in the folder, has no contrast, cannot
+            be read, or differs in size from the first image.
     """
     path, needed = folder / GOALS_FILE, f"the {GOALS_FILE} that `vjepa2-ac goals` writes"
-    found = record_of(_GoalsFile, read_json_object(path, needed=needed), where=str(path), needed=needed)
+    content = record_of(_GoalsFile, read_json_object(path, needed=needed), where=str(path), needed=needed)
     goals: list[SubGoal] = []
-    for place, entry in enumerate(found.goals, start=1):
-        image_path = _path_of(entry, folder, where=f"{path}: goal {place}")
+    for number, entry in enumerate(content.goals, start=1):
+        image_path = _path_of(entry, folder, where=f"{path}: goal {number}")
         image = read_image(image_path)
         require_image(image, where=str(image_path), like=goals[0].image if goals else None)
         require_contrast([image], where=str(image_path))
         try:
             goals.append(SubGoal(image, entry.name, entry.at_least, entry.at_most, entry.share, entry.gripper))
         except InputError as error:
-            raise InputError(where=f"{path}: goal {place}", found=error.found, needed=error.needed) from None
+            raise InputError(where=f"{path}: goal {number}", found=error.found, needed=error.needed) from None
     return tuple(goals)
 
 
 def _path_of(entry: GoalEntry, folder: Path, *, where: str) -> Path:
-    """Return the path of a goal's image, which is in the folder: goals.json may be a third party's.
+    """Return the path of a goal's image; refuse paths outside the folder, since goals.json may be untrusted.
 
     Raises:
-        InputError: The path leads out of the folder, or has control characters.
+        InputError: The path is outside the folder, or has control characters.
     """
     name, root = Path(entry.file), os.path.realpath(folder)
     is_local = entry.file.isprintable() and not name.is_absolute() and ".." not in name.parts
@@ -202,13 +202,13 @@ def write_goals(
     frames: Sequence[int | None] = (),
     origin: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write goals into a folder, whole or not at all, and return the path of its goals.json.
+    """Write goals into a folder, completely or not at all, and return the path of its goals.json.
 
     Args:
-        folder: A new or empty one; other files in it stay.
+        folder: A new folder, or one without goals; its other files are kept.
         goals: In order.
-        frames: Of the demonstration, of each goal; empty: not known.
-        origin: Where they come from, as plain values.
+        frames: Index of each goal's frame in the demonstration; empty: unknown.
+        origin: The source of the goals, as plain values.
 
     Raises:
         InputError: The folder cannot be written.
@@ -219,8 +219,8 @@ def write_goals(
     none = [None] * len(goals)
     with folder_writer(folder, GOALS_FILE) as filling:
         entries = []
-        for place, (goal, frame) in enumerate(zip(goals, frames or none, strict=True), start=1):
-            name = f"goal_{place}.png"
+        for number, (goal, frame) in enumerate(zip(goals, frames or none, strict=True), start=1):
+            name = f"goal_{number}.png"
             (filling / name).write_bytes(encode_png(goal.image))
             bounds = (goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper)
             entries.append(GoalEntry(name, *bounds, frame))

@@ -1,4 +1,4 @@
-"""Loading a run or a model to plan with: merged, in eval mode, compiled on request; and its calibrated axes."""
+"""Loading of a run or a model for planning: adapter merged, in eval mode, and compiled on request."""
 
 from __future__ import annotations
 
@@ -23,19 +23,21 @@ def load_to_plan(
 ) -> Subject:
     """Load a run or a model for planning, on its device.
 
-    The settings of a run are those of its config: planning, seed, crop, stride, type of the weights. Those of a model
-    are the given config's; without one the defaults, and float32 weights if the device has no bfloat16, or is a CPU.
-    Limits beyond the motions in the training data, and narrow data, are logged and in the subject's `warnings`.
-    Trained weights are merged before the model moves to the device (see `prepare_for_planning`): it is there once.
+    The settings of a run (planning, seed, crop, stride, dtype of the weights) are read from its config. The settings of
+    a model are those of `config`, or the defaults; the default dtype is bfloat16 on a GPU that supports it, otherwise
+    float32. Limits beyond the motions in the training data, and low-diversity training data, are logged as warnings and
+    stored in the subject's `warnings`. An adapter is merged before the model moves to the device, so that the device
+    holds only one copy (see `prepare_for_planning`).
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
-        checkpoint: Of a run: selected, newest, best, or a number of optimizer steps.
+        checkpoint: For a run: selected, newest, best, or a number of optimizer steps.
         config: A config file, for a model.
-        overrides: Such as planning.horizon=2.
+        overrides: For example planning.horizon=2.
 
     Raises:
-        InputError: It does not exist, cannot be used for planning, or a setting is invalid or has no effect.
+        InputError: The run or model does not exist or cannot be used for planning, or a setting is invalid or has no
+            effect.
     """
     dtype = "bfloat16" if torch.cuda.is_available() and has_bf16() else "float32"
     settings = planning_settings(subject, config=config, overrides=overrides, dtype=dtype)
@@ -52,17 +54,17 @@ def load_to_plan(
 
 
 def prepare_for_planning(world_model: WorldModel, config: PlanningConfig) -> WorldModel:
-    """Return the model for planning: the same, or a copy that shares its encoder, for an adapted one.
+    """Return the model for planning: the same model, or a merged copy that shares its encoder if it has an adapter.
 
-    Trained weights are float32, and planning does not use autocast as training does: unmerged, PEFT computes an
-    adapter in float32, and a predictor that was trained whole takes float32 throughout. So it is merged and computes in
-    the base's type. On a fake GPU a decision at the released sizes in bfloat16 takes 7.5 s unmerged, 3.7 s with
-    adapters in bfloat16 beside their layers, and 3.0 s merged. Merging costs no accuracy: after 200 steps of the demo
-    predictions are off by 2.5 % of the adapter's effect, by 2.7 % without merging, and the base's by 2.4 %. The updates
-    lost to rounding (below 0.2 % of a weight) are below bfloat16's noise in the output of a layer.
+    Trained weights are float32, and planning does not use autocast as training does. Unmerged, PEFT computes an adapter
+    in float32, and a fully fine-tuned predictor computes everything in float32. The merged copy computes in the dtype
+    of the base model. On a simulated GPU a decision at the released sizes in bfloat16 takes 7.5 s unmerged, 3.7 s with
+    unmerged bfloat16 adapters, and 3.0 s merged. Merging costs no accuracy: after 200 steps of the demo, the rounding
+    error of bfloat16 predictions is 2.5 % of the adapter's effect when merged, 2.7 % unmerged, and 2.4 % for the base
+    model. The updates lost to rounding (below 0.2 % of a weight) are below bfloat16's noise in the output of a layer.
 
     Raises:
-        InputError: Its blocks are to be compiled, and there is no compiler.
+        InputError: `planning.compile` is `blocks`, and there is no compiler.
     """
     if world_model.adaptation is not None:
         world_model = unadapted_copy(world_model)

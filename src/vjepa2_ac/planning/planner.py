@@ -1,7 +1,7 @@
-"""The planner: a cost function in, a plan out. The loop around each solver: time, limits, bad energies, a record.
+"""The planner: minimises a cost function over action sequences, with a time budget and limits, and records the search.
 
-Axes: samples (action sequences), decisions (chosen actions), steps (of the model; a decision is repeated for
-`SearchSpace.repeat` of them), dim (components of an action). All on the CPU.
+Tensor axes: samples (action sequences), decisions (actions that are chosen), steps (model steps; each decision is
+repeated for `SearchSpace.repeat` of them), dim (components of an action). All tensors are on the CPU.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from vjepa2_ac.planning.search_space import SearchSpace, pose_space
 from vjepa2_ac.planning.solvers import EvaluatedPlans, PlanStart, Samples, Solver
 from vjepa2_ac.registry import PLANNERS
 
-Clock = Callable[[], float]  # seconds, from anywhere
-Cancelled = Callable[[], bool]  # whether nobody waits for the plan any more
+Clock = Callable[[], float]  # seconds since an arbitrary start
+Cancelled = Callable[[], bool]  # returns whether the plan is no longer needed
 Stopped = Literal["finished", "out of time", "no finite energy"]
 
 
 class SearchCancelledError(Exception):
-    """A search was ended from outside before it was done; there is no plan."""
+    """The caller cancelled the search; there is no plan."""
 
 
 @runtime_checkable
 class Cost(Protocol):
-    """A planner's only view of a model: the cost of action sequences. Lower is better; NaN is not allowed.
+    """The interface between planner and model: the cost of action sequences. Lower is better; NaN is not allowed.
 
-    One that evaluates in parts may have an attribute `progress`, which it calls after each part with the action
-    sequences so far, and all of the call.
+    A cost that evaluates in parts may have an attribute `progress`, which it calls after each part with the number of
+    evaluated action sequences and the total of the call.
     """
 
     def __call__(self, actions: Float[Tensor, "samples steps dim"]) -> Float[Tensor, " samples"]:
@@ -49,7 +49,7 @@ class Cost(Protocol):
 
 
 def until_cancelled(cancelled: Cancelled, progress: Progress = no_progress) -> Progress:
-    """Return a progress that raises `SearchCancelledError` in what reports to it, once that is cancelled."""
+    """Return a progress callback that raises `SearchCancelledError` in its caller once `cancelled` returns true."""
 
     def report(done: int, total: int) -> None:
         if cancelled():
@@ -61,18 +61,18 @@ def until_cancelled(cancelled: Cancelled, progress: Progress = no_progress) -> P
 
 @contextmanager
 def reporting(cost: Cost, progress: Progress, *, done: int, share: int, total: int) -> Iterator[None]:
-    """Report the progress of the one evaluation within a `with` block: its parts, if the cost says so, and its end.
+    """Report the progress of the evaluation in a `with` block: after each part that the cost reports, and at the end.
 
     Args:
-        cost: What is evaluated.
-        progress: Called with what is done, and the total.
-        done: Before the evaluation.
-        share: Of the evaluation in the total, however many action sequences it has.
-        total: Of all evaluations.
+        cost: The cost that is evaluated.
+        progress: Called with the number of evaluated action sequences and the total.
+        done: Number before this evaluation.
+        share: Number that this evaluation adds, however many action sequences it has.
+        total: Number for all evaluations.
     """
 
     def evaluated(part: int, of: int) -> None:
-        if part < of:  # the last part is done when its energies are there
+        if part < of:  # the end is reported after the `with` block, when the energies have been computed
             progress(done + share * part // of, total)
 
     parts: Any = cost if hasattr(cost, "progress") else SimpleNamespace(progress=no_progress)
@@ -86,37 +86,37 @@ def reporting(cost: Cost, progress: Progress, *, done: int, share: int, total: i
 
 @dataclass(frozen=True)
 class Iteration:
-    """The record of one iteration, for figures."""
+    """The record of one iteration, for plots."""
 
     samples: int
-    finite: int  # of these, how many have an energy
+    finite: int  # number of samples with a finite energy
     elites: Float[Tensor, "elites decisions dim"]  # best first
     elite_energies: Float[Tensor, " elites"]
-    mean: Float[Tensor, "decisions dim"]  # of the distribution after it
+    mean: Float[Tensor, "decisions dim"]  # of the distribution after the iteration
     std: Float[Tensor, "decisions dim"]
     seconds: float
 
     @property
     def lowest(self) -> float:
-        """The energy of this iteration's best; infinite where there is none."""
+        """Lowest energy of this iteration; infinite if no energy is finite."""
         return float(self.elite_energies[0]) if len(self.elite_energies) else math.inf
 
     @property
     def elite_energy(self) -> float:
-        """The mean of the elites' energies; infinite where there are none."""
+        """Mean energy of the elites; infinite if there are none."""
         return float(self.elite_energies.mean()) if len(self.elite_energies) else math.inf
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The planned actions, and how they were found."""
+    """The planned actions, and a record of their search."""
 
-    actions: Float[Tensor, "steps dim"]  # within the limits, always
-    energy: float  # of these actions; NaN where the plan is to do nothing
+    actions: Float[Tensor, "steps dim"]  # always within the limits
+    energy: float  # of these actions; NaN with "no finite energy"
     stopped: Stopped  # with "no finite energy" the actions are zero
     iterations: tuple[Iteration, ...]
-    mean: Float[Tensor, "decisions dim"]  # where the search ended, before the gripper is rounded
-    repeat: int  # model steps of a decision
+    mean: Float[Tensor, "decisions dim"]  # final mean of the search, before the gripper is rounded
+    repeat: int  # model steps for which each decision is repeated
     planner: str
     seed: int
     evaluations: int  # number of evaluated action sequences
@@ -125,8 +125,8 @@ class Plan:
     def start_after(self) -> PlanStart:
         """Return the start of the next search, one model step later.
 
-        A decision of the next plan begins at the mean of what this plan would have done in its model steps: if an
-        action is repeated, a decision begins between two of this plan's. The last decision is repeated.
+        Each decision starts at the mean of this plan's actions in the same model steps. If actions are repeated, such
+        model steps can belong to two decisions of this plan. The last action is repeated.
         """
         elites = self.iterations[-1].elites if self.iterations else self.mean[None][:0]
         return PlanStart(_one_step_later(self.mean[None], self.repeat)[0], _one_step_later(elites, self.repeat))
@@ -134,43 +134,43 @@ class Plan:
 
 def _one_step_later(decisions: Samples, repeat: int) -> Samples:
     steps = decisions.shape[1] * repeat
-    places = (torch.arange(steps) + 1).clamp(max=steps - 1) // repeat
+    indices = (torch.arange(steps) + 1).clamp(max=steps - 1) // repeat
     return reduce(
-        decisions[:, places], "samples (decisions repeat) dim -> samples decisions dim", "mean", repeat=repeat
+        decisions[:, indices], "samples (decisions repeat) dim -> samples decisions dim", "mean", repeat=repeat
     )
 
 
 def samples_of_iterations(config: PlanningConfig) -> tuple[int, ...]:
-    """Return the number of action sequences that each iteration evaluates, without those that icem reuses."""
-    one = torch.zeros(1, 1)
-    search = _solver(config, SearchSpace(one, one, one), Generator(), PlanStart(one, one[None]))
+    """Return the number of new action sequences that each iteration evaluates, without those that icem reuses."""
+    zeros = torch.zeros(1, 1)
+    search = _solver(config, SearchSpace(zeros, zeros, zeros), Generator(), PlanStart(zeros, zeros[None]))
     return _samples_of(search, config)
 
 
 def _solver(config: PlanningConfig, space: SearchSpace, generator: Generator, start: PlanStart | None) -> Solver:
-    name, given = config.planner.name, config.planner.options
-    search: Solver = PLANNERS.find(name)(space, config, generator, start, **PLANNERS.options(name, given))
+    name, options = config.planner.name, config.planner.options
+    search: Solver = PLANNERS.find(name)(space, config, generator, start, **PLANNERS.options(name, options))
     return search
 
 
 def _samples_of(search: Solver, config: PlanningConfig) -> tuple[int, ...]:
-    """Return the samples of each iteration; a solver of a third party need not say how many it draws."""
+    """Return the number of samples of each iteration; a third-party solver need not have `num_samples`."""
     number = getattr(search, "num_samples", lambda _: config.samples)
     return tuple(itertools.takewhile(bool, map(number, range(config.iterations))))
 
 
 @dataclass
 class Planner:
-    """Searches the action sequence of lowest cost, and knows nothing else about the model.
+    """A search for the action sequence of lowest cost. It uses the model only through the cost function.
 
-    Whatever the cost returns, the actions of a plan are within the limits; if no cost is finite, they are zero.
+    For any output of the cost, the actions of a plan are within the limits; if no cost is finite, they are zero.
 
     Args:
-        config: The solver, and how long it searches.
+        config: The solver, its number of iterations, and its time budget.
         space: The allowed actions; None: an arm's actions within `planning.limits`.
         clock: Measures the time budget.
-        progress: Called with the number of evaluated action sequences of a plan: at its start, after each part that the
-            cost reports, and after each iteration.
+        progress: Called with the number of evaluated action sequences and the total: at the start of a search, after
+            each part that the cost reports, and after each iteration.
     """
 
     config: PlanningConfig
@@ -191,12 +191,14 @@ class Planner:
         Args:
             cost: The cost of action sequences. Called without gradients except by planner gradient.
             generator: On the CPU; the same seed gives the same plan. Its initial seed is recorded.
-            start: Left by an earlier plan (`Plan.start_after`).
-            cancelled: Asked before every iteration, and after each part that the cost reports.
-            space: The allowed actions, as many as usual; None: those of the planner.
+            start: Start of the search, from the previous plan (`Plan.start_after`), a prior or a policy; None: zero
+                motion.
+            cancelled: Called before every iteration, and after each part that the cost reports; returns whether to
+                stop.
+            space: The allowed actions, with the planner's number of decisions; None: those of the planner.
 
         Raises:
-            SearchCancelledError: It was cancelled.
+            SearchCancelledError: `cancelled` returned true.
             ValueError: The cost does not return one number per sample.
         """
         began, config, space = self.clock(), self.config, space or self.space or pose_space(self.config)
@@ -206,14 +208,14 @@ class Planner:
         total = sum(shares)
         self.progress(0, total)
         while len(record) < len(shares):
-            longest = max((one.seconds for one in record), default=0.0)
+            longest = max((iteration.seconds for iteration in record), default=0.0)
             if record and config.budget_s is not None and self.clock() - began + longest > config.budget_s:
                 break
             if cancelled():
                 raise SearchCancelledError
             done, share = sum(shares[: len(record)]), shares[len(record)]
-            watched = until_cancelled(cancelled, self.progress)
-            with reporting(cost, watched, done=done, share=share, total=total):
+            report = until_cancelled(cancelled, self.progress)
+            with reporting(cost, report, done=done, share=share, total=total):
                 record.append(self._iterate(search, cost, space))
         stopped: Stopped = "finished" if len(record) == len(shares) else "out of time"
         actions, energy, evaluated = _chosen(search.result(), record, cost, space, lowest=stopped == "out of time")
@@ -228,17 +230,17 @@ class Planner:
             repeat=space.repeat,
             planner=config.planner.name,
             seed=generator.initial_seed(),
-            evaluations=sum(one.samples for one in record) + evaluated,
+            evaluations=sum(iteration.samples for iteration in record) + evaluated,
             seconds=self.clock() - began,
         )
 
     def _iterate(self, search: Solver, cost: Cost, space: SearchSpace) -> Iteration:
         began = self.clock()
         decisions = search.sample()
-        found = _evaluated(cost, decisions, space, gradients=search.uses_gradients)
-        best = found.best(search.elites)
-        search.update(found)
-        counts = len(decisions), len(found.energies)
+        plans = _evaluated(cost, decisions, space, gradients=search.uses_gradients)
+        best = plans.best(search.elites)
+        search.update(plans)
+        counts = len(decisions), len(plans.energies)
         return Iteration(*counts, best.decisions, best.energies, search.mean, search.std, self.clock() - began)
 
 
@@ -249,31 +251,32 @@ def _evaluated(cost: Cost, decisions: Samples, space: SearchSpace, *, gradients:
         if energies.shape != (len(decisions),):
             raise ValueError(f"energies of shape {tuple(energies.shape)} for {len(decisions)} action sequences")
         finite = torch.isfinite(energies)
-        downhill = None
+        gradient = None
         if gradients:
-            (downhill,) = torch.autograd.grad(energies.where(finite, 0.0).sum(), decisions)
-            downhill = torch.nan_to_num(downhill, nan=0.0, posinf=0.0, neginf=0.0)
+            (gradient,) = torch.autograd.grad(energies.where(finite, 0.0).sum(), decisions)
+            gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
     finite = finite.cpu()
-    return EvaluatedPlans(decisions.detach()[finite], energies.detach().float().cpu()[finite], downhill)
+    return EvaluatedPlans(decisions.detach()[finite], energies.detach().float().cpu()[finite], gradient)
 
 
 def _chosen(
     answer: Tensor | None, record: list[Iteration], cost: Cost, space: SearchSpace, *, lowest: bool
 ) -> tuple[Float[Tensor, "steps dim"] | None, float, int]:
-    """Return actions, their energy, and the number of extra evaluations: the result, or else the best sample.
+    """Return actions, their energy, and the number of extra evaluations.
 
-    With `lowest`, the one of lower cost: a mean that has hardly moved may lead nowhere.
+    The actions are the solver's result, or the best sample if the result has no finite energy. With `lowest` (a search
+    that was stopped early) they are the one with the lower energy, since the mean may still be close to its start.
     """
-    found = min(record, key=lambda one: one.lowest)
-    best = found.elites[0] if len(found.elites) else None
+    best_iteration = min(record, key=lambda iteration: iteration.lowest)
+    best = best_iteration.elites[0] if len(best_iteration.elites) else None
     chosen, lowest_energy, evaluated = None, math.nan, 0
     for decisions in (answer, best):
         if decisions is None or (chosen is not None and not lowest):
             continue
-        done, energies = space.finished(decisions), [found.lowest]
-        if decisions is not best or not torch.equal(done, decisions):
-            energies = _evaluated(cost, done[None], space, gradients=False).energies.tolist()
+        finished, energies = space.finished(decisions), [best_iteration.lowest]
+        if decisions is not best or not torch.equal(finished, decisions):
+            energies = _evaluated(cost, finished[None], space, gradients=False).energies.tolist()
             evaluated += 1
         if energies and not energies[0] >= lowest_energy:
-            chosen, lowest_energy = space.over_steps(done), energies[0]
+            chosen, lowest_energy = space.over_steps(finished), energies[0]
     return chosen, lowest_energy, evaluated

@@ -1,4 +1,4 @@
-"""The action space: limits per axis and of the L1 norm, fixed axes, and rounding of a finished plan."""
+"""The search space of actions: limits per axis and of the L1 norm, fixed axes, the gripper's rounding, a workspace."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from vjepa2_ac.spaces import StateSpace
 
 GRIPPER = 6  # of a pose
 GRIPPER_ROUNDING = 0.25  # smaller changes of closedness become zero
-_ROUNDING = 4 * torch.finfo(torch.float32).eps  # a norm is rounded more than once
+_ROUNDING = 4 * torch.finfo(torch.float32).eps  # margin for the rounding errors of a norm
 
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """Limits of each component of each decision; where both limits are equal, it is fixed.
+    """Limits of each component of each decision; a component whose two limits are equal is fixed.
 
-    They are finite, the lower ones not above the upper ones; with `l1`, they allow zero motion.
+    The limits are finite, and no lower limit is above its upper limit. With `l1` they allow zero motion.
     """
 
     lower: Float[Tensor, "decisions dim"]
     upper: Float[Tensor, "decisions dim"]
-    std: Float[Tensor, "decisions dim"]  # of the first samples; `start_std` of a planner is a share of it
+    std: Float[Tensor, "decisions dim"]  # of the first samples, before it is scaled by a planner's `start_std`
     repeat: int = 1  # model steps of a decision
     l1: float | None = None  # the largest sum of the absolute dx, dy and dz
-    gripper: int | None = None  # the index of the gripper in an action; None: not known
+    gripper: int | None = None  # index of the gripper in an action; None: unknown
     gripper_rounding: float = 0.0  # changes below this are set to zero in a finished plan
 
     @property
     def decisions(self) -> int:
-        """Number of chosen actions."""
+        """Number of actions that the search chooses."""
         return int(self.lower.shape[0])
 
     @property
     def dim(self) -> int:
-        """Components of an action."""
+        """Number of components of an action."""
         return int(self.lower.shape[1])
 
     @property
     def steps(self) -> int:
-        """Model steps of a plan."""
+        """Number of model steps of a plan."""
         return self.decisions * self.repeat
 
     @property
     def free(self) -> Tensor:
-        """Components that are not fixed, in at least one decision: indices along dim."""
+        """Indices of the components that are not fixed in at least one decision."""
         return (self.lower < self.upper).any(dim=0).nonzero()[:, 0]
 
     @property
@@ -59,15 +59,15 @@ class SearchSpace:
         return torch.where(self.lower < self.upper, self.std, 0.0)
 
     def allowed(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch decisions dim"]:
-        """Return each decision, clipped to the limits; the result is always allowed, even for NaN.
+        """Return each decision, clipped to the limits; the result is always allowed, and NaN becomes the allowed zero.
 
-        Where dx, dy and dz exceed the limit of the L1 norm, they are scaled towards zero motion.
+        If dx, dy and dz exceed the limit of the L1 norm, they are scaled down together.
         """
         clipped = torch.nan_to_num(decisions, nan=0.0).clamp(self.lower, self.upper)
         if self.l1 is None:
             return clipped
         length = clipped[..., :3].abs().sum(dim=-1, keepdim=True)
-        length = length.clamp(min=torch.finfo(length.dtype).tiny)  # without a motion its share would be infinite
+        length = length.clamp(min=torch.finfo(length.dtype).tiny)  # avoids a division by zero
         share = (self.l1 * (1 - _ROUNDING) / length).clamp(max=1.0)
         return torch.cat([clipped[..., :3] * share, clipped[..., 3:]], dim=-1)
 
@@ -76,11 +76,11 @@ class SearchSpace:
 
         Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, round_small_elements.
         """
-        done = self.allowed(decisions)
+        rounded = self.allowed(decisions)
         if self.gripper is not None:
-            one = done[:, self.gripper]
-            done[:, self.gripper] = torch.where(one.abs() < self.gripper_rounding, 0.0, one)
-        return done
+            gripper = rounded[:, self.gripper]
+            rounded[:, self.gripper] = torch.where(gripper.abs() < self.gripper_rounding, 0.0, gripper)
+        return rounded
 
     def over_steps(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch steps dim"]:
         """Return the action of each model step."""
@@ -115,7 +115,7 @@ def pose_space(config: PlanningConfig) -> SearchSpace:
     if limits.gripper_mode in {"open", "close"}:
         lower[:, GRIPPER] = upper[:, GRIPPER] = 1.0 if limits.gripper_mode == "close" else -1.0
     std = reach.clone()
-    std[GRIPPER] = 1.0  # beyond the limit of the gripper, as upstream: samples then gather there
+    std[GRIPPER] = 1.0  # as upstream: larger than the gripper's limit, so that many samples are clipped to the limit
     return SearchSpace(
         lower=lower,
         upper=upper,
@@ -128,7 +128,7 @@ def pose_space(config: PlanningConfig) -> SearchSpace:
 
 
 def _towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
-    """Return values in float32, rounded towards smaller ones: float32's 0.05 is above 0.05."""
+    """Return values in float32, rounded towards zero, so that no limit is exceeded: float32's 0.05 is above 0.05."""
     exact = torch.tensor(values, dtype=torch.float64)
     nearest = exact.float()
     return torch.where(nearest.double() > exact, torch.nextafter(nearest, torch.zeros_like(nearest)), nearest)
@@ -139,14 +139,14 @@ _NEAR_M = 1e-8  # rounding of float32 actions; far below the resolution of a rob
 
 @dataclass(frozen=True)
 class Workspace:
-    """A box for the flange's position."""
+    """A box that contains all positions that the flange may reach."""
 
     low: Float[np.ndarray, " 3"]
     high: Float[np.ndarray, " 3"]
 
     @classmethod
     def of(cls, limits: LimitsConfig, space: StateSpace) -> Workspace | None:
-        """Return the box of these limits; None: there is none.
+        """Return the box of `planning.limits.workspace`; None: there is none.
 
         Raises:
             InputError: States are not poses in the base frame.
@@ -160,62 +160,63 @@ class Workspace:
         return cls(*(np.array(corner, dtype=np.float64) for corner in limits.workspace))
 
     def narrowed(self, space: SearchSpace, state: Float[np.ndarray, " 7"]) -> SearchSpace:
-        """Return the search space whose first decision stays inside, in each model step for which it is repeated.
+        """Return a search space whose first decision stays inside the box in each model step of its repetition.
 
-        From a position outside along an axis, no motion farther outwards is searched; `kept` adds the motion inside.
+        From a position outside along an axis, motions farther outwards are excluded; `kept` adds the motion inwards.
         """
         lower, upper = space.lower.clone(), space.upper.clone()
-        room_down = torch.from_numpy(np.minimum(self.low - state[:3], 0.0)).float() / space.repeat
-        room_up = torch.from_numpy(np.maximum(self.high - state[:3], 0.0)).float() / space.repeat
-        lower[0, :3] = torch.maximum(lower[0, :3], room_down)
-        upper[0, :3] = torch.minimum(upper[0, :3], room_up)
+        lowest = torch.from_numpy(np.minimum(self.low - state[:3], 0.0)).float() / space.repeat
+        highest = torch.from_numpy(np.maximum(self.high - state[:3], 0.0)).float() / space.repeat
+        lower[0, :3] = torch.maximum(lower[0, :3], lowest)
+        upper[0, :3] = torch.minimum(upper[0, :3], highest)
         return replace(space, lower=lower, upper=upper)
 
     def kept(
         self, state: Float[np.ndarray, " 7"], actions: Float[np.ndarray, "steps 7"], limits: LimitsConfig
     ) -> Float[np.ndarray, "steps 7"]:
-        """Return actions whose targets are all inside, for a robot that a single action can bring inside.
+        """Return actions whose target positions are all inside the box.
 
-        A target outside is moved to the nearest position inside. If the action then exceeds its limits, it is shortened
-        towards the shortest motion that ends inside.
+        The robot must be inside, or near enough for one action to bring it inside. A target outside is moved to the
+        nearest position inside. If the action then exceeds its limits, it is shortened towards the shortest motion that
+        ends inside.
 
         Args:
             state: The state of the robot.
-            actions: Changes of each model step, within the limits.
+            actions: Changes of the state in each model step, within the limits.
             limits: The limits of an action.
         """
         kept, position = np.array(actions, dtype=np.float64), np.array(state[:3], dtype=np.float64)
         reach = np.array(limits.xyz_m)
         for action in kept:
-            way = np.clip(position + action[:3], self.low, self.high) - position
-            if abs(way - action[:3]).max() > _NEAR_M:
-                action[:3] = _shortened(np.clip(way, -reach, reach), self.way_back(position), limits.l1)
+            motion = np.clip(position + action[:3], self.low, self.high) - position
+            if abs(motion - action[:3]).max() > _NEAR_M:
+                action[:3] = _shortened(np.clip(motion, -reach, reach), self.way_back(position), limits.l1)
             position = position + action[:3]
         return kept
 
     def way_back(self, position: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Return the shortest motion that ends inside; zeros from a position inside."""
+        """Return the shortest motion that ends inside the box; zeros for a position inside."""
         return np.asarray(np.clip(position, self.low, self.high) - position)
 
 
 def _shortened(
-    way: Float[np.ndarray, " 3"], way_back: Float[np.ndarray, " 3"], l1: float | None
+    motion: Float[np.ndarray, " 3"], shortest: Float[np.ndarray, " 3"], l1: float | None
 ) -> Float[np.ndarray, " 3"]:
     """Return a motion whose L1 norm is within its limit, and that still ends inside the workspace.
 
-    Only the part beyond the shortest way inside is scaled: both parts have the same direction along each axis, so that
-    their L1 norms add up.
+    Only the part beyond the shortest motion inside is scaled: both parts have the same direction along each axis, so
+    that their L1 norms add up.
 
     Args:
-        way: From a position to one inside.
-        way_back: From the same position, the shortest way inside, which is within the limit.
+        motion: From a position to a position inside.
+        shortest: The shortest motion from the same position to a position inside; within the limit.
         l1: The limit; None: there is none.
     """
     if l1 is None:
-        return way
-    beyond = way - way_back
-    room, length = l1 - abs(way_back).sum(), abs(beyond).sum()
-    return np.asarray(way_back + beyond * min(1.0, max(room, 0.0) / max(length, _NEAR_M)))
+        return motion
+    beyond = motion - shortest
+    allowed, length = l1 - abs(shortest).sum(), abs(beyond).sum()
+    return np.asarray(shortest + beyond * min(1.0, max(allowed, 0.0) / max(length, _NEAR_M)))
 
 
 def is_allowed(way: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:

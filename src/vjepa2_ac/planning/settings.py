@@ -1,4 +1,4 @@
-"""The settings of a decision: of a run, of a config, or the defaults; calibrated axes. PyTorch is not imported."""
+"""Settings for planning (from a run, a config or the defaults), and calibrated axes. PyTorch is not imported."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ USED = (
     "planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype",
     "training.device", *MOVABLE,
 )  # fmt: skip
-_ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
-_SLACK = 1.1  # uniform motion has its 99th percentile below its limit, and that of some episodes is not exact
+_ANY_TYPE = "training.precision=bf16"  # allows any model.dtype: the rule about autocast is not relevant to planning
+_SLACK = 1.1  # the 99th percentile of uniform motion is below its maximum, and is inexact for few episodes
 
 
 def planning_settings(
     subject: str, *, config: str | Path | None = None, overrides: Sequence[str] = (), dtype: str = "float32"
 ) -> Config:
-    """Return the config to plan with: that of a run; for a model the given one, or the defaults.
+    """Return the config for planning: the run's config; for a model the given config, or the defaults.
 
     Args:
-        subject: The folder of a run; or a model: what `model.base` takes.
+        subject: The folder of a run; or a model, as in `model.base`.
         config: A config file, for a model.
-        overrides: Such as planning.horizon=2.
-        dtype: Of the weights of a model, where no config says it.
+        overrides: For example planning.horizon=2.
+        dtype: Of a model's weights, if there is no config.
 
     Raises:
-        InputError: A setting is wrong or does not matter.
+        InputError: A setting is invalid, or is not used for planning.
     """
     _require_relevant(subject, overrides)
     if is_run(subject):
@@ -51,17 +51,17 @@ def planning_settings(
             found, fix = f"{subject}, a run, which has a config of its own", "Change single settings by key=value"
             raise InputError(where=f"--config {config}", found=found, fix=fix)
         folder = Path(subject)
-        its = with_taught_limits(read_run_config(folder, [*overrides, _ANY_TYPE]), folder)
+        settings = with_taught_limits(read_run_config(folder, [*overrides, _ANY_TYPE]), folder)
     elif config is None:
-        its = config_of_model(subject, overrides, dtype=dtype)
+        settings = config_of_model(subject, overrides, dtype=dtype)
     else:
-        its = load_config(config, [*overrides, _ANY_TYPE])
-        its = its.model_copy(update={"model": its.model.with_base(subject)})
-    require_limits(its)
-    if (axes := its.planning.axes) is not None:
+        settings = load_config(config, [*overrides, _ANY_TYPE])
+        settings = settings.model_copy(update={"model": settings.model.with_base(subject)})
+    require_limits(settings)
+    if (axes := settings.planning.axes) is not None:
         read_axes(axes)
-        require_base_frame(f"planning.axes: {axes}", is_base=_is_base_pose(its.data))
-    return its
+        require_base_frame(f"planning.axes: {axes}", is_base=_is_base_pose(settings.data))
+    return settings
 
 
 # ---- calibrated axes ----
@@ -71,23 +71,23 @@ _FIX = "Fit them with `vjepa2-ac data calibrate CONFIG --axes MODEL`, and name t
 
 
 class AxesFile(BaseModel):
-    """What planning needs of axes.json, which `data calibrate --axes` writes."""
+    """The part of axes.json (written by `data calibrate --axes`) that planning needs."""
 
     format: Literal[1]
-    # About z, counterclockwise from above: what the model infers, from what was executed.
+    # Rotation about z, counterclockwise seen from above, from executed actions to the actions that the model infers.
     yaw_degrees: float = Field(validation_alias=AliasPath("yaw_degrees", "value"), allow_inf_nan=False)
     subject: str = Field(validation_alias=AliasPath("model", "subject"))  # the model, as given
     encoder: str = Field(validation_alias=AliasPath("model", "encoder"))  # hashes of its weights
     predictor: str = Field(validation_alias=AliasPath("model", "predictor"))
-    problem: str | None  # why nothing can be planned by it
-    centre_m: tuple[float, float] = (0.0, 0.0)  # x, y about which is turned
+    problem: str | None  # why these axes cannot be used; None: they can
+    centre_m: tuple[float, float] = (0.0, 0.0)  # x, y of the rotation axis
 
 
 def read_axes(path: str | Path) -> AxesFile:
-    """Return calibrated axes that can be planned by.
+    """Read calibrated axes, and refuse those that planning cannot use.
 
     Raises:
-        InputError: There is no such file, it is none of calibrated axes, or the fit is not good enough.
+        InputError: There is no such file, it does not contain calibrated axes, or the fit is not good enough.
     """
     where, needed = f"planning.axes: {path}", f"calibrated axes of format {AXES_FORMAT}"
     values = read_json_object(path, needed=needed, fix=_FIX)
@@ -99,10 +99,10 @@ def read_axes(path: str | Path) -> AxesFile:
 
 
 def require_base_frame(where: str, *, is_base: bool) -> None:
-    """Refuse states that have no vertical axis to turn about.
+    """Refuse states that are not poses in the robot's base frame: only these have a vertical axis to rotate about.
 
     Raises:
-        InputError: They are no poses in the robot's base frame.
+        InputError: The states are not such poses.
     """
     if not is_base:
         found = "states that are no poses in the robot's base frame"
@@ -111,10 +111,10 @@ def require_base_frame(where: str, *, is_base: bool) -> None:
 
 
 def require_axes_in(data: DataConfig) -> None:
-    """Refuse data in which there are no axes to calibrate, before a model is loaded.
+    """Refuse data whose axes cannot be calibrated, before a model is loaded.
 
     Raises:
-        InputError: The states are no poses in the base frame, or the stride is still to be chosen.
+        InputError: The states are not poses in the base frame, or the stride is not chosen yet.
     """
     require_base_frame("data calibrate --axes", is_base=_is_base_pose(data))
     require_stride(data, to="calibrate axes, for axes are those of a model step")
@@ -132,7 +132,7 @@ def _require_relevant(subject: str, overrides: Sequence[str]) -> None:
         key = override.partition("=")[0]
         try:
             is_relevant = Affects.PLAN in mark_of(key, Config)
-        except KeyError:  # the config says what is wrong
+        except KeyError:  # an unknown key; loading the config reports it
             continue
         if is_of_moved(override) and not is_run(subject):
             found = f"{subject}, which is not the folder of a run"
@@ -143,7 +143,7 @@ def _require_relevant(subject: str, overrides: Sequence[str]) -> None:
 
 
 def require_limits(config: Config) -> None:
-    """Refuse limits of poses that are those of the data, where no run has said which (vectors: `search_space`).
+    """Refuse `planning.limits.xyz: data` for poses if no run has recorded its motions (vectors: see `search_space`).
 
     Raises:
         InputError: As `LimitsConfig.xyz_m`.
@@ -154,24 +154,24 @@ def require_limits(config: Config) -> None:
 
 @dataclass(frozen=True)
 class Taught:
-    """What a run noted of the actions in its data."""
+    """Statistics of the motions in a run's training data."""
 
-    # 99th percentile of the size of each number's change in a model step
+    # 99th percentile of the absolute change of each number in a model step
     changes: tuple[Annotated[float, Field(ge=0.0, allow_inf_nan=False)], ...]
-    narrow: str = ""  # why the data are narrow; empty: they are not, or that is not known
+    narrow: str = ""  # why the data have a low diversity; empty: they do not, or this is unknown
 
 
 def taught_in(folder: Path, *, poses: bool) -> Taught | None:
-    """Return what a run noted of the actions in its data; None: nothing, as older runs of poses.
+    """Read the statistics of the motions in a run's training data; None: the run has none, as older runs of poses.
 
     Raises:
-        InputError: The file does not say it.
+        InputError: The file is invalid.
     """
     path = folder / CHANGES
     if not path.is_file():
         return None
-    noted = {name: one for name, one in read_json_object(path).items() if name in {"changes", "narrow"}}
-    taught = record_of(Taught, noted, where=str(path), needed="a number of 0 or more for each of the state's")
+    values = {name: value for name, value in read_json_object(path).items() if name in {"changes", "narrow"}}
+    taught = record_of(Taught, values, where=str(path), needed="a number of 0 or more for each of the state's")
     if poses and (len(taught.changes) != len(POSE) or max(taught.changes[:3]) > REACH_M):
         needed = f"{len(POSE)} numbers: {', '.join(POSE.change_names)}, positions in metres"
         raise InputError(where=str(path), found=str(taught.changes), needed=needed)
@@ -179,29 +179,29 @@ def taught_in(folder: Path, *, poses: bool) -> Taught | None:
 
 
 def with_taught_limits(config: Config, folder: Path) -> Config:
-    """Return the config of a run with the limits that `data` means in `planning.limits`, if the run knows them.
+    """Return the config of a run with `data` in `planning.limits` replaced by the recorded limits, if there are any.
 
     Raises:
-        InputError: What the run noted are no limits.
+        InputError: As `taught_in`.
     """
     limits, poses = config.planning.limits, config.data.states == "pose"
     if (limits.xyz if poses else limits.axes) != "data" or (taught := taught_in(folder, poses=poses)) is None:
         return config
-    # Down to tenths of a millimetre: an axis that only measurement moves is held.
-    metres = tuple(math.floor(1e4 * one) / 1e4 for one in taught.changes[:3])
+    # Rounded down to 0.1 mm, so that an axis with nothing but measurement noise is fixed.
+    metres = tuple(math.floor(1e4 * change) / 1e4 for change in taught.changes[:3])
     numbers = {"xyz": metres} if poses else {"axes": taught.changes}
     planning = config.planning.model_copy(update={"limits": limits.model_copy(update=numbers)})
     return config.model_copy(update={"planning": planning})
 
 
 def warn_beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
-    """Log and return why plans may leave what a run was taught, a sentence each: narrow data, or limits beyond them.
+    """Log and return warnings if a run was trained on low-diversity data, or if the limits exceed the data's motions.
 
-    Limits are compared with the 99th percentile of each number's change, which they may exceed by a tenth.
+    Limits are compared with the 99th percentile of each number's change, which they may exceed by 10 %.
 
     Args:
-        config: Of the run, with the limits to plan with.
-        folder: Of the run.
+        config: The config of the run, with the limits for planning.
+        folder: The folder of the run.
 
     Raises:
         InputError: As `taught_in`.
@@ -209,28 +209,28 @@ def warn_beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
     poses = config.data.states == "pose"
     if (taught := taught_in(folder, poses=poses)) is None:
         return ()
-    found = [f"{folder} learned from narrow data: {taught.narrow}"] if taught.narrow else []
+    warnings = [f"{folder} learned from narrow data: {taught.narrow}"] if taught.narrow else []
     names = POSE.change_names if poses else vector_states(len(taught.changes)).names
     reach = _reach(config.planning.limits, taught, poses=poses)
-    for knob, (unit, factor, numbers) in (_OF_POSES if poses else _OF_VECTORS).items():
+    for key, (unit, factor, numbers) in (_OF_POSES if poses else _OF_VECTORS).items():
         beyond = [
-            f"{name} {factor * most:.3g} ({factor * far:.3g}){unit}"
-            for name, most, far in list(zip(names, reach, taught.changes, strict=False))[numbers]
-            if most > _SLACK * far
+            f"{name} {factor * limit:.3g} ({factor * change:.3g}){unit}"
+            for name, limit, change in list(zip(names, reach, taught.changes, strict=False))[numbers]
+            if limit > _SLACK * change
         ]
         if beyond:
-            name = f"planning.limits.{knob}"
-            way_out = f"{name}=data stays within" if knob in {"xyz", "axes"} else f"lower {name}"
-            found.append(
+            name = f"planning.limits.{key}"
+            fix = f"{name}=data stays within" if key in {"xyz", "axes"} else f"lower {name}"
+            warnings.append(
                 f"{name} exceeds the motions in the training data of {folder}: {', '.join(beyond)} (99th percentile of"
-                f" the data in parentheses). Predictions beyond it are unreliable; {way_out}"
+                f" the data in parentheses). Predictions beyond it are unreliable; {fix}"
             )
-    for text in found:
+    for text in warnings:
         logger.warning(text)
-    return tuple(found)
+    return tuple(warnings)
 
 
-_OF_POSES = {  # which numbers a knob limits, and in which unit people read them
+_OF_POSES = {  # config key: displayed unit, its factor, and the numbers of a state that the key limits
     "xyz": (" cm", 100.0, slice(0, 3)),
     "rotation": (" degrees", 180 / math.pi, slice(3, 6)),
     "gripper": ("", 1.0, slice(6, 7)),
@@ -239,7 +239,7 @@ _OF_VECTORS = {"axes": ("", 1.0, slice(None))}
 
 
 def _reach(limits: LimitsConfig, taught: Taught, *, poses: bool) -> Sequence[float]:
-    """Return how far limits let each number go in a model step; nothing where they do not say it for each."""
+    """Return the largest change of each number in a model step; empty if the limits do not define one for each."""
     if not poses:
         axes = limits.axes if isinstance(limits.axes, tuple) else taught.changes
         axes = axes * len(taught.changes) if len(axes) == 1 else axes

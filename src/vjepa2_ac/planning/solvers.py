@@ -1,7 +1,7 @@
-"""Solvers: how the action sequence of lowest cost is searched. CEM, iCEM, MPPI, gradient descent.
+"""Solvers, which search for the action sequence of lowest cost: CEM, iCEM, MPPI, gradient descent.
 
-A solver samples decisions, receives their energies, and has a result; `planning.planner` has the loop around it. A
-solver of your own has the constructor, the attributes and the methods of `Solver`, which it need not inherit
+A solver proposes decisions, receives their energies, and returns a result; `planning.planner` runs the loop. A custom
+solver has the constructor, the attributes and the methods of `Solver`, but need not inherit from it
 (docs/extending.md). Its options are the fields of its class `Config`.
 """
 
@@ -21,25 +21,25 @@ from vjepa2_ac.config.section import Positive, PositiveInt, Section, Share, Zero
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.search_space import SearchSpace
 
-_NARROWEST = 0.1  # of the usual standard deviation: a prior is not as sure as it says
+_NARROWEST = 0.1  # lower bound on the std from a prior, relative to the usual std: a prior is overconfident
 Momentum = float | Tensor  # share of the old mean or standard deviation in the new one
 Elites = Annotated[int, Field(ge=2)]
 
 
 @dataclass(frozen=True)
 class PlanStart:
-    """The start of a search: what the last decision left, or what a prior says."""
+    """The start of a search, from the previous plan, an action prior or a policy."""
 
     mean: Float[Tensor, "decisions dim"]
     elites: Float[Tensor, "elites decisions dim"]
-    std: Float[Tensor, "decisions dim"] | None = None  # None: the planner's own
+    std: Float[Tensor, "decisions dim"] | None = None  # None: the planner's
 
     @classmethod
     def of_samples(cls, samples: Float[Tensor, "samples steps dim"], space: SearchSpace) -> PlanStart:
-        """Return what actions of a policy say: their mean, and how far they are apart.
+        """Return the mean and the standard deviation of actions that a policy proposes.
 
         Raises:
-            InputError: They have fewer model steps than a plan, or other numbers.
+            InputError: The actions have fewer model steps than a plan, or another number of components.
         """
         if samples.ndim != 3 or not len(samples) or samples.shape[1] < space.steps or samples.shape[2] != space.dim:
             needed = f"one or more, of {counted(space.steps, 'model step')} or more and {space.dim} numbers"
@@ -57,11 +57,11 @@ Samples = Float[Tensor, "samples decisions dim"]
 
 @dataclass(frozen=True)
 class EvaluatedPlans:
-    """Decisions with their energies; those without a finite one are left out, so it may be empty."""
+    """Decisions with their energies; those without a finite energy are left out, so there may be none."""
 
     decisions: Float[Tensor, "finite decisions dim"]
     energies: Float[Tensor, " finite"]
-    gradients: Samples | None = None  # of all samples, 0 where not finite
+    gradients: Samples | None = None  # for all samples; 0 where the energy is not finite
 
     def best(self, count: int) -> EvaluatedPlans:
         """Return the decisions of lowest energy, best first; fewer if there are not enough."""
@@ -74,10 +74,10 @@ class Solver:
 
     Args:
         space: The allowed decisions.
-        config: Its settings.
-        generator: Of its samples.
-        start: What the last decision left.
-        options: The options of a planner that has some.
+        config: Settings for planning.
+        generator: Random generator of the samples.
+        start: The start of the search; None: zero motion.
+        options: The solver's options, an instance of its `Config`, if it has one.
     """
 
     uses_gradients = False
@@ -102,14 +102,14 @@ class Solver:
 
     @property
     def elites(self) -> int:
-        """How many of the best are recorded."""
+        """Number of best decisions that are recorded."""
         return int(getattr(self._options, "elites", ELITES))
 
     def begin(self, start: Before) -> None:
-        """Prepare the search; `start` is what the last decision left."""
+        """Prepare the search from its start."""
 
     def num_samples(self, iteration: int) -> int:  # noqa: ARG002 - the same in all iterations
-        """Return how many decisions an iteration (from 0) evaluates, without reused ones; 0 ends the search."""
+        """Return the number of new decisions that an iteration (from 0) evaluates; 0 ends the search."""
         return self._config.samples
 
     def sample(self) -> Samples:
@@ -117,7 +117,7 @@ class Solver:
         raise NotImplementedError
 
     def update(self, evaluated: EvaluatedPlans) -> None:
-        """Update the distribution. Without any finite energy, nothing changes."""
+        """Update the distribution; without any finite energy it must not change."""
         raise NotImplementedError
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
@@ -125,7 +125,7 @@ class Solver:
         return None
 
     def _for_gripper(self, others: float, *, gripper: float) -> Float[Tensor, " dim"]:
-        """Return one number for each component of an action, another one for the gripper."""
+        """Return a vector with `others` for each component of an action and `gripper` for the gripper."""
         numbers = torch.full((self._space.dim,), others)
         if self._space.gripper is not None:
             numbers[self._space.gripper] = gripper
@@ -137,7 +137,7 @@ class Solver:
         return self._space.allowed(self.mean + self.std * noise)
 
     def _fit(self, best: Float[Tensor, "elites decisions dim"], keep_mean: Momentum, keep_std: Momentum) -> None:
-        """Move the distribution to its elites; a single one does not change the standard deviation."""
+        """Move the distribution towards the elites; a single elite does not change the standard deviation."""
         if len(best):
             self.mean = keep_mean * self.mean + (1 - keep_mean) * best.mean(dim=0)
         if len(best) > 1:
@@ -156,17 +156,17 @@ def white_noise(space: SearchSpace, samples: int, generator: Generator) -> Sampl
 
 
 class Sampling(Section):
-    """What the planners that draw samples have in common."""
+    """Options of all planners that draw samples."""
 
     start_std: Positive = 1.0
     """Standard deviation of the first samples, as a share of the limits of position and rotation."""
 
 
 class CemSolver(Solver):
-    """As upstream: samples are clipped, mean and standard deviation keep a share of their old values.
+    """CEM as upstream: samples are clipped; mean and standard deviation move towards the elites with a momentum.
 
-    Differs from upstream: a warm start is possible, samples without a finite energy are no elites, and a fixed gripper
-    is exact in the result as well.
+    Differences from upstream: a warm start is possible, samples without a finite energy are never elites, and a fixed
+    gripper has its exact value in the result, too.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, cem.
     """
@@ -204,9 +204,10 @@ class CemSolver(Solver):
 
 
 class IcemSolver(Solver):
-    """Fewer samples per iteration; elites are reused and shifted into the next decision; the result is the best sample.
+    """Improved CEM: fewer samples in each iteration, reused elites, and coloured noise; the result is the best sample.
 
-    The last iteration also evaluates the mean. Components of a sample are independent, decisions are correlated.
+    With `warm_start` elites are also shifted into the next decision. The last iteration also evaluates the mean. The
+    components of an action are independent; the decisions of a plan are correlated.
 
     Source: Pinneri et al., Sample-efficient Cross-Entropy Method for Real-time Planning, arXiv 2008.06389, algorithm 1.
     """
@@ -219,19 +220,19 @@ class IcemSolver(Solver):
         momentum: Share = 0.1
         """Share of the old mean and standard deviation in the new ones."""
         noise_exponent: Annotated[float, Field(ge=0.0, le=8.0)] = 2.0
-        """Power spectrum 1 / frequency^exponent along the plan: 0 is white, more is smoother."""
+        """Power spectrum 1 / frequency^exponent along the plan: 0 is white noise, larger values are smoother."""
         shrink: Annotated[float, Field(ge=1.0)] = 1.25
-        """Each iteration has as many samples as the last divided by this, and at least twice the elites."""
+        """Factor by which the number of samples decreases per iteration, down to twice the number of elites."""
         kept: ZeroToOne = 0.3
         """Share of the elites that are reused, in the next iteration and, with warm_start, in the next decision."""
 
     def begin(self, start: Before) -> None:
-        """Reuse the elites of the last decision."""
+        """Reuse the elites of the previous decision."""
         self._iteration = 0
         self._kept = self.mean[None][:0] if start is None else self._few(start.elites)
 
     def num_samples(self, iteration: int) -> int:
-        """Return how many decisions are new: fewer in each iteration."""
+        """Return the number of new decisions, which decreases in each iteration."""
         return max(int(self._config.samples * self._options.shrink**-iteration), 2 * self.elites)
 
     def sample(self) -> Samples:
@@ -268,7 +269,7 @@ def coloured_noise(samples: int, decisions: int, dim: int, exponent: float, gene
     frequency = torch.fft.rfftfreq(decisions).clamp(min=1 / decisions)
     scale = frequency ** (-exponent / 2)
     parts = torch.randn(2, samples, dim, len(frequency), generator=generator)
-    single = torch.zeros(len(frequency), dtype=torch.bool)  # real coefficients, which stand for one wave
+    single = torch.zeros(len(frequency), dtype=torch.bool)  # real coefficients (constant and Nyquist), counted once
     single[0] = True
     single[-1] = single[-1] or decisions % 2 == 0
     wave = torch.complex(parts[0], parts[1].masked_fill(single, 0.0)) * torch.where(single, 1.0, 0.5**0.5)
@@ -278,9 +279,9 @@ def coloured_noise(samples: int, decisions: int, dim: int, exponent: float, gene
 
 
 class MppiSolver(Solver):
-    """Weights exp(-energy / temperature); the noise decays by a fixed factor, and the mean is evaluated itself.
+    """MPPI: the mean is weighted by exp(-energy / temperature), and the noise decays by a fixed factor.
 
-    The control cost of the original is left out: the limits define the allowed actions.
+    The mean itself is also evaluated. The control cost of the paper is omitted: the limits define the allowed actions.
 
     Source: Williams et al., Information Theoretic MPC for Model-Based Reinforcement Learning, ICRA 2017, algorithm 2.
     """
@@ -289,9 +290,9 @@ class MppiSolver(Solver):
         """Options of mppi: model predictive path integral control."""
 
         temperature: Positive = 0.1
-        """Of the weights exp(-energy / temperature), in standard deviations of the samples' energies."""
+        """Temperature of the weights exp(-energy / temperature), in standard deviations of the samples' energies."""
         std_decay: Annotated[float, Field(gt=0.0, le=1.0)] = 0.8
-        """Factor of the standard deviation after each iteration; 1: constant."""
+        """Factor by which the standard deviation is multiplied after each iteration; 1: constant."""
 
     def sample(self) -> Samples:
         """Return the mean and samples around it."""
@@ -313,10 +314,10 @@ class MppiSolver(Solver):
 
 
 class PriorSolver(Solver):
-    """No search: what the prior says, once evaluated.
+    """No search: the action prior's proposal, evaluated once.
 
     Raises:
-        InputError: There is no start: a command that loads no prior has nothing to say.
+        InputError: There is no start, because no prior is loaded.
     """
 
     def num_samples(self, iteration: int) -> int:
@@ -334,14 +335,14 @@ class PriorSolver(Solver):
         return self.mean[None]
 
     def update(self, evaluated: EvaluatedPlans) -> None:
-        """Learn nothing."""
+        """Ignore the energies: the proposal is not improved."""
 
 
 class GradientSolver(Solver):
-    """Adam on decisions in units of their limits, projected onto the allowed set after every step.
+    """Gradient descent: Adam on decisions in units of their limits, projected onto the allowed set after every step.
 
-    Each start descends independently: the first from the best current descent of the last decision, since the mean of
-    several that lead to different places leads nowhere. The result is the best of all evaluated decisions.
+    Several starts descend independently. The first begins at the best elite of the previous decision, not at the mean
+    of the elites, because these may be different solutions. The result is the best of all evaluated decisions.
     """
 
     uses_gradients = True
@@ -350,18 +351,18 @@ class GradientSolver(Solver):
         """Options of gradient: gradient descent through the model."""
 
         starts: PositiveInt = 8
-        """Sequences that are optimised at once: the first from the previous plan (or none), the others from random
-        ones."""
+        """Sequences that are optimised in parallel: the first starts from the previous plan (or zero motion), the
+        others from random sequences."""
         learning_rate: Positive = 0.1
-        """Of Adam at the first iteration, as a share of the limits; it decays linearly to zero."""
+        """Learning rate of Adam at the first iteration, as a share of the limits; it decays linearly to zero."""
 
     @property
     def elites(self) -> int:
-        """All descents are recorded."""
+        """Number of recorded decisions: one for each descent."""
         return int(self._options.starts)
 
     def begin(self, start: Before) -> None:
-        """Draw where the descents start."""
+        """Draw the starting points of the descents."""
         space, config, options = self._space, self._config, self._options
         noise = white_noise(space, options.starts, self._generator)
         noise[0] = 0.0
@@ -370,9 +371,11 @@ class GradientSolver(Solver):
             origin = start.elites[0] if len(start.elites) else start.mean
         half = (space.upper - space.lower) / 2
         self._unit = torch.where(half > 0, half, 1.0)
-        self._place = space.allowed(origin + self.std * noise) / self._unit
-        self._adam = torch.optim.Adam([self._place], lr=options.learning_rate)
-        self._fall = torch.optim.lr_scheduler.LambdaLR(self._adam, lambda step: max(0.0, 1 - step / config.iterations))
+        self._scaled = space.allowed(origin + self.std * noise) / self._unit
+        self._adam = torch.optim.Adam([self._scaled], lr=options.learning_rate)
+        self._schedule = torch.optim.lr_scheduler.LambdaLR(
+            self._adam, lambda step: max(0.0, 1 - step / config.iterations)
+        )
 
     def num_samples(self, iteration: int) -> int:  # noqa: ARG002 - the same in all iterations
         """Return the number of descents."""
@@ -380,7 +383,7 @@ class GradientSolver(Solver):
 
     def sample(self) -> Samples:
         """Return the current decisions of each descent."""
-        return self._space.allowed(self._place * self._unit)
+        return self._space.allowed(self._scaled * self._unit)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Take one gradient step.
@@ -390,10 +393,10 @@ class GradientSolver(Solver):
         """
         if evaluated.gradients is None:
             raise ValueError("the cost has no gradients")
-        self._place.grad = evaluated.gradients * self._unit
+        self._scaled.grad = evaluated.gradients * self._unit
         self._adam.step()
-        self._fall.step()
+        self._schedule.step()
         with torch.no_grad():
-            self._place.copy_(self.sample() / self._unit)
+            self._scaled.copy_(self.sample() / self._unit)
             descents = self.sample()
             self.mean, self.std = descents.mean(dim=0), descents.std(dim=0, correction=0)
