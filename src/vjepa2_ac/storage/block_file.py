@@ -1,6 +1,6 @@
-"""A seekable file of blocks that are fetched when they are read, and cached on the local disk: none is fetched twice.
+"""Seekable remote files, fetched block by block on demand, and the local disk cache of remote bytes.
 
-`DiskCache` is the one cache of remote bytes: whole files and parts of them use it too.
+`DiskCache` holds the blocks of these files, and also whole files and parts of them. No block is fetched twice.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from vjepa2_ac.storage import remote
 logger = logging.getLogger(__name__)
 
 BLOCK_BYTES = 128 << 10
-_READ_AHEAD_BLOCKS = 32  # at most, for sequential reads
+_READ_AHEAD_BLOCKS = 32  # upper limit for sequential reads
 _CACHED_BLOCKS = 128
 
-_KEPT_SHARE = 0.8  # of the limit, after an eviction: so that a scan of the folder is rare
-_CRC_BYTES = 4  # behind the data of an entry
-_TOTAL_BYTES = 8  # length of the number in the file `lock`
+_KEPT_SHARE = 0.8  # an eviction reduces the folder to this share of the limit, so that folder scans are rare
+_CRC_BYTES = 4  # appended to the data of an entry
+_TOTAL_BYTES = 8  # length of the total size stored in the file `lock`
 _PART = struct.Struct(">QQI")  # start, size and CRC of a part of an entry
 
 
 class RangedFile(io.RawIOBase):
     """A seekable file that is fetched in blocks; the last 16 MB read are cached in memory.
 
-    A seek costs one block of 128 KB. Sequential reads fetch twice as much each time, up to 4 MB. So a video's header,
-    or one group of its frames, costs little more than its bytes, and a whole file few reads.
+    A seek costs one block of 128 KB. Each sequential read fetches twice as much as the previous one, up to 4 MB. So
+    reading a video's header or one group of its frames fetches few extra bytes, and a whole file needs few requests.
 
     Args:
-        fetch: Returns exactly `length` bytes from `start`: called with (start, length), which are of whole blocks.
+        fetch: Returns exactly `length` bytes from `start`. It is called with (start, length) of whole blocks.
         size: Size of the file.
     """
 
@@ -53,15 +53,15 @@ class RangedFile(io.RawIOBase):
         self._fetched_to, self._read_ahead = -1, 1
 
     def readable(self) -> bool:
-        """Return that it can be read."""
+        """Return True: the file can be read."""
         return True
 
     def seekable(self) -> bool:
-        """Return that it can seek."""
+        """Return True: the file can seek."""
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Go to an offset from the start, the current position or the end; return it from the start, as `tell` does."""
+        """Move to an offset from the start, the current position or the end; return the new position from the start."""
         base = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
         if base + offset < 0:
             raise ValueError(f"negative position {base + offset}")
@@ -69,7 +69,7 @@ class RangedFile(io.RawIOBase):
         return self._position
 
     def readinto(self, buffer: bytearray | memoryview, /) -> int:  # type: ignore[override] # any writable buffer
-        """Fill a buffer with the next bytes; return how many there were."""
+        """Fill a buffer with the next bytes; return the number of bytes read."""
         view = memoryview(buffer).cast("B")
         data = self._range(self._position, min(self._position + len(view), self._size))
         view[: len(data)] = data
@@ -88,7 +88,7 @@ class RangedFile(io.RawIOBase):
         return data[start - first * BLOCK_BYTES : end - first * BLOCK_BYTES]
 
     def _load(self, number: int, last: int) -> dict[int, bytes]:
-        """Return a block by number; if it must be fetched, also the wanted ones up to the next cached block."""
+        """Return block `number`; if it must be fetched, also the blocks up to `last` or the next cached block."""
         if number in self._blocks:
             self._blocks.move_to_end(number)
             return {number: self._blocks[number]}
@@ -106,19 +106,19 @@ class RangedFile(io.RawIOBase):
 
 
 class DiskCache:
-    """Entries of bytes under keys in a local folder; the least recently used are evicted at the limit.
+    """A key-value store of bytes in a local folder; at the size limit the least recently used entries are evicted.
 
     Any number of threads and processes may use one folder. The file `lock` holds the total size of its entries. A
     writer adds the size of its entry to the total before it stores the entry. If the total would exceed the limit, the
     writer first scans the folder and evicts entries down to 80 % of the limit, while other writers wait. So the folder
     exceeds the limit by at most one entry for each thread that was storing an entry during the last scan.
 
-    If the folder cannot be used, all entries count as absent: that causes a warning, never an error.
+    If the folder cannot be used, all entries count as absent, which causes a warning and never an error.
 
     Args:
         folder: Created with the first entry.
-        limit_bytes: Total size of all entries, in bytes. An entry of more than 80 % of it is not stored, so with 0 none
-            is; with 0 none is evicted either. None: no limit.
+        limit_bytes: Total size of all entries, in bytes. An entry larger than 80 % of the limit is not stored. With 0
+            no entry is stored or evicted. None: no limit.
     """
 
     def __init__(self, folder: str | Path, limit_bytes: int | None) -> None:
@@ -126,14 +126,14 @@ class DiskCache:
         self._refused = set[Path]()
 
     def read(self, key: str) -> bytes | None:
-        """Return the entry of a key, or None if there is none or it is damaged; the entry counts as used now."""
+        """Return the entry of a key, or None if the entry is absent or damaged; mark the entry as just used."""
         path = self._path(key)
         try:
             content = path.read_bytes()
         except OSError as error:
             self._note_refusal(path, error)
             return None
-        with suppress(OSError):  # evicted meanwhile, or in a read-only folder
+        with suppress(OSError):  # the entry was evicted meanwhile, or the folder is read-only
             os.utime(path)
         data, crc = content[:-_CRC_BYTES], content[-_CRC_BYTES:]
         return data if crc == _crc(data) else None
@@ -157,7 +157,7 @@ class DiskCache:
             self._note_refusal(path, error)
 
     def read_or_make(self, key: str, make: Callable[[], bytes]) -> bytes:
-        """Return the entry of a key; make and store it if there is none."""
+        """Return the entry of a key; if it is absent, create it with `make` and store it."""
         data = self.read(key)
         if data is None:
             data = make()
@@ -165,13 +165,13 @@ class DiskCache:
         return data
 
     def write_parts(self, key: str, parts: Sequence[bytes]) -> None:
-        """Store a list of parts under a key, as `write` does; `read_parts` returns some of them."""
+        """Store a list of parts under a key, as `write` does; `read_parts` reads selected parts."""
         starts = accumulate(map(len, parts), initial=len(parts) * _PART.size)
         table = [_PART.pack(start, len(part), zlib.crc32(part)) for start, part in zip(starts, parts, strict=False)]
         self.write(key, b"".join([*table, *parts]))
 
     def read_parts(self, key: str, count: int, numbers: Sequence[int]) -> list[bytes] | None:
-        """Return some of the `count` parts of an entry without reading the others; None if absent or damaged."""
+        """Return the parts `numbers` of an entry of `count` parts, reading only these; None if absent or damaged."""
         path = self._path(key)
         try:
             with path.open("rb", buffering=0) as file:
@@ -187,7 +187,7 @@ class DiskCache:
         return parts if [zlib.crc32(part) for part in parts] == [table[number][2] for number in numbers] else None
 
     def _note_refusal(self, path: Path, error: OSError) -> None:
-        """Warn once; an entry that is there, and that the system refuses, is not replaced."""
+        """Log one warning per cache; an existing entry that the system refuses to read or write is not replaced."""
         if isinstance(error, FileNotFoundError):
             return
         if not self._refused:
@@ -200,21 +200,21 @@ class DiskCache:
         return self._folder / name[:2] / name[2:]
 
     def _reserve(self, size: int) -> None:
-        """Add the size of an entry to the total of the folder, after an eviction if it does not fit."""
+        """Add the size of an entry to the total size of the folder, evicting other entries first if it does not fit."""
         if not self._limit:
             return
         with os.fdopen(os.open(self._folder / "lock", os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0) as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             try:
                 total = int.from_bytes(lock.read(_TOTAL_BYTES), "big")
-                if total == 0 or total + size > self._limit:  # 0: a new file, or a power cut emptied it
+                if total == 0 or total + size > self._limit:  # 0: a new file, or a file emptied by a power cut
                     total = self._evict(size, self._limit)
                 os.pwrite(lock.fileno(), (total + size).to_bytes(_TOTAL_BYTES, "big"), 0)
             finally:
                 fcntl.flock(lock, fcntl.LOCK_UN)  # closing is not enough: a process forked meanwhile has the file open
 
     def _evict(self, size: int, limit: int) -> int:
-        """Evict the least recently used entries if one of this size does not fit; return the total size of the rest."""
+        """Evict the least recently used entries if `size` more bytes do not fit; return the total size of the rest."""
         entries = sorted(self._entries())
         total = sum(entry_size for _, entry_size, _ in entries)
         if total + size <= limit:
@@ -227,7 +227,7 @@ class DiskCache:
         return total
 
     def _entries(self) -> Iterator[tuple[int, int, str]]:
-        """Yield last use, size and path of every entry, and of what killed writers left of one."""
+        """Yield last use, size and path of every entry, and of partial files left behind by killed writers."""
         for inner in [entry.path for entry in os.scandir(self._folder) if entry.is_dir()]:
             for entry in os.scandir(inner):
                 with suppress(FileNotFoundError):  # renamed meanwhile
@@ -242,7 +242,8 @@ def _crc(data: bytes) -> bytes:
 class BlockCachedFile(RangedFile):
     """A seekable file behind a URL; each block is fetched once per machine.
 
-    The error of a fetch stays in `failure`: libraries that read through this object may wrap it in their own.
+    The error of a failed fetch is stored in `failure`: libraries that read through this object may wrap the error in
+    one of their own types.
 
     Args:
         path: The URL.
@@ -258,7 +259,7 @@ class BlockCachedFile(RangedFile):
         self.failure: Exception | None = None
 
     def _fetched(self, start: int, length: int) -> bytes:
-        """Return whole blocks: no others are requested."""
+        """Return the bytes of whole blocks from the disk cache or the URL."""
         blocks = [(at, min(BLOCK_BYTES, self._bytes - at)) for at in range(start, start + length, BLOCK_BYTES)]
         try:
             return b"".join(cached_ranges(self._path, blocks, key=self._key, cache=self._cache))
@@ -268,33 +269,33 @@ class BlockCachedFile(RangedFile):
 
 
 def cached_ranges(url: str, ranges: Sequence[tuple[int, int]], *, key: str, cache: DiskCache) -> list[bytes]:
-    """Return several (start, length) pieces of a file behind a URL, each complete, from the disk where they are there.
+    """Return several (start, length) pieces of a file behind a URL, each complete, using the disk cache.
 
-    Missing ones are fetched concurrently, adjacent ones together.
+    Missing pieces are fetched concurrently; adjacent pieces are fetched in one request.
 
     Args:
         url: The file.
-        ranges: None of them empty.
-        key: Of the file's content.
-        cache: Keeps each piece by itself.
+        ranges: Non-empty (start, length) ranges.
+        key: Identifies the content of the file.
+        cache: Stores each piece as a separate entry.
 
     Raises:
         OSError: There is no such file, or it ends within a piece.
-        UnreachableError: It cannot be reached.
+        UnreachableError: The file cannot be reached.
     """
-    found = {one: cache.read(f"{key} {one}") or b"" for one in ranges}
-    lacking = sorted(one for one, data in found.items() if len(data) != one[1])
-    for one, data in zip(lacking, remote.read_neighbours(url, lacking), strict=True):
-        found[one] = data
-        cache.write(f"{key} {one}", data)
-    return [found[one] for one in ranges]
+    pieces = {span: cache.read(f"{key} {span}") or b"" for span in ranges}
+    missing = sorted(span for span, data in pieces.items() if len(data) != span[1])
+    for span, data in zip(missing, remote.read_neighbours(url, missing), strict=True):
+        pieces[span] = data
+        cache.write(f"{key} {span}", data)
+    return [pieces[span] for span in ranges]
 
 
 def open_remote(url: str) -> RangedFile:
-    """Open a file behind a URL for reading and seeking; its reads are retried, and not cached on the disk.
+    """Open a file behind a URL for reading and seeking; reads are retried and are not cached on the disk.
 
     Raises:
         OSError: There is no such file.
-        UnreachableError: It cannot be reached.
+        UnreachableError: The file cannot be reached.
     """
     return RangedFile(lambda start, length: remote.read_ranges(url, [(start, length)])[0], remote.file_size(url))

@@ -1,11 +1,11 @@
-"""Files on this machine and behind URLs: find, read and hash them; write local ones whole, or not at all.
+"""Files on this machine and behind URLs: find, read and hash them; write local files atomically.
 
-A path is local, or a URL such as `gs://bucket/folder` (see `remote`). A missing or truncated file is an error of the
-file. A network failure is not: it is retried, and finally raises an `UnreachableError`; nor is an error of the
-operating system (see `unreadable`). Handlers of broken episodes catch an `InputError`, which this is not.
+A path is local, or a URL such as `gs://bucket/folder` (see `remote`). A missing or truncated file raises an
+`InputError`, which the handlers of broken episodes catch. Network failures are retried and finally raise an
+`UnreachableError`, as do errors of the operating system (see `unreadable`): neither says that the file is broken.
 
 A file is written under a temporary name, `.NAME.RANDOM.partial` in the target folder, and renamed when it is complete
-and on the disk. What a killed writer left is removed by a later one, when it is unchanged for a day.
+and on the disk. Partial files of killed writers are removed by a later writer once they are unchanged for a day.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLO
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 _UNWRITABLE = _FULL | _ABSENT | {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.EINVAL, errno.ELOOP}
 _PARTIAL = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
-_NAME_BYTES = 200  # of the 255 that a name may have
+_NAME_BYTES = 200  # leaves space for the suffix of a temporary name: file systems allow 255
 _OLD_S = 86_400.0
 _POINTER_BYTES = 1024  # git-lfs pointers are smaller
 
@@ -49,23 +49,23 @@ ByteReader = RangedFile | io.BufferedIOBase
 
 
 def join(folder: str | Path, name: str) -> str:
-    """Return the path of a file in a folder; of the folder itself if the name is empty."""
+    """Return the path of a file in a folder, or the path of the folder itself if the name is empty."""
     if not name:
         return str(folder)
     return f"{str(folder).rstrip('/')}/{name}" if is_url(folder) else str(Path(folder) / name)
 
 
 def absolute(path: str | Path) -> str:
-    """Return the one name of a place: an absolute path with links resolved, also for `file://`; or a URL.
+    """Return the canonical form of a path or URL: local paths (also `file://`) absolute with links resolved.
 
-    It does not depend on the working directory, and has no trailing slash.
+    The result does not depend on the working directory and has no trailing slash.
     """
     local = str(path).removeprefix("file://")
     return local.rstrip("/") if is_url(local) else str(Path(local).resolve())
 
 
 def exists(path: str | Path) -> bool:
-    """Return whether there is a file or folder."""
+    """Return whether a file or folder exists at a path or URL."""
     if not is_url(path):
         return Path(path).exists()
     try:
@@ -85,7 +85,7 @@ def file_size(path: str | Path) -> int:
 
 
 def file_version(path: str | Path) -> str:
-    """Return a version of a file's content that changes with the content, as far as is known without reading it.
+    """Return a version string that changes when a file's content changes, without reading the content.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
@@ -94,7 +94,7 @@ def file_version(path: str | Path) -> str:
 
 
 def list_folder(folder: str | Path) -> list[FileInfo]:
-    """Return the files and folders in a folder, sorted by name; none where there is no such folder.
+    """Return the files and folders in a folder, sorted by name; an empty list if there is no such folder.
 
     Raises:
         OSError: The folder cannot be listed.
@@ -104,8 +104,8 @@ def list_folder(folder: str | Path) -> list[FileInfo]:
     paths = sorted(Path(folder).iterdir()) if Path(folder).is_dir() else []
     stats = {path.name: path.stat() if path.is_file() else None for path in paths}
     return [
-        FileInfo(name, one.st_size, str(one.st_mtime_ns)) if one else FileInfo(name, 0, "", is_file=False)
-        for name, one in stats.items()
+        FileInfo(name, status.st_size, str(status.st_mtime_ns)) if status else FileInfo(name, 0, "", is_file=False)
+        for name, status in stats.items()
     ]
 
 
@@ -124,14 +124,14 @@ def require_content(path: str | Path, size: int | None = None) -> None:
 
     Args:
         path: The file, which may be missing.
-        size: Its size, as a listing gives it; None: it is looked up on this machine. A pointer behind a URL is refused
+        size: The file's size from a listing; None: it is looked up on this machine. A pointer behind a URL is refused
             anyway as soon as its beginning is read.
 
     Raises:
         InputError: The file is a pointer; or a pipe or a device, which may never end.
         UnreachableError: The file is at a URL and cannot be read.
     """
-    with suppress(OSError):  # the caller reports what cannot be read
+    with suppress(OSError):  # the caller reports a file that cannot be read
         if size is None:
             if is_url(path) or stat.S_ISDIR((status := Path(path).stat()).st_mode):
                 return
@@ -145,10 +145,10 @@ def require_content(path: str | Path, size: int | None = None) -> None:
 def open_to_read(path: str | Path) -> ByteReader:
     """Open a file for reading and seeking; the caller closes it.
 
-    Of a URL only the blocks that are read are fetched, so it can be given to a reader of videos or tables.
+    Behind a URL only the blocks that are read are fetched, so the result suits readers of videos and tables.
 
     Raises:
-        InputError: It is a git-lfs pointer, a pipe or a device.
+        InputError: The file is a git-lfs pointer, a pipe or a device.
         OSError: There is no such file, or it cannot be read.
     """
     require_content(path)
@@ -158,17 +158,17 @@ def open_to_read(path: str | Path) -> ByteReader:
 def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -> UserError:
     """Return the error of a file that is missing, truncated, or refused by the operating system.
 
-    The first is a MissingFileError, the second an InputError. The last (no permission, too many open files, a disk that
-    went away) says nothing about the file's content: an UnreachableError, which is never stored and never a reason to
-    remove or replace the file. Without permission it is a RefusedError, with the mode and the owner.
+    A missing file is a MissingFileError, a truncated one an InputError. A refusal (no permission, too many open files,
+    a disconnected disk) says nothing about the file's content: it is an UnreachableError, which is never stored and
+    never a reason to remove or replace the file. Missing permission is a RefusedError, with the mode and the owner.
 
     Args:
         where: The file, and its episode.
         error: The system's error.
-        needed: What should be there.
-        fix: How to fix it where the file is wrong.
+        needed: The expected kind of file.
+        fix: How to fix a missing or truncated file.
     """
-    if isinstance(error, FileNotFoundError | NotADirectoryError):  # of a URL it has no number
+    if isinstance(error, FileNotFoundError | NotADirectoryError):  # for a URL the error has no errno
         absent = os.strerror(errno.ENOENT)
         return MissingFileError(where=where, found=f"cannot be read: {absent}", needed=needed, fix=fix)
     found = f"cannot be read: {error.strerror or error}"
@@ -180,8 +180,9 @@ def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -
 
 
 def is_refusal(error: BaseException) -> bool:
-    """Return whether the operating system refused to read: libraries raise other errors for a damaged file."""
-    return isinstance(error, OSError) and error.errno != errno.EINVAL  # a seek before the start of a damaged file
+    """Return whether the operating system refused to read, as opposed to a library that found a damaged file."""
+    # EINVAL comes from a seek before the start, which the offsets of a damaged file cause.
+    return isinstance(error, OSError) and error.errno != errno.EINVAL
 
 
 @contextmanager
@@ -210,10 +211,10 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def read_bounded(path: str | Path, most_bytes: int) -> bytes:
-    """Return the content of a stranger's small file: at most `most_bytes` are ever read.
+    """Return the content of a small untrusted file, reading at most `most_bytes` (and one byte to detect more).
 
     Raises:
-        InputError: It is larger, a git-lfs pointer, or may never end, such as a pipe.
+        InputError: The file is larger, a git-lfs pointer, or may never end, such as a pipe.
         OSError: There is no such file, or it cannot be read.
     """
     require_content(path)
@@ -225,7 +226,7 @@ def read_bounded(path: str | Path, most_bytes: int) -> bytes:
 
 
 def read_range(path: str | Path, start: int, length: int) -> bytes:
-    """Return `length` bytes from `start`; fewer if the file ends before.
+    """Return `length` bytes of a file from `start`; fewer if the file ends earlier.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
@@ -242,7 +243,7 @@ def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[byt
 
     Raises:
         OSError: There is no such file, it cannot be read, or it ends within a piece.
-        UnreachableError: It cannot be reached.
+        UnreachableError: The URL cannot be reached.
     """
     if is_url(path):
         return remote.read_ranges(str(path), ranges)
@@ -266,19 +267,19 @@ def sha256_of_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-# ---- write, on this machine ----
+# ---- write local files ----
 
 
 @contextmanager
 def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
-    """Open a local file that gets its name, complete, when the block ends, and never if the block fails.
+    """Open a local file for writing that appears under its name only when the block ends without an error.
 
-    Missing folders are created. The bytes are on the disk (fsync) before the file gets its name.
+    Missing folders are created. The bytes are on the disk (fsync) before the file is renamed to its final name.
     """
     target = Path(path)
     temporary = _new_partial(target.parent, target.name)
     try:
-        with temporary.open("xb") as file:  # opened by name: some libraries determine the format by it
+        with temporary.open("xb") as file:  # opened by name: some libraries derive the format from the name
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -299,51 +300,51 @@ def write_atomically(path: str | Path, data: bytes | str) -> None:
 
 @contextmanager
 def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
-    """Yield an empty local folder to fill; its files move to `folder` when the block ends, and nowhere if it fails.
+    """Yield an empty temporary folder whose files are moved to `folder` when the block ends without an error.
 
-    A new folder appears complete. An existing one is not replaced (it may be the working directory, or mounted) and
-    keeps its other files: the old manifest is removed first and the new one comes last, so a folder with a manifest is
-    complete.
+    A new folder appears complete. An existing folder is not replaced (it may be the working directory, or mounted) and
+    keeps its other files: the old manifest is removed first and the new one is moved last, so a folder with a manifest
+    is always complete.
 
     Args:
-        folder: Where the files go; missing folders are created.
-        manifest: Name of the file without which the folder does not count.
+        folder: The target folder; missing folders are created.
+        manifest: Name of the file that marks the folder as complete.
 
     Raises:
         InputError: The folder cannot be created or written, or the disk is full.
     """
     target = Path(folder).resolve()
     with user_can_write(folder):
-        there = target.is_dir()
-        if target.exists() and not there:
+        is_folder = target.is_dir()
+        if target.exists() and not is_folder:
             raise NotADirectoryError(errno.ENOTDIR, "it is a file")
-        filling = _new_partial(target if there else target.parent, target.name)
-        filling.mkdir()
+        temporary = _new_partial(target if is_folder else target.parent, target.name)
+        temporary.mkdir()
     try:
         with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's
-            yield filling
+            yield temporary
         with user_can_write(folder):
-            if there:
-                _move_into(target, filling, manifest)
+            if is_folder:
+                _move_into(target, temporary, manifest)
             else:
-                filling.replace(target)
-            sync(target if there else target.parent)
+                temporary.replace(target)
+            sync(target if is_folder else target.parent)
     except BaseException:
-        shutil.rmtree(filling, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
         raise
 
 
-def _move_into(target: Path, filled: Path, manifest: str) -> None:
+def _move_into(target: Path, source: Path, manifest: str) -> None:
     (target / manifest).unlink(missing_ok=True)
-    files = [path.relative_to(filled) for path in filled.rglob("*") if path.is_file()]
+    files = [path.relative_to(source) for path in source.rglob("*") if path.is_file()]
     for file in sorted(files, key=lambda file: file == Path(manifest)):
         (target / file).parent.mkdir(parents=True, exist_ok=True)
-        (filled / file).replace(target / file)
-    shutil.rmtree(filled)
+        (source / file).replace(target / file)
+    shutil.rmtree(source)
 
 
 def sync(path: str | Path) -> None:
-    """Make the bytes of a local file, or the names in a local folder, survive a power cut."""
+    """Flush the bytes of a local file, or the names in a local folder, to the disk (fsync)."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -374,10 +375,10 @@ def is_empty(folder: Path) -> bool:
 
 
 def require_new_folder(folder: Path) -> None:
-    """Refuse a folder that holds something already.
+    """Refuse a folder that exists and is not empty.
 
     Raises:
-        InputError: It does, or it cannot be looked into.
+        InputError: The folder is not empty, or cannot be listed.
     """
     with user_can_write(folder):
         in_use = folder.is_dir() and not is_empty(folder)
@@ -387,26 +388,26 @@ def require_new_folder(folder: Path) -> None:
 
 
 def try_writing_at(path: Path) -> None:
-    """Write a temporary file into a folder, or where it would be made. Nothing stays there.
+    """Test whether a folder, or its nearest existing parent, can be written, with a temporary file.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The folder cannot be written.
     """
-    with tempfile.TemporaryFile(dir=_nearest(path)):
+    with tempfile.TemporaryFile(dir=_nearest_existing(path)):
         pass
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the free bytes on the disk of a folder, which need not exist yet."""
-    return shutil.disk_usage(_nearest(folder)).free
+    """Return the free bytes on the disk of a folder; the folder need not exist yet."""
+    return shutil.disk_usage(_nearest_existing(folder)).free
 
 
-def _nearest(path: Path) -> Path:
-    return next(place for place in (path, *path.absolute().parents) if place.exists())
+def _nearest_existing(path: Path) -> Path:
+    return next(folder for folder in (path, *path.absolute().parents) if folder.exists())
 
 
 def _new_partial(parent: Path, name: str) -> Path:
-    """Return the temporary path of a file or folder that will be renamed to `name`; its folder is there."""
+    """Return a temporary path in `parent` for a file or folder that will be renamed to `name`; create `parent`."""
     parent.mkdir(parents=True, exist_ok=True)
     remove_abandoned(parent.absolute())
     short = name.encode(errors="surrogateescape")[:_NAME_BYTES].decode(errors="ignore")
@@ -415,12 +416,12 @@ def _new_partial(parent: Path, name: str) -> Path:
 
 @functools.cache
 def remove_abandoned(folder: Path) -> None:
-    """Remove the partial files in a folder that are unchanged for a day; those that cannot be removed stay.
+    """Remove partial files that are unchanged for a day from a folder; files that cannot be removed are skipped.
 
-    A folder is scanned only the first time that this process writes there: it may hold thousands of files.
+    Each process scans a folder only once, before its first write there, because folders may hold thousands of files.
     """
     with suppress(OSError):
         for path in [path for path in folder.iterdir() if _PARTIAL.fullmatch(path.name) and not path.is_symlink()]:
             with suppress(OSError):
-                if time.time() - max(one.lstat().st_mtime for one in (path, *path.rglob("*"))) > _OLD_S:
+                if time.time() - max(entry.lstat().st_mtime for entry in (path, *path.rglob("*"))) > _OLD_S:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()

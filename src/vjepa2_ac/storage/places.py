@@ -1,7 +1,8 @@
-"""Resolution of paths given by the user: the same rules for config knobs, options and environment variables.
+"""Resolution of paths from the user: the same rules for config keys, options and environment variables.
 
-`~` is the user's home. Where only a local folder is allowed, a URL is refused: taken as a path it would create a
-folder called `gs:`. An invalid path raises a ValueError, whose message continues after the name of the knob.
+`~` is the user's home. Where only a local folder is allowed, a URL is refused, because as a path it would create a
+folder called `gs:`. An invalid path raises a ValueError whose message completes a sentence that starts with the name
+of the config key.
 """
 
 from __future__ import annotations
@@ -10,33 +11,33 @@ import os
 import re
 from pathlib import Path
 
-BUILTIN = "builtin:"  # models and configs that come with the package
+BUILTIN = "builtin:"  # prefix of models and configs in the package
 NO_DATA = "none"  # data.path of a model without a config
 CLOSED_LOOP_FILE = "closed_loop.json"  # in RUN/closed_loop/TASK-DOMAIN
-SIMULATION_FILE = "simulation.json"  # in a data set that `simulate record` made
+SIMULATION_FILE = "simulation.json"  # in a data set written by `simulate record`
 
 HUB = "hf://"
 
 _REPOSITORY = re.compile(r"hf://[\w.-]+/[\w.-]+(@[\w./-]+)?")
-_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # with one slash, too: a Path turns a URL into that
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # also with one slash: Path("gs://a") becomes "gs:/a"
 
 
 def is_url(path: str | Path) -> bool:
-    """Return whether a path names a file behind fsspec (`gs://…`) rather than one on this machine."""
+    """Return whether a path is a URL that fsspec reads (`gs://…`) rather than a local path."""
     return "://" in str(path)
 
 
 def folder_at(place: str) -> Path | str:
-    """Return a folder of this machine as a path, also one at `file://`; any other as its URL."""
+    """Return a local folder (also `file://`) as a Path, or a remote folder as its URL."""
     local = place.removeprefix("file://")
     return local if is_url(local) else Path(local)
 
 
 def anywhere(path: str) -> str:
-    """Return a local path, with `~` expanded, or a URL; without a trailing slash.
+    """Resolve a path from the user that may be local or a URL: expand `~` and remove a trailing slash.
 
     Raises:
-        ValueError: It is empty, of an unknown user's home, no path, or neither a URL nor a path.
+        ValueError: The path is empty, starts with the home of an unknown user, or is a malformed URL.
     """
     if is_url(path):
         return path.rstrip("/")
@@ -46,23 +47,23 @@ def anywhere(path: str) -> str:
 
 
 def on_this_machine(path: str) -> str:
-    """Return a local path, with `~` expanded; without a trailing slash.
+    """Resolve a path from the user that must be local: expand `~` and remove a trailing slash.
 
     Raises:
-        ValueError: It is a URL, empty, of an unknown user's home, or no path.
+        ValueError: The path is empty, a URL, or starts with the home of an unknown user.
     """
     if not path.strip():
         raise ValueError("is empty")
     if is_url(path) or _SCHEME.match(path):
         raise ValueError("is a URL (or looks like one), and only a path of this machine will do")
-    expanded = os.path.expanduser(path)  # noqa: PTH111 - a Path would take a `./` away
+    expanded = os.path.expanduser(path)  # noqa: PTH111 - Path would remove a leading `./`
     if expanded.startswith("~"):
         raise ValueError(f"names the home of a user who is not here; for a folder of that name write ./{path}")
     return expanded.rstrip("/") or "/"
 
 
 def of_a_model(name: str) -> str:
-    """Return the name of a model: unchanged for one of the package, any other as `on_this_machine` does.
+    """Resolve the name of a model: keep a built-in name, resolve any other as `on_this_machine` does.
 
     Raises:
         ValueError: As `on_this_machine`.
@@ -71,10 +72,10 @@ def of_a_model(name: str) -> str:
 
 
 def of_an_encoder(name: str) -> str:
-    """Return the name of an encoder: a repository of the Hub unchanged, any other as `of_a_model` does.
+    """Resolve the name of an encoder: keep a Hub repository, resolve any other as `of_a_model` does.
 
     Raises:
-        ValueError: As `on_this_machine`; or a repository without an owner and a name.
+        ValueError: As `on_this_machine`; or the Hub repository has no owner or no name.
     """
     if not name.startswith(HUB):
         return of_a_model(name)
@@ -84,5 +85,5 @@ def of_an_encoder(name: str) -> str:
 
 
 def literal(path: Path) -> str:
-    """Return a path that means the same when it is read as a knob: a folder may be called `~`."""
+    """Return a path as a config value that resolves to the same path, also for a folder whose name starts with `~`."""
     return f"./{path}" if str(path).startswith("~") else str(path)

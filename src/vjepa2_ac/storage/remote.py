@@ -1,7 +1,7 @@
 """Remote files: `gs://`, `hf://`, `s3://` and every other protocol of fsspec.
 
-All network failures are handled here (see `retries`): the result is the data, FileNotFoundError as from a disk, or
-UnreachableError. Every function may be called from many threads, and in every process.
+All network failures are handled here (see `retries`): a function returns the data, or raises FileNotFoundError (as for
+a local file) or UnreachableError. All functions are safe to call from several threads and processes.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from vjepa2_ac.storage import retries
 _T = TypeVar("_T")
 
 _THREADS = 64  # concurrent reads of `read_ranges` in a process
-_PIECE_BYTES = 16 << 20  # longer reads are split: each piece has the full time-out
-_SLOWEST_BYTES_PER_S = 1 << 20  # when writing: allowed in addition to the time-out of any request
+_PIECE_BYTES = 16 << 20  # longer reads are split, so that each piece has the full time-out
+_SLOWEST_BYTES_PER_S = 1 << 20  # a write may take this long per byte in addition to the usual time-out
 _VERSION_KEYS = ("generation", "etag", "ETag", "blob_id", "mtime", "last_modified", "LastModified", "created")
 
 _LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
-_EXTRAS = {"gs": "gcs", "hf": ""}  # the second: every installation
+_EXTRAS = {"gs": "gcs", "hf": ""}  # extra of this package per protocol; empty: always installed
 _KNOWN = "a folder of this machine, or gs://, hf://, s3://"
-_NO_PLACES = frozenset({  # they lead to other file systems, some by templates that are executed
+_CHAINED_PROTOCOLS = frozenset({  # chained fsspec protocols, which wrap other file systems; some execute templates
     "async_wrapper", "asyncwrapper", "blockcache", "cached", "dask", "data", "dir", "filecache", "generic",
     "libarchive", "reference", "simplecache", "tar", "zip",
 })  # fmt: skip
@@ -36,7 +36,7 @@ _EMULATOR = "STORAGE_EMULATOR_HOST"
 _MACHINE = Path("/sys/class/dmi/id/product_name")
 
 
-_POINTER = b"version https://git-lfs.github.com/spec/v1"  # the beginning of what git-lfs commits in place of a file
+_POINTER = b"version https://git-lfs.github.com/spec/v1"  # first bytes of the pointer that git-lfs commits for a file
 
 
 class ShortReadError(OSError):
@@ -44,11 +44,11 @@ class ShortReadError(OSError):
 
 
 class FileInfo(NamedTuple):
-    """A file or folder in a listing, on this machine or at a server."""
+    """A file or folder in a listing, on this machine or on a server."""
 
     name: str
-    size: int
-    version: str  # changes with the content, as far as is known without reading it
+    size: int  # in bytes
+    version: str  # changes with the content, as far as the listing shows
     is_file: bool = True
 
 
@@ -75,44 +75,46 @@ def file_size(url: str) -> int:
 
     Raises:
         FileNotFoundError: There is no such file.
-        UnreachableError: It cannot be reached.
+        UnreachableError: The URL cannot be reached.
     """
     return _persist(url, lambda timeout_s: _size_once(url, timeout_s))
 
 
 def file_version(url: str) -> str:
-    """Return the server's version of a file's content, which changes with the content; empty where there is none.
+    """Return the server's version of a file, which changes with the content; empty if the server has none.
 
     Raises:
         FileNotFoundError: There is no such file or folder.
-        UnreachableError: It cannot be reached.
+        UnreachableError: The URL cannot be reached.
     """
     return _version_of(_persist(url, lambda timeout_s: _ask(url, "info", timeout_s)))
 
 
 def list_folder(url: str) -> list[FileInfo]:
-    """Return the entries of a folder, sorted by name: one listing, one call per page; none if there is no such folder.
+    """Return the entries of a folder, sorted by name; an empty list if there is no such folder.
+
+    The server is asked for one listing, with one request per page.
 
     Raises:
-        UnreachableError: It cannot be reached.
+        UnreachableError: The URL cannot be reached.
     """
     try:
         listed = _persist(url, lambda timeout_s: _ask(url, "ls", timeout_s, detail=True, refresh=True))
     except FileNotFoundError:
         return []
-    names = {str(found["name"]).rstrip("/").rsplit("/", 1)[-1]: found for found in listed}
+    entries = {str(entry["name"]).rstrip("/").rsplit("/", 1)[-1]: entry for entry in listed}
     return [
-        FileInfo(name, int(found.get("size") or 0), _version_of(found), found["type"] == "file")
-        for name, found in sorted(names.items())
+        FileInfo(name, int(entry.get("size") or 0), _version_of(entry), entry["type"] == "file")
+        for name, entry in sorted(entries.items())
     ]
 
 
 def files_below(url: str) -> dict[str, FileInfo]:
-    """Return all files below a folder by their relative paths: one listing, one request per page, not cached.
+    """Return all files below a folder by their relative paths, with one uncached listing (one request per page).
 
     Raises:
-        FileNotFoundError: There is no such folder; of Google's, no such bucket.
-        UnreachableError: It cannot be reached.
+        FileNotFoundError: There is no such folder; on Google Cloud Storage, no such bucket.
+        UnreachableError: The URL cannot be reached.
     """
     filesystem = _filesystem(url)
     root = filesystem._strip_protocol(url).rstrip("/") + "/"
@@ -121,21 +123,21 @@ def files_below(url: str) -> dict[str, FileInfo]:
         filesystem.invalidate_cache()
         return _once(filesystem, "find", timeout_s, root, detail=True)
 
-    found = _persist(url, find)
-    names = {name.removeprefix(root): about for name, about in found.items() if name != root}
-    return {name: FileInfo(name, int(about.get("size") or 0), _version_of(about)) for name, about in names.items()}
+    entries = {name.removeprefix(root): entry for name, entry in _persist(url, find).items() if name != root}
+    return {name: FileInfo(name, int(entry.get("size") or 0), _version_of(entry)) for name, entry in entries.items()}
 
 
 def send(source: Path, url: str) -> None:
-    """Write a local file to a URL; folders are created where the file system has them.
+    """Write a local file to a URL; folders are created on file systems that have folders.
 
     Raises:
-        FileNotFoundError: There is no such local file; of Google's, no such bucket.
-        UnreachableError: It cannot be written; a RefusedError if that is permanent.
+        FileNotFoundError: There is no such local file; on Google Cloud Storage, no such bucket.
+        UnreachableError: The URL cannot be written; a RefusedError if that is permanent.
     """
     filesystem = _filesystem(url, writing=True)
     names = (str(source), filesystem._strip_protocol(url))
-    pieces = {"chunksize": _PIECE_BYTES} if _protocol(url) == "gs" else {}  # a piece is read while other reads wait
+    # Small pieces, because fsspec's event loop is blocked while a piece is read from the disk.
+    pieces = {"chunksize": _PIECE_BYTES} if _protocol(url) == "gs" else {}
     allowed_s = retries.DEFAULT.timeout_s + source.stat().st_size / _SLOWEST_BYTES_PER_S
     _persist(url, lambda timeout_s: _once(filesystem, "put_file", timeout_s, *names, **pieces), "written", allowed_s)
 
@@ -145,18 +147,18 @@ def remove(url: str) -> None:
 
     Raises:
         FileNotFoundError: There is no such file.
-        UnreachableError: It cannot be removed; a RefusedError if that is permanent.
+        UnreachableError: The file cannot be removed; a RefusedError if that is permanent.
     """
     _persist(url, lambda timeout_s: _ask(url, "rm_file", timeout_s, writing=True), "written")
 
 
 def read_range(url: str, start: int, length: int) -> bytes:
-    """Return `length` bytes from `start`; fewer only if the file ends.
+    """Return `length` bytes of a file from `start`; fewer only at the end of the file.
 
     Raises:
         FileNotFoundError: There is no such file.
-        InputError: It is a git-lfs pointer.
-        UnreachableError: It cannot be reached.
+        InputError: The file is a git-lfs pointer.
+        UnreachableError: The URL cannot be reached.
     """
     if length > _PIECE_BYTES:
         cuts = range(start, start + length, _PIECE_BYTES)
@@ -172,7 +174,7 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
 
     Raises:
         OSError: There is no such file, or it ends within a piece.
-        UnreachableError: It cannot be reached.
+        UnreachableError: The URL cannot be reached.
     """
     pieces = _concurrently(url, ranges)
     for (start, length), piece in zip(ranges, pieces, strict=True):
@@ -182,12 +184,12 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
 
 
 def read_neighbours(url: str, ranges: Sequence[tuple[int, int]], gap_bytes: int = 0) -> list[bytes]:
-    """Return several (start, length) pieces as `read_ranges`; those at most `gap_bytes` apart are fetched together.
+    """Return several (start, length) pieces like `read_ranges`, fetching neighbouring pieces in one request.
 
     Args:
         url: The file.
-        ranges: Ascending.
-        gap_bytes: Such a gap is fetched, too.
+        ranges: (start, length) ranges, ascending.
+        gap_bytes: Pieces at most this far apart are fetched together with the gap between them.
     """
     runs: list[list[tuple[int, int]]] = []
     for start, length in ranges:
@@ -207,7 +209,7 @@ def _concurrently(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
 
 
 def bytes_fetched() -> int:
-    """Return how many bytes of files this process has read so far, including failed attempts."""
+    """Return the number of bytes that this process has fetched from URLs, including failed attempts."""
     return _fetched[0]
 
 
@@ -219,31 +221,31 @@ def _threads(process: int) -> ThreadPoolExecutor:  # noqa: ARG001 - threads do n
     return ThreadPoolExecutor(_THREADS, thread_name_prefix="remote")
 
 
-def _version_of(found: Mapping[str, Any]) -> str:
-    return next((str(found[key]) for key in _VERSION_KEYS if found.get(key) is not None), "")
+def _version_of(entry: Mapping[str, Any]) -> str:
+    return next((str(entry[key]) for key in _VERSION_KEYS if entry.get(key) is not None), "")
 
 
 def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
-    """Read a range; accept a short answer only at the end of the file."""
-    bare: Any = {} if _filesystem(url).async_impl else {"cache_type": "none"}  # else megabytes are prefetched
+    """Read a range with one request; accept a short response only at the end of the file."""
+    bare: Any = {} if _filesystem(url).async_impl else {"cache_type": "none"}  # the default prefetches megabytes
     try:
         data: bytes = _ask(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
     except Exception as error:
         if retries.status_of(error) != 416:
             raise
-        data = b""  # the server has nothing at `start`
+        data = b""  # HTTP 416: the file ends before `start`
     with _counting:
         _fetched[0] += len(data)
     if len(data) == length:
         return data
-    there = max(0, min(start + length, _size_once(url, timeout_s)) - start)
-    if len(data) != there:
-        raise ConnectionError(f"{len(data)} of {there} bytes at {start}")
+    available = max(0, min(start + length, _size_once(url, timeout_s)) - start)
+    if len(data) != available:
+        raise ConnectionError(f"{len(data)} of {available} bytes at {start}")
     return data
 
 
 def _size_once(url: str, timeout_s: float) -> int:
-    """Return the size of a file, with one request; at Google without checking whether it is a folder."""
+    """Return the size of a file with one request; on Google Cloud Storage skip the check whether it is a folder."""
     method = "get_object" if hasattr(_filesystem(url), "_get_object") else "info"
     return int(_ask(url, method, timeout_s)["size"])
 
@@ -260,7 +262,7 @@ def _persist(url: str, action: Callable[[float], _T], doing: str = "read", timeo
 
 
 def _ask(url: str, method: str, timeout_s: float, *, writing: bool = False, **arguments: Any) -> Any:
-    """Call a method of the URL's file system with the URL's path, once; with a time-out where that is possible."""
+    """Call a method of the URL's file system with the URL's path, without retries; async ones have a time-out."""
     filesystem = _filesystem(url, writing=writing)
     return _once(filesystem, method, timeout_s, filesystem._strip_protocol(url), **arguments)
 
@@ -274,7 +276,7 @@ def _once(filesystem: Any, method: str, timeout_s: float, *arguments: Any, **opt
 
 
 def login_hint(url: str) -> str:
-    """Return what to do when permission is missing, as a sentence."""
+    """Return the fix for missing permission, as a sentence."""
     protocol = _protocol(url)
     log_in = f"Log in with `{_LOG_IN[protocol]}`, or check the name" if protocol in _LOG_IN else "Check the login"
     if protocol == "hf":
@@ -283,16 +285,16 @@ def login_hint(url: str) -> str:
 
 
 def google_token() -> str:
-    """Return the kind of Google login: the user's default login if there is one, else the machine's, else anonymous.
+    """Return gcsfs' name for the available Google login: the user's default login, else the machine's, else anonymous.
 
-    DROID needs no login. A local emulator never receives one.
+    DROID needs no login. A local emulator never receives a login.
     """
     if os.environ.get(_EMULATOR):
         return "anon"
     folder = Path(os.environ.get("CLOUDSDK_CONFIG") or Path.home() / ".config" / "gcloud")
     if os.environ.get("GOOGLE_APPLICATION_CREDENTIALS") or (folder / "application_default_credentials.json").is_file():
         return "google_default"
-    try:  # the firmware says so: a network request would take seconds on any other machine
+    try:  # read from the firmware: a network request would take seconds on machines outside Google Cloud
         return "cloud" if _MACHINE.read_text().startswith("Google") else "anon"
     except OSError:
         return "anon"
@@ -303,12 +305,12 @@ _opening = threading.Lock()
 
 
 def _filesystem(url: str, *, writing: bool = False) -> Any:
-    """Return the file system of a URL: one for all threads of a process; fsspec would create one for each.
+    """Return the file system of a URL, shared by all threads of a process (fsspec would create one per thread).
 
-    Readers request read access only: some logins may not write.
+    Readers request read access only, because some logins may not write.
 
     Raises:
-        InputError: The library for it is not installed, or there is none.
+        InputError: The library for the protocol is not installed or does not exist.
     """
     protocol = _protocol(url)
     with _opening:
@@ -320,7 +322,7 @@ def _filesystem(url: str, *, writing: bool = False) -> Any:
         if key not in _filesystems:
             try:
                 opened = _google(kind, options) if protocol == "gs" else kind(**options, skip_instance_cache=True)
-            except TypeError as error:  # it needs more than an address
+            except TypeError as error:  # this file system needs more arguments than a URL holds
                 raise InputError(where=url, found=f"an address alone does not do ({error})", needed=_KNOWN) from None
             _filesystems[key] = opened
         return _filesystems[key]
@@ -337,7 +339,7 @@ def _kind(url: str, protocol: str) -> Any:
     os.environ.setdefault("GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT", "false")
     import fsspec
 
-    if protocol in _NO_PLACES:
+    if protocol in _CHAINED_PROTOCOLS:
         raise InputError(where=url, found=f"{protocol}://, which is no place but a way to another", needed=_KNOWN)
     try:
         return fsspec.get_filesystem_class(protocol)
@@ -349,13 +351,13 @@ def _kind(url: str, protocol: str) -> Any:
 
 
 def _google(kind: Any, options: dict[str, Any]) -> Any:
-    """Open Google's file system without its own retries: six for each of ours, up to half a minute in total."""
+    """Open gcsfs without its own retries, which would add six attempts (up to 30 s) to each of `with_retries`."""
     once = getattr(kind._request, "__wrapped__", kind._request)
     open_as = partial(type(kind.__name__, (kind,), {"_request": once}), use_listings_cache=False, **options)
-    who = google_token()
+    login = google_token()
     try:
-        return open_as(token=who)
+        return open_as(token=login)
     except (ValueError, OSError):
-        if who != "cloud":
+        if login != "cloud":
             raise
-        return open_as(token="anon")  # noqa: S106 - a machine may have no account of its own
+        return open_as(token="anon")  # noqa: S106 - a cloud machine may have no service account

@@ -29,11 +29,11 @@ _WARNING_INTERVAL_S = 30.0
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """How long an operation is retried: at most `attempts` times `timeout_s`, plus the waits between.
+    """The duration of retries: at most `attempts` attempts of `timeout_s` each, plus the waits between them.
 
-    The waits double from the first to the longest. Half of each is random, so that many processes do not retry at the
-    same moment. A library without time-outs, or with its own retries (huggingface_hub: six), takes longer per attempt:
-    none begins after `total_s`.
+    The waits double from the first to the longest. Half of each wait is random, so that many processes do not retry at
+    the same moment. A library without time-outs, or with retries of its own (huggingface_hub: six), takes longer per
+    attempt; no attempt starts after `total_s`.
     """
 
     attempts: int = 8
@@ -43,12 +43,12 @@ class RetryPolicy:
     total_s: float = 300.0
 
     def wait_s(self, failures: int) -> float:
-        """Return how long to wait after so many failures."""
+        """Return the wait in seconds after the given number of failures in a row."""
         longest: float = min(self.first_wait_s * 2 ** (failures - 1), self.longest_wait_s)
-        return longest * (1 + secrets.randbelow(1001) / 1000) / 2  # own randomness: no generator of a run is used
+        return longest * (1 + secrets.randbelow(1001) / 1000) / 2  # leaves the random generators of a run unchanged
 
 
-DEFAULT = RetryPolicy()  # fails within a minute on immediate errors, within five on no answer
+DEFAULT = RetryPolicy()  # gives up within 1 minute if errors are immediate, within 5 if the server never responds
 
 
 def with_retries(
@@ -60,22 +60,22 @@ def with_retries(
     doing: str = "read",
     progress: Callable[[], int] = lambda: 0,
 ) -> _T:
-    """Return what an action returns, trying again while its failures are of a kind that passes.
+    """Call an action, retry it after temporary failures, and return its result.
 
     Args:
         where: What is read or written, for messages.
-        action: Called with the seconds that it may take.
-        policy: How often to try, and how long.
-        access: The way out where permission is missing, as a sentence.
+        action: Called with its time limit in seconds.
+        policy: Number of attempts, waits and time limits.
+        access: The fix for missing permission, as a sentence.
         doing: "read" or "written", for messages.
-        progress: How far the action is, where a later attempt goes on from there; attempts and time are counted anew
-            from the last one that came farther.
+        progress: Returns the progress of an action that can resume. Attempts and time are counted from zero again
+            after each attempt that made progress.
 
     Raises:
-        InputError: The action raised it, as it may any `UserError`.
-        OSError: There is no such file, or it is a folder, or the other way round.
-        UnreachableError: What failed did not pass in time; a RefusedError where permission is missing, or it does not
-            pass.
+        InputError: Raised by the action, like any other `UserError`.
+        OSError: There is no such file, it is a folder where a file is expected, or a file where a folder is.
+        UnreachableError: The failure did not pass in time; a RefusedError if permission is missing or the failure is
+            permanent.
     """
     begin, failures, before = time.monotonic(), 0, progress()
     while True:
@@ -85,9 +85,9 @@ def with_retries(
             raise
         except Exception as error:
             if type(error).__module__ == "builtins" and not isinstance(error, OSError | ValueError | EOFError):
-                raise  # an error of Python's own that no network causes, such as a TypeError
-            if not _passes(error):
-                is_denied = status_of(error) in _NO_ACCESS or _is_of_login(error)
+                raise  # a programming error such as a TypeError
+            if not _is_temporary(error):
+                is_denied = status_of(error) in _NO_ACCESS or _is_login_error(error)
                 found = f"{'no permission' if is_denied else f'cannot be {doing}'} ({_summary(error)})"
                 fix = access if is_denied else "Check the address"
                 raise RefusedError(where=where, found=found, fix=fix) from error
@@ -99,13 +99,13 @@ def with_retries(
                 found = f"not reached in {failures} attempts over {seconds:.0f} s; the last: {_summary(error)}"
                 fix = "Check the network, and start again: a run goes on from its last checkpoint"
                 raise UnreachableError(where=where, found=found, fix=fix) from error
-            _say(failures, "%s: %s; trying again in %.1f s", where, _summary(error), wait_s)
+            _log_failure(failures, "%s: %s; trying again in %.1f s", where, _summary(error), wait_s)
         time.sleep(wait_s)
 
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Log retried failures below warnings, in this thread: for callers that can do without the result."""
+    """Log retried failures at level INFO in this thread, for callers that do not depend on the result."""
     token = _quiet.set(True)
     try:
         yield
@@ -117,8 +117,8 @@ _quiet = ContextVar("_quiet", default=False)
 _last_warning_s = [-_WARNING_INTERVAL_S]
 
 
-def _say(failures: int, text: str, *arguments: object) -> None:
-    """Log a failure; as a warning from the third of a call on, at most once in half a minute."""
+def _log_failure(failures: int, text: str, *arguments: object) -> None:
+    """Log a failure: as a warning from the third failure of a call, at most every 30 s, otherwise at level INFO."""
     now = time.monotonic()
     is_late = failures >= _FAILURES_BEFORE_WARNING and now - _last_warning_s[0] > _WARNING_INTERVAL_S
     is_warning = is_late and not _quiet.get()
@@ -128,31 +128,33 @@ def _say(failures: int, text: str, *arguments: object) -> None:
 
 
 def status_of(error: BaseException) -> int | None:
-    """Return the HTTP status of an error of any library, or None."""
+    """Return the HTTP status of an error from any client library, or None."""
     for holder in (error, getattr(error, "response", None)):
         for name in ("code", "status", "status_code"):
-            found = getattr(holder, name, None)
-            if isinstance(found, int | str) and str(found).isdigit():
-                return int(found)
-    return 403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None  # as gcsfs says
+            status = getattr(holder, name, None)
+            if isinstance(status, int | str) and str(status).isdigit():
+                return int(status)
+    return (
+        403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None
+    )  # the text of gcsfs
 
 
-def _passes(error: Exception) -> bool:
+def _is_temporary(error: Exception) -> bool:
     status = status_of(error)
     if status is not None:
         return status in _PASSING_STATUS
-    if _is_of_login(error):
+    if _is_login_error(error):
         return type(error).__name__ == "TransportError" or bool(getattr(error, "retryable", False))
-    # JSON: a truncated listing. A file is said to exist where a condition of the server's is not met.
+    # A JSON error comes from a truncated listing. FileExistsError means that a precondition of the server failed.
     return isinstance(error, json.JSONDecodeError) or not isinstance(error, ValueError | FileExistsError)
 
 
-def _is_of_login(error: Exception) -> bool:
+def _is_login_error(error: Exception) -> bool:
     return type(error).__module__.startswith("google.auth") or "Credentials" in type(error).__name__
 
 
 def _summary(error: Exception) -> str:
-    """Return a library's error in one line."""
+    """Return the message of a library's error on one line."""
     status = status_of(error)
     text = " ".join(str(getattr(error, "message", "") or error).split())
     text = text if len(text) <= _LONGEST_SUMMARY else f"{text[:_LONGEST_SUMMARY]}…"

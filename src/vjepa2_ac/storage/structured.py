@@ -1,7 +1,7 @@
-"""JSON and YAML: values of a file, as a mapping or as a record of declared types; and JSON that this program writes.
+"""Read JSON and YAML into mappings or typed records, and write JSON.
 
-Both parsers execute nothing. A stranger's file is read up to a size; YAML has no aliases, so that none becomes larger.
-Invalid content is an InputError, a missing file a MissingFileError.
+Untrusted files are safe to parse: neither parser executes anything, the file size is limited, and YAML aliases, which
+can expand without limit, are refused. Invalid content is an InputError, a missing file a MissingFileError.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from vjepa2_ac.storage import read_bounded, user_can_read
 T = TypeVar("T")
 
 MOST_BYTES = 16 << 20
-_MOST_SHOWN = 120  # characters of a value
-_MOST_PROBLEMS = 5  # shown of one file
+_MOST_SHOWN = 120  # characters of a value in messages
+_MOST_PROBLEMS = 5  # problems of one file in a message
 _PLAIN_LIST = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null|true|false),?\s+)+)\]")
-_INNER_WORDS = {  # pydantic uses JSON's terms; the user may have written YAML
+_PYDANTIC_TERMS = {  # pydantic uses the terms of JSON; the file may be YAML
     "Value error, ": "",
     "a valid array": "a list",
     "a valid tuple": "a list",
@@ -44,16 +44,16 @@ _INNER_WORDS = {  # pydantic uses JSON's terms; the user may have written YAML
 
 
 def json_object(data: bytes | str, *, where: str, needed: str = "a JSON object", fix: str = "") -> dict[str, Any]:
-    """Return the keys and values of a JSON object; numbers may be NaN and infinite, as Python writes them.
+    """Parse a JSON object; numbers may be NaN and infinite, as Python writes them.
 
     Args:
         data: The text.
         where: The file, for messages.
-        needed: What it should be.
-        fix: How to fix it.
+        needed: The expected content, for messages.
+        fix: How to fix the file, for messages.
 
     Raises:
-        InputError: It is not JSON, or no object.
+        InputError: The text is not JSON, or not an object.
     """
     try:
         value = json.loads(data)
@@ -67,11 +67,11 @@ def json_object(data: bytes | str, *, where: str, needed: str = "a JSON object",
 def read_json_object(
     path: str | Path, *, most_bytes: int = MOST_BYTES, needed: str = "a JSON object", fix: str = ""
 ) -> dict[str, Any]:
-    """Return the keys and values of a JSON object in a file, on this machine or behind a URL.
+    """Read a JSON object from a local file or a URL.
 
     Raises:
-        InputError: As `json_object`; or the file is larger than `most_bytes`. A MissingFileError: there is none.
-        UnreachableError: It cannot be read now.
+        InputError: As `json_object`; or the file is larger than `most_bytes`. A MissingFileError if there is no file.
+        UnreachableError: The file cannot be read now.
     """
     with user_can_read(path, needed=needed, fix=fix):
         data = read_bounded(path, most_bytes)
@@ -79,33 +79,33 @@ def read_json_object(
 
 
 def json_text(value: Any) -> str:
-    """Return plain values as indented JSON, each list of plain values on one line.
+    """Return plain values as indented JSON, with each list of numbers on one line.
 
     Raises:
         ValueError: A number is not finite.
     """
     text = json.dumps(value, indent=1, allow_nan=False)
-    return _PLAIN_LIST.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n"
+    return _PLAIN_LIST.sub(lambda match: "[" + " ".join(match[1].split()) + "]", text) + "\n"
 
 
 def finite_or_none(value: float) -> float | None:
-    """Return a number; None for NaN and infinity, which JSON does not have."""
+    """Return a number, or None for NaN and infinity, which JSON does not have."""
     return value if math.isfinite(value) else None
 
 
 def plain(value: Any) -> Any:
-    """Return values with arrays and tensors in them as plain ones: numbers that are not finite are None."""
+    """Convert arrays and tensors in nested values to lists, and numbers that are not finite to None."""
     if hasattr(value, "tolist"):
         return plain(value.tolist())
     if isinstance(value, Mapping):
-        return {key: plain(one) for key, one in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(one) for one in value]
+        return [plain(item) for item in value]
     return finite_or_none(value) if isinstance(value, float) else value
 
 
 def utc_now() -> str:
-    """Return the time in UTC, to the second, as ISO 8601."""
+    """Return the current time in UTC, to the second, as ISO 8601."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
 
@@ -115,17 +115,17 @@ _adapter: Callable[[Any], Any] = cache(TypeAdapter)
 
 
 def record_of(kind: type[T], values: Any, *, where: str, needed: str = "", fix: str = "") -> T:
-    """Return a dataclass, or a model of pydantic's, of values from JSON: none is converted to another type.
+    """Create a dataclass or pydantic model from values of JSON, without converting any value to another type.
 
     Args:
         kind: The class; its annotations may have pydantic's bounds.
-        values: A mapping of its fields; those with a default may be missing.
+        values: A mapping from field names to values; fields with a default may be missing.
         where: The file, for messages.
-        needed: What it should be.
-        fix: How to fix it.
+        needed: The expected content, for messages.
+        fix: How to fix the file, for messages.
 
     Raises:
-        InputError: A value is missing, unknown, of another type or beyond its bounds.
+        InputError: A value is missing, unknown, of another type or out of bounds.
     """
     problems: list[str] = []
     if is_dataclass(kind) and isinstance(values, dict):
@@ -134,7 +134,7 @@ def record_of(kind: type[T], values: Any, *, where: str, needed: str = "", fix: 
         record: T = _adapter(kind).validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
         problems += [
-            ".".join(map(str, one["loc"])) + ": " * bool(one["loc"]) + message_of(one) for one in error.errors()
+            ".".join(map(str, item["loc"])) + ": " * bool(item["loc"]) + message_of(item) for item in error.errors()
         ]
     if problems:
         more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
@@ -143,21 +143,21 @@ def record_of(kind: type[T], values: Any, *, where: str, needed: str = "", fix: 
 
 
 def message_of(detail: Any) -> str:
-    """Return pydantic's message for one value in this program's terms, with the value found.
+    """Return pydantic's message for one value in this program's terms, followed by the value.
 
     Args:
-        detail: One of `ValidationError.errors()`.
+        detail: An item of `ValidationError.errors()`.
     """
-    message, found = str(detail["msg"]), detail.get("input")
+    message, value = str(detail["msg"]), detail.get("input")
     if detail["type"] == "missing":
         return "missing"
-    for inner, ours in _INNER_WORDS.items():
-        message = message.replace(inner, ours)
-    return message if isinstance(found, dict) else f"{message} (found {shown(found)})"
+    for term, replacement in _PYDANTIC_TERMS.items():
+        message = message.replace(term, replacement)
+    return message if isinstance(value, dict) else f"{message} (found {shown(value)})"
 
 
 def shown(value: object) -> str:
-    """Return a value as Python source, cut if it is long."""
+    """Return the `repr` of a value, truncated if it is long."""
     text = repr(value)
     return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}…"
 
@@ -166,12 +166,12 @@ def shown(value: object) -> str:
 
 
 def parse_yaml(text: str, *, where: str) -> Any:
-    """Return the values of a YAML document: mappings with keys of text, lists, text, numbers, truth values, None.
+    """Parse a YAML document into mappings with string keys, lists, strings, numbers, booleans and None.
 
-    A date is text, as are 017 and 12:30, which YAML would take for other numbers; 1e-4 is a number.
+    Dates, 017 and 12:30 are strings (YAML 1.1 would read the last two as the numbers 15 and 750); 1e-4 is a number.
 
     Raises:
-        InputError: It is not YAML, has a key twice or an alias; names line and column.
+        InputError: The text is not YAML, or has a duplicate key or an alias; names line and column.
     """
     try:
         return yaml.load(text, _Loader)  # noqa: S506 - a SafeLoader
@@ -183,29 +183,29 @@ def parse_yaml(text: str, *, where: str) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, stricter and without surprising numbers."""
+    """PyYAML's safe loader without aliases, duplicate keys and the unusual numbers of YAML 1.1."""
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
-        """Compose a node, which is no alias: a few lines of those can stand for more than fits into memory."""
+        """Compose a node; refuse aliases, because a few lines of them can expand to more than fits into memory."""
         if self.check_event(yaml.AliasEvent):
             mark = self.peek_event().start_mark  # type: ignore[no-untyped-call] # PyYAML's
             raise yaml.MarkedYAMLError(problem="an alias; write it out", problem_mark=mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: MappingNode, deep: bool = False) -> dict[Any, Any]:  # noqa: ARG002 - PyYAML's
-        """Return keys, as they are written, and values; each key once."""
-        found: dict[str, Any] = {}
+        """Return a mapping with the keys as written in the file; refuse duplicate keys."""
+        mapping: dict[str, Any] = {}
         for key, value in node.value:
             if not isinstance(key, ScalarNode):
                 problem = "a key that is a mapping or a list itself; fill in the template, if it is {{ NAME }} of one"
                 raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
-            if key.value in found:
+            if key.value in mapping:
                 raise yaml.MarkedYAMLError(problem=f"key {key.value!r} is given twice", problem_mark=key.start_mark)
-            found[key.value] = self.construct_object(value, deep=True)
-        return found
+            mapping[key.value] = self.construct_object(value, deep=True)
+        return mapping
 
 
-_NUMBERS = {  # PyYAML's own make numbers of 017 and 12:30, and text of 1e-4
+_NUMBERS = {  # PyYAML's patterns read 017 and 12:30 as numbers, and 1e-4 as a string
     "int": re.compile(r"[-+]?(?:0|[1-9][0-9_]*|0b[01_]+|0x[0-9a-fA-F_]+)$"),
     "float": re.compile(
         r"[-+]?(?:[0-9][0-9_]*\.[0-9_]*(?:[eE][-+]?[0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+"

@@ -1,4 +1,4 @@
-"""Safetensors files: written whole; read with names, shapes and types checked, and every number finite."""
+"""Safetensors files: written completely or not at all; on reading, names, shapes, types and values are checked."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Write tensors to a new safetensors file, whose mode follows the umask as that of any other file.
+    """Write tensors to a new safetensors file, with the file mode of the umask.
 
     Raises:
-        OSError: The disk is full, or another error of the system.
+        OSError: The disk is full, or another error of the operating system.
     """
     path.touch()
     mode = stat.S_IMODE(path.stat().st_mode)
     try:
         whole = {name: value.detach().to("cpu").contiguous() for name, value in tensors.items()}
         save_file(whole, path, metadata={"format": "pt"})
-        path.chmod(mode)  # safetensors 0.8 makes it 0600
-    except SafetensorError as error:  # whose text alone has the system's number
+        path.chmod(mode)  # safetensors 0.8 creates files with mode 0600
+    except SafetensorError as error:  # the errno is only in the text of the error
         number = re.search(r"os error (\d+)", str(error))
         raise OSError(int(number[1]) if number else errno.EIO, str(error), str(path)) from None
 
@@ -42,24 +42,24 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
 def read_tensors(
     path: Path, like: Mapping[str, Tensor], *, needed: str, fix: str, dtype: torch.dtype | None = None
 ) -> dict[str, Tensor]:
-    """Read a safetensors file whose tensors must have the names and shapes of given ones.
+    """Read a safetensors file and check names and shapes of its tensors.
 
     Args:
         path: The file.
-        like: Tensors of these names and shapes.
-        needed: What the file should be, for messages.
-        fix: What to do if it holds other tensors, or a number that is not finite, as a sentence.
+        like: Tensors with the expected names and shapes.
+        needed: The expected file, for messages.
+        fix: The fix if the file holds other tensors or a number that is not finite, as a sentence.
         dtype: Type of the result; None: as in the file.
 
     Raises:
-        InputError: The file is missing or truncated, is of another format, holds other tensors, or NaN or infinity.
+        InputError: The file is missing, truncated or of another format, or holds other tensors, NaN or infinity.
     """
     with open_safetensors(path, needed=needed) as file:
         found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
         check_tensors(found, {name: value.shape for name, value in like.items()}, where=str(path), fix=fix)
         mapped = {name: file.get_tensor(name) for name in like}
         require_floats(mapped, where=str(path), fix=fix)
-        # copied: the file may be replaced while it is in use
+        # Copied, because the memory-mapped file may be replaced while the tensors are in use.
         weights = {name: value.to(dtype or value.dtype, copy=True) for name, value in mapped.items()}
     require_finite(weights, where=str(path), fix=fix)
     return weights
@@ -67,20 +67,20 @@ def read_tensors(
 
 @contextmanager
 def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
-    """Open a safetensors file, whose header is checked against its size; its tensors are mapped.
+    """Open a safetensors file with memory-mapped tensors, after comparing its header with its size.
 
     Raises:
-        InputError: It is missing, truncated, a git-lfs pointer, a pipe or of another format; also of a tensor that is
-            read within the block.
-        UnreachableError: It cannot be read.
+        InputError: The file is missing, truncated, a git-lfs pointer, a pipe or of another format; also if a tensor
+            that is read within the block is invalid.
+        UnreachableError: The file cannot be read.
     """
     again = "Copy or write the folder again"
     with storage.user_can_read(path, needed=needed, fix=again):
-        path.open("rb").close()  # safetensors calls a file without permission a missing one
+        path.open("rb").close()  # safetensors reports a file without read permission as missing
         try:
             with safe_open(path, framework="pt") as file:
                 yield file
-        except (SafetensorError, OSError, TypeError) as error:  # the last: of a type that torch does not have
+        except (SafetensorError, OSError, TypeError) as error:  # TypeError: a dtype that torch does not have
             if storage.is_refusal(error):
                 raise
             found = f"not a whole safetensors file ({error})"
@@ -90,10 +90,10 @@ def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
 def check_tensors(
     found: Mapping[str, tuple[int, ...]], needed: Mapping[str, tuple[int, ...]], *, where: str, fix: str
 ) -> None:
-    """Refuse tensors that are missing, unknown or of another shape, and name some of them.
+    """Refuse tensors that are missing, unknown or of another shape.
 
     Raises:
-        InputError: Any of these.
+        InputError: Names the first four such tensors.
     """
     problems = [f"missing: {name}" for name in needed.keys() - found.keys()]
     problems += [f"unknown: {name}" for name in found.keys() - needed.keys()]
@@ -107,7 +107,7 @@ def check_tensors(
 
 
 def require_floats(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> None:
-    """Refuse weights of another type than float16, bfloat16, float32 and float64, which casting would change.
+    """Refuse weights whose type is not float16, bfloat16, float32 or float64, because casting would change them.
 
     Raises:
         InputError: Names the first such tensor.
@@ -120,7 +120,8 @@ def require_floats(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> No
 def require_finite(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> None:
     """Refuse tensors that hold NaN or infinity.
 
-    Minimum and maximum show it in one pass, without extra memory: a second for a thousand million numbers.
+    Minimum and maximum are finite only if all values are. They need one pass and no extra memory: about 1 s for 10^9
+    numbers.
 
     Raises:
         InputError: Names the first such tensor.

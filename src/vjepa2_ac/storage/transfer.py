@@ -1,4 +1,4 @@
-"""File transfer to and from another place: a local folder, a URL that can be written; and models from the Hub.
+"""File transfer to and from another local folder or a writable URL, and download of models from the Hub.
 
 A permanent failure to write a file is a `RefusedError`, any other an `UnreachableError`. As when reading, temporary
 failures at a URL are retried. A file in an object store is either complete or absent.
@@ -20,7 +20,7 @@ from vjepa2_ac.storage.files import atomic_writer, join, try_writing_at, user_ca
 from vjepa2_ac.storage.places import HUB, is_url
 from vjepa2_ac.storage.remote import FileInfo
 
-_AWAY = frozenset({
+_TEMPORARY_ERRORS = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC,
     errno.EDQUOT,
 })  # fmt: skip
@@ -28,14 +28,14 @@ _PIECE_BYTES = 32 << 20
 
 
 def upload(source: Path, target: str) -> None:
-    """Copy a local file to another place, replacing any file there; readers never see a part of it.
+    """Copy a local file atomically to another folder or a URL, replacing an existing file.
 
     Raises:
         FileNotFoundError: There is no such local file.
-        UnreachableError: It cannot be written; a RefusedError if that is permanent.
+        UnreachableError: The target cannot be written; a RefusedError if that is permanent.
     """
     if not is_url(target):
-        with source.open("rb") as file, _explained(target), atomic_writer(target) as copy:
+        with source.open("rb") as file, _write_errors_as_user_errors(target), atomic_writer(target) as copy:
             shutil.copyfileobj(file, copy)
         return
     try:
@@ -47,11 +47,11 @@ def upload(source: Path, target: str) -> None:
 
 
 def write(path: str, data: bytes | str) -> None:
-    """Write a file whole, on this machine or behind a URL, replacing any file there; text is written as UTF-8.
+    """Write a local file or a URL atomically, replacing an existing file; text is written as UTF-8.
 
     Raises:
-        InputError: This machine's disk is full, or cannot be written.
-        UnreachableError: It cannot be written there; a RefusedError if that is permanent.
+        InputError: The local disk is full, or cannot be written.
+        UnreachableError: The URL cannot be written; a RefusedError if that is permanent.
     """
     if not is_url(path):
         with user_can_write(path):
@@ -64,12 +64,12 @@ def write(path: str, data: bytes | str) -> None:
 
 
 def download(source: str, target: Path) -> None:
-    """Copy a file from another place to this machine, atomically, and synced to the disk.
+    """Copy a file from another folder or a URL to this machine, atomically, and flush it to the disk.
 
     Raises:
         FileNotFoundError: There is no such file.
-        OSError: It cannot be read, or the copy not be written.
-        UnreachableError: The other place cannot be reached.
+        OSError: The source cannot be read, or the copy cannot be written.
+        UnreachableError: The URL cannot be reached.
     """
     if not is_url(source):
         with Path(source).open("rb") as file, atomic_writer(target) as copy:
@@ -82,41 +82,41 @@ def download(source: str, target: Path) -> None:
 
 
 def remove(path: str) -> None:
-    """Remove a file at another place; it may not exist.
+    """Remove a file at a path or URL; a missing file is no error.
 
     Raises:
-        UnreachableError: It cannot be removed; a RefusedError if that is permanent.
+        UnreachableError: The file cannot be removed; a RefusedError if that is permanent.
     """
     if is_url(path):
         with suppress(FileNotFoundError):
             remote.remove(path)
         return
-    with _explained(path):
+    with _write_errors_as_user_errors(path):
         Path(path).unlink(missing_ok=True)
 
 
 def remove_folder(folder: str, *, first: str) -> None:
-    """Remove all files below a folder; first the one without which it does not count.
+    """Remove all files below a folder, starting with `first`, the file that marks the folder as complete.
 
     Raises:
-        UnreachableError: It cannot be removed; a RefusedError if that is permanent.
+        UnreachableError: A file cannot be removed; a RefusedError if that is permanent.
     """
     remove(join(folder, first))
     for name in file_sizes(folder):
         remove(join(folder, name))
     if not is_url(folder) and Path(folder).exists():
-        with _explained(folder):
+        with _write_errors_as_user_errors(folder):
             shutil.rmtree(folder)
 
 
 def file_sizes(folder: str) -> dict[str, int]:
-    """Return the sizes of all files below a folder by their relative paths; none if there is no such folder.
+    """Return the size in bytes of each file below a folder by its relative path; empty if there is no such folder.
 
     Raises:
-        UnreachableError: It cannot be listed; a RefusedError if that is permanent.
+        UnreachableError: The folder cannot be listed; a RefusedError if that is permanent.
     """
     if not is_url(folder):
-        with _explained(folder):
+        with _write_errors_as_user_errors(folder):
             sizes = dict[str, int]()
             for path in Path(folder).rglob("*"):
                 with suppress(FileNotFoundError):  # a temporary file that was renamed meanwhile
@@ -127,27 +127,27 @@ def file_sizes(folder: str) -> dict[str, int]:
 
 
 def files_below(url: str) -> dict[str, FileInfo]:
-    """Return all files below a folder behind a URL, by their relative paths: one listing; none if there is no folder.
+    """Return all files below a folder behind a URL by their relative paths; empty if there is no such folder.
 
     Raises:
-        UnreachableError: It cannot be listed; a RefusedError if that is permanent.
+        UnreachableError: The folder cannot be listed; a RefusedError if that is permanent.
     """
     try:
         return remote.files_below(url)
     except FileNotFoundError:
-        if url.startswith(("gs://", "gcs://")):  # which has no folders: only buckets can be missing
+        if url.startswith(("gs://", "gcs://")):  # has no folders, so only buckets can be missing
             raise _no_bucket(url) from None
         return {}
 
 
 def try_writing(folder: str) -> None:
-    """Test whether files can be written to and removed from a place. Nothing remains there.
+    """Test whether files can be written to and removed from a folder or URL, with a temporary file.
 
     Raises:
-        UnreachableError: It cannot be written now; a RefusedError if that is permanent.
+        UnreachableError: The folder cannot be written now; a RefusedError if that is permanent.
     """
     if not is_url(folder):
-        with _explained(folder):
+        with _write_errors_as_user_errors(folder):
             try_writing_at(Path(folder))
         return
     trial = join(folder, f".write-check-{secrets.token_hex(8)}")
@@ -156,11 +156,11 @@ def try_writing(folder: str) -> None:
 
 
 @contextmanager
-def _explained(path: str) -> Iterator[None]:
+def _write_errors_as_user_errors(path: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        kind = UnreachableError if error.errno in _AWAY else RefusedError
+        kind = UnreachableError if error.errno in _TEMPORARY_ERRORS else RefusedError
         found = f"cannot be written: {error.strerror or error}"
         raise kind(where=path, found=found, fix="Check its permissions, and the disk") from error
 
@@ -171,17 +171,17 @@ def _no_bucket(url: str) -> RefusedError:
 
 
 def from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
-    """Return the folder of a model in the Hub's cache, after downloading what is missing; a part is gone on with.
+    """Download the missing files of a model on the Hub, resuming partial downloads; return its folder in the cache.
 
     Args:
         name: hf://owner/name, with @revision if it is not the newest.
-        files: Patterns of the files that are wanted.
-        where: For messages.
+        files: Patterns of the required files.
+        where: The config key or option, for messages.
 
     Raises:
-        RefusedError: There is no such model, or not for this user.
+        RefusedError: There is no such model, or this user may not read it.
         UnreachableError: The Hub cannot be reached, and the model is not in the cache.
-        InputError: The Hub answers something else, or the disk is full.
+        InputError: The Hub returns another error, or the disk is full.
     """
     from huggingface_hub import errors, snapshot_download
 
@@ -196,5 +196,5 @@ def from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
         fix = "Check the network, or name a folder of this machine"
         raise UnreachableError(where=where, found="the Hub cannot be reached", fix=fix) from None
     except (errors.HfHubHTTPError, OSError, ValueError) as error:
-        said = next(iter(str(error).strip().splitlines()), type(error).__name__)
-        raise InputError(where=where, found=said, needed="the files of a model", fix="Check name and disk") from None
+        message = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise InputError(where=where, found=message, needed="the files of a model", fix="Check name and disk") from None
