@@ -182,13 +182,13 @@ def test_a_display_matrix_other_than_a_quarter_turn_is_refused(matrix: tuple[int
 def test_only_what_the_asked_frames_need_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12)
     decoded: list[int] = []
-    keep = video_reader._Video._keep
+    keep = video_reader._Video._collect
 
     def counted(self: video_reader._Video, frames: Sequence[Any], *others: Any) -> None:
         decoded.extend(frame.pts for frame in frames)
         keep(self, frames, *others)
 
-    monkeypatch.setattr(video_reader._Video, "_keep", counted)
+    monkeypatch.setattr(video_reader._Video, "_collect", counted)
     read_frames(path, [14, 38], where="a")
     assert [time // 1024 for time in decoded] == [12, 13, 14, 36, 37, 38]
 

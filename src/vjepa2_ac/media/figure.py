@@ -1,7 +1,7 @@
-"""Figures in one style: as PNG files, as pixels, and as SVG for a page; and films of what a model imagines.
+"""Figures in one style, as PNG files, pixels and SVG for a page, and videos and image strips of predicted frames.
 
-Every image of a film says what it is: recorded, what the simulator shows, decoded from the latents of a true frame, or
-imagined.
+The colour around each image shows its kind: recorded, simulated, decoded from the latents of a true frame, or
+predicted by a model.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from matplotlib.patches import Patch
 
 from vjepa2_ac.storage import atomic_writer
 
-# What a page or an image may not hold, or what misleads a reader: control characters, halves of surrogate pairs,
+# Characters that are invalid in a page or an image, or mislead a reader: control characters, lone surrogates,
 # noncharacters, and marks that change the direction of text.
 _HIDDEN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff\\ufffe\\uffff]")
 GREY, BLUE, ORANGE, GREEN, RED = "#8a8a8a", "#1f6fb4", "#d1762a", "#2b8a3e", "#b3246b"
@@ -39,13 +39,13 @@ _STYLE = {
     "axes.titlelocation": "left",
     "axes.titlesize": 9,
     "legend.frameon": False,
-    "text.parse_math": False,  # what people call things is shown as it is: a dollar sign begins no formula
+    "text.parse_math": False,  # names from the user are shown literally, also with dollar signs
 }
 
 
 def headline(figure: Any, words: str) -> None:
-    """Write one line above a figure, whose layout makes room for it; what does not fit is left out."""
-    line = textwrap.shorten(words, int(12 * figure.get_figwidth()), placeholder=" …")  # 12 letters in an inch
+    """Write a title of one line above a figure, truncated to the width of the figure."""
+    line = textwrap.shorten(words, int(12 * figure.get_figwidth()), placeholder=" …")  # 12 letters per inch
     figure.suptitle(line, fontsize=10.5, x=0.01, ha="left")
 
 
@@ -53,15 +53,15 @@ def headline(figure: Any, words: str) -> None:
 def written_figure(
     path: Path, width: float, height: float, *, dpi: int = 100, size: float = 8, **options: Any
 ) -> Iterator[Any]:
-    """Yield a figure of so many inches to draw on, which is then written as PNG, atomically.
+    """Yield a figure to draw on, and write it atomically as a PNG file when the block ends.
 
     Args:
         path: The file.
-        width: In inches.
-        height: Likewise.
+        width: Width of the figure in inches.
+        height: Height of the figure in inches.
         dpi: Pixels per inch.
-        size: Of the letters, in points.
-        options: Of the figure.
+        size: Font size in points.
+        options: Further arguments of matplotlib's `Figure`.
     """
     with in_our_style({"font.size": size}):
         figure = new_figure(width, height, **{"layout": "constrained", **options})
@@ -71,41 +71,41 @@ def written_figure(
 
 
 def in_our_style(changes: dict[str, Any]) -> AbstractContextManager[None]:
-    """Return a context in which matplotlib draws in the style of all our figures, but for some changes."""
+    """Return a context in which matplotlib draws in the style of this package, with some rc parameters changed."""
     return mpl.rc_context(_STYLE | changes)
 
 
 def pixels_of(figure: Any) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw a figure, and return its pixels."""
+    """Draw a figure and return its RGB pixels."""
     figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 
 
 def new_figure(width: float, height: float, **options: Any) -> Figure:
-    """Return a figure of so many inches with a canvas of its own: pyplot keeps figures, and may open windows."""
+    """Return a figure (size in inches) with a canvas, without pyplot, which keeps figures and may open windows."""
     figure = Figure(figsize=(width, height), **options)
     FigureCanvasAgg(figure)
     return figure
 
 
 def svg_of(draw: Callable[..., None], width: float, height: float, *given: Any) -> str:
-    """Return what is drawn of what is given, so many inches large, as SVG in a data: URL; always the same bytes."""
+    """Call `draw(figure, *given)` on a figure (size in inches) and return it as an SVG data: URL, reproducibly."""
     style = {"font.size": 9, "legend.fontsize": 8, "svg.fonttype": "none", "svg.hashsalt": "vjepa2-ac"}
     text = io.StringIO()
     with in_our_style(style), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a reader's fonts have it
+        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # browsers have the glyph
         figure = new_figure(width, height, layout="constrained")
         draw(figure, *given)
-        FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None})  # `savefig` would lay it out twice
+        FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None})  # `savefig` would compute the layout twice
     return f"data:image/svg+xml;base64,{base64.b64encode(text.getvalue().encode()).decode()}"
 
 
 def visible(text: str) -> str:
-    """Return a text without what a page or an image may not show."""
+    """Return a text with invalid and misleading characters replaced by U+FFFD."""
     return _HIDDEN.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
-# ---- films ----
+# ---- image strips and videos of rollouts ----
 
 Pixels = UInt8[np.ndarray, "_ _ 3"]
 Kind = Literal["recorded", "simulated", "decoded", "imagined", "error"]
@@ -119,46 +119,46 @@ MEANING: dict[Kind, tuple[str, str]] = {
 }
 """Colour and meaning of each kind."""
 
-_DOTS = 100  # per inch
+_DOTS = 100  # pixels per inch
 _LABEL, _STORY, _HEAD, _GAP, _LINE, _LEGEND = 160, 90, 90, 14, 17, 270  # pixels
-_MOST_COLUMNS = 6  # that can be read where 800 pixels are as wide as a page
-_PREVIEW_S, _START_S, _END_S, _LOOP_S = 1.2, 0.8, 0.8, 6.0  # how long a loop shows them; all of it, at most
-_SLOWER = 2.0  # than reality, so that an eye can follow
+_MOST_COLUMNS = 6  # more are too small to read on a page that is 800 pixels wide
+_PREVIEW_S, _START_S, _END_S, _LOOP_S = 1.2, 0.8, 0.8, 6.0  # durations of parts of a loop, and its maximal duration
+_SLOWER = 2.0  # a loop plays at half the real speed
 
 
 @dataclass(frozen=True, eq=False)
 class StripRow:
-    """Frames of one story by one teller, the first one at the start."""
+    """One row of a strip: the frames of one rollout by one model, from the start frame on."""
 
-    label: str  # who tells: what really happens, the base, ...
-    kind: Kind  # of all frames, except for the first one of what is imagined: it is given, and decoded
+    label: str  # the source of the frames: the model, or the simulator
+    kind: Kind  # kind of all frames; the first frame of a predicted row is the decoded start frame
     frames: UInt8[np.ndarray, "time height width 3"]
-    captions: tuple[str, ...] = ()  # of each frame, in small letters; none: no line for them
-    story: str = ""  # the actions, where several are told
-    outlines: Bool[np.ndarray, "time height width"] | None = None  # where the arm really is; None: nobody knows
+    captions: tuple[str, ...] = ()  # one per frame, in small letters; empty: no captions
+    story: str = ""  # name of the action sequence, if the strip has several
+    outlines: Bool[np.ndarray, "time height width"] | None = None  # mask of the true arm; None: unknown
 
 
 @dataclass(frozen=True, eq=False)
 class FilmStrip:
-    """Rows of equal length."""
+    """Rollouts of equal length, to be drawn as an image strip or a video."""
 
     title: str
     rows: tuple[StripRow, ...]
-    seconds: tuple[float, ...]  # of each frame since the start
+    seconds: tuple[float, ...]  # time of each frame since the start
     source: str = ""  # model and clip, in small letters
 
     @property
     def about_outlines(self) -> str:
-        """What the outlines mean, if there are any."""
+        """The legend of the outlines; empty if no row has outlines."""
         return "; white line: where the arm really is" * any(row.outlines is not None for row in self.rows)
 
 
 def draw_strip(film: FilmStrip, *, side: int = 116) -> Pixels:
-    """Return all rows below each other, time from left to right; of many times some, evenly spread.
+    """Draw all rows below each other, with up to six evenly spread times from left to right; return the pixels.
 
     Args:
-        film: What is shown.
-        side: Height and width of an image, in pixels, about.
+        film: The rollouts.
+        side: Approximate height and width of an image, in pixels.
     """
     columns = min(len(film.seconds), _MOST_COLUMNS)
     captioned = sum(bool(row.captions) for row in film.rows)
@@ -179,62 +179,62 @@ def draw_strip(film: FilmStrip, *, side: int = 116) -> Pixels:
 
 
 def draw_rows(figure: Any, film: FilmStrip) -> None:
-    """Draw the rows of a strip on a figure, or on a part of one."""
-    places = np.unique(np.linspace(0, len(film.seconds) - 1, _MOST_COLUMNS).round().astype(int)).tolist()
-    grid = figure.subplots(len(film.rows), len(places), squeeze=False)
-    for row, beside in zip(film.rows, grid, strict=True):
-        for place, axes in zip(places, beside, strict=True):
-            _show(axes, row, place)
+    """Draw the rows of a strip on a figure or subfigure."""
+    indices = np.unique(np.linspace(0, len(film.seconds) - 1, _MOST_COLUMNS).round().astype(int)).tolist()
+    grid = figure.subplots(len(film.rows), len(indices), squeeze=False)
+    for row, row_axes in zip(film.rows, grid, strict=True):
+        for index, axes in zip(indices, row_axes, strict=True):
+            _show(axes, row, index)
         label = f"{row.label}:\n{row.story}" if row.story else row.label
-        beside[0].set_ylabel(label, color=MEANING[row.kind][0], rotation=0, ha="right", va="center")
-    for place, axes in zip(places, grid[0], strict=True):
-        text = f"{film.seconds[place]:.2f} s" if place else "start, given"
+        row_axes[0].set_ylabel(label, color=MEANING[row.kind][0], rotation=0, ha="right", va="center")
+    for index, axes in zip(indices, grid[0], strict=True):
+        text = f"{film.seconds[index]:.2f} s" if index else "start, given"
         axes.set_title(text, fontsize=8, color=GREY, loc="left")
 
 
 def film_frames(film: FilmStrip, *, side: int = 172) -> Iterator[Pixels]:
-    """Yield an image for each time: a table of stories and tellers, of which there are more across than down.
+    """Yield a video frame for each time: a grid of models and action sequences, whose longer side is horizontal.
 
     Args:
-        film: What is shown.
-        side: Height and width of an image, in pixels, about.
+        film: The rollouts.
+        side: Approximate height and width of an image, in pixels.
     """
-    stories, tellers = dict.fromkeys(row.story for row in film.rows), dict.fromkeys(row.label for row in film.rows)
-    down, across = sorted((list(stories), list(tellers)), key=len)
+    stories, labels = dict.fromkeys(row.story for row in film.rows), dict.fromkeys(row.label for row in film.rows)
+    row_names, column_names = sorted((list(stories), list(labels)), key=len)
     cells = {names: row for row in film.rows for names in ((row.story, row.label), (row.label, row.story))}
-    for place, seconds in enumerate(film.seconds):
-        when = f"{seconds:.2f} s after the only frame that is given" if place else "the start: all that is given"
-        size = _STORY + len(across) * (side + _GAP), _HEAD + len(down) * (side + _GAP)
+    for index, seconds in enumerate(film.seconds):
+        caption = f"{seconds:.2f} s after the only frame that is given" if index else "the start: all that is given"
+        size = _STORY + len(column_names) * (side + _GAP), _HEAD + len(row_names) * (side + _GAP)
         with _figure(film, size) as figure:
-            figure.supxlabel(when + film.about_outlines, fontsize=9, x=0.01, ha="left")
-            grid = figure.subplots(len(down), len(across), squeeze=False)
-            for name, beside in zip(down, grid, strict=True):
-                for other, axes in zip(across, beside, strict=True):
-                    if (row := cells.get((name, other))) is None:
+            figure.supxlabel(caption + film.about_outlines, fontsize=9, x=0.01, ha="left")
+            grid = figure.subplots(len(row_names), len(column_names), squeeze=False)
+            for row_name, row_axes in zip(row_names, grid, strict=True):
+                for column_name, axes in zip(column_names, row_axes, strict=True):
+                    if (row := cells.get((row_name, column_name))) is None:
                         axes.set_axis_off()
                     else:
-                        _show(axes, row, place)
-                beside[0].set_ylabel(name.replace(", ", ",\n"), rotation=0, ha="right", va="center")
-            for other, axes in zip(across, grid[0], strict=True):
-                axes.set_title(other, fontsize=9.5)
+                        _show(axes, row, index)
+                row_axes[0].set_ylabel(row_name.replace(", ", ",\n"), rotation=0, ha="right", va="center")
+            for column_name, axes in zip(column_names, grid[0], strict=True):
+                axes.set_title(column_name, fontsize=9.5)
             yield pixels_of(figure)
 
 
 def loop_of(film: FilmStrip) -> list[tuple[int, float]]:
-    """Return the times of a film in the order of a loop, each with the seconds for which it is shown.
+    """Return (frame index, duration in seconds) of each frame of an endless loop.
 
-    The end comes first, since that is what a preview shows; then all from the start, in real time or slower, but so
-    that the loop is short.
+    The last frame comes first, because previews show the first frame of a loop. Then all frames follow from the start,
+    at half the real speed, or faster where the loop would be longer than 6 s.
     """
     last = len(film.seconds) - 1
-    room = (_LOOP_S - _PREVIEW_S - _START_S - _END_S) / max(last - 1, 1)
-    steps = [min(_SLOWER * step, room) for step in np.diff(film.seconds).tolist()]
+    longest_s = (_LOOP_S - _PREVIEW_S - _START_S - _END_S) / max(last - 1, 1)
+    steps = [min(_SLOWER * step, longest_s) for step in np.diff(film.seconds).tolist()]
     return [(last, _PREVIEW_S), (0, _START_S), *zip(range(1, last), steps, strict=False), (last, _END_S)]
 
 
 @contextmanager
 def _figure(film: FilmStrip, size: tuple[int, int]) -> Iterator[Any]:
-    """Yield a figure of a width and a height in pixels, with the title of a film."""
+    """Yield a figure of (width, height) in pixels with the title of the rollouts."""
     with in_our_style({"font.size": 9}):
         figure = new_figure(*(pixels / _DOTS for pixels in size), dpi=_DOTS, layout="compressed", facecolor="white")
         figure.suptitle(film.title, fontsize=11, weight="bold", x=0.01, ha="left")
@@ -242,25 +242,25 @@ def _figure(film: FilmStrip, size: tuple[int, int]) -> Iterator[Any]:
 
 
 def show_framed(axes: Any, image: UInt8[np.ndarray, "height width 3"], kind: Kind) -> None:
-    """Show an image in a frame of the colour of its kind."""
+    """Show an image with a border in the colour of its kind."""
     axes.imshow(image)
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set(visible=True, color=MEANING[kind][0], linewidth=3)
 
 
-def _show(axes: Any, row: StripRow, place: int) -> None:
-    show_framed(axes, row.frames[place], "decoded" if row.kind == "imagined" and place == 0 else row.kind)
-    if row.outlines is not None and row.outlines[place].any():
+def _show(axes: Any, row: StripRow, index: int) -> None:
+    show_framed(axes, row.frames[index], "decoded" if row.kind == "imagined" and index == 0 else row.kind)
+    if row.outlines is not None and row.outlines[index].any():
         for colour, width in (("black", 2.2), ("white", 1.2)):
-            axes.contour(row.outlines[place], [0.5], colors=colour, linewidths=width)
+            axes.contour(row.outlines[index], [0.5], colors=colour, linewidths=width)
     if row.captions:
-        axes.set_xlabel(row.captions[place] or " ", fontsize=7, color=GREY)
+        axes.set_xlabel(row.captions[index] or " ", fontsize=7, color=GREY)
 
 
 def error_colours(
     errors: Float[np.ndarray, "grid grid"], size: tuple[int, int], worst: float = 1.0
 ) -> Float[np.ndarray, "height width 3"]:
-    """Return the errors of patches as colours from 0 to 255: from black, no error, to bright yellow, the worst one."""
+    """Return patch errors as RGB colours from 0 to 255, from black (no error) to bright yellow (`worst` or more)."""
     colours = 255 * colormaps["inferno"](np.nan_to_num(errors / max(worst, 1e-12)))[..., :3]
     rows, columns = (np.arange(side) * len(errors) // side for side in size)
     return np.asarray(colours[rows][:, columns])
@@ -271,33 +271,33 @@ _BETWEEN = 6
 
 
 def side_by_side(images: Sequence[Pixels], captions: Sequence[str], title: str = "", *, enlarged: int = 2) -> Pixels:
-    """Return images of one size in a row, a caption above each, a title above all.
+    """Join images of one size horizontally, with a caption above each and a title above all.
 
     Args:
         images: The images.
-        captions: One for each.
-        title: A line, at most as long as all images are wide; empty: none.
-        enlarged: Pixels per pixel, along both axes.
+        captions: One caption per image.
+        title: One line, at most as wide as all images together; empty: no title.
+        enlarged: Integer scale factor of both axes.
     """
-    large = [picture.repeat(enlarged, axis=0).repeat(enlarged, axis=1) for picture in images]
+    large = [image.repeat(enlarged, axis=0).repeat(enlarged, axis=1) for image in images]
     columns = [
-        np.concatenate([_text_image(text, one.shape[1]), one]) for text, one in zip(captions, large, strict=True)
+        np.concatenate([_text_image(text, image.shape[1]), image]) for text, image in zip(captions, large, strict=True)
     ]
     gap = np.full((columns[0].shape[0], _BETWEEN, 3), 255, dtype=np.uint8)
     row = np.concatenate([part for column in columns for part in (column, gap)][:-1], axis=1)
     return np.concatenate([_text_image(title, row.shape[1], points=11.0), row]) if title else row
 
 
-def below_each_other(pictures: Sequence[Pixels]) -> Pixels:
-    """Return images of any sizes below each other; what is narrower than another has white beside it."""
-    width = max(picture.shape[1] for picture in pictures)
-    beside = [np.full((picture.shape[0], width - picture.shape[1], 3), 255, np.uint8) for picture in pictures]
-    return np.concatenate([np.concatenate(pair, axis=1) for pair in zip(pictures, beside, strict=True)])
+def below_each_other(images: Sequence[Pixels]) -> Pixels:
+    """Join images vertically; narrower images are padded with white on the right."""
+    width = max(image.shape[1] for image in images)
+    padding = [np.full((image.shape[0], width - image.shape[1], 3), 255, np.uint8) for image in images]
+    return np.concatenate([np.concatenate(pair, axis=1) for pair in zip(images, padding, strict=True)])
 
 
 @lru_cache(maxsize=512)
 def _text_image(text: str, width: int, *, points: float = 9.0) -> UInt8[np.ndarray, "_ width 3"]:
-    """Return a line of text on white; read only, since it is drawn once."""
+    """Return an image of one line of text on white; callers must not modify it, because it is cached."""
     figure = new_figure(width / _DOTS, _CAPTION / _DOTS, dpi=_DOTS, facecolor="white")
     figure.text(8 / width, 0.5, text, fontsize=points, va="center", ha="left", parse_math=False)
     return pixels_of(figure)

@@ -1,4 +1,4 @@
-"""Images as RGB pixels: PNG and JPEG, decoded and encoded, the size limit of all decoders, and checks of a camera."""
+"""Decode and encode PNG and JPEG images, limit the size of decoded images, and check the frames of cameras."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import StateSpace, rotation_angles
 from vjepa2_ac.storage import read_bounded, user_can_read
 
-MOST_PIXELS = 100_000_000  # a robot's camera has a tenth; a file of 600 bytes may claim forty times as many
-_MOST_BYTES = 1 << 32  # of images that are decoded together
-_MOST_FILE_BYTES = 1 << 28  # a PNG of the largest image without compression has 300 MB
-_LEAST_SIDE = 16  # pixels of an image of a robot's scene
+MOST_PIXELS = 100_000_000  # ten times a robot's camera; the header of a 600-byte file may claim forty times as many
+_MOST_BYTES = 1 << 32  # limit for images that are decoded together
+_MOST_FILE_BYTES = 1 << 28  # an uncompressed PNG of the largest allowed image has 300 MB
+_LEAST_SIDE = 16  # least height and width of an image of a robot's scene, in pixels
 
 
 def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> None:
     """Refuse images that are too large, or too many of that size to be decoded together, before memory is allocated.
 
     Args:
-        height: Of each, in pixels.
-        width: Likewise.
+        height: Height of each image in pixels.
+        width: Width of each image in pixels.
         where: The file, and its episode and step, for messages.
-        count: How many are decoded together.
+        count: Number of images that are decoded together.
 
     Raises:
-        InputError: They are.
+        InputError: The images are too large.
     """
     if not 0 < height * width <= MOST_PIXELS or count * height * width * 3 > _MOST_BYTES:
         found = f"{count} images of {height} x {width} pixels at once"
@@ -48,15 +48,15 @@ def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> N
 
 
 def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = None) -> None:
-    """Refuse an array that is no RGB image, or of another size than a given one.
+    """Refuse an array that is not an RGB image, or whose size differs from a reference image.
 
     Args:
         image: The array.
-        where: Its name in errors.
-        like: An image of the same camera, of the required size.
+        where: Name of the image, for messages.
+        like: A reference image of the same camera; None: any size.
 
     Raises:
-        InputError: Says what was found.
+        InputError: The array has another shape or type.
     """
     found = f"an array of shape {image.shape} and type {image.dtype}"
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < _LEAST_SIDE:
@@ -69,10 +69,10 @@ def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = No
 
 
 def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
-    """Refuse a mask that is not of an image's size.
+    """Refuse a mask whose height and width differ from those of an image.
 
     Raises:
-        InputError: Says what was found.
+        InputError: The sizes differ.
     """
     if mask.shape != like.shape[:2]:
         found, needed = f"shape {mask.shape} (height, width)", f"{like.shape[:2]}, as the goal image"
@@ -82,11 +82,11 @@ def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
 def decode_images(
     images: Sequence[bytes], steps: Sequence[int], where: str
 ) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return PNG or JPEG images as RGB, by their content; JPEG bit for bit as TensorFlow's decoder.
+    """Decode PNG or JPEG images to RGB; JPEG is bit for bit equal to TensorFlow's decoder.
 
     Args:
-        images: One or more, all of one size.
-        steps: Control step of each, for messages.
+        images: One or more encoded images of one size. The format is detected from the content.
+        steps: Control step of each image, for messages.
         where: File, episode and camera, for messages.
 
     Raises:
@@ -109,11 +109,11 @@ def _decode_as_tensorflow(image: bytes, where: str) -> UInt8[np.ndarray, "height
 def stack_frames(
     frames: Iterable[UInt8[np.ndarray, "height width 3"]], steps: Sequence[int], where: str
 ) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return frames, which are decoded one after another, as one array.
+    """Stack frames from an iterator that decodes them one after another.
 
     Args:
-        frames: One or more, all of one size.
-        steps: Control step of each, for messages.
+        frames: One or more frames of one size.
+        steps: Control step of each frame, for messages.
         where: File, episode and camera, for messages.
 
     Raises:
@@ -124,29 +124,29 @@ def stack_frames(
         at = f"{where}: step {step}"
         require_bounded(frame.shape[0], frame.shape[1], at, count=len(steps))
         if stacked and frame.shape != stacked[0].shape:
-            found, needed = (f"an image of {one.shape[0]}x{one.shape[1]}" for one in (frame, stacked[0]))
+            found, needed = (f"an image of {image.shape[0]}x{image.shape[1]}" for image in (frame, stacked[0]))
             raise InputError(where=at, found=found, needed=f"{needed}, as at step {steps[0]}")
         stacked.append(frame)
     return np.stack(stacked)
 
 
 def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95) -> bytes:
-    """Return an RGB image as JPEG; the default quality is TFDS's."""
+    """Encode an RGB image as JPEG; the default quality is that of TensorFlow Datasets."""
     return bytes(
         simplejpeg.encode_jpeg(np.ascontiguousarray(frame), quality=quality, colorspace="RGB", colorsubsampling="420")
     )
 
 
 _PNG = b"\x89PNG"
-_EXIF = b"Exif\0\0"  # begins the EXIF data of a JPEG
+_EXIF = b"Exif\0\0"  # header of the EXIF data in a JPEG
 _EIGHT_BIT = {"1", "L", "LA", "P", "RGB", "RGBA"}  # Pillow's modes of at most 8 bits a channel
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
-    """Return the RGB pixels of a PNG or JPEG file, as `decode_image` does.
+    """Read a PNG or JPEG file and return its RGB pixels, as `decode_image` does.
 
     Raises:
-        InputError: There is no such file, it is too large, a pipe or a device, or neither PNG nor JPEG.
+        InputError: The file is missing, too large, a pipe or a device, or neither PNG nor JPEG.
     """
     with user_can_read(path, needed="an image: PNG or JPEG"):
         data = read_bounded(path, _MOST_FILE_BYTES)
@@ -154,17 +154,17 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Return the RGB pixels of PNG or JPEG bytes, turned and mirrored as their EXIF orientation says.
+    """Decode PNG or JPEG bytes to RGB pixels, rotated and mirrored according to the EXIF orientation.
 
     Transparency is dropped.
 
     Raises:
-        InputError: They are neither, damaged, too large, or of more than 8 bits a channel.
+        InputError: The bytes are neither PNG nor JPEG, damaged, too large, or have more than 8 bits per channel.
     """
     try:
         if data.startswith(b"\xff\xd8"):
             pixels = _decode_jpeg(data, where)
-            if _EXIF not in data:  # a robot's camera writes none; the search is a thousandth of the decoding
+            if _EXIF not in data:  # robot cameras write no EXIF; this search takes a thousandth of the decoding time
                 return pixels
             with JpegImageFile(io.BytesIO(data)) as image:  # reads the header only
                 return _upright(pixels, image)
@@ -184,7 +184,7 @@ def _decode_jpeg(data: bytes, where: str, *, is_fast: bool = False) -> UInt8[np.
 
 
 def _upright(pixels: UInt8[np.ndarray, "height width 3"], image: Image.Image) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Return the pixels of an image file as viewers show it: EXIF data that cannot be read change nothing."""
+    """Rotate and mirror pixels according to the EXIF orientation of an image; unreadable EXIF data are ignored."""
     with suppress(OSError, ValueError, SyntaxError, struct.error, LookupError):
         orientation = image.getexif()[ExifTags.Base.Orientation]
         turned = Image.fromarray(pixels)
@@ -200,7 +200,7 @@ def _as_rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def encode_png(pixels: UInt8[np.ndarray, "height width channels"]) -> bytes:
-    """Return pixels (RGB or RGBA) as PNG."""
+    """Encode RGB or RGBA pixels as PNG."""
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "PNG", optimize=True)
     return file.getvalue()
@@ -209,20 +209,26 @@ def encode_png(pixels: UInt8[np.ndarray, "height width channels"]) -> bytes:
 def encode_webp(
     frames: Sequence[UInt8[np.ndarray, "height width channels"]], seconds: Sequence[float], *, quality: int
 ) -> bytes:
-    """Return frames (RGB or RGBA) of one size as an endless WebP, each shown for so long; one: a still image."""
+    """Encode RGB or RGBA frames of one size as an endless WebP animation, or a single frame as a still image.
+
+    Args:
+        frames: The frames.
+        seconds: Duration of each frame.
+        quality: Quality of the compression, from 0 to 100.
+    """
     file = io.BytesIO()
     first, *others = (Image.fromarray(frame) for frame in frames)
-    times = [int(1000 * one) for one in seconds]
+    times = [int(1000 * duration_s) for duration_s in seconds]
     first.save(file, "WEBP", save_all=True, append_images=others, duration=times, loop=0, quality=quality)
     return file.getvalue()
 
 
 # ---- checks of a camera ----
 
-_BLOCKS = 16  # along each side of an image: the mean of a block averages out the noise of a sensor, a scene stays
-_LEAST_CONTRAST = 1.0  # of 255: a covered lens with a noise of 10 is below, a scene at 5 % of its light is above
-_STILL_M, _STILL_RAD = 0.005, math.radians(3.0)  # measured states of a still arm vary less
-_STILL_SHARE = 0.5  # the same for vectors, as a share of the largest change in a model step
+_BLOCKS = 16  # blocks along each side of an image; averaging over a block removes sensor noise but not the scene
+_LEAST_CONTRAST = 1.0  # of 255: below for a covered lens with noise of 10, above for a scene at 5 % of its light
+_STILL_M, _STILL_RAD = 0.005, math.radians(3.0)  # larger than the noise of the measured states of a still arm
+_STILL_SHARE = 0.5  # the same threshold for vectors, as a share of the largest change in a model step
 
 CameraFrame = tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, " dim"]]
 """The newest frame of one camera, and the state that was measured when this frame appeared."""
@@ -231,12 +237,12 @@ CameraFrame = tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, " dim
 def newest_frames(
     views: Iterable[np.ndarray], state: Float[np.ndarray, " dim"], before: Iterable[CameraFrame]
 ) -> tuple[CameraFrame, ...]:
-    """Return the newest frame of each camera: the earlier one where the pixels are equal.
+    """Return the newest distinct frame of each camera: a repeated image keeps the state of its first appearance.
 
     Args:
-        views: What each camera shows; copied, since a driver may write the next image into the same memory.
-        state: Measured.
-        before: The newest frames so far; empty after a reset.
+        views: The current image of each camera; copied, since a driver may reuse its memory for the next image.
+        state: The measured state.
+        before: The previous result; empty after a reset.
     """
     pairs = zip_longest(views, before)
     return tuple(last if last and np.array_equal(last[0], view) else (view.copy(), state) for view, last in pairs)
@@ -253,7 +259,7 @@ def has_moved(
     Args:
         before: The earlier state.
         now: The later state.
-        space: The meaning of the numbers.
+        space: The space of the states.
         largest: The largest change of each number in a model step; used for vectors, whose units are unknown.
     """
     (change,) = space.differences(np.stack([before, now]))
@@ -263,19 +269,19 @@ def has_moved(
 
 
 def is_uniform(image: UInt8[np.ndarray, "height width 3"]) -> bool:
-    """Return whether an image has no contrast: a black, covered or defect camera, with or without noise.
+    """Return whether an image has no contrast, as from a black, covered or defective camera, with or without noise.
 
-    The standard deviation of the means of 16 x 16 blocks is below 1 of 255 in each colour.
+    The criterion: the standard deviation of the means of 16 x 16 blocks is below 1 of 255 in each colour.
     """
     blocks = Image.fromarray(np.ascontiguousarray(image)).resize((_BLOCKS, _BLOCKS), Image.Resampling.BOX)
     return bool(np.asarray(blocks, dtype=float).std(axis=(0, 1)).max() < _LEAST_CONTRAST)
 
 
 def require_contrast(views: Iterable[np.ndarray], *, where: str) -> None:
-    """Refuse an image if what one of its cameras shows has no contrast.
+    """Refuse an image if the view of any of its cameras has no contrast.
 
     Raises:
-        InputError: The image is uniform.
+        InputError: A view is uniform.
     """
     if any(map(is_uniform, views)):
         found, needed = "an image without contrast, as of a black or covered camera", "an image of the scene"

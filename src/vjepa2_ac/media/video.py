@@ -1,8 +1,8 @@
-"""Read frames of an MP4 at given positions or times, decoding only what they need; write videos and GIFs.
+"""Read frames of an MP4 at requested positions or times, decoding only the necessary packets; write videos and GIFs.
 
-A frame is identified by its presentation time, never by counting at the rate in the header: that rate is often wrong
-(DROID's), and frames are stored in another order than they are shown (B-frames). Frames are rotated and mirrored as the
-file's display matrix says. A video is written completely or not at all.
+Frames are identified by their presentation time, never by counting at the frame rate in the header, because that rate
+is often wrong (as in DROID) and B-frames are stored in another order than they are shown. Frames are rotated and
+mirrored according to the display matrix of the file. Videos are written atomically.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 _STRICT = {
-    "err_detect": "crccheck+bitstream+buffer+explode",  # an error rather than a guessed frame
+    "err_detect": "crccheck+bitstream+buffer+explode",  # raises an error instead of concealing damage
     "max_pixels": str(MOST_PIXELS),
 }
-_START = -(1 << 40)  # before every frame
-_SAME_RATE = 0.98  # and more of the steps' rate: times in milliseconds round 30 Hz to 30.3 Hz
+_START = -(1 << 40)  # a time before all frames
+_SAME_RATE = 0.98  # least ratio of the video's rate to the steps' rate; times in ms round 30 Hz to 30.3 Hz
 _FIX = "Copy the file again, or leave the episode out"
 _CRF = 20  # x264's constant rate factor: text stays sharp
-_COLOURS = 255  # of a GIF
-_SAMPLED = 4  # every so many-th pixel decides about the palette
+_COLOURS = 255  # colours of a GIF
+_SAMPLED = 4  # every n-th pixel along both axes is used to compute the palette
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
@@ -54,7 +54,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class VideoHeader:
-    """The number and the times of a video's frames, known without decoding."""
+    """The number and the rate of a video's frames, determined without decoding."""
 
     num_frames: int
     span_s: float  # from the first frame to the last
@@ -69,23 +69,24 @@ def read_frames(
     clock: Clock | None = None,
     times: Sequence[int] | None = None,
 ) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return the RGB frames at these positions of a video, in this order; positions may repeat.
+    """Return the RGB frames at the requested positions of a video, in the order of the request.
 
-    Decoding starts at the key frame before a requested frame; only requested frames become RGB. With a clock, a step
-    has the frame nearest to its time, at most 0.49 of a step away; of two frames equally near, the earlier one. The
-    frame of a step does not depend on the other requested steps.
+    Decoding starts at the key frame before a requested frame; only requested frames are converted to RGB. With a
+    clock, the frame of a step is the one nearest to its time, at most 0.49 of a step away; if two are equally near, the
+    earlier one. The frame of a step does not depend on the other requested steps.
 
     Args:
         file: Local path, URL, or a file open for reading, which stays open.
-        steps: Positions in display order, from 0; with a clock, its steps.
+        steps: Positions in display order, from 0; with a clock, the episode's steps. Positions may repeat.
         where: The file and its episode, for messages.
-        clock: The times of the steps, where positions do not identify the frames.
-        times: What `frame_times` returned for the file: of a video with B-frames it reads every packet.
+        clock: The times of the steps, if positions do not identify the frames.
+        times: The result of `frame_times` for the file, which is slow for videos with B-frames (it reads every
+            packet); None: it is computed.
 
     Raises:
-        InputError: Not a video, damaged, without such frames, or of a codec that cannot be decoded.
+        InputError: The file is not a video, damaged, lacks requested frames, or has a codec that cannot be decoded.
         OSError: A file behind a URL cannot be read.
-        ValueError: No steps, or one before the first.
+        ValueError: There are no steps, or a step is negative.
     """
     if not steps or min(steps) < 0:
         raise ValueError(f"{where}: steps {list(steps)}")
@@ -110,7 +111,7 @@ def _shown_at(steps: Sequence[int], times: Sequence[int], where: str) -> list[in
 
 
 def _shown_by(video: _Video, clock: Clock, steps: Sequence[int]) -> list[int]:
-    """Return when the frames nearest to the times of these steps are shown."""
+    """Return the presentation time of the frame nearest to the time of each step."""
     targets = [round((clock.start_s + step / clock.rate_hz) / video.unit_s) for step in steps]
     if len(set(targets)) < len(set(steps)):
         found = f"times in units of {video.unit_s:g} s for {clock.rate_hz:g} frames a second"
@@ -128,10 +129,10 @@ def _shown_by(video: _Video, clock: Clock, steps: Sequence[int]) -> list[int]:
 
 
 def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
-    """Return number and rate of a video's frames: from its index, or from its packets if it has none.
+    """Return number and rate of a video's frames, from its index, or from its packets if it has no index.
 
     Raises:
-        InputError: Not a video, or damaged.
+        InputError: The file is not a video, or damaged.
         OSError: A file behind a URL cannot be read.
     """
     with _opened(file, where) as video:
@@ -139,19 +140,19 @@ def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
 
 
 def frame_times(file: str | Path | ByteReader, *, where: str) -> list[int]:
-    """Return when each frame of a video is shown, in order, in the video's units of time; errors as `read_header`."""
+    """Return the presentation time of each frame of a video, in the video's units; errors as `read_header`."""
     with _opened(file, where) as video:
         return video.times()
 
 
 def is_deep_grey(pixel_format: str) -> bool:
-    """Return whether a pixel format has one channel of more than 8 bits, such as gray12le: a depth map's."""
+    """Return whether a pixel format is that of a depth map: one channel of more than 8 bits, such as gray12le."""
     return re.match(r"gray(9|1\d|f)", pixel_format) is not None
 
 
 @contextmanager
 def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
-    """Open a video for decoding in one thread: the loader's workers are the parallelism."""
+    """Open a video for decoding in one thread, because the loader's workers already run in parallel."""
     av = video_library(where)
     if isinstance(file, (str, Path)):
         with storage.user_can_read(where, needed="a whole, undamaged MP4", fix=_FIX):
@@ -161,7 +162,7 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
         return
     source = _QuietFile(file)
     try:
-        # The demuxer by name: otherwise libav follows playlists to other files.
+        # The demuxer is fixed, because libav would otherwise follow playlists to other files.
         with av.open(source, format="mp4", metadata_errors="replace") as container:
             yield _Video(container, _stream_of(container, where), av.video.reformatter.VideoReformatter(), where)
     except (av.FFmpegError, InputError) as error:
@@ -190,7 +191,10 @@ def _stream_of(container: Any, where: str) -> VideoStream:
 
 
 class _QuietFile:
-    """A file for libav that seems to end where reading fails: PyAV would print the error and treat it as damage."""
+    """A file for libav that returns end of file on a read error and stores the error.
+
+    PyAV would print such an error and treat the file as damaged.
+    """
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -201,24 +205,24 @@ class _QuietFile:
         if self.error is None:
             try:
                 return bytes(self._file.read(size))
-            except Exception as error:  # any error is raised again after libav has returned
+            except Exception as error:  # raised again after libav has returned
                 self.error = error
         return b""
 
     def seek(self, offset: int, whence: int = 0) -> int:
         try:
             return int(self._file.seek(offset, whence))
-        except (OSError, ValueError):  # an offset of a damaged file
+        except (OSError, ValueError):  # an invalid offset in a damaged file
             return -1
 
 
 @dataclass(frozen=True)
 class _Video:
-    """An open video. Times are in units of the stream; its index has decoding times, not presentation times."""
+    """An open video. Times are in units of the stream; its index holds decoding times, not presentation times."""
 
     container: Any
     stream: VideoStream
-    converter: Any  # one for all frames: creating one takes as long as using it
+    converter: Any  # shared by all frames, because creating a converter takes as long as using it
     where: str
 
     @property
@@ -227,15 +231,15 @@ class _Video:
 
     @property
     def is_indexed(self) -> bool:
-        """Whether the file's header lists every frame (a fragmented MP4's does not)."""
+        """Whether the header of the file lists every frame, which is false for a fragmented MP4."""
         return 0 < self.stream.frames == len(self.stream.index_entries)
 
     def stored_times(self) -> list[int]:
-        """Return the decoding time of each frame, from the header; it is the presentation time if none is reordered."""
+        """Return the decoding time of each frame from the header: the presentation time if there are no B-frames."""
         return [entry.timestamp for entry in self.stream.index_entries if not entry.is_discard]
 
     def times(self) -> list[int]:
-        """Return the presentation time of each frame, in order; of reordered ones from every packet of the file."""
+        """Return the presentation time of each frame, in order; with B-frames this reads every packet of the file."""
         if self.is_indexed:
             first = next(self.packets(), None)
             if first is not None and first.pts == first.dts and not self.stream.codec_context.has_b_frames:
@@ -243,21 +247,22 @@ class _Video:
         return sorted(int(packet.pts) for packet in self.packets() if packet.pts is not None and not packet.is_discard)
 
     def packets(self, seek_to: int = _START) -> Iterator[Packet[VideoStream]]:
-        """Yield packets, from the start or from a key frame."""
+        """Yield packets from the start, or from the key frame at or before `seek_to`."""
         self.container.seek(seek_to, stream=self.stream, backward=True)
         yield from (packet for packet in self.container.demux(self.stream) if packet.dts is not None)
 
     def header(self) -> VideoHeader:
-        """Return number and rate of the frames; the intervals of decoding times are those of presentation times."""
+        """Return number and rate of the frames; decoding times have the same intervals as presentation times."""
         times = self.stored_times() if self.is_indexed else self.times()
         intervals = np.diff(times) * self.unit_s
         interval_s = float(np.median(intervals)) if len(intervals) else 0.0
         return VideoHeader(len(times), float(intervals.sum()), 1 / interval_s if interval_s > 0 else 0.0)
 
     def nearest_times(self, targets: Sequence[int], tolerance: int) -> dict[int, int]:
-        """Return when the frame nearest to each of these ascending times is shown, by its packet; nothing is decoded.
+        """Return the presentation time of the frame nearest to each of these ascending times, without decoding.
 
-        Of two frames equally near it is the earlier one. Times without a frame within the tolerance are left out.
+        If two frames are equally near, the earlier one is used. Times without a frame within the tolerance are left
+        out.
         """
         times: list[int] = []
         for packet in self._packets_before(targets[0]):
@@ -270,7 +275,7 @@ class _Video:
         return {target: time for target, time in nearest.items() if abs(time - target) <= tolerance}
 
     def decode(self, times: list[int]) -> dict[int, Frame]:
-        """Return the frames that are shown at these ascending times."""
+        """Return the frames with these ascending presentation times."""
         require_bounded(self.stream.height or 1, self.stream.width or 1, self.where, count=len(times))
         frames: dict[int, Frame] = {}
         while missing := [time for time in times if time not in frames]:
@@ -280,24 +285,24 @@ class _Video:
         return frames
 
     def _decode_run(self, times: list[int], frames: dict[int, Frame]) -> None:
-        """Decode from the key frame before the first time for as long as that costs less than the next seek."""
+        """Decode from the key frame before the first time until a later key frame precedes the next missing time."""
         decoder = self.stream.codec_context
         sent: set[int] = set()
         delay: int | None = None
         for packet in self._packets_before(times[0]):
             decoded = int(packet.dts or 0)
             shown = decoded if packet.pts is None else int(packet.pts)
-            delay = shown - decoded if delay is None else delay  # of the key frame; all of the file have the same
+            delay = shown - decoded if delay is None else delay  # all key frames of a file have the same delay
             sent.add(shown)
-            self._keep(decoder.decode(packet), times, frames)
+            self._collect(decoder.decode(packet), times, frames)
             if times[0] in sent:
                 following = next((time for time in times if time not in sent), None)
                 if following is None or self._key_frame_before(following - delay) > decoded + int(packet.duration or 0):
                     break
-        self._keep(decoder.decode(None), times, frames)
+        self._collect(decoder.decode(None), times, frames)
 
     def _packets_before(self, target: int) -> Iterator[Packet[VideoStream]]:
-        """Yield packets from the last key frame that is shown no later than the target."""
+        """Yield packets from the last key frame whose presentation time is at most the target."""
         sought = target
         while sought > _START:
             packets = self.packets(sought)
@@ -310,11 +315,11 @@ class _Video:
         yield from self.packets()
 
     def _key_frame_before(self, time: int) -> int:
-        """Return the decoding time of the last key frame that is decoded no later than a time."""
-        place = self.stream.index_entries.search_timestamp(time, backward=True, any_frame=False)
-        return int(self.stream.index_entries[place].timestamp) if place >= 0 else _START
+        """Return the decoding time of the last key frame whose decoding time is at most `time`."""
+        index = self.stream.index_entries.search_timestamp(time, backward=True, any_frame=False)
+        return int(self.stream.index_entries[index].timestamp) if index >= 0 else _START
 
-    def _keep(self, decoded: Sequence[VideoFrame], times: list[int], frames: dict[int, Frame]) -> None:
+    def _collect(self, decoded: Sequence[VideoFrame], times: list[int], frames: dict[int, Frame]) -> None:
         for frame in decoded:
             time = frame.pts
             if time is None or time in frames or time not in times:
@@ -327,13 +332,13 @@ class _Video:
 
 
 def _nearest(times: Sequence[int], target: int) -> int:
-    """Return the nearest of some ascending times, the earlier of two equally near; a far one if there is none."""
+    """Return the item of ascending times nearest to a target (the earlier of two equally near); `_START` if empty."""
     index = bisect_left(times, target)
     return min(times[max(0, index - 1) : index + 1], key=lambda time: abs(time - target), default=_START)
 
 
 def _upright(image: Frame, frame: VideoFrame, where: str) -> UInt8[np.ndarray, "displayed_height displayed_width 3"]:
-    """Return an image as it is displayed: phones store videos on their side, with a matrix that says how."""
+    """Rotate and mirror an image according to its display matrix, with which phones store rotated videos."""
     if not frame.rotation:
         return image
     stored = cast("Any", frame.side_data)["DISPLAYMATRIX"]
@@ -351,10 +356,10 @@ def _unusable(where: str, found: str, needed: str) -> InputError:
 
 
 def video_library(where: str = "video") -> Any:
-    """Return PyAV.
+    """Import and return PyAV.
 
     Raises:
-        UnreachableError: It is not installed.
+        UnreachableError: PyAV is not installed.
     """
     return require_library("av", where=where, called="PyAV, which decodes and writes video", extra="video")
 
@@ -366,14 +371,15 @@ def write_video(
 
     Args:
         path: A local file; missing folders are created.
-        frames: Of one size, at least one.
+        frames: One or more frames of one size.
         rate_hz: Frames per second.
-        crf: x264's constant rate factor; a lower one loses less.
-        key_frame_every: Frames from a key frame to the next; few make single frames quick to read. None: x264 decides.
+        crf: x264's constant rate factor; a lower value means higher quality.
+        key_frame_every: Interval between key frames, in frames; a small one makes random access fast. None: x264's
+            default.
 
     Raises:
         UnreachableError: PyAV is not installed.
-        ValueError: No frames, or of different sizes.
+        ValueError: There are no frames, or they differ in size.
     """
     av = video_library()
     size: tuple[int, int] | None = None
@@ -397,21 +403,21 @@ def write_video(
 
 
 def write_gif(path: str | Path, frames: Sequence[Frame], *, seconds: Sequence[float]) -> Path:
-    """Write RGB frames as an endless GIF, and return its path.
+    """Write RGB frames as an endless GIF and return its path.
 
-    Colours are rounded to 255 without dithering, which would flicker and take several times the room.
+    Colours are reduced to 255 without dithering, which would flicker and make the file several times larger.
 
     Args:
         path: A local file; missing folders are created.
-        frames: Of one size, at least one.
-        seconds: How long each is shown; GIFs know hundredths.
+        frames: One or more frames of one size.
+        seconds: Duration of each frame; GIFs store hundredths of a second.
     """
     from PIL import Image
 
     sample = np.concatenate([frame[::_SAMPLED, ::_SAMPLED].reshape(-1, 3) for frame in frames])
     palette = Image.fromarray(sample[None]).quantize(_COLOURS)
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    milliseconds = [max(20, round(100 * one) * 10) for one in seconds]
+    milliseconds = [max(20, round(100 * duration_s) * 10) for duration_s in seconds]
     with atomic_writer(path) as file:
         images[0].save(
             file, "GIF", save_all=True, append_images=images[1:], duration=milliseconds, loop=0, optimize=True
