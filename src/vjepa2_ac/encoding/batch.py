@@ -1,6 +1,6 @@
-"""Batches of latents: from the frozen encoder, or from a latent cache.
+"""Batches of latents, computed by the frozen encoder or read from a latent cache.
 
-Training, evaluation and planning only see the result of this module.
+Training, evaluation and planning receive latents only from this module.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from vjepa2_ac.model.world_model import WorldModel, heads_to_replace, widths_as_
 def encode_batch(
     world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int = ENCODE_CHUNK
 ) -> LatentBatch:
-    """Encode the frames of a batch on the device, each independently.
+    """Encode the frames of a batch on the device, each frame independently.
 
-    Latents of a batch from a cache are used unchanged: `require_same_encoder` has compared the encoders.
+    A batch from a latent cache is not encoded again: `require_same_encoder` has compared the encoders.
 
     Args:
         world_model: The model whose frozen encoder is used.
-        batch: Clips from the loader: uint8 pixels, cropped, of any size; or latents.
+        batch: Clips from the loader, as cropped uint8 frames of any size or as latents.
         device: The model's device.
         chunk: Frames per encoder call.
 
@@ -66,24 +66,24 @@ def encode_frames(
     chunk: int = ENCODE_CHUNK,
     views: int = 1,
 ) -> Float[Tensor, "time tokens dim"]:
-    """Return the latents of camera frames, each encoded independently, on the model's device.
+    """Encode camera frames on the model's device, each frame independently, and return their latents.
 
-    Of several views side by side each is encoded by itself; their tokens follow one after another.
+    Several views side by side in a frame are encoded separately, and their tokens are concatenated.
 
     Args:
         world_model: The model whose frozen encoder is used.
         frames: RGB, uncropped, of any size.
-        crop: The part of a frame that the model sees.
-        chunk: Frames per encoder call; no more are on the device as pixels at once.
-        views: Cameras side by side in each frame.
+        crop: The kind of crop before encoding.
+        chunk: Frames per encoder call, and the number of frames that are on the device as pixels at once.
+        views: Number of cameras side by side in each frame.
 
     Raises:
-        InputError: The width is not that of so many views.
+        InputError: The width of the frames is not a multiple of the number of views.
     """
 
     def encoded(part: UInt8[np.ndarray, "frames height all 3"]) -> Tensor:
-        seen = view(split_views(part, views), crop)
-        pixels = torch.from_numpy(np.ascontiguousarray(seen)).to(world_model.device)[None]
+        cropped = view(split_views(part, views), crop)
+        pixels = torch.from_numpy(np.ascontiguousarray(cropped)).to(world_model.device)[None]
         latents = world_model.encode(pixels_to_input(pixels, world_model.image_size), chunk=chunk)[0]
         return latents.reshape(len(part), -1, latents.shape[-1])
 
@@ -91,15 +91,15 @@ def encode_frames(
 
 
 def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
-    """Return what determines the latents of a model in a run: the key by which a cache is found or refused.
+    """Return the settings that determine a model's latents: part of the key by which a cache is found or refused.
 
-    Takes as long as it takes to hash the encoder's weights.
+    This function hashes the encoder's weights, which takes time.
     """
     parts = {
         "encoder": world_model.encoder_fingerprint(),
         "image_size": world_model.image_size,
         "patch_size": world_model.sizes.patch_size,
-        "normalisation": 1,  # in `transforms.pixels_to_input`, and of features: increase it when one of them changes
+        "normalisation": 1,  # version; increase it if `transforms.pixels_to_input` or the feature normalisation changes
         "model.dtype": config.model.dtype,
         "training.precision": config.training.precision,
         **world_model.encoder_beyond_tensors,
@@ -108,27 +108,27 @@ def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
 
 
 def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Config) -> None:
-    """Refuse cached latents of another encoder, image size or precision; other data sets pass.
+    """Refuse a latent cache from another encoder, image size or precision; data sets of frames are accepted.
 
     Raises:
-        InputError: Names what differs.
+        InputError: Lists the differences.
     """
-    if isinstance(dataset.source, LatentSource):  # else the weights need not be hashed
+    if isinstance(dataset.source, LatentSource):  # the weights are hashed only for caches
         differing = dataset.source.key.differences_of(encoding_of(world_model, config))
         if differing:
             raise another_cache(Path(dataset.config.path), differing)
 
 
 def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> None:
-    """Refuse data whose states or actions do not have the width that the model takes.
+    """Refuse data whose states or actions do not have the width that the model expects.
 
     Args:
         world_model: The model.
-        widths: Of the data.
-        where: The source of the model's name.
+        widths: Widths of states and actions of the data.
+        where: The config key or option that names the model, for messages.
 
     Raises:
-        InputError: Names both.
+        InputError: The widths differ.
     """
     if heads_to_replace(world_model.sizes, widths):
         found = f"data with states of {widths.state} and actions of {widths.action} numbers"
@@ -138,10 +138,10 @@ def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> No
 
 
 def extrinsics_for(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "batch time 6"] | None:
-    """Return the camera poses of a batch if the model needs them.
+    """Return the camera poses of a batch if the model needs them, otherwise None.
 
     Raises:
-        InputError: It does, and a clip has none; names the episodes of the batch.
+        InputError: The model needs camera poses and a clip has none; names the episodes of the batch.
     """
     if not world_model.sizes.predictor.use_extrinsics:
         return None

@@ -1,7 +1,7 @@
-"""Encoding of a whole data set, as a command or at the start of a run.
+"""Encode a whole data set into a latent cache, by the command `encode` or at the start of a run.
 
-As a command, processes do not communicate: each encodes its share of the episodes and marks each finished one by a
-file. Those of a run wait for one another.
+The processes of the command do not communicate: each encodes its share of the episodes and writes one file per finished
+episode. The processes of a training run wait for each other.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.storage import free_bytes
 
-Engine = Callable[[Config, LatentCache, Sequence[FramesToEncode], Reporter], None]  # encodes what is left
+Engine = Callable[[Config, LatentCache, Sequence[FramesToEncode], Reporter], None]  # encodes the missing frames
 
-_LOOKS_EVERY_S = 1.0  # for the files of other processes
-_LONGEST_UNSEEN_S = 60.0  # of a new file in a folder of the network
+_LOOKS_EVERY_S = 1.0  # interval between checks for the files of other processes
+_LONGEST_UNSEEN_S = 60.0  # a new file in a network folder becomes visible to other machines within this time
 
 
 @dataclass(frozen=True)
@@ -41,26 +41,26 @@ class EncodedSet:
     """The result of encoding a cache."""
 
     folder: Path | str
-    episodes: int  # of the data set
-    encoded: int  # episodes, of all cameras
-    frames: int  # of all cameras
+    episodes: int  # number of episodes of the data set
+    encoded: int  # number of episodes encoded for all cameras
+    frames: int  # number of encoded frames of all cameras
     bytes: int
-    broken: Mapping[str, str]  # episodes that could not be read, and why
-    is_finished: bool  # else other processes are still at work
+    broken: Mapping[str, str]  # reasons of the episodes that could not be read, by identity
+    is_finished: bool  # False while other processes are still encoding
 
 
 def encode_config(
     config: Config, reporter: Reporter = SILENT, *, out: Path | str | None = None, engine: Engine | None = None
 ) -> EncodedSet:
-    """Write the latents of every frame that the clips of a config need, or this process's share of them.
+    """Encode all frames that the clips of a config need, or this process's share of them, into a latent cache.
 
-    Episodes that could not be read are tried again.
+    Episodes that could not be read before are tried again.
 
     Args:
         config: The data, the model whose encoder is used, device and precision.
         reporter: Receives messages, and the progress of indexing and encoding.
         out: The folder of the cache; None: the one of `data.cache`.
-        engine: What encodes; None: this process, on its device.
+        engine: Encodes the missing frames; None: this process encodes them on its device.
 
     Raises:
         InputError: Some input cannot be used, or the disk space is too small.
@@ -78,13 +78,13 @@ def encode_config(
         cache.begin()
         reporter.note(f"Everything is encoded already, in {cache.folder}")
     table, broken, files = cache.dataset.table, cache.broken, cache.files
-    sizes = [(one, files.size(one.episode, one.camera)) for one in cache.wanted]
-    absent = {one.episode for one, size in sizes if not size}
+    sizes = [(request, files.size(request.episode, request.camera)) for request in cache.wanted]
+    absent = {request.episode for request, size in sizes if not size}
     return EncodedSet(
         folder=cache.folder,
         episodes=len(table),
-        encoded=len({one.episode for one in cache.wanted} - absent),
-        frames=sum(len(one.steps) for one, size in sizes if size),
+        encoded=len({request.episode for request in cache.wanted} - absent),
+        frames=sum(len(request.steps) for request, size in sizes if size),
         bytes=sum(size for _, size in sizes),
         broken={table.identity(number): reason for number, reason in broken.items()},
         is_finished=absent <= broken.keys(),
@@ -97,7 +97,7 @@ def open_cache(
     """Open the data set of a config and its latent cache, finished or not, and load the model whose encoder is used.
 
     Raises:
-        InputError: The folder is another cache's.
+        InputError: The folder holds another cache.
     """
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     reporter.task(LOADING)
@@ -108,10 +108,10 @@ def open_cache(
 
 
 def require_encodable(config: Config) -> None:
-    """Refuse a config that cannot have a cache, before anything is opened.
+    """Refuse a config that cannot use a latent cache, before anything is opened.
 
     Raises:
-        InputError: The data are a cache, the stride is not known, or training clips are changed.
+        InputError: The data are a cache already, the stride is unknown, or `data.transforms` changes training clips.
     """
     data = config.data
     if data.is_cache:
@@ -124,10 +124,10 @@ def require_encodable(config: Config) -> None:
 
 
 def begin_encoding(cache: LatentCache, left: Sequence[FramesToEncode], reporter: Reporter) -> None:
-    """Report the work, check the disk space or the URL, and write what the cache is.
+    """Report the work, check the disk space or the URL, and create the files that describe the cache.
 
     Raises:
-        InputError: The space is too small, or the folder cannot be used.
+        InputError: The disk space is too small, or the folder cannot be used.
         UnreachableError: The URL cannot be written.
     """
     config = cache.dataset.config
@@ -149,15 +149,15 @@ def encode_share(
     share: ProcessShare,
     reporter: Reporter,
 ) -> None:
-    """Begin, and encode the share of one process: every n-th episode of n processes.
+    """Begin the cache and encode the share of one process: every n-th episode for n processes.
 
     Raises:
-        InputError: As of `begin_encoding` and `encode_files`; or too many are broken, by all processes together.
+        InputError: As `begin_encoding` and `encode_files`; or the processes together found too many broken episodes.
     """
     dataset = cache.dataset
     begin_encoding(cache, left, reporter)
-    mine = [one for one in left if one.episode % share.processes == share.rank]
-    encode_files(dataset, mine, encoder, cache.files, reporter.task("encoding frames", "frames"))
+    requests = [request for request in left if request.episode % share.processes == share.rank]
+    encode_files(dataset, requests, encoder, cache.files, reporter.task("encoding frames", "frames"))
     for number, reason in cache.broken.items():
         dataset.broken.met(dataset.table.identity(number), reason)
 
@@ -171,7 +171,9 @@ def with_latents(
     *,
     check_only: bool = False,
 ) -> Dataset:
-    """Return the data set of a run, with its clips from the latent cache if the config has one.
+    """Return the data set of a run with clips from the latent cache, or unchanged if the config uses no cache.
+
+    With `data.cache: auto` missing latents are encoded first.
 
     Args:
         config: The config of the run.
@@ -179,10 +181,10 @@ def with_latents(
         model: The model whose encoder is used.
         accelerator: Its processes share the encoding.
         reporter: Receives messages for the user.
-        check_only: Encode nothing: report what would be encoded, and leave the clips as frames.
+        check_only: Only report how much would be encoded, and return clips of frames.
 
     Raises:
-        InputError: The cache is another encoder's, is required and missing, or cannot be made.
+        InputError: The cache is from another encoder, is required and missing, or cannot be written.
     """
     if (cache := _cache_of(config, dataset, model)) is None:
         return dataset
@@ -197,23 +199,23 @@ def with_latents(
             frames = counted(frames_in(left), "frame")
             reporter.note(f"A run would first encode {frames} of {cache.summary(left)}. The cache is {cache.folder}")
             return dataset
-    found = cache.opened()
+    cached_dataset = cache.opened()
     reporter.note(f"Latents come from {cache.folder}: the encoder is not needed")
-    return found
+    return cached_dataset
 
 
 def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -> Dataset:
-    """Return a data set with its clips from a finished latent cache of this encoder if there is one, else unchanged.
+    """Return a data set with clips from a finished latent cache of this encoder, or unchanged if there is none.
 
     Raises:
-        InputError: The data set is itself a cache, of another encoder.
+        InputError: The data set is itself a latent cache, from another encoder.
     """
     cache = _cache_of(config, dataset, model)
     return dataset if cache is None or cache.missing() else cache.opened()
 
 
 def _cache_of(config: Config, dataset: Dataset, model: WorldModel) -> LatentCache | None:
-    """Return the latent cache that a config has for its data; None: it has none, or the data are one themselves."""
+    """Return the latent cache of a config's data; None if caching is off or the data are a cache themselves."""
     if config.data.is_cache or config.data.cache == "off":
         require_same_encoder(model, dataset, config)
         return None
@@ -223,7 +225,7 @@ def _cache_of(config: Config, dataset: Dataset, model: WorldModel) -> LatentCach
 def _encode_together(
     cache: LatentCache, make_encoder: partial[EncoderOnDevice], accelerator: Accelerator, reporter: Reporter
 ) -> None:
-    """Encode what is missing, each process of a run its share; what stops one of them stops all."""
+    """Encode the missing frames, split between the processes of a run; an error in one process stops all."""
     share = ProcessShare(accelerator.process_index, accelerator.num_processes)
     if share.processes > 1:
         first_only(accelerator, cache.begin)
@@ -238,14 +240,18 @@ def _encode_together(
         agreed(accelerator, lambda: require_shared(cache, lambda: not cache.missing()))
 
 
-def require_shared(cache: LatentCache, sees: Callable[[], bool]) -> None:
-    """Wait until this process sees what another one has written, and refuse a folder in which it does not.
+def require_shared(cache: LatentCache, is_visible: Callable[[], bool]) -> None:
+    """Wait until files written by other processes are visible here; refuse a folder that is not shared.
+
+    Args:
+        cache: The cache, for messages.
+        is_visible: Returns whether the files are visible.
 
     Raises:
-        InputError: It does not within a minute: longer than a folder of the network takes.
+        InputError: The files are not visible after 60 s, which is longer than a network folder takes.
     """
     end = time.monotonic() + _LONGEST_UNSEEN_S
-    while not sees():
+    while not is_visible():
         if time.monotonic() > end:
             found = "a folder in which a process of the run does not see what another one wrote"
             fix = "Set it to one that all machines of the run share; or run `vjepa2-ac encode` once on every machine"

@@ -1,6 +1,6 @@
-"""The latent cache of an open data set: the frames that clips need, its key and folder, and the encoding into it.
+"""The latent cache of an open data set: the frames that clips need, the cache's key and folder, and the encoding.
 
-Threads decode ahead, the encoder computes, and threads write whole files.
+Encoding is a pipeline: threads decode frames in advance, the encoder computes latents, and threads write the files.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import free_bytes
 
 _GIGABYTE = 10**9
-FRAMES_AT_ONCE = 64  # decoded in one go: a run of a video, and 180 MB of 720p at most
-_PREFETCHED_PARTS = 2  # per thread: one in progress, and one ready
-_WRITES_UNDER_WAY = 2  # files: limits the memory
+FRAMES_AT_ONCE = 64  # decoded together: consecutive frames of a video, at most 180 MB at 720p
+_PREFETCHED_PARTS = 2  # per thread: one in progress and one ready
+_WRITES_UNDER_WAY = 2  # files at most, which limits the memory
 
 
 @dataclass(frozen=True, eq=False)
 class FramesToEncode:
-    """Frames to encode, of one camera of one episode."""
+    """The frames to encode from one camera of one episode."""
 
     episode: int  # index into the data set's table
     camera: str
@@ -64,9 +64,9 @@ class FramesToEncode:
 
 
 def needed_frames(dataset: Dataset) -> Iterator[FramesToEncode]:
-    """Yield, in the data set's order, the frames that clips of any split use, of every episode with clips and camera.
+    """Yield the frames that clips of any split use, per episode and camera, in the data set's order.
 
-    Episodes that are shorter than a clip, left out or wholly idle are not included.
+    Episodes without clips are not included: those that are shorter than a clip, excluded or completely idle.
     """
     starts, config = dataset.starts, dataset.config
     within = np.arange(config.frames) * config.model_stride
@@ -82,93 +82,94 @@ def needed_frames(dataset: Dataset) -> Iterator[FramesToEncode]:
 
 @dataclass(frozen=True, eq=False)
 class LatentCache:
-    """The cache of an open data set, finished or not. Several processes may write into its folder.
+    """The latent cache of an open data set, finished or not. Several processes may write into its folder.
 
-    It is finished when nothing is missing. So a kill, a deleted file or a further episode needs no repair: the next
-    encoding writes what is missing.
+    The cache is finished when no file is missing. After a kill, a deleted file or a new episode no repair is needed:
+    the next encoding writes the missing files.
     """
 
     dataset: Dataset
     encoding: Encoding
     key: CacheKey
-    folder: Path | str  # here, or a URL
+    folder: Path | str  # local folder or URL
 
     @classmethod
     def of(cls, dataset: Dataset, encoding: Encoding, folder: Path | str | None = None) -> LatentCache:
         """Return the cache of a data set and an encoder.
 
         Args:
-            dataset: Frames, not itself a cache.
-            encoding: How they become latents.
-            folder: Its folder; None: in `data.cache_dir`, or with the other caches of this machine.
+            dataset: A data set of frames, not itself a cache.
+            encoding: The settings by which frames become latents.
+            folder: The folder of the cache; None: a folder in `data.cache_dir`, or in the machine's default cache.
         """
         config = dataset.config
         key = key_of_cache(config, fingerprint_of(dataset.table), encoding)
         parent = config.cache_dir or cache_folder(config.disk_cache) / "latents"
-        place = storage.join(parent, key.digest) if folder is None else str(folder)
-        return cls(dataset, encoding, key, storage.folder_at(place))
+        path = storage.join(parent, key.digest) if folder is None else str(folder)
+        return cls(dataset, encoding, key, storage.folder_at(path))
 
     @property
     def files(self) -> LatentFiles:
-        """Its files; behind a URL they are listed anew."""
+        """The files of the cache; behind a URL each access lists the folder again."""
         cache = fetched_data(self.dataset.config.disk_cache) if storage.is_url(self.folder) else None
         return LatentFiles(self.folder, self.key.digest, cache)
 
     @cached_property
     def wanted(self) -> tuple[FramesToEncode, ...]:
-        """The frames of the whole cache."""
+        """The frames of the finished cache."""
         return tuple(needed_frames(self.dataset))
 
     def missing(self, *, retry: bool = False) -> list[FramesToEncode]:
-        """Return what is not there; with `retry`, also what could not be read, or is damaged behind a URL.
+        """Return the frames whose file is missing; with `retry` also those of unreadable episodes.
 
-        The header of each local file is read, so that a damaged one counts as missing and is encoded again.
+        The header of each local file is read, so that damaged files count as missing and are encoded again. Behind a
+        URL headers are read only with `retry`.
         """
         if not self.is_begun:
             return list(self.wanted)
         files = self.files
-        is_there = files.has if retry else files.is_done
-        there = in_parallel(lambda one: is_there(one.episode, one.camera), self.wanted, CONNECTIONS)
-        return [one for one, is_whole in zip(self.wanted, there, strict=True) if not is_whole]
+        is_present = files.has if retry else files.is_done
+        results = in_parallel(lambda request: is_present(request.episode, request.camera), self.wanted, CONNECTIONS)
+        return [request for request, is_complete in zip(self.wanted, results, strict=True) if not is_complete]
 
     @property
     def is_begun(self) -> bool:
-        """Whether its folder says what it is."""
+        """Whether the files that describe the cache exist (`begin` writes them)."""
         return all(storage.exists(storage.join(self.folder, name)) for name in (CACHE, EPISODES))
 
     @property
     def broken(self) -> dict[int, str]:
-        """The episodes that could not be read, by their index, and why; found by any process."""
-        found, wanted = self.files.broken, {one.episode for one in self.wanted}
-        return {number: reason for number, reason in found.items() if number in wanted}
+        """The reasons of the episodes that any process could not read, by the index of the episode."""
+        reasons, episodes = self.files.broken, {request.episode for request in self.wanted}
+        return {number: reason for number, reason in reasons.items() if number in episodes}
 
     @property
     def bytes_per_frame(self) -> int:
-        """The approximate size of a frame, with its picture."""
+        """The approximate size of a frame in bytes: its latents and its image."""
         encoding = self.encoding
         latents = bytes_per_frame(encoding.tokens, encoding.dim, self.dataset.config.cache_dtype)
         return latents + picture_bytes(encoding.image_size)
 
     def summary(self, left: Sequence[FramesToEncode]) -> str:
-        """Return as text how large the whole is, and how much of it is left."""
+        """Return the number of frames and the size of the cache as text, and how many frames are left to encode."""
         frames, num_left = frames_in(self.wanted), frames_in(left)
         size = f"{counted(frames, 'frame')} ({frames * self.bytes_per_frame / _GIGABYTE:.3g} GB)"
         return size if num_left == frames else f"{size}; {frames - num_left:,} cached, {num_left:,} to encode"
 
     def require_own(self) -> None:
-        """Refuse a folder of another cache, or of other things.
+        """Refuse a folder that holds another cache or other files.
 
         Raises:
-            InputError: Says how the other cache differs.
+            InputError: Lists how the other cache differs.
         """
         require_own_folder(self.folder, CACHE, self.key, where=f"latent cache {self.folder}")
 
     def begin(self) -> None:
-        """Write what the cache is, if the folder does not say so yet.
+        """Write the files that describe the cache, unless they exist.
 
         Raises:
-            InputError: The folder has another cache or other things, or cannot be written.
-            UnreachableError: It cannot be written at the URL.
+            InputError: The folder holds another cache or other files, or cannot be written.
+            UnreachableError: The URL cannot be written.
         """
         self.require_own()
         if self.is_begun:
@@ -183,10 +184,10 @@ class LatentCache:
             storage.write(storage.join(self.folder, name), data)
 
     def require_space(self, left: Sequence[FramesToEncode]) -> None:
-        """Refuse to start if the disk has too little space for what is left; what is behind a URL has no end.
+        """Refuse to start if the local disk has too little space for the missing frames; URLs are not checked.
 
         Raises:
-            InputError: Says how much is free, how much is needed, and what to do.
+            InputError: Names the free space, the required space, and fixes.
         """
         if not isinstance(self.folder, Path):
             return
@@ -200,7 +201,7 @@ class LatentCache:
         """Return the same data set, with the same clips in the same order, read as latents from this cache.
 
         Raises:
-            InputError: It is not finished; if it was not even begun, says how the others there differ.
+            InputError: The cache is not finished; if it was not begun, names how other caches in the folder differ.
         """
         if self.is_begun:
             return through_latents(self.dataset, self.folder)
@@ -217,20 +218,26 @@ class LatentCache:
 
 
 def frames_in(wanted: Sequence[FramesToEncode]) -> int:
-    """Return how many frames these are."""
-    return sum(len(one.steps) for one in wanted)
+    """Return the total number of frames of some requests."""
+    return sum(len(request.steps) for request in wanted)
 
 
 def picture_bytes(image_size: int) -> int:
-    """Return the approximate size of a frame's picture as JPEG, with a share of the states."""
+    """Return the approximate size in bytes of a frame's JPEG image, including its share of the states."""
     return 1000 + image_size**2 // 3
 
 
 def require_space(folder: Path, frames: int, per_frame: int, *, fix: str) -> None:
-    """Refuse to encode frames for which the disk has too little space.
+    """Refuse to encode frames if the disk has too little space.
+
+    Args:
+        folder: A folder on the disk; need not exist.
+        frames: Number of frames.
+        per_frame: Size of a frame in bytes.
+        fix: The fix, for messages.
 
     Raises:
-        InputError: Says how much is free, and how much is needed.
+        InputError: Names the free and the required space.
     """
     needed, free = frames * per_frame, free_bytes(folder)
     if needed > free:
@@ -249,7 +256,7 @@ class EncoderOnDevice:
     world_model: WorldModel
     device: torch.device
     autocast: Callable[[], contextlib.AbstractContextManager[object]]
-    chunk: int = ENCODE_CHUNK  # frames at once
+    chunk: int = ENCODE_CHUNK  # frames per encoder call
 
     @classmethod
     def of(cls, config: Config, model: WorldModel, device: torch.device) -> EncoderOnDevice:
@@ -265,7 +272,7 @@ class EncoderOnDevice:
 
 
 _Frames = UInt8[Tensor, "frames height width 3"]  # cropped
-_Parts = Iterator[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]  # neighbouring frames of a request
+_Parts = Iterator[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]  # consecutive frames of a request
 
 
 def encode_files(
@@ -277,41 +284,42 @@ def encode_files(
     *,
     exact_pictures: bool = False,
 ) -> None:
-    """Write the file of each request; an episode that cannot be read is left out by `data.broken_episodes`, and noted.
+    """Encode the requested frames and write one file per request.
 
-    A file gets its name when it is complete: a kill loses only those in progress.
+    An episode that cannot be read is recorded in the cache and treated as `data.broken_episodes` states. Files are
+    written atomically, so a kill loses only the files in progress.
 
     Args:
         dataset: Source of the frames.
         wanted: The requests.
-        encoder: Makes the latents.
-        files: Where they go.
+        encoder: Computes the latents.
+        files: The files of the cache.
         progress: Called with (done, total) in frames.
-        exact_pictures: Store the frames as the encoder saw them bit for bit, not as JPEGs.
+        exact_pictures: Store the encoder's input images without loss instead of as JPEGs.
 
     Raises:
-        InputError: An episode cannot be read and the policy does not skip it, or too many are; or a file cannot be
-            written. Written files stay.
+        InputError: An episode cannot be read and the policy does not skip it, too many episodes are broken, or a file
+            cannot be written. Files that were written before remain.
         UnreachableError: A failure of the connection, not of the episode.
     """
     threads, writes = max(1, dataset.config.workers), deque[Future[None]]()
-    done, total = 0, sum(len(one.steps) for one in wanted)
+    done, total = 0, frames_in(wanted)
     progress(done, total)
     writers = _WRITES_UNDER_WAY if storage.is_url(files.folder) else 1
     with ThreadPoolExecutor(threads, "decode") as decoders, ThreadPoolExecutor(writers, "write") as writer:
         parts_ahead = _parts(decoders, dataset, wanted, encoder, threads * _PREFETCHED_PARTS)
         try:
-            for one, parts in groupby(parts_ahead, itemgetter(0)):
+            for request, parts in groupby(parts_ahead, itemgetter(0)):
                 try:
-                    encoded = _encode(encoder, one, parts, dataset.config.cache_dtype)
+                    encoded = _encode(encoder, request, parts, dataset.config.cache_dtype)
                 except InputError as error:
-                    dataset.leave_out(one.episode, error)
-                    files.note_broken(one.episode, one.camera, str(error))
+                    dataset.leave_out(request.episode, error)
+                    files.note_broken(request.episode, request.camera, str(error))
                 else:
-                    writes.append(writer.submit(_write, files, one.episode, encoded, exact_pictures=exact_pictures))
+                    writes.append(writer.submit(_write, files, request.episode, encoded, exact_pictures=exact_pictures))
                 while len(writes) > _WRITES_UNDER_WAY:
                     writes.popleft().result()
-                done += len(one.steps)
+                done += len(request.steps)
                 progress(done, total)
             for write in writes:
                 write.result()
@@ -326,15 +334,15 @@ def _parts(
     encoder: EncoderOnDevice,
     ahead: int,
 ) -> _Parts:
-    """Yield parts in the requested order, while threads read the next ones; an episode is opened once."""
-    frames = encoder.chunk * max(1, FRAMES_AT_ONCE // encoder.chunk)  # whole chunks, but for the last of an episode
+    """Yield parts in the order of the requests, while threads read the next parts; each episode is opened once."""
+    frames = encoder.chunk * max(1, FRAMES_AT_ONCE // encoder.chunk)  # whole chunks, except at the end of an episode
     waiting = deque[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]()
-    for one in wanted:
-        recording = pool.submit(dataset.read, one.episode, one.camera)
-        for first in range(0, len(one.steps), frames):
-            steps = one.steps[first : first + frames].tolist()
+    for request in wanted:
+        recording = pool.submit(dataset.read, request.episode, request.camera)
+        for first in range(0, len(request.steps), frames):
+            steps = request.steps[first : first + frames].tolist()
             pinned = encoder.device.type == "cuda"
-            waiting.append((one, pool.submit(_read, dataset, recording, steps, pinned=pinned)))
+            waiting.append((request, pool.submit(_read, dataset, recording, steps, pinned=pinned)))
             if len(waiting) > ahead:
                 yield waiting.popleft()
     while waiting:
@@ -348,9 +356,9 @@ def _read(dataset: Dataset, opened: Future[Episode], steps: Sequence[int], *, pi
 
 
 def _encode(
-    encoder: EncoderOnDevice, one: FramesToEncode, parts: _Parts, kind: CacheType
+    encoder: EncoderOnDevice, request: FramesToEncode, parts: _Parts, kind: CacheType
 ) -> Callable[[], EncodedEpisode]:
-    """Encode an episode, and return a function that waits for the results."""
+    """Start to encode an episode, and return a function that waits for the result."""
     latents, pictures = list[StoredLatents](), list[Tensor]()
     for _, part in parts:
         recording, frames = part.result()
@@ -362,14 +370,16 @@ def _encode(
     def fetched() -> EncodedEpisode:
         if encoder.device.type == "cuda":
             torch.cuda.synchronize(encoder.device)
-        seen = np.ascontiguousarray(rearrange(torch.cat(pictures), "n c h w -> n h w c").numpy())
-        return EncodedEpisode(recording, one.camera, one.steps.tolist(), joined_latents(latents, torch.cat), seen)
+        images = np.ascontiguousarray(rearrange(torch.cat(pictures), "n c h w -> n h w c").numpy())
+        return EncodedEpisode(
+            recording, request.camera, request.steps.tolist(), joined_latents(latents, torch.cat), images
+        )
 
     return fetched
 
 
 def _to_host(tensor: Tensor) -> Tensor:
-    """Return a copy in the host's memory; from a GPU it is only enqueued: the next part need not wait."""
+    """Return a copy in host memory; a copy from a GPU is asynchronous, so that the next part need not wait."""
     if not tensor.is_cuda:
         return tensor.cpu()
     return torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)

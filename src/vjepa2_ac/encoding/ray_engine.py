@@ -1,4 +1,4 @@
-"""Encoding on a cluster: Ray Data hands missing episodes to actors, and those of a lost actor to another one."""
+"""Encoding on a cluster: Ray Data distributes the missing episodes to actors and retries those of a lost actor."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, Lat
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
 from vjepa2_ac.reporter import Reporter
 
-_MOST_AT_ONCE = 16  # requests in a task: the next one is decoded while one is encoded
-_FEWEST_TASKS = 64  # if there are as many requests: the last ones end at about the same time
-_MOST_DEATHS = 10  # of actors one after the other before they have begun: nothing is installed on their nodes
-_LONGEST_END_S = 30.0
+_MOST_AT_ONCE = 16  # requests per task at most; within a task decoding and encoding overlap
+_FEWEST_TASKS = 64  # with enough requests, so that all actors finish at about the same time
+_MOST_DEATHS = 10  # consecutive actors that die during start-up, as on nodes without this package
+_LONGEST_END_S = 30.0  # wait for a thread of Ray Data at shutdown
 _AGAIN = "The same command goes on with what is missing"
 
 
 @contextlib.contextmanager
 def ray_engine(address: str) -> Iterator[Engine]:
-    """Connect to a Ray cluster, or start a Ray on this machine, until the context ends.
+    """Connect to a Ray cluster, or start Ray on this machine, until the context ends; yield the engine.
 
     Args:
-        address: Of the cluster, as `ray.init` takes it; empty: start one.
+        address: Address of the cluster, as for `ray.init`; empty: start Ray on this machine.
 
     Raises:
         UnreachableError: Ray is not installed, or there is no cluster at the address.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     if address:
-        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "1")  # 40 s, not 13 minutes, where nobody answers
+        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "1")  # an unreachable address fails in 40 s, not 13 min
     where = f"--engine ray={address}" if address else "--engine ray"
     ray = require_library("ray", where=where, called="Ray, which shares work on a cluster", extra="cluster")
     require_library("ray.data", where=where, called="Ray Data, which shares work on a cluster", extra="cluster")
-    how: dict[str, Any] = {"address": address} if address else {"address": "local", "include_dashboard": False}
+    options: dict[str, Any] = {"address": address} if address else {"address": "local", "include_dashboard": False}
     try:
-        ray.init(**how, logging_level=logging.ERROR, log_to_driver=False)
+        ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
     except (OSError, RuntimeError, ValueError) as error:
         found = f"no Ray cluster that can be used ({error})"
         raise UnreachableError(where=where, found=found, fix="`ray status` on its head node shows it") from None
@@ -56,19 +56,19 @@ def ray_engine(address: str) -> Iterator[Engine]:
         raise UnreachableError(where=where, found=f"Ray has given up ({error})", fix=_AGAIN) from error
     finally:
         for thread in threading.enumerate():
-            if thread.name == "iter_threaded":  # of Ray Data: one that asks Ray after its end ends us without an error
+            if thread.name == "iter_threaded":  # this thread of Ray Data would kill the process if Ray shut down first
                 thread.join(_LONGEST_END_S)
         ray.shutdown()
 
 
 def _encode(where: str, config: Config, cache: LatentCache, left: Sequence[FramesToEncode], reporter: Reporter) -> None:
-    """Encode what is left with an actor on each GPU, or on each CPU core where there is none.
+    """Encode the missing frames with one actor per GPU, or per CPU core on a cluster without GPUs.
 
-    An actor that joins late takes part, and one that dies loses nothing.
+    Actors may join later, and the episodes of an actor that dies are encoded by another one.
 
     Raises:
-        InputError: As of `encode_share`, from any actor; or there is no GPU and the config requests one; or an actor
-            has other data, or not the folder of the cache.
+        InputError: As `encode_share`, from any actor; or the config requests a GPU and there is none; or an actor has
+            other data, or cannot access the folder of the cache.
     """
     import ray
 
@@ -111,32 +111,33 @@ class _Task:
 @dataclass(frozen=True, eq=False)
 class _Result:
     frames: int
-    broken: Mapping[str, str]  # all that the actor has met, by identity, and why
-    error: Exception | None = None  # a value: Ray would wrap it, and may try again
+    broken: Mapping[str, str]  # reasons of all broken episodes that the actor has found, by identity
+    error: Exception | None = None  # returned, because Ray would wrap a raised error and may retry the task
 
 
 class _Actor:
-    """Encodes on one device. What it needs is opened and loaded at the first task."""
+    """A worker that encodes on one device; it opens the data and loads the model at the first task."""
 
-    def __init__(self, config: Mapping[str, Any], folder: Path | str, here: Path) -> None:
-        self._config, self._folder, self._here = config, folder, here
+    def __init__(self, config: Mapping[str, Any], folder: Path | str, working_directory: Path) -> None:
+        self._config, self._folder, self._working_directory = config, folder, working_directory
 
     @cached_property
     def _opened(self) -> tuple[LatentCache, EncoderOnDevice]:
-        with contextlib.suppress(OSError):  # where this node has no such folder, what is missed will be named
-            os.chdir(self._here)
+        with contextlib.suppress(OSError):  # if this node lacks the folder, opening the data reports missing files
+            os.chdir(self._working_directory)
         config = parse_config(self._config, where="the config")
         cache, model = open_cache(config, self._folder)
         require_shared(cache, lambda: cache.is_begun)
         return cache, EncoderOnDevice.of(config, model, computing_device(config.training))
 
     def __call__(self, row: Mapping[str, Any]) -> dict[str, _Result]:
-        wanted = row["wanted"].wanted
+        requests = row["wanted"].wanted
         try:
             cache, encoder = self._opened
-            left = [one for one in wanted if not cache.files.has(one.episode, one.camera)]  # by one that died
+            # An actor that died may have written some of the files.
+            left = [request for request in requests if not cache.files.has(request.episode, request.camera)]
             encode_files(cache.dataset, left, encoder, cache.files)
         except Exception as error:
             error.add_note(traceback.format_exc())
             return {"found": _Result(0, {}, error)}
-        return {"found": _Result(frames_in(wanted), cache.dataset.broken.reasons)}
+        return {"found": _Result(frames_in(requests), cache.dataset.broken.reasons)}
