@@ -1,4 +1,4 @@
-"""The commands serve and simulate: a planner that steers a robot, or the simulated arm, in closed loop."""
+"""The commands serve and simulate: planning in closed loop for a robot or a simulated arm."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def add_serve(commands: cli.Commands) -> None:
 
 
 def add_simulate(commands: cli.Commands) -> None:
-    """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
+    """Add `simulate` to a parser. `simulate record` records data; otherwise a model is tested in closed loop."""
     parser = cli.command(commands, "simulate", _simulate, "demo/run --task reach --domain B --episodes 10")
     cli.add(parser, "subject RUN_OR_MODEL|record", "a run, or what model.base takes; or: record", cli.as_model)
     cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
@@ -79,10 +79,10 @@ def add_simulate(commands: cli.Commands) -> None:
 
 
 def _serve(options: argparse.Namespace) -> int:
-    """Serve a planner to a robot, over a websocket.
+    """Serve the planner to a robot over a websocket.
 
-    In the protocol of openpi's clients: pictures, states and goals in, actions within planning.limits out
-    (docs/serving.md). Runs until SIGTERM or Ctrl-C.
+    The server uses the protocol of openpi's clients. A request contains an image, a state and a goal; the reply
+    contains actions within planning.limits (docs/serving.md). The command runs until SIGTERM or Ctrl-C.
     """
     from vjepa2_ac.serving.access import Access, read_key
 
@@ -99,7 +99,7 @@ def _serve(options: argparse.Namespace) -> int:
         cli.require_new_place(options.record)
     goals = None if options.goals is None else read_kept_goals(options.goals)
     ended = serve(lambda: _loaded(options, goals), access, options.port, cli.show)
-    if not ended:  # a search or a loading that takes longer than anybody waits: nothing of it is to be kept
+    if not ended:  # the planning thread still searches or loads; its result is not needed, so do not wait for it
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)
@@ -107,7 +107,7 @@ def _serve(options: argparse.Namespace) -> int:
 
 
 def _loaded(options: argparse.Namespace, goals: KeptGoals | None) -> tuple[Session, Mapping[str, Any]]:
-    """Load the model, and make a first decision; return what is served, and what a robot is told of it."""
+    """Load the model and make a first decision; return the session and the metadata for clients."""
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.goals import require_ends
@@ -128,25 +128,25 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None) -> tuple[Sessi
         is_blind=is_blind(ranking_of_run(options.subject, loaded.chosen)),
     )
     controller = Controller.of_subject(loaded, extrinsics=options.extrinsics)
-    for kept in (goals or {}).values():
-        require_ends(kept, first=1)
+    for sequence in (goals or {}).values():
+        require_ends(sequence, first=1)
     session = Session(controller, goals or {}, how)
     about = metadata_of(loaded, session)
     Work.begin("the first decision")
     cli.show(in_words(about, options.subject), f"a first decision took {warm_up(controller):.1f} s")
     Work.begin("")
     if options.record is not None:
-        of_record = {**about, "overrides": options.overrides, "config": options.config, **loaded.as_dict()}
-        session.recorder = Recorder(options.record, of_record)
+        server = {**about, "overrides": options.overrides, "config": options.config, **loaded.as_dict()}
+        session.recorder = Recorder(options.record, server)
     return session, about
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    """Let a model steer a simulated arm; or record data of it.
+    """Test a model on a simulated arm in closed loop, or record data.
 
-    It acts towards a goal image, compared with the zero action, random actions and an oracle. Or, as `simulate record
-    FOLDER`: record demonstrations of the arm as a DROID data set. Status 1 where the model gave no finite energy in any
-    decision.
+    The model plans actions towards goal images. Its success rate is compared with those of the zero action, random
+    actions and an oracle. The exit status is 1 if the model returned no finite energy in any decision. `simulate record
+    FOLDER` records demonstrations of the arm as a DROID data set instead.
     """
     if options.world is not None:
         _refuse(options, ("task", "domain"), needed="none: the world has its own")
@@ -225,14 +225,18 @@ def _run_benchmark(options: argparse.Namespace) -> int:
 
 
 def _require_benchmark(options: argparse.Namespace) -> None:
-    """Refuse options that do not belong together, and a model that cannot plan."""
+    """Check that the options fit together and that the run or model exists.
+
+    Raises:
+        InputError: They do not, or it does not exist.
+    """
     if options.domain == "random":
         raise InputError(where="--domain random", found="a model that steers", needed="A or B")
     cli.require_to_plan(options)
 
 
 def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
-    """Let the model and its competitors act; return the benchmark and the folder for its files."""
+    """Run the closed-loop benchmark; return its result and the folder for its files."""
     from vjepa2_ac.simulation.benchmark import BenchmarkOptions, require_to_act, run_benchmark
     from vjepa2_ac.simulation.domains import load_mujoco
     from vjepa2_ac.simulation.worlds import OtherWorld, run_world_benchmark
@@ -256,7 +260,7 @@ def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
 
 
 def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse.Namespace) -> Summary:
-    """Return the verdict of the closed loop, with the other verdicts that `evaluate` wrote for this checkpoint."""
+    """Return a summary of the closed-loop verdict and, if `evaluate` measured this checkpoint, its other verdicts."""
     from vjepa2_ac.evaluation.summary import Summary, not_measured
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
@@ -266,7 +270,7 @@ def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse
     measured = f"{trials.task}, {trials.place}, {counted(trials.steps, 'step')} of {trials.seconds_per_step:.2f} s"
     summary = Summary(subject.name, measured, predicts, uses, ranks, verdict)
     if subject.chosen and (Path(subject.name) / METRICS_FILE).is_file():
-        with contextlib.suppress(InputError):  # of an older format: the other verdicts are not measured
+        with contextlib.suppress(InputError):  # metrics.json has an older format: keep "not measured"
             evaluated = read_metrics(Path(subject.name))
             if evaluated.about.checkpoint == subject.chosen:
                 summary = replace(evaluated.summary, measured=measured, plans=verdict)
@@ -274,7 +278,7 @@ def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse
 
 
 def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> list[str]:
-    """Return the command that follows from the verdicts of a closed loop, as lines; none if no command does."""
+    """Return a line with the recommended next command; empty if there is none."""
     is_evaluated, command = summary.predicts.value is not None, _evaluate_command(options)
     if verdict.needs or options.sub_goals is not None:  # the verdict names the fix; a server plans without sub-goals
         return []
@@ -282,20 +286,29 @@ def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> li
         words = cli.option_words(options, "checkpoint", "config", "plugin")
         command = shell_command("serve", options.subject, *words, *options.overrides)
     elif command and is_evaluated:
-        if any(map(is_of_moved, options.overrides)):  # `data calibrate` needs the base in its place
+        if any(map(is_of_moved, options.overrides)):  # `data calibrate` needs the base model at its original path
             return []
         command = shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
     return [f"Next: {command}"] * bool(command)
 
 
 def _evaluate_command(options: argparse.Namespace) -> str:
-    """Return the command that evaluates what was simulated; empty for what is no run, whose data are not known."""
+    """Return the `evaluate` command for the tested run; empty for a model, because its data are not known."""
     words = [*cli.option_words(options, "checkpoint", "plugin"), *filter(is_of_moved, options.overrides)]
     return shell_command("evaluate", options.subject, *words) if is_run(options.subject) else ""
 
 
 def _refuse(options: argparse.Namespace, names: Sequence[str], *, needed: str) -> None:
-    """Refuse options that mean nothing to this subject."""
+    """Check that options without an effect in this mode are not set.
+
+    Args:
+        options: Parsed arguments.
+        names: Names of the options that have no effect.
+        needed: What they need, for the error.
+
+    Raises:
+        InputError: One of them is set.
+    """
     for name in names:
         if getattr(options, name) is not None:
             shown = f"--{name.replace('_', '-')}"

@@ -13,7 +13,7 @@ from vjepa2_ac.errors import InputError, counted, shell_command
 from vjepa2_ac.reporter import INDEXING, SILENT
 from vjepa2_ac.storage.structured import json_text, plain
 
-_CLIPS, _PAIRS = 64, 200  # to calibrate by: strides, axes (as the paper)
+_CLIPS, _PAIRS = 64, 200  # for the calibration of strides and of axes; 200 pairs as in the paper
 
 
 def add_data(commands: cli.Commands) -> None:
@@ -57,10 +57,11 @@ def _add_commands(commands: cli.Commands) -> None:
 
 
 def _convert(options: argparse.Namespace) -> None:
-    """Write a data set as LeRobot v3.0.
+    """Convert a data set to LeRobot v3.0.
 
-    The tables are Parquet, the videos MP4. Episodes are written whole: states, actions, task, success, and all cameras
-    of data.camera. The videos are H.264, which is lossy; all other values are exact. OUT appears when it is complete.
+    Tables are written as Parquet, videos as MP4. Whole episodes are written: states, actions, task, success, and all
+    cameras in data.camera. Videos are encoded with H.264, which is lossy; all other values are exact. The folder OUT
+    is created when the conversion is complete.
     """
     config = cli.read_config(options.config, options.overrides)
     cli.require_new_place(options.out)
@@ -74,9 +75,9 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 def _converter(options: argparse.Namespace) -> None:
-    """Print a script that makes a data set of another form, as ROS bags.
+    """Print a script that converts another format, for example ROS bags.
 
-    Without NAME: list the scripts.
+    Without NAME the scripts are listed.
     """
     from vjepa2_ac.init.look import converter_text, converters
 
@@ -88,11 +89,11 @@ def _converter(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    """Check a data set: read clips as training would, judge every number.
+    """Check a data set: read clips as in training, and check all values.
 
-    Each line begins with ok, warning, error or skipped (the check did not run; the line says what it needs).
+    Each line starts with ok, warning, error or skipped. A skipped check did not run; its line states what it needs.
 
-    Exit status 0: no errors. 1: training would not start, or learn nothing. 2: an input cannot be used.
+    Exit status 0: no errors. 1: training would fail or learn nothing. 2: an input cannot be used.
     """
     config = cli.read_config(options.config, options.overrides)
     if options.model is not None:
@@ -104,10 +105,10 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
     """Check the data of a config and print the findings; return 1 if one of them is an error.
 
     Args:
-        config: The data, and the order and size of batches.
-        clips: The approximate number of clips to read; a model is measured on twice as many.
-        model: A run or a model that measures the data, too.
-        as_json: Print one JSON object and nothing else, when all checks are done.
+        config: The config, for its data set, batch size and seed.
+        clips: The approximate number of clips to read; measurements with a model use twice this number.
+        model: A run or a model with which the data are measured in addition.
+        as_json: Whether to print only one JSON object, after all checks.
     """
     from vjepa2_ac.cli.tables import print_finding, variants_table
     from vjepa2_ac.data.dataset import open_dataset
@@ -126,8 +127,8 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
     batch_size, probe = config.training.batch_size, None
     with contextlib.nullcontext(SILENT) if as_json else cli.reporter() as reporter:
         progress = reporter.task(INDEXING)
-        for one in check_data(config.data, seed=config.seed, batch_size=batch_size, clips=clips, progress=progress):
-            add(one)
+        for finding in check_data(config.data, seed=config.seed, batch_size=batch_size, clips=clips, progress=progress):
+            add(finding)
         if model is not None:
             dataset, progress = at_some_stride(open_dataset(config.data)), reporter.task("probing")
             probe = probe_config(config, dataset, model=model, clips=2 * clips, progress=progress)
@@ -137,14 +138,15 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
     if probe is not None:
         add(Finding("warning" if probe.better else "ok" if probe.is_decided else "skipped", "probe", probe.verdict()))
     if as_json:
-        print(json_text({**findings_as_dict(findings), "variants": plain([asdict(one) for one in variants])}), end="")
+        values = plain([asdict(variant) for variant in variants])
+        print(json_text({**findings_as_dict(findings), "variants": values}), end="")
     else:
         cli.show(summary_of(findings))
-    return int(any(one.level == "error" for one in findings))
+    return int(any(finding.level == "error" for finding in findings))
 
 
 def _inspect(options: argparse.Namespace) -> None:
-    """Say what is in a data set, and draw a contact sheet."""
+    """Print the statistics of a data set, and draw a contact sheet."""
     config = cli.read_config(options.config, options.overrides)
     cli.make_folder(options.out)
 
@@ -164,10 +166,10 @@ def _inspect(options: argparse.Namespace) -> None:
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    """Find how many control steps a model's step is, or its axes.
+    """Find the stride that fits a model, or the rotation of its axes.
 
-    By its error relative to persistence at each stride. With --axes: the rotation between its axes and the robot's;
-    status 1 where it cannot be measured.
+    For each stride, the one-step error relative to persistence is measured. With --axes the rotation between the
+    model's axes and the robot's axes is measured instead; the exit status is 1 if it cannot be measured.
     """
     config = cli.read_config(options.config, options.overrides, base=options.axes is None)
     if options.axes is not None:
@@ -192,7 +194,7 @@ def _calibrate(options: argparse.Namespace) -> int:
 
 
 def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
-    """Fit the axes of a model; return 1 where nothing can be planned by them."""
+    """Fit the rotation between the model's axes and the robot's; return 1 if it cannot be used for planning."""
     if options.model is not None:
         raise InputError(where="--model", found="--axes beside it", needed="one of them: --model is of strides")
     cli.require_subject(options.axes)

@@ -1,4 +1,4 @@
-"""The commands evaluate, compare and imagine: what runs and models predict on held-out episodes."""
+"""The commands evaluate, compare and imagine, which measure and show predictions on held-out episodes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vjepa2_ac.process import is_first
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.folder import is_of_moved, is_run
 
-_NAMED = ("none", "up", "left", "close")  # actions from an image, whose true ones are not known
+_NAMED = ("none", "up", "left", "close")  # default actions of `imagine --image`, which has no recorded actions
 
 if TYPE_CHECKING:
     from vjepa2_ac.decoding.imagine import Imagination
@@ -75,10 +75,9 @@ def add_imagine(commands: cli.Commands) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    """Measure a run on held-out episodes: did it become better?
+    """Measure a run or a model on held-out episodes: is it better?
 
-    Its predictions are compared with those of its base model, with persistence, and with wrong actions. A model is
-    measured likewise.
+    The predictions are compared with those of the base model, with persistence, and with predictions for wrong actions.
     """
     from vjepa2_ac.evaluation.request import ProbeOptions, settle
 
@@ -86,8 +85,8 @@ def _evaluate(options: argparse.Namespace) -> None:
     if unused := [word for word in options.overrides if not is_of_moved(word)]:
         needed = "model.base=PATH, for a run whose base was moved: evaluate does not change other config keys"
         raise InputError(where="command line", found=" ".join(unused), needed=needed)
-    asked = cli.evaluation_options(options, probes=cli.record_of_options(ProbeOptions, options))
-    cli.require_subject(subject, settle(subject, asked), options.words)
+    request = cli.evaluation_options(options, probes=cli.record_of_options(ProbeOptions, options))
+    cli.require_subject(subject, settle(subject, request), options.words)
     cli.say_places_elsewhere(subject)
 
     from vjepa2_ac.cli.tables import row_tables
@@ -97,10 +96,10 @@ def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.reports.write import write_evaluation
 
     with cli.reporter() as reporter:
-        evaluation = evaluate_subject(subject, asked, reporter=reporter if is_first() else SILENT)
-        if is_first():  # the other processes shared its work
+        evaluation = evaluate_subject(subject, request, reporter=reporter if is_first() else SILENT)
+        if is_first():  # the other processes only share the computation
             reporter.task("writing report and figures")
-            measured = write_evaluation(evaluation, asked.out or Path(subject))
+            measured = write_evaluation(evaluation, request.out or Path(subject))
     if is_first():
         if options.all:
             checkpoint, notes = evaluation.about.checkpoint, evaluation.notes
@@ -114,7 +113,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _next(measured: Evaluated, options: argparse.Namespace) -> list[str]:
-    """Return the command that follows from the summary; empty if no command does."""
+    """Return a line with the recommended next command; empty if there is none."""
     about, summary, settings = measured.evaluation.about, measured.summary, options.overrides
     config = options.data or f"{about.subject}/config.yaml"
     words = ["data", "check", config]
@@ -126,7 +125,7 @@ def _next(measured: Evaluated, options: argparse.Namespace) -> list[str]:
             words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
         elif summary.plans is None and (simulation := _simulation(about, options)):
             words = simulation
-        elif summary.verdicts[2].conclusion == "yes":  # a robot is not recommended without a measured gain
+        elif summary.verdicts[2].conclusion == "yes":  # `serve` is recommended only after a measured improvement
             words = ["serve", about.subject, *cli.option_words(options, "checkpoint"), *settings]
         else:
             return []
@@ -134,7 +133,7 @@ def _next(measured: Evaluated, options: argparse.Namespace) -> list[str]:
 
 
 def _simulation(about: About, options: argparse.Namespace) -> list[str]:
-    """Return the words of the command that tests a run in closed loop; empty unless `simulate record` made the data."""
+    """Return the arguments of the command that tests a run in closed loop; empty unless its data were simulated."""
     from vjepa2_ac.distributed import is_on_cpu
     from vjepa2_ac.planning.settings import planning_settings
     from vjepa2_ac.simulation.domains import Domain
@@ -152,9 +151,9 @@ def _simulation(about: About, options: argparse.Namespace) -> list[str]:
 
 
 def _compare(options: argparse.Namespace) -> None:
-    """Put evaluated runs side by side: one table, one image.
+    """Compare evaluated runs in one table and one image.
 
-    `evaluate` has measured them on the same clips.
+    `evaluate` must have measured all runs on the same clips.
     """
     from vjepa2_ac.reports.comparison import compare
 
@@ -171,11 +170,12 @@ def _compare(options: argparse.Namespace) -> None:
 
 
 def _imagine(options: argparse.Namespace) -> None:
-    """Film what a model imagines from a frame, under any actions.
+    """Make a video of a model's predicted frames, for any actions.
 
-    From a frame of a held-out clip under the recorded actions, beside the truth and the base, and under actions that
-    were not taken; or from an image: a strip, an MP4 and a GIF. Of data that `simulate record` made, what really
-    happens is shown, too. A decoded image is no evidence of success: docs/decoding.md.
+    The rollouts start from a frame of a held-out clip, or from an image. For a clip, those with the recorded actions
+    are shown with the true frames and those of the base model. Other actions can be named. For data from `simulate
+    record`, the simulator also shows the true outcome of the other actions. The command writes an image strip, an MP4
+    and a GIF. Decoded frames are no evidence of success (docs/decoding.md).
     """
     _require_one_start(options)
 
@@ -190,14 +190,18 @@ def _imagine(options: argparse.Namespace) -> None:
 
 
 def _require_one_start(options: argparse.Namespace) -> None:
-    """Refuse options that do not belong together."""
+    """Check that the options name one start: a clip, or an image with its state.
+
+    Raises:
+        InputError: Options are missing or contradict each other.
+    """
     if options.start is not None and options.episode is None:
         raise InputError(where="--start", found="no --episode", needed="the episode whose control step it is")
     if (options.image is None) != (options.state is None):
         raise InputError(where="--image, --state", found="one of them", needed="both: state and image of one moment")
     clip = {"--episode": options.episode, "--data": options.data}
-    if options.image is not None and (given := [name for name, value in clip.items() if value is not None]):
-        raise InputError(where="--image", found=f"{', '.join(given)}, too", needed="a clip or an image, not both")
+    if options.image is not None and (used := [name for name, value in clip.items() if value is not None]):
+        raise InputError(where="--image", found=f"{', '.join(used)}, too", needed="a clip or an image, not both")
 
 
 def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imagination:
@@ -207,9 +211,9 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
 
     cli.say_places_elsewhere(options.subject)
     how = {"evaluation": cli.evaluation_options(options, out=out), "size_m": options.size / 100}
-    asked = cli.record_of_options(ImagineOptions, options, **how)
-    cli.require_subject(options.subject, settle(options.subject, asked.evaluation), options.words)
-    return imagine_clip(options.subject, asked, simulate=simulated_outcome, reporter=reporter)
+    request = cli.record_of_options(ImagineOptions, options, **how)
+    cli.require_subject(options.subject, settle(options.subject, request.evaluation), options.words)
+    return imagine_clip(options.subject, request, simulate=simulated_outcome, reporter=reporter)
 
 
 def _of_image(options: argparse.Namespace) -> Imagination:
@@ -217,14 +221,14 @@ def _of_image(options: argparse.Namespace) -> Imagination:
     from vjepa2_ac.media.images import read_image
 
     cli.require_to_plan(options)
-    seen = Seen(read_image(options.image), options.state, options.extrinsics)
+    observation = Seen(read_image(options.image), options.state, options.extrinsics)
     named = {"actions": options.actions or _NAMED, "size_m": options.size / 100}
-    asked = cli.record_of_options(ImagineOptions, options, **named)
-    return imagine_image(cli.load_planning_session(options), asked, seen)
+    request = cli.record_of_options(ImagineOptions, options, **named)
+    return imagine_image(cli.load_planning_session(options), request, observation)
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """Parse the value of --actions."""
+    """Parse the value of --actions: names or files with commas between them."""
     if names := tuple(word for word in text.split(",") if word):
         return names
     raise argparse.ArgumentTypeError("no actions; give one or more names, with commas between them")

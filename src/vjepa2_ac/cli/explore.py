@@ -1,4 +1,4 @@
-"""The command explore: a page in which a person drives a model's imagination."""
+"""The command explore: an interactive page that shows a model's predictions for commanded motions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.explore.views import Views
 
 _DEMO_RUN, _BUILTIN_MODEL = "demo/run", f"{BUILTIN}sim-tiny"
-_EPISODES = 8  # simulated where a model of the package comes without data
+_EPISODES = 8  # number of episodes to simulate for the package's model, which has no data set
 
 
 def add_explore(commands: cli.Commands) -> None:
@@ -43,12 +43,12 @@ def add_explore(commands: cli.Commands) -> None:
 
 
 def _explore(options: argparse.Namespace) -> int:
-    """Open a page in which you drive the model's imagination.
+    """Open an interactive page that shows predictions for your motions.
 
-    Press a key and see what the model thinks happens, beside its base and what is true; choose a goal, see the energy,
-    let it plan (docs/explore.md). Runs until Ctrl-C.
+    Press a key to command a motion, and compare the predicted frames with those of the base model and with the true
+    frames. Choose a goal to see the energy and to plan (docs/explore.md). The command runs until Ctrl-C.
     """
-    if "=" in (options.subject or "") and not Path(options.subject).exists():  # no subject, and an override first
+    if "=" in (options.subject or "") and not Path(options.subject).exists():  # the subject is omitted: an override
         options.subject, options.overrides = None, [options.subject, *options.overrides]
     subject = options.subject or (_DEMO_RUN if is_run(_DEMO_RUN) else _BUILTIN_MODEL)
     config = read_run_config(Path(subject), options.overrides) if is_run(subject) else None
@@ -77,7 +77,14 @@ def _serve(views: Views, options: argparse.Namespace, about: str) -> None:
 
 @contextmanager
 def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
-    """Yield the config whose data are explored: the given one; None, a run's own; or of episodes that are simulated."""
+    """Yield the config of the data to explore.
+
+    It is the config of `--data`; or None for the data of a run; or, for the package's model, a config of episodes that
+    are simulated into a temporary folder.
+
+    Raises:
+        InputError: Another model is given without `--data`.
+    """
     if options.data is not None:
         yield cli.read_config(options.data)
     elif is_run(subject):
@@ -97,7 +104,7 @@ def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
 
 
 def _decoder(subject: str, options: argparse.Namespace) -> TrainedDecoder:
-    """Load the decoder: the given one, or the one next to the run, or that of the package."""
+    """Load the decoder of `--decoder`, or else the one in the run's parent folder, or else the package's decoder."""
     from vjepa2_ac.decoding.decoder import CARD, load_decoder
 
     folder = Path(subject).parent / "decoder"
@@ -114,9 +121,9 @@ def _views(
     from vjepa2_ac.simulation.counterfactual import SimulatedFutures
 
     require_one_process()
-    asked = cli.evaluation_options(options, data=data, out=Path())
-    config = settle(subject, asked)
+    request = cli.evaluation_options(options, data=data, out=Path())
+    config = settle(subject, request)
 
-    load = partial(load_models, subject, config, asked)
+    load = partial(load_models, subject, config, request)
     explorer = open_explorer(config, decoder, options.split, load, SimulatedFutures.of, reporter)
     return Views.of(subject, explorer, config)

@@ -1,4 +1,4 @@
-"""Shared parts of the commands: adding a subcommand and its arguments, and what each of them may be."""
+"""Helpers shared by the commands: the argument parser, common arguments, parsers of values, and early checks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 Handler = Callable[[argparse.Namespace], int | None]
 
-QUICK = {"samples": 64, "iterations": 4}  # of `planning`, for a CPU; docs/planning.md says how good this planner is
+QUICK = {"samples": 64, "iterations": 4}  # `planning` keys of a fast search on a CPU; docs/planning.md rates its plans
 QUICK_WORDS = tuple(f"planning.{key}={value}" for key, value in QUICK.items())
 _QUICK_SEQUENCES = 256
 _MOST = 10**9
@@ -44,15 +44,18 @@ _Read = TypeVar("_Read")
 
 
 class _Help(argparse.HelpFormatter):
-    """A usage that has only what must be given; paragraphs stay apart, and one with indented lines stays as it is."""
+    """A help formatter whose usage line shows only required arguments.
+
+    Paragraphs are wrapped separately. A paragraph with indented lines is not wrapped.
+    """
 
     def add_usage(self, usage: Any, actions: Iterable[argparse.Action], groups: Any, prefix: Any = None) -> None:
         one_of = [action for group in groups if group.required for action in group._group_actions]
-        given = [action for action in actions if action.required or not action.option_strings or action in one_of]
-        super().add_usage(usage, given, groups, prefix)
+        required = [action for action in actions if action.required or not action.option_strings or action in one_of]
+        super().add_usage(usage, required, groups, prefix)
 
     def _split_lines(self, text: str, width: int) -> list[str]:
-        return textwrap.wrap(text, width, break_on_hyphens=False)  # vjepa2-ac stays in one line
+        return textwrap.wrap(text, width, break_on_hyphens=False)  # keeps "vjepa2-ac" on one line
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         parts = text.split("\n\n")
@@ -61,12 +64,12 @@ class _Help(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose help begins with an example, and whose errors say what a wrong word may have meant.
+    """An argument parser whose help starts with an example and whose errors suggest the closest known word.
 
-    Its messages cannot move a terminal's cursor, and it takes `-0.3,0.1` for a value.
+    Control characters in its messages are escaped, and a word such as `-0.3,0.1` is read as a value, not an option.
     """
 
-    example = ""  # what stands behind its name
+    example = ""  # arguments of the example, without the name of the command
 
     def __init__(self, **how: Any) -> None:
         super().__init__(**how, formatter_class=_Help, add_help=False)
@@ -75,29 +78,30 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"^-[\d.]")
 
     def format_help(self) -> str:
-        """Return the example, then the usage and what can be given."""
+        """Return the help text: the example, the usage, and the arguments."""
         example = f"example:\n  {self.prog} {self.example}\n\n" if self.example else ""
         return example + super().format_help()
 
     def error(self, message: str) -> NoReturn:
-        """Print the error, and exit with status 2."""
+        """Print the error and exit with status 2."""
         super().error(printable(message))
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        known = [str(one) for one in action.choices or ()]
+        known = [str(choice) for choice in action.choices or ()]
         if known and str(value) not in known:
             hint = did_you_mean(str(value), known) or f"Known are {', '.join(known)}"
             raise argparse.ArgumentError(action, f"{value!r} is unknown. {hint.rstrip()}")
 
 
 def command(commands: Commands, name: str, handler: Handler, example: str = "") -> Parser:
-    """Add a command, and return its parser.
+    """Add a command and return its parser.
 
     Args:
-        commands: Of a parser.
-        name: What is typed.
-        handler: Its docstring is the help; the first paragraph, a short line, stands in the list of commands.
-        example: What is typed behind the name, in the help.
+        commands: The subparsers of the parent parser.
+        name: Name of the command.
+        handler: The function that runs the command. Its docstring is the help text; the first paragraph, a short line,
+            is shown in the list of commands.
+        example: Arguments of the example in the help text.
     """
     text = inspect.getdoc(handler) or ""
     parser = commands.add_parser(name, help=text.partition("\n\n")[0], description=text)
@@ -109,11 +113,11 @@ def command(commands: Commands, name: str, handler: Handler, example: str = "") 
 
 
 def add_commands(parser: Parser, groups: Mapping[str, Sequence[Callable[[Commands], None]]]) -> None:
-    """Give a parser commands, which its help lists in groups, a line each; without a command it is shown.
+    """Add groups of commands to a parser. Its help lists them, one per line; without a command the help is printed.
 
     Args:
-        parser: It gets them.
-        groups: By title, what adds commands.
+        parser: The parser to extend.
+        groups: For each group title, functions that add commands.
     """
 
     def no_command(_options: argparse.Namespace) -> int:
@@ -126,7 +130,7 @@ def add_commands(parser: Parser, groups: Mapping[str, Sequence[Callable[[Command
         for add_to in adders:
             add_to(commands)
         added = list(commands.choices.items())[before:]
-        lines = [f"  {name:<9} {(one.description or ' ').splitlines()[0]}" for name, one in added]
+        lines = [f"  {name:<9} {(subparser.description or ' ').splitlines()[0]}" for name, subparser in added]
         if lines:
             parser.description = "\n".join([f"{parser.description}\n\n{title}:", *lines])
     parser.usage = f"{parser.prog} COMMAND ..."
@@ -139,21 +143,22 @@ def add(
     """Add an argument to a parser.
 
     Args:
-        parser: A parser, or a group of one.
-        words: Its name, or its names if it is an option, and what its value is called: "config CONFIG", "--clips N".
-        text: Its help. It says the default, also of an option that fills a record, which has None here.
-        read: Reads a value.
-        how: As `argparse.ArgumentParser.add_argument`.
+        parser: A parser or an argument group.
+        words: The name or option names, then the placeholder of the value: "config CONFIG", "--clips N".
+        text: The help text. It states the default, also for options whose parsed default is None because a dataclass
+            defines the default.
+        read: Converts the text of a value.
+        how: Keyword arguments of `argparse.ArgumentParser.add_argument`.
     """
-    first, *others = words.split()
-    names = [first, *(word for word in others if word.startswith("--"))]
-    value = next((word for word in others if word not in names), None)
-    how |= {name: one for name, one in (("type", read), ("metavar", value)) if one is not None}
+    first, *rest = words.split()
+    names = [first, *(word for word in rest if word.startswith("--"))]
+    metavar = next((word for word in rest if word not in names), None)
+    how |= {name: value for name, value in (("type", read), ("metavar", metavar)) if value is not None}
     parser.add_argument(*names, help=text, **how)
 
 
 def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a YAML config", **how: Any) -> None:
-    """Add the config that a command reads, and `key=value` words behind it."""
+    """Add the argument for a config file and the `key=value` arguments that override its keys."""
     add(parser, "config CONFIG", what, as_config, **how)
     add(parser, "overrides key=value", f"such as {such_as} (all keys: `vjepa2-ac config schema`)", nargs="*")
 
@@ -164,7 +169,7 @@ def add_checkpoint(parser: argparse._ActionsContainer, default: str | None = "se
 
 
 def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
-    """Add the run or the model that plans, `key=value` words behind it, and what else a `planning_session` is of."""
+    """Add the arguments of `load_planning_session`: run or model, overrides, checkpoint, config and extrinsics."""
     add(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
     add(parser, "overrides key=value", such_as, nargs="*")
     group = parser.add_argument_group("the model")
@@ -174,63 +179,69 @@ def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
 
 
 def add_all(parser: argparse._ActionsContainer) -> None:
-    """Add the option that shows more than the answer."""
+    """Add the option that prints all tables in addition to the summary."""
     add(parser, "--all", "print every table, too, and the files that were written", action="store_true")
 
 
 def add_decoder(parser: argparse._ActionsContainer, shows: str, **how: Any) -> None:
-    """Add `--decoder`, with which something is drawn."""
+    """Add `--decoder`, the decoder that converts latents into images."""
     add(parser, "--decoder FOLDER", f"show {shows}: of `vjepa2-ac decoder`, or builtin:sim-tiny", as_model, **how)
 
 
-def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **others: Any) -> _Record:
-    """Return a record whose fields are the options of their names that were given, and others."""
-    given = {field.name: getattr(options, field.name, None) for field in fields(kind)}  # type: ignore[arg-type]
-    return kind(**{name: value for name, value in given.items() if value is not None} | others)
+def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **more: Any) -> _Record:
+    """Create a dataclass from the options that have the names of its fields and are set; `more` fields override them.
+
+    Args:
+        kind: The dataclass.
+        options: Parsed arguments.
+        more: Further field values.
+    """
+    values = {field.name: getattr(options, field.name, None) for field in fields(kind)}  # type: ignore[arg-type]
+    return kind(**{name: value for name, value in values.items() if value is not None} | more)
 
 
-def evaluation_options(options: argparse.Namespace, **others: Any) -> EvaluationOptions:
-    """Return the options of an evaluation that were given, with the config of --data, and others."""
+def evaluation_options(options: argparse.Namespace, **more: Any) -> EvaluationOptions:
+    """Create the options of an evaluation from parsed arguments, with the config of `--data`; `more` overrides them."""
     from vjepa2_ac.evaluation.request import EvaluationOptions
 
     data = read_config(options.data) if options.data else None
-    return record_of_options(EvaluationOptions, options, **({"data": data} | others))
+    return record_of_options(EvaluationOptions, options, **({"data": data} | more))
 
 
 def show(*parts: Any, files: Iterable[str | Path] = ()) -> None:
-    """Print texts and tables one below another, and the files that were written."""
+    """Print texts and tables, then one line for each written file."""
     from vjepa2_ac.cli.progress import show
 
     show(*parts, files=files)
 
 
 def reporter() -> ConsoleReporter:
-    """Return what shows messages and progress."""
+    """Return a reporter that prints messages and progress to the console."""
     from vjepa2_ac.cli.progress import ConsoleReporter
 
     return ConsoleReporter()
 
 
 def say_places_elsewhere(subject: str) -> None:
-    """Print the addresses that the config of a run names, before any of them is contacted; nothing for a model."""
+    """Print the remote URLs in the config of a run, before any of them is contacted; print nothing for a model."""
     if is_run(subject) and is_first():
-        for place in places_elsewhere(read_run_config(Path(subject))):
-            show(f"{subject} names a place elsewhere: {place}")
+        for url in places_elsewhere(read_run_config(Path(subject))):
+            show(f"{subject} names a place elsewhere: {url}")
 
 
 def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool = False, of_run: bool = False) -> Config:
-    """Read a config, and refuse one whose data set is not on this machine, before what takes seconds is imported.
+    """Read a config and check that its local data set exists, before the slow import of PyTorch.
 
-    What lies elsewhere is found out later.
+    A data set at a URL is not checked.
 
     Args:
         path: The YAML file.
-        overrides: Such as training.steps=100.
-        base: Whether `model.base` and `model.encoder` have to be there, too.
-        of_run: It is the config of a run, whatever else is in its folder.
+        overrides: Changed keys, such as training.steps=100.
+        base: Whether to check that `model.base` and `model.encoder` exist, too.
+        of_run: Whether the file is the config of a run.
 
     Raises:
-        InputError: The config is wrong, or one of them is not there.
+        InputError: The config is invalid, or the data set or the model does not exist.
     """
     from vjepa2_ac.model.model_files import require_model
 
@@ -246,15 +257,15 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
 
 
 def require_subject(subject: str, config: Config | None = None, command: Sequence[str] = ()) -> None:
-    """Refuse a run or a model that is not there, before what takes seconds is imported.
+    """Check that a run or model exists, before the slow import of PyTorch.
 
     Args:
-        subject: The folder of a run; or a model: what `model.base` takes.
-        config: The config of a run, with the overrides of the command; None: as it is in the run's folder.
-        command: The words of the command, if it has overrides for the run.
+        subject: The folder of a run, or a model in a form that `model.base` accepts.
+        config: The config of the run, with the overrides of the command. None: read it from the run's folder.
+        command: The arguments of the command, for the fix that the error proposes.
 
     Raises:
-        InputError: There is no such run or model, or the base of the run is gone.
+        InputError: There is no such run or model, or the base model of the run does not exist any more.
     """
     from vjepa2_ac.model.model_files import find_base, require_base_of_run
 
@@ -265,10 +276,10 @@ def require_subject(subject: str, config: Config | None = None, command: Sequenc
 
 
 def require_to_plan(options: argparse.Namespace) -> Config:
-    """Return the settings to plan with; refuse those that cannot be, before what takes seconds is imported.
+    """Return the config to plan with, and check it and the model's files before the slow import of PyTorch.
 
     Raises:
-        InputError: One of them is wrong or not there.
+        InputError: An override or option is invalid, or the run or model does not exist.
     """
     from vjepa2_ac.planning.settings import planning_settings
 
@@ -278,7 +289,7 @@ def require_to_plan(options: argparse.Namespace) -> Config:
 
 
 def load_planning_session(options: argparse.Namespace) -> Subject:
-    """Load the run or the model that plans, with the settings that `require_to_plan` has checked."""
+    """Load the run or model that plans, with the options that `require_to_plan` has checked."""
     from vjepa2_ac.planning.model_setup import load_to_plan
 
     say_places_elsewhere(options.subject)
@@ -287,33 +298,33 @@ def load_planning_session(options: argparse.Namespace) -> Subject:
 
 
 def open_data(config: Config, reporter: ConsoleReporter) -> Dataset:
-    """Open the data set of a config, and show the progress."""
+    """Open the data set of a config and show the progress of indexing."""
     from vjepa2_ac.data.dataset import open_dataset
 
     return open_dataset(config.data, progress=reporter.task(INDEXING))
 
 
 def write_json(path: Path, values: Any) -> Path:
-    """Write plain values as JSON, atomically; return the file."""
+    """Write plain values to a JSON file atomically, and return its path."""
     write_atomically(path, json_text(values))
     return path
 
 
 def make_folder(folder: Path) -> None:
-    """Create the folder of `--out` before any long work.
+    """Create the folder of `--out`, so that a wrong path fails before any long computation.
 
     Raises:
-        InputError: It cannot be.
+        InputError: The folder cannot be created.
     """
     with user_can_write(f"--out {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
 
 
 def require_new_place(folder: Path) -> None:
-    """Refuse a folder that is not empty or could not be made, before any long work.
+    """Check that an output folder is new or empty and can be written, before any long computation.
 
     Raises:
-        InputError: It is one of these.
+        InputError: The folder is not empty or cannot be created.
     """
     require_new_folder(folder)
     with user_can_write(folder):
@@ -321,26 +332,27 @@ def require_new_place(folder: Path) -> None:
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parse a command line; `key=value` may be anywhere after a command that takes it.
+    """Parse a command line in which `key=value` may be at any position after a command that accepts overrides.
 
-    argparse does not accept such words after an option, and treats them as unknown arguments.
+    argparse itself reports such words as unknown arguments if they follow an option.
     """
     options, rest = parser.parse_known_args(arguments)
-    parser, others = options.parser, [word for word in rest if "=" not in word or _OPTION.match(word)]
+    parser, no_overrides = options.parser, [word for word in rest if "=" not in word or _OPTION.match(word)]
     takes_keys = hasattr(options, "overrides")
-    if any(map(_OPTION.match, others)) or (rest and not takes_keys):
-        unknown = others if takes_keys else rest
+    if any(map(_OPTION.match, no_overrides)) or (rest and not takes_keys):
+        unknown = no_overrides if takes_keys else rest
         text = f"unrecognized arguments: {' '.join(unknown)}. {did_you_mean(unknown[0], parser._option_string_actions)}"
         parser.error(text.removesuffix(". ").rstrip())
-    if others and vars(options).get("subject") != "record":  # `simulate record` takes a folder there
-        parser.error(f"{' '.join(others)!r} is no key=value (numbers go in one word: 0.4,0,0.3; names side by side)")
+    if no_overrides and vars(options).get("subject") != "record":  # the argument of `simulate record` is a folder
+        words = " ".join(no_overrides)
+        parser.error(f"{words!r} is no key=value (numbers go in one word: 0.4,0,0.3; names side by side)")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
 
 
 def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:
-    """Return what reads a value of an option, of what raises a ValueError whose message continues after the value."""
+    """Convert a parser of values into one for argparse. The message of its ValueError is appended to the value."""
 
     def value(text: str) -> _Read:
         try:
@@ -357,35 +369,37 @@ def _config_path(text: str) -> str:
     return places.on_this_machine(text)
 
 
-as_config = _reader(_config_path)  # a config of this machine, or one that comes with the package
-as_local = _reader(places.on_this_machine)  # a path of this machine, in its spelling; `~` is the user's home
+as_config = _reader(_config_path)  # a local config file, or builtin:NAME
+as_local = _reader(places.on_this_machine)  # a local path as text; `~` is the user's home folder
 as_path = _reader(lambda text: Path(places.on_this_machine(text)))
-as_place = _reader(places.anywhere)  # a path of this machine, or a URL
-as_model = _reader(places.of_a_model)  # a path of this machine, or a model that comes with the package
+as_place = _reader(places.anywhere)  # a local path or a URL
+as_model = _reader(places.of_a_model)  # a local path, or builtin:NAME
 
 
 def whole_number(least: int, most: int = _MOST) -> Callable[[str], int]:
-    """Return a parser of whole numbers from `least` to `most`; by default a limit that no use reaches."""
+    """Return a parser of integers from `least` to `most`; the default of `most` is practically unlimited."""
     return _numbers(int, lambda number: least <= number <= most, f"a whole number from {least} to {most}")
 
 
 def number_between(least: float, most: float, unit: str) -> Callable[[str], float]:
     """Return a parser of numbers with a unit, strictly between the bounds."""
-    meant = f"a number of {unit} above {least:g} and below {most:g}"
-    return _numbers(float, lambda number: least < number < most, meant)
+    expected = f"a number of {unit} above {least:g} and below {most:g}"
+    return _numbers(float, lambda number: least < number < most, expected)
 
 
-def _numbers(kind: Callable[[str], _Number], fits: Callable[[_Number], bool], meant: str) -> Callable[[str], _Number]:
+def _numbers(
+    kind: Callable[[str], _Number], is_valid: Callable[[_Number], bool], expected: str
+) -> Callable[[str], _Number]:
     def read(text: str) -> _Number:
         with contextlib.suppress(ValueError):
-            if fits(number := kind(text)):
+            if is_valid(number := kind(text)):
                 return number
-        raise argparse.ArgumentTypeError(f"{text!r} is not {meant}")
+        raise argparse.ArgumentTypeError(f"{text!r} is not {expected}")
 
     return read
 
 
-count = whole_number(1)  # a number of things
+count = whole_number(1)
 
 
 def _numbers_in(text: str) -> np.ndarray:
@@ -401,10 +415,10 @@ as_numbers = _reader(_numbers_in)
 
 
 def _camera_pose(text: str) -> np.ndarray:
-    """Read the value of --extrinsics.
+    """Parse the value of --extrinsics: x, y, z in metres, then roll, pitch, yaw in radians.
 
     Raises:
-        InputError: It is no pose.
+        InputError: The numbers are not a camera pose.
     """
     from vjepa2_ac.spaces import EXTRINSICS
 
@@ -413,27 +427,33 @@ def _camera_pose(text: str) -> np.ndarray:
     return extrinsics
 
 
-# ---- commands that a command recommends at its end ----
+# ---- the command that a command recommends as the next step ----
 
 
 def option_words(options: argparse.Namespace, *names: str) -> list[str]:
-    """Return the words of a command line that give some options their present values.
+    """Return the command-line words that set options to their current values; defaults are left out.
 
     Args:
-        options: As their parser returned them.
-        names: The options to include, by their destinations.
+        options: Parsed arguments.
+        names: The `dest` names of the options to include.
     """
     words, values = list[str](), vars(options)
     for action in options.parser._actions:
         value = values.get(action.dest)
         if action.dest in names and action.option_strings and value not in (None, action.default):
-            for one in value if isinstance(value, list) else [value]:
-                words += [action.option_strings[-1], str(one)]
+            for item in value if isinstance(value, list) else [value]:
+                words += [action.option_strings[-1], str(item)]
     return words
 
 
 def quick_words(words: Sequence[str], planning: PlanningConfig, *, on_cpu: bool) -> list[str]:
-    """Return the overrides for the quick planner if a search on a CPU would be long; none if `words` set its size."""
+    """Return the overrides of the quick search if a search on a CPU would take long.
+
+    Args:
+        words: Overrides of the user. If they set the size of the search, the result is empty.
+        planning: The planning config.
+        on_cpu: Whether the model runs on a CPU; otherwise the result is empty.
+    """
     from vjepa2_ac.planning.planner import samples_of_iterations
 
     is_chosen = any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)

@@ -1,4 +1,4 @@
-"""The commands plan and goals: the next action of a robot, and goals that follow one another, of a demonstration."""
+"""The commands plan, which plans the next action of a robot, and goals, which extracts goals from a demonstration."""
 
 from __future__ import annotations
 
@@ -61,15 +61,16 @@ def add_goals(commands: cli.Commands) -> None:
 def _plan(options: argparse.Namespace) -> int:
     """Plan actions from an image and a state to a goal image.
 
-    Writes plan.json, and an image of the search. Exits with status 1 if the model gives no finite energy, or predicts
-    that the plan is worse than the zero action or than the current frame; the first line of the result then says so.
+    Writes plan.json and an image of the search. The exit status is 1 if the model returns no finite energy, or predicts
+    that the plan is worse than the zero action or than the current frame. The first line of the output then states
+    this.
     """
     from vjepa2_ac.data.sources.indexed_source import measured_space
     from vjepa2_ac.planning.goals import require_ends
 
     state = options.state
     config = cli.require_to_plan(options)
-    measured_space(config.data, len(state)).require_state(state, "--state")  # how wide, only the model knows
+    measured_space(config.data, len(state)).require_state(state, "--state")  # the model checks the width later
     cli.make_folder(options.out)
     goals = _goals_of(options, config)
     require_ends(goals, first=1)
@@ -91,21 +92,21 @@ def _plan(options: argparse.Namespace) -> int:
         reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
         controller = Controller.of_subject(session, seed=options.seed, extrinsics=options.extrinsics)
         controller.planner.progress = reporter.task("planning", "action sequences")
-        found = decide(controller, request, nodes=options.nodes, reporter=reporter)
+        result = decide(controller, request, nodes=options.nodes, reporter=reporter)
     names = options.goal or [str(options.goals or options.goal_from)]
     about = session.as_dict() | {"start": options.start, "goals": names, "mask": options.mask}
     about["decoder"] = None if decoder is None else decoder.as_dict()
-    imagined = None if decoder is None else imagine_plan(found, decoder)
+    predicted_frames = None if decoder is None else imagine_plan(result, decoder)
     with user_can_write(options.out):
-        file = write_plan(found, about, options.out / PLAN_FILE)
-        image = plot_plan(found, options.out / PLAN_IMAGE, imagined)
-    words = textwrap.fill(summarize(found), _COLUMNS)
-    cli.show(*found.worse_than.values(), plan_table(found), words, files=[file, image])
-    return int(found.decision.why == "no finite energy" or bool(found.worse_than))
+        file = write_plan(result, about, options.out / PLAN_FILE)
+        image = plot_plan(result, options.out / PLAN_IMAGE, predicted_frames)
+    summary = textwrap.fill(summarize(result), _COLUMNS)
+    cli.show(*result.worse_than.values(), plan_table(result), summary, files=[file, image])
+    return int(result.decision.why == "no finite energy" or bool(result.worse_than))
 
 
 def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
-    """Return what a search predicts, and on a CPU what is quicker."""
+    """Return a line with the size of the search, and on a CPU the overrides of a faster search."""
     from vjepa2_ac.planning.planner import samples_of_iterations
 
     sequences, steps = counted(sum(samples_of_iterations(config)), "action sequence"), counted(config.horizon, "step")
@@ -116,7 +117,7 @@ def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
 
 
 def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return start and mask; refuse what does not fit the goal, before a model is loaded."""
+    """Read the start image and the mask, and check that they fit the goal image, before a model is loaded."""
     from vjepa2_ac.media.images import read_image, require_image, require_mask
 
     start = read_image(options.start)
@@ -128,7 +129,7 @@ def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _goals_of(options: argparse.Namespace, config: Config) -> tuple[SubGoal, ...]:
-    """Return the goals of a folder; or images that share the horizon equally."""
+    """Return the goals: from a folder, from an episode, or from images that divide the horizon equally."""
     from vjepa2_ac.media.images import read_image, require_image
     from vjepa2_ac.planning.goals import equal_durations, read_goal_folder, timed
 
@@ -145,10 +146,10 @@ def _goals_of(options: argparse.Namespace, config: Config) -> tuple[SubGoal, ...
 
 
 def _goals(options: argparse.Namespace) -> None:
-    """Make goals that follow one another, from a demonstration.
+    """Extract a sequence of goals from a demonstration.
 
-    The goals are key frames of an episode, with durations and gripper modes, in a folder that `plan --goals`
-    and `serve --goals` take, with a contact sheet.
+    The goals are key frames of an episode, with durations and gripper modes. They are written with a contact sheet to a
+    folder that `plan --goals` and `serve --goals` read.
     """
     from vjepa2_ac.data.windows import require_stride
 

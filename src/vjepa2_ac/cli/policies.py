@@ -1,4 +1,4 @@
-"""The commands score, prior and monitor: a policy's actions judged, actions proposed, and a robot watched."""
+"""The commands score (rank policies), prior (train an action prior) and monitor (detect anomalies)."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def add_monitor(commands: cli.Commands) -> None:
 def _score(options: argparse.Namespace) -> int:
     """Rank policies by the energy of their actions at held-out frames.
 
-    A chunk of actions is better than another if the model predicts that it leads nearer to the goal. Exits with status
-    1 if the model ranks true actions no better than chance.
+    An action chunk is better than another if the model predicts an outcome closer to the goal. The exit status is 1 if
+    the model ranks true actions no better than chance.
     """
     cli.require_to_plan(options)
 
@@ -64,7 +64,7 @@ def _score(options: argparse.Namespace) -> int:
     session = cli.load_planning_session(options)
     require_frames(session.config.data, to="score policies at")
     with cli.reporter() as reporter:
-        found = score_policies(
+        scores = score_policies(
             Controller.of_subject(session, extrinsics=options.extrinsics),
             cli.open_data(session.config, reporter),
             policies,
@@ -72,23 +72,23 @@ def _score(options: argparse.Namespace) -> int:
             control_steps=options.control_steps,
             progress=reporter.task("scoring", "places"),
         )
-    share = f"{found.others_below_true:.0%} of the actions of other places"
+    share = f"{scores.others_below_true:.0%} of the actions of other places"
     notes = [f"{share} have a lower energy than the true ones (chance {CHANCE:.0%})."]
-    if found.is_blind:
+    if scores.is_blind:
         notes.append("No order: the model cannot tell actions apart on these data, and these energies mean nothing.")
-    if found.left_out:
-        notes.append(f"Left out: {counted(found.left_out, 'frame')} whose episode ends before the goal.")
+    if scores.left_out:
+        notes.append(f"Left out: {counted(scores.left_out, 'frame')} whose episode ends before the goal.")
     about = session.as_dict() | {"policies": [str(file) for file in options.policies], "form": options.form}
-    cli.show(scores_table(found), *notes, files=[cli.write_json(options.out, about | found.as_dict())])
-    return int(found.is_blind)
+    cli.show(scores_table(scores), *notes, files=[cli.write_json(options.out, about | scores.as_dict())])
+    return int(scores.is_blind)
 
 
 def _monitor(options: argparse.Namespace) -> int:
-    """Notice when reality departs from what the model predicts.
+    """Detect frames that deviate from the model's predictions.
 
-    Each frame of an episode is predicted from the one before it. What held-out episodes show, where nothing was wrong,
-    gives the threshold; `planning.monitor` takes the file, and `serve` tells alarms. Status 1 where a watched episode
-    has one.
+    Each frame of an episode is predicted from the previous one. The threshold is calibrated on held-out episodes
+    without disturbances. With `planning.monitor=FILE`, `serve` reports alarms. The exit status is 1 if a watched
+    episode has an alarm.
     """
     if (views := cli.require_to_plan(options).planning.views) > 1:
         needed, fix = "1: a monitor is made with one camera", "Add planning.views=1"
@@ -109,8 +109,8 @@ def _monitor(options: argparse.Namespace) -> int:
     model, files = session.world_model, []
     with cli.reporter() as reporter:
         dataset = cli.open_data(session.config, reporter)
-        seen = dataset if data is None else cli.open_data(data, reporter)
-        wanted = [find_episode(seen, one) for one in options.episode]
+        watched_data = dataset if data is None else cli.open_data(data, reporter)
+        episodes = [find_episode(watched_data, name) for name in options.episode]
         if options.threshold is None:
             progress = reporter.task("held-out episodes", "episodes")
             monitor = calibrate_monitor(model, dataset, options.false_alarms, progress)
@@ -119,19 +119,20 @@ def _monitor(options: argparse.Namespace) -> int:
             monitor = Monitor.read(
                 options.threshold, model.fingerprints(), tokens=model.num_tokens, where="--threshold"
             )
-        watched = list(watch_episodes(model, seen, wanted, reporter.task("watching", "episodes")))
-    of = f"{counted(len(monitor.scores), 'held-out episode')} of up to {counted(monitor.steps, 'model step')}"
-    note = f"An alarm is a surprise above {monitor.threshold:.4g}, calibrated on {of}. At most"
+        watched = list(watch_episodes(model, watched_data, episodes, reporter.task("watching", "episodes")))
+    source = f"{counted(len(monitor.scores), 'held-out episode')} of up to {counted(monitor.steps, 'model step')}"
+    note = f"An alarm is a surprise above {monitor.threshold:.4g}, calibrated on {source}. At most"
     note += f" {monitor.false_alarms:.1%} of undisturbed episodes have an alarm."
     cli.show(*([watched_table(watched, monitor)] if watched else []), note, files=files)
-    return int(any(one.first_alarm(monitor) is not None for one in watched))
+    return int(any(episode.first_alarm(monitor) is not None for episode in watched))
 
 
 def _prior(options: argparse.Namespace) -> None:
-    """Train what proposes actions to the planner, in minutes.
+    """Train an action prior, which proposes actions to the planner.
 
-    It learns from the demonstrations of a run which action leads from one image to another. Searches then start from
-    it (planning.prior=FOLDER) and need fewer samples, or none (planning.planner=prior).
+    The prior learns from demonstrations which action leads from one image to another. With planning.prior=FOLDER
+    searches start from its proposals and need fewer samples; with planning.planner=prior they need none. Training takes
+    minutes.
     """
     run = is_run(options.subject)
     file = Path(options.subject) / CONFIG if run else options.subject
@@ -143,11 +144,10 @@ def _prior(options: argparse.Namespace) -> None:
     with cli.reporter() as reporter:
         card = train_prior(config, folder, cli.record_of_options(PriorOptions, options), reporter)
     text = "Error on held-out clips: not measured; it needs a test split."
-    if found := card.held_out:
-        true, others = (found[name]["value"] for name in ("true_goals", "goals_of_others"))
-        text = (
-            f"Error on held-out clips relative to the zero action: {true:.2f}; with goals of other clips {others:.2f}."
-        )
-        text += " The prior ignores the goal." if others <= true else ""
+    if errors := card.held_out:
+        true, shuffled = (errors[name]["value"] for name in ("true_goals", "goals_of_others"))
+        text = f"Error on held-out clips relative to the zero action: {true:.2f};"
+        text += f" with goals of other clips {shuffled:.2f}."
+        text += " The prior ignores the goal." if shuffled <= true else ""
     cli.show(text)
     cli.show(f"The prior is in {folder}. Plan with it: {shlex.quote(f'planning.prior={folder}')} planning.samples=100")

@@ -20,17 +20,18 @@ from vjepa2_ac.process import EXIT_STATUS, StoppedError, is_first, tidy_end
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return its status.
+    """Run a command and return its exit status.
 
-    0 done, 1 a check failed, 2 an input cannot be used, 75 a training run was asked to stop and can be resumed,
-    130 interrupted. A reader that closes early, as `head` does, changes nothing; a full disk for the output is an
-    error, in the end.
+    0: done. 1: a check failed. 2: an input cannot be used. 75: a training run was stopped by a signal and can be
+    resumed. 130: interrupted. If the reader of the output closes early, as `head` does, the status does not change. If
+    the output could not be written, for example to a full disk, an error is printed at the end.
     """
-    # OpenMP reads it when PyTorch is imported: a waiting thread sleeps after about 20 microseconds, not milliseconds.
-    # Until then it holds its core: two trainings on the same cores were ten times slower (commit 0d046757).
+    # OpenMP reads this spin count when PyTorch is imported. With it an idle thread sleeps after about 20 microseconds
+    # instead of milliseconds. A spinning thread occupies its core: with the default, two trainings on the same cores
+    # were ten times slower (commit 0d046757).
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-    atexit.register(gc.freeze)  # PyTorch's half a million objects are not searched for garbage when the program ends
-    with process.own_streams() as lost, _our_warnings(), tidy_end():
+    atexit.register(gc.freeze)  # skips the garbage collection of PyTorch's 500,000 objects when the program exits
+    with process.own_streams() as lost, _print_package_warnings(), tidy_end():
         status = _run(arguments)
         if problem := lost():
             _complain(f"standard output: cannot be written ({problem}): some output is missing")
@@ -51,13 +52,13 @@ def _run(arguments: Sequence[str] | None) -> int:
             name_plugins(options.plugin)
         with watch_silence():
             return handler(options) or 0
-    except ModuleNotFoundError as error:  # most of those of extras are errors of their own
+    except ModuleNotFoundError as error:  # most missing libraries of extras already raise a UserError
         library = (error.name or "vjepa2_ac").partition(".")[0]
         if library == "vjepa2_ac":
             raise
         _complain(f"{library}: it is not installed. Run {pip_install(extra_of(library))}")
         return 2
-    except (UserError, OSError, MemoryError, RuntimeError) as error:  # a full disk, a path that is no path
+    except (UserError, OSError, MemoryError, RuntimeError) as error:  # OSError: for example a full disk
         if isinstance(error, RuntimeError) and not is_out_of_memory(error):
             raise
         if not getattr(error, "is_told", False):
@@ -73,7 +74,11 @@ def _run(arguments: Sequence[str] | None) -> int:
 
 
 def _require_working_directory() -> None:
-    """Check that the working directory exists: relative paths and libraries of PyTorch need it."""
+    """Check that the working directory exists. Relative paths need it, and so does the import of PyTorch's libraries.
+
+    Raises:
+        InputError: It was deleted or unmounted.
+    """
     try:
         Path.cwd()
     except OSError:
@@ -91,15 +96,15 @@ class _Warning(logging.Formatter):
 
 
 @contextlib.contextmanager
-def _our_warnings() -> Iterator[None]:
-    """Print warnings of this program, as long as the context lasts; those of libraries are left to them."""
-    ours, handler = logging.getLogger("vjepa2_ac"), logging.StreamHandler()
+def _print_package_warnings() -> Iterator[None]:
+    """Print the log warnings of this package to stderr within the context. Loggers of libraries are not changed."""
+    logger, handler = logging.getLogger("vjepa2_ac"), logging.StreamHandler()
     handler.setFormatter(_Warning())
-    ours.addHandler(handler)
+    logger.addHandler(handler)
     try:
         yield
     finally:
-        ours.removeHandler(handler)
+        logger.removeHandler(handler)
 
 
 def _parser() -> Parser:

@@ -1,4 +1,4 @@
-"""Console output of a run: progress, tables and numbers; plain lines where there is no terminal."""
+"""Console output: progress bars, tables and messages; without a terminal, plain lines instead of bars."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from vjepa2_ac.errors import printable
 from vjepa2_ac.reporter import Reporter
 
 _FIRST_LINE_S, _LINE_EVERY_S = 4.0, 10.0
-_WIDE = 120  # columns that leave room for a long bar
-_BESIDE_A_CELL = 3  # a line and two spaces
-_WHOLE = 16  # characters: a longer word of a table, such as a path, may be divided
+_WIDE = 120  # columns; at least this width shows a long bar
+_BESIDE_A_CELL = 3  # columns between two cells: a border and two spaces
+_WHOLE = 16  # characters; a longer word in a table, such as a path, may be split over lines
 _LONGEST_LINE = 100  # columns
 _COMMAND = r"(Next: )?(?<![\w/.-])(vjepa2-ac |(\S+ -m )?pip install )((?!   #).)*"
 _IN_ONE_PIECE = re.compile(rf"^ +|`[^`\n]*`|{_COMMAND}|(?<=\d) %", re.MULTILINE)
-_SPACE = "\ue000"  # in place of a space at which no line is broken
+_SPACE = "\ue000"  # stands for a non-breaking space
 
 
 def wrapped(text: str) -> str:
-    """Return a text in lines of at most 100 columns; a command, which may be pasted, stays on one line.
+    """Wrap a text to lines of at most 100 columns. A shell command stays on one line, so that it can be copied.
 
-    Further lines begin where the last column of the first one does: columns are two or more spaces apart.
+    If a line has columns, which are separated by two or more spaces, continuation lines are indented to the last one.
     """
     width, lines = min(_LONGEST_LINE, console.width), []
-    for line in _IN_ONE_PIECE.sub(lambda found: found[0].replace(" ", _SPACE), text).split("\n"):
+    for line in _IN_ONE_PIECE.sub(lambda match: match[0].replace(" ", _SPACE), text).split("\n"):
         columns = re.match(r"(.{0,38} {2,})?", line.replace(_SPACE, " "))[0]  # type: ignore[index]  # always matches
         indent = " " * (len(columns) if columns.strip() else len(columns) + 2)
         style = textwrap.TextWrapper(width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
         first, *more = style.wrap(line) if len(line) > width else [line]
-        # A word that is too long for the last column, such as a path, stays on the line of the other columns.
+        # A word that is longer than the last column, such as a path, stays on the line of the other columns.
         if more and first.replace(_SPACE, " ") == columns.rstrip():
             first, more = f"{columns}{more[0].lstrip()}", more[1:]
         lines += [first, *more]
@@ -49,44 +49,44 @@ def wrapped(text: str) -> str:
 
 
 class PlainConsole(Console):
-    """Shows every text literally: brackets, colons or control characters of a name or path have no meaning.
+    """A rich console that prints strings literally: brackets, colons and control characters in names have no effect.
 
-    Coloured text is a `rich.text.Text`.
+    To print coloured text, pass a `rich.text.Text`.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, soft_wrap=True, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Return the literal form of a text: of a line, a cell, a title."""
+        """Return a line, cell or title as literal text, with control characters escaped."""
         return super().render_str(printable(text), **options)
 
 
 class MetricsTable(Table):
-    """A table that does not cut numbers and words: if the terminal is narrow, cells are wrapped at their spaces.
+    """A table that does not truncate numbers and words: in a narrow terminal, cells are wrapped at spaces.
 
-    A cell may not squeeze the others, however long it is.
+    A long cell does not make the other columns narrower than their words.
 
     Args:
-        title: Above the table.
-        columns: Their names.
-        labelled: Whether the first column has labels, on the left; numbers are on the right.
+        title: Printed above the table.
+        columns: Column names.
+        labelled: Whether the first column contains labels, which are left-aligned. Numbers are right-aligned.
     """
 
     def __init__(self, title: str, columns: Sequence[str], *, labelled: bool = True) -> None:
         super().__init__(title=title, title_justify="left", caption_justify="left")
-        for place, name in enumerate(columns):
-            self.add_column(name, justify="left" if labelled and place == 0 else "right", overflow="fold")
+        for index, name in enumerate(columns):
+            self.add_column(name, justify="left" if labelled and index == 0 else "right", overflow="fold")
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Any]:
-        """Yield what is shown. The widest columns give way first, down to their longest word that stays whole."""
+        """Render the table. The widest columns are narrowed first, at least to their longest unsplit word."""
         texts = [[str(text) for text in (column.header, *column.cells)] for column in self.columns]
         words = [[cell_len(word) for text in of_column for word in text.split()] for of_column in texts]
         least = [max((size for size in sizes if size <= _WHOLE), default=1) for sizes in words]
         widths = [max(map(cell_len, of_column), default=1) for of_column in texts]
-        room = options.max_width - len(widths) * _BESIDE_A_CELL - 1
-        while sum(widths) > room and (giving := [n for n, width in enumerate(widths) if width > least[n]]):
-            widths[max(giving, key=lambda n: widths[n])] -= 1
+        available = options.max_width - len(widths) * _BESIDE_A_CELL - 1
+        while sum(widths) > available and (reducible := [n for n, width in enumerate(widths) if width > least[n]]):
+            widths[max(reducible, key=lambda n: widths[n])] -= 1
         for column, width in zip(self.columns, widths, strict=True):
             column.width = width
         yield from super().__rich_console__(console, options)
@@ -94,19 +94,19 @@ class MetricsTable(Table):
 
 console = PlainConsole()
 if not console.is_terminal:
-    console.width = 120  # a log file has room
+    console.width = 120  # a log file is not limited to 80 columns
 
 
 def show(*parts: str | Table, files: Iterable[str | Path] = ()) -> None:
-    """Print texts and tables one below another, and the files that were written."""
-    for part in (*(wrapped(one) if isinstance(one, str) else one for one in parts), *(f"  {file}" for file in files)):
+    """Print texts and tables, then one line for each written file."""
+    for part in (*(wrapped(item) if isinstance(item, str) else item for item in parts), *(f"  {f}" for f in files)):
         console.print(part)
 
 
 class ProgressBar:
-    """The progress of a task: a bar with a short text in a terminal, a line every few seconds elsewhere.
+    """Progress display of a task: a bar with a short text in a terminal, otherwise a line every few seconds.
 
-    It begins at the first call: nothing is shown of work that is done at once.
+    It appears at the first call, so a task that finishes immediately shows nothing.
     """
 
     def __init__(self, title: str, unit: str = "") -> None:
@@ -115,7 +115,7 @@ class ProgressBar:
         self._bar: Progress | None = None
 
     def __call__(self, done: int, total: int, words: str = "") -> None:
-        """Show that `done` of `total` are done; another total begins another bar."""
+        """Show that `done` of `total` units are done; a different `total` starts a new bar."""
         if total != self._total:
             self._open(done, total)
         now = time.monotonic()
@@ -133,7 +133,7 @@ class ProgressBar:
             Work.begin(f"finishing {self.title}")
 
     def close(self) -> None:
-        """Restore the terminal."""
+        """Remove the bar and restore the terminal."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
@@ -157,7 +157,7 @@ class ProgressBar:
         self._bar.start()
 
     def _left(self, done: int, now: float) -> str:
-        """Return as text the time left at the average speed so far."""
+        """Return the estimated time left as text, from the average speed so far; empty if unknown."""
         advanced, remaining = done - self._first, self._total - done
         if advanced <= 0 or remaining <= 0:
             return ""
@@ -165,7 +165,7 @@ class ProgressBar:
 
 
 class ConsoleReporter(Reporter):
-    """Shows messages, and one task after another as a bar; at the end of its `with` block the terminal is restored."""
+    """Prints messages, and shows one task at a time as a bar. Leaving its `with` block restores the terminal."""
 
     def __init__(self) -> None:
         self._bar = ProgressBar("")
@@ -175,7 +175,7 @@ class ConsoleReporter(Reporter):
         console.print(wrapped(text))
 
     def task(self, title: str, unit: str = "") -> ProgressBar:
-        """Begin another task; return its bar."""
+        """Start a task, which ends the previous one, and return its progress bar."""
         self._bar.close()
         self._bar = ProgressBar(title, unit)
         Work.begin(title)

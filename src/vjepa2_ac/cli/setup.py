@@ -1,4 +1,4 @@
-"""The commands around a run: init, config, download, doctor and demo."""
+"""The commands init, config, download, doctor and demo."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _SIMULATED = "demo/data"
 _KNOWN = {"droid": "gs://gresearch/robotics/droid/1.0.1", "sim": _SIMULATED}
 _TRIAL_STEPS = 100
-_LEAST_SHOWN = 500_000  # bytes: less would be shown as 0.000 GB
+_LEAST_SHOWN = 500_000  # bytes; smaller parts would be printed as 0.000 GB
 _UNTESTED = (
     "Estimated with fake tensors. On an H100 the estimate for training from frames was within 1 % of the peak that"
     " PyTorch measured. For training from cached latents it was not compared after its last change. The CUDA allowance"
@@ -82,8 +82,8 @@ def add_demo(commands: cli.Commands) -> None:
 def _init(options: argparse.Namespace) -> int:
     """Write a commented config for your data and this machine.
 
-    Guesses are marked, the data are looked at as `data check` does (exit status as of that), and the next commands are
-    printed.
+    Uncertain values are marked GUESSED. The data are then checked as by `data check`, with the same exit status, and
+    the next commands are printed.
     """
     path, is_scratch = _KNOWN.get(options.path, options.path), options.scratch
     name = "scratch-" * is_scratch + ("sim" if path == _SIMULATED else _name_of(path))
@@ -101,18 +101,18 @@ def _init(options: argparse.Namespace) -> int:
         (find_encoder_path if is_scratch else find_base)(options.model)
     Work.begin("looking at the data")
     is_missing = path == _SIMULATED and not Path(path).exists()
-    found = simulated(path) if is_missing else look_at(path)
+    data = simulated(path) if is_missing else look_at(path)
 
     from vjepa2_ac.init.draft import TINY, choose_model, make_draft, this_machine
     from vjepa2_ac.init.found import guesses
 
     with cli.reporter() as reporter:
-        found = found if is_missing else measured(found, reporter.task(INDEXING))
+        data = data if is_missing else measured(data, reporter.task(INDEXING))
     model, machine = choose_model(options.model or (TINY if path == _SIMULATED else None), is_scratch), this_machine()
-    cli.show(f"Data: {'; '.join(found.about)}.\nMachine: {machine.about}.")
-    draft = make_draft(found, machine, model, run_dir=f"runs/{name}")
+    cli.show(f"Data: {'; '.join(data.about)}.\nMachine: {machine.about}.")
+    draft = make_draft(data, machine, model, run_dir=f"runs/{name}")
     with user_can_write(f"--out {out}"):
-        write_atomically(out, draft.text(found, machine).encode())
+        write_atomically(out, draft.text(data, machine).encode())
     guessed = [f"  GUESSED  {key} = {value_and_why}" for key, value_and_why in guesses(draft.knobs).items()]
     cli.show(*draft.costs, f"Written: {out}", *guessed)
     status = 0 if is_missing else _check(draft, out)
@@ -126,13 +126,13 @@ def _init(options: argparse.Namespace) -> int:
 
 
 def _name_of(path: str) -> str:
-    """Return a name for the config and the run: of the last folder that is not a version."""
+    """Return a name for the config and the run: the last part of the path that is not a version number."""
     parts = [re.sub(r"\W+", "-", part).strip("-") for part in path.split("/") if not re.fullmatch(r"[\d.v]*", part)]
     return next((part for part in reversed(parts) if part), "own")
 
 
 def _check(draft: Draft, out: Path) -> int:
-    """Run `data check` on the config; a reason why it cannot be is printed, and the config stays."""
+    """Run `data check` on the new config and return its exit status. An error is printed, and the config is kept."""
     from vjepa2_ac.cli.data import check_and_print
 
     cli.show(f"\n$ {shell_command('data', 'check', out)}")
@@ -144,7 +144,7 @@ def _check(draft: Draft, out: Path) -> int:
 
 
 def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
-    """Return the commands from a trial to the real run, and what each is for."""
+    """Return the next commands, from a trial to the full run, each with its purpose."""
     trial, steps = f"runs/{name}-trial", draft.config.training.steps
     short = (f"training.steps={_TRIAL_STEPS}", "validation.every=50", "checkpoint.every=50")
     return [
@@ -159,13 +159,13 @@ def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
 
 
 def _config(options: argparse.Namespace) -> None:
-    """Show the configs of the package, and every key with its range.
+    """Show the configs of the package, or all config keys.
 
-    What is shown:
-      list    the configs that come with the package
-      text    one of them with its comments, to begin a config of your own with
-      show    a config with every default
-      schema  every key with its range, as JSON schema
+    Choices:
+      list    the configs that are included in the package
+      text    one of them with its comments, as a template for your config
+      show    a config with all defaults
+      schema  all keys with their types and ranges, as JSON schema
     """
     what, of_one = options.what, options.what in {"show", "text"}
     if of_one != (options.config is not None):
@@ -183,16 +183,17 @@ def _config(options: argparse.Namespace) -> None:
 
 
 def _download(options: argparse.Namespace) -> None:
-    """Fetch Meta's world model, or an encoder of V-JEPA 2 or 2.1.
+    """Download Meta's world model, or an encoder of V-JEPA 2 or 2.1.
 
-    It goes on where it stopped; its size is checked.
+    An interrupted download is resumed by the same command. The size of the file is checked.
     """
     from vjepa2_ac.model.model_files import OFFICIAL, PUBLISHED, download, find_published
 
     if options.list:
-        for one in PUBLISHED:
-            encoder = f"{one.encoder.name} ({one.encoder.parameters / 1e6:,.0f} M), {one.image_size} px, key {one.key}"
-            cli.show(f"{one.name:<22}{one.holds}, {encoder}, {one.size}, {one.licence}")
+        for model in PUBLISHED:
+            parameters = f"{model.encoder.parameters / 1e6:,.0f} M"
+            encoder = f"{model.encoder.name} ({parameters}), {model.image_size} px, key {model.key}"
+            cli.show(f"{model.name:<22}{model.holds}, {encoder}, {model.size}, {model.licence}")
         cli.show("The licence is that of Meta's repository. `download` checks the size: Meta publishes no hashes.")
         return
     known = find_published(options.name or OFFICIAL)
@@ -207,10 +208,11 @@ def _download(options: argparse.Namespace) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    """Say whether a run fits this GPU, or what this machine is.
+    """Estimate whether a run fits on this GPU, or describe this machine.
 
-    The memory is estimated part by part, with a training step on fake tensors: no weights are loaded. Exit status 0: it
-    fits, 1: it does not, 2: something cannot be used.
+    With a config, the GPU memory is estimated part by part with a training step on fake tensors; no weights are loaded.
+    Without a config, versions and hardware are printed. Exit status 0: the run fits. 1: it does not fit. 2: an input
+    cannot be used.
     """
     if options.config is None:
         for line in _report_lines():
@@ -237,7 +239,7 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _memory_lines(estimate: MemoryEstimate) -> list[str]:
-    """Return one line for every part of at least 0.001 GB, then both totals."""
+    """Return one line for each memory part of at least 0.0005 GB, then the peaks without and with checkpointing."""
     weights = estimate.parameters
     counts = f"encoder {weights.encoder:,}, predictor {weights.predictor:,}, trained {weights.trained:,}"
     lines = [f"Parameters: {counts}", "Estimated GPU memory, part by part (not all parts are needed at once):"]
@@ -251,25 +253,25 @@ def _memory_lines(estimate: MemoryEstimate) -> list[str]:
 
 
 def _verdict(needed: int, available: int, gpu: str | None, overrides: list[str] | None) -> str:
-    """Return whether the run fits, or what to change.
+    """Return a sentence that states whether the run fits, and otherwise which keys to change.
 
     Args:
-        needed: Bytes at the peak.
-        available: Bytes of the GPU.
-        gpu: Its name; None: there is none on this machine.
-        overrides: Changes that make it fit, or None if none do.
+        needed: Estimated peak memory in bytes.
+        available: Memory of the GPU in bytes.
+        gpu: Name of the GPU; None: this machine has none.
+        overrides: `key=value` changes with which the run fits; None: there are none.
     """
-    fits, size, room = needed <= available, f"{needed / 1e9:.1f} GB", f"{available / 1e9:.1f} GB"
-    text = f"{'Fits' if fits else 'Does not fit'}: the estimated peak is {size}; {gpu or 'a usual GPU'} has {room}."
+    fits, size, capacity = needed <= available, f"{needed / 1e9:.1f} GB", f"{available / 1e9:.1f} GB"
+    text = f"{'Fits' if fits else 'Does not fit'}: the estimated peak is {size}; {gpu or 'a usual GPU'} has {capacity}."
     if not fits:
         text += f" It fits with {', '.join(overrides)}." if overrides else " It needs a larger GPU or a smaller model."
     return text if gpu else f"{text}\nThis machine: not measured; it needs a GPU, PyTorch finds none."
 
 
 def _report_lines() -> Iterator[str]:
-    """Yield what a bug report needs of this machine: versions, CPU, GPU, settings; no secret, no path.
+    """Yield lines for a bug report: versions, CPU, GPU and environment variables, without secrets and paths.
 
-    PyTorch comes last, because its import may fail; the last line says what this machine can run.
+    PyTorch is imported last, because the import may fail. The last line states what this machine can run.
     """
     root = Path(__file__).parents[3]
     commit = _output(f"git -C {shlex.quote(str(root))} describe --always --dirty") if (root / ".git").exists() else ""
@@ -277,8 +279,8 @@ def _report_lines() -> Iterator[str]:
     yield f"Python {platform.python_version()}, {platform.platform()}"
     name = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"))
     yield f"CPU: {name[1] if name else platform.machine()}, {counted(os.cpu_count() or 1, 'core')}"
-    asked = [line for line in requires("vjepa2-ac") or [] if not re.search("extra == .(data|dev|docs)", line)]
-    yield f"Libraries: {', '.join(dict.fromkeys(_with_version(line) for line in asked))}"
+    libraries = [line for line in requires("vjepa2-ac") or [] if not re.search("extra == .(data|dev|docs)", line)]
+    yield f"Libraries: {', '.join(dict.fromkeys(_with_version(line) for line in libraries))}"
     for key, value in sorted(os.environ.items()):
         if _SETTINGS.fullmatch(key):
             yield f"{key}={'(a path)' if '/' in value else value}"
@@ -298,8 +300,8 @@ def _report_lines() -> Iterator[str]:
 
 
 def _output(command: str) -> str:
-    """Return what a program prints; nothing where it is not there."""
-    return subprocess.getoutput(f"{command} 2>/dev/null")  # noqa: S605 - our own words
+    """Return the standard output of a shell command; empty if the program is not installed."""
+    return subprocess.getoutput(f"{command} 2>/dev/null")  # noqa: S605 - the command is a constant of this file
 
 
 def _with_version(requirement: str) -> str:
@@ -310,19 +312,20 @@ def _with_version(requirement: str) -> str:
         return f"{name} (not installed)"
 
 
-_CLIP = "--episode B_seed5_00h39_000039 --start 5"  # held out; the arm is low, with room to move in the image
+_CLIP = "--episode B_seed5_00h39_000039 --start 5"  # a held-out clip in which the arm can move within the image
 
 
 def _demo(_options: argparse.Namespace) -> int:
-    """See all of it on a simulated arm: record, train, judge, film.
+    """Run the whole workflow on a simulated arm, in about 5 minutes.
 
-    A tiny world model is trained with LoRA. All of it is in the folder demo, in 4 to 6 minutes on 2 cores, without a
-    download. Run the same command again to resume.
+    The command records data, fine-tunes a tiny world model with LoRA, trains a decoder, makes a video of predicted
+    frames and evaluates the run. It needs 4 to 6 minutes on 2 CPU cores and no download. All files are written to the
+    folder demo. Run the same command again to resume.
     """
     from vjepa2_ac.simulation.domains import load_mujoco
 
     load_mujoco()
-    Work.begin("")  # each command shows its own
+    Work.begin("")  # each command prints its own progress
     commands = [
         _RECORD.format(path=_SIMULATED),
         f"train {BUILTIN}demo",
@@ -333,6 +336,6 @@ def _demo(_options: argparse.Namespace) -> int:
     for words in commands[Path(_SIMULATED).exists() :]:
         print(f"$ vjepa2-ac {words}", flush=True)
         program = [sys.executable, "-P", "-m", "vjepa2_ac.cli", *shlex.split(words)]
-        if status := subprocess.call(program):  # noqa: S603 - our own command
+        if status := subprocess.call(program):  # noqa: S603 - the command is a constant of this file
             return status
     return 0

@@ -1,4 +1,4 @@
-"""Tables and notes of the commands: what was measured, planned, simulated, trained and found in data; and a run."""
+"""Console tables of the commands, and the console of a training run."""
 
 from __future__ import annotations
 
@@ -29,22 +29,28 @@ if TYPE_CHECKING:
     from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
 
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red", "skipped": "cyan"}
-_USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that are not mentioned
+_USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of decisions that need no note
 _DECODERS = {"decoder": "decoder", "linear": "linear decoder", "mean_image": "mean image"}
-_MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
+_MUCH_WAITING = 0.2  # share of the step time; above it more data.workers or a local copy of the data would help
 
 
 def row_tables(rows: Sequence[Row], title: str) -> list[Table]:
-    """Return the rows that are for a screen; groups of the same columns share a table."""
+    """Return console tables of all rows that are not marked as detail; adjacent sections with equal columns share one.
+
+    Args:
+        rows: Rows of an evaluation or comparison.
+        title: Printed above the first table.
+    """
     tables: list[Table] = []
     has_intervals = any(row.estimate.has_interval for row in rows)
-    sure = "95 % interval over episodes" if has_intervals else "one episode: no interval"
-    for columns, group in groupby(sections([row for row in rows if not row.detail]), lambda one: one.columns):
-        shared = list(group)
-        with_chance = any(chance for section in shared for _, chance, _ in section.lines)
+    interval_note = "95 % interval over episodes" if has_intervals else "one episode: no interval"
+    shown = sections([row for row in rows if not row.detail])
+    for columns, group in groupby(shown, lambda section: section.columns):
+        sections_of_table = list(group)
+        with_chance = any(chance for section in sections_of_table for _, chance, _ in section.lines)
         head = ["", *(["persistence or chance"] if with_chance else []), *columns]
-        table = MetricsTable("" if tables else f"{title} ({sure})", head)
-        for section in shared:
+        table = MetricsTable("" if tables else f"{title} ({interval_note})", head)
+        for section in sections_of_table:
             table.add_section()
             table.add_row(section.title)
             for label, chance, cells in section.lines:
@@ -54,7 +60,10 @@ def row_tables(rows: Sequence[Row], title: str) -> list[Table]:
 
 
 def plan_table(answer: PlanResult) -> Table:
-    """Return a row for each model step: its action, and the state after it; of a vector a row for each number."""
+    """Return a table of a plan, with the action and the predicted state of each model step.
+
+    For poses there is one row per model step. For other states there is one row per model step and free number.
+    """
     is_pose, turns = answer.state_space.is_pose, bool(answer.actions[:, POSE.rotation].any())
     names = ["number", "changes by", "then"]
     if is_pose:
@@ -66,29 +75,29 @@ def plan_table(answer: PlanResult) -> Table:
     table = MetricsTable(title, ["step", *names], labelled=False)
     for step, (action, after) in enumerate(zip(answer.actions, answer.states[1:], strict=True), start=1):
         if is_pose:
-            way = [f"{value * 100:+.2f}" for value in action[POSE.position]]
+            motion = [f"{value * 100:+.2f}" for value in action[POSE.position]]
             turn = [" ".join(f"{value:+.1f}" for value in np.degrees(action[POSE.rotation]))] * turns
             then = " ".join(f"{value:.3f}" for value in after[POSE.position])
-            table.add_row(str(step), *way, *turn, f"{action[POSE.gripper]:+.2f}", then, f"{after[POSE.gripper]:.2f}")
+            table.add_row(str(step), *motion, *turn, f"{action[POSE.gripper]:+.2f}", then, f"{after[POSE.gripper]:.2f}")
             continue
-        for one in answer.space.free.tolist():
-            table.add_row(str(step), answer.state_space.names[one], f"{action[one]:+.4g}", f"{after[one]:.4g}")
+        for axis in answer.space.free.tolist():
+            table.add_row(str(step), answer.state_space.names[axis], f"{action[axis]:+.4g}", f"{after[axis]:.4g}")
     return table
 
 
 def goals_table(made: MadeGoals) -> Table:
-    """Return a row for each goal."""
+    """Return a table with one row per goal that was extracted from a demonstration."""
     columns = ["goal", "frame", "at least", "at most", "share", "gripper"]
     table = MetricsTable(f"Goals of {made.origin['episode']} (at least and at most: model steps)", columns)
-    for place, (key, goal) in enumerate(zip(made.keys, made.goals, strict=True)):
-        name = f"{place + 1} {goal.name}".strip()
+    for number, (key, goal) in enumerate(zip(made.keys, made.goals, strict=True), start=1):
+        name = f"{number} {goal.name}".strip()
         row = [name, str(key.frame), str(goal.at_least), "no limit" if goal.at_most is None else str(goal.at_most)]
         table.add_row(*row, "not used" if goal.share is None else f"{goal.share:g}", goal.gripper or "default")
     return table
 
 
 def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
-    """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
+    """Return a table with one row per policy of a closed-loop benchmark, with 95 % intervals over episodes."""
     trials = benchmark.trials
     table = MetricsTable(
         f"{trials.task} in {trials.place}: {counted(len(trials.trials), 'problem')} of seed {trials.about['seed']},"
@@ -109,7 +118,7 @@ def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
 
 
 def benchmark_notes(benchmark: ClosedLoopBenchmark) -> tuple[str, ...]:
-    """Return notes on unusual decisions and commands: a line each, none if all was as usual."""
+    """Return notes on unusual decisions and unreachable commands, one line each; empty if there are none."""
     notes = []
     for result in benchmark.results:
         unusual = {why: number for why, number in result.why_counts.items() if why not in _USUAL}
@@ -122,7 +131,7 @@ def benchmark_notes(benchmark: ClosedLoopBenchmark) -> tuple[str, ...]:
 
 
 def held_out_table(card: DecoderCard) -> Table:
-    """Return a table of how well the decoder shows frames of held-out episodes, beside what needs no network."""
+    """Return a table of the decoder's image quality on held-out frames, compared with the two baselines."""
     held_out = card.held_out
     table = MetricsTable(
         f"{counted(held_out['frames'], 'frame')} of {counted(held_out['episodes'], 'held-out episode')}"
@@ -147,62 +156,63 @@ def print_finding(finding: Finding) -> None:
 
 
 def variants_table(title: str, results: Sequence[VariantResult], best: VariantResult | None = None) -> Table:
-    """Return the table of `data check --model` and of `data calibrate`: a row for each variant of the same clips."""
+    """Return the table of `data check --model` and `data calibrate`, with one row per variant of the same clips."""
     columns = ["variant", "error / persistence", "difference", "error", "persistence", "episodes"]
     table = MetricsTable(f"{title} (95 % interval over episodes)", columns)
-    for one in results:
-        difference = "" if one.difference is None else str(one.difference)
-        numbers = (f"{one.error:.4f}", f"{one.persistence:.4f}", f"{one.episodes}")
-        table.add_row(f"{one.name}{' <' * (one is best)}", str(one.ratio), difference, *numbers)
+    for result in results:
+        difference = "" if result.difference is None else str(result.difference)
+        numbers = (f"{result.error:.4f}", f"{result.persistence:.4f}", f"{result.episodes}")
+        table.add_row(f"{result.name}{' <' * (result is best)}", str(result.ratio), difference, *numbers)
     return table
 
 
 def scores_table(scores: PolicyScores) -> Table:
-    """Return a row for each policy, and one for the demonstrated actions."""
+    """Return a table with one row per scored policy and one for the demonstrated actions."""
     title = f"Energy relative to the zero action, {counted(scores.places, 'frame')}"
     columns = ["policy", "all chunks", "its best", "behind the one before"]
     table = MetricsTable(f"{title} of {counted(scores.episodes, 'episode')}", columns)
-    for one in scores.policies:
-        table.add_row(one.name, str(one.mean), str(one.best), "" if one.behind is None else str(one.behind))
+    for policy in scores.policies:
+        behind = "" if policy.behind is None else str(policy.behind)
+        table.add_row(policy.name, str(policy.mean), str(policy.best), behind)
     table.add_row("demonstrated", str(scores.demonstrated), "", "")
     return table
 
 
 def watched_table(watched: Sequence[WatchedEpisode], monitor: Monitor) -> Table:
-    """Return a row for each watched episode."""
+    """Return a table of the highest surprise and the first alarm of each monitored episode."""
     table = MetricsTable("Surprise, over the threshold", ["episode", "highest", "first alarm at control step"])
-    for one in watched:
-        first, highest = one.first_alarm(monitor), one.scores(monitor.expected).max() / monitor.threshold
-        table.add_row(one.name, f"{highest:.2f}", "no alarm" if first is None else str(one.steps[first]))
+    for episode in watched:
+        first, highest = episode.first_alarm(monitor), episode.scores(monitor.expected).max() / monitor.threshold
+        table.add_row(episode.name, f"{highest:.2f}", "no alarm" if first is None else str(episode.steps[first]))
     return table
 
 
 class TrainingConsole(ConsoleReporter):
-    """Shows a training run."""
+    """Shows a training run: a progress bar, and the metrics of each validation."""
 
     def __init__(self) -> None:
         super().__init__()
         self._steps, self._validation = 0, ""
 
     def started(self, done: int, total: int) -> None:
-        """Begin the bar."""
+        """Start the progress bar at `done` of `total` optimizer steps."""
         bar, self._steps = self.task("training"), total
         if done < total:
             bar(done, total)
 
     def stepped(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Move the bar."""
+        """Update the progress bar after an optimizer step: loss, last validation, speed, time waiting for data."""
         speed = metrics["samples_per_second"]
-        words = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
+        parts = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
         if metrics.get("data_wait_share", 0.0) > _MUCH_WAITING:
-            words.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
-        self._bar(step, self._steps, "  ".join(word for word in words if word))
+            parts.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
+        self._bar(step, self._steps, "  ".join(part for part in parts if part))
 
     def validated(self, step: int, found: Validation) -> None:
-        """Print the validation's metrics; metrics.jsonl has them for every horizon."""
+        """Print the metrics of a validation; metrics.jsonl contains them for every horizon."""
         errors = found.errors
         true, zero, shuffled = (one_step_over_persistence(errors, actions).value for actions in ACTIONS)
-        rollout = [one.value for one in over_persistence(errors, "rollout")]
+        rollout = [estimate.value for estimate in over_persistence(errors, "rollout")]
         self._validation = f"one-step error {true:.3f} of persistence"
         rank = "not measured (needs validation.ranking_clips and clips in which the robot moves)"
         if found.ranking is not None:

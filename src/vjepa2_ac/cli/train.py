@@ -1,4 +1,4 @@
-"""The commands that compute once what others use: train, encode, decoder and export."""
+"""The commands train, encode, decoder and export."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ def add_export(commands: cli.Commands) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    """Train a LoRA adapter, or the whole predictor, as a config says.
+    """Train a LoRA adapter, or all weights of the predictor.
 
-    SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step, write a checkpoint, end with status 75; the same command goes
-    on from there. A second signal: end at once.
+    On SIGTERM, SIGINT, SIGUSR1 or SIGHUP: finish the current step, save a checkpoint and exit with status 75. Run the
+    same command again to resume. A second signal ends the process at once.
     """
     from vjepa2_ac.model.model_files import require_base_of_run
 
@@ -87,8 +87,8 @@ def _train(options: argparse.Namespace) -> None:
 def _encode(options: argparse.Namespace) -> None:
     """Encode all frames once, and cache the latents for training.
 
-    Those that the clips of a config need, by the frozen encoder. Stopping it costs the few episodes in progress at
-    most: the same command goes on. Several processes (torchrun) share the work.
+    The frozen encoder encodes all frames that the clips of the config need. If the command is stopped, only the few
+    episodes in progress are lost; run the same command again to resume. Several processes (torchrun) share the work.
     """
     config = cli.read_config(options.config, options.overrides, base=True)
 
@@ -117,7 +117,7 @@ def _encode(options: argparse.Namespace) -> None:
 
 
 def _as_engine(text: str) -> str:
-    """Return the address in `ray=ADDRESS`; empty in `ray`."""
+    """Parse the value of --engine: return the address in `ray=ADDRESS`, or an empty text for `ray`."""
     name, separator, address = text.partition("=")
     if name != "ray" or bool(separator) != bool(address):
         raise argparse.ArgumentTypeError(f"{text!r} is neither ray nor ray=ADDRESS")
@@ -125,11 +125,11 @@ def _as_engine(text: str) -> str:
 
 
 def _decoder(options: argparse.Namespace) -> None:
-    """Train what turns latents into images, for films.
+    """Train a decoder that converts latents into images.
 
-    It is trained on the latents of true frames, and what `imagine` and --decoder show images with. It belongs to
-    the config's encoder and camera, and serves every run on them. Stopping it costs a checkpoint's distance at
-    most: the same command goes on.
+    The decoder is trained on the latents of true frames. `imagine` and the option --decoder show predicted frames with
+    it. It depends on the encoder and the camera of the config, so all runs with these can use it. If the command is
+    stopped, run the same command again: it resumes from the last checkpoint.
     """
     config = cli.read_config(options.config, options.overrides, base=True)
 
@@ -148,7 +148,7 @@ def _decoder(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    """Write a run's model, or its adapter, for others to use."""
+    """Export the model of a run, or its adapter."""
     config = read_run_config(options.run, options.overrides)
     cli.require_subject(str(options.run), config, options.words)
 

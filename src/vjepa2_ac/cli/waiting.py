@@ -1,6 +1,7 @@
-"""A line on stderr about the current work of a command that has printed nothing for some seconds.
+"""Status lines on stderr while a command prints nothing for some seconds.
 
-A running progress bar writes all the time, so the line never appears next to it. Nothing heavy is imported.
+A running progress bar prints continuously, so the lines never interrupt it. The module imports no large library,
+because it runs while these are imported.
 """
 
 from __future__ import annotations
@@ -14,26 +15,26 @@ from collections.abc import Iterator
 from vjepa2_ac.errors import printable
 from vjepa2_ac.process import is_first, silent_s
 
-_SILENT_S = (5.0, 15.0, 60.0)  # seconds without output before the first, the second and each further line about a work
+_SILENT_S = (5.0, 15.0, 60.0)  # seconds without output before the first, second and each further line of a task
 _CHECK_S = 0.25
 
 
 class Work:
-    """What the command does now; there is one, as there is one console."""
+    """The current task of the command. Its state is global, because a process has one console."""
 
-    title = ""  # empty: nothing to report, as in a server that waits for requests
+    title = ""  # empty: print nothing, for example while a server waits for requests
     began = 0.0
-    lines = 0  # about this work, which were printed
+    lines = 0  # number of status lines printed for this task
 
     @classmethod
     def begin(cls, title: str) -> None:
-        """Set what the command does from now on; empty: nothing to report."""
+        """Set the current task; with an empty title no status lines are printed."""
         cls.title, cls.began, cls.lines = title, time.monotonic(), 0
 
 
 @contextlib.contextmanager
 def watch_silence() -> Iterator[None]:
-    """Print what the command does if it is silent for some seconds, within the context."""
+    """Print the current task whenever the command printed nothing for some seconds, within the context."""
     Work.begin("loading libraries and model")
     ended = threading.Event()
     if is_first():
