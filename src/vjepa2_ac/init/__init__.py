@@ -1,1 +1,1 @@
-"""A config for what is there: the data are looked at, the machine too, and each value has its reason beside it."""
+"""Draft a commented config for a data set and this machine (`vjepa2-ac init`)."""

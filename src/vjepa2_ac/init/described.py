@@ -1,4 +1,4 @@
-"""Data sets that describe themselves: RLDS by dataset_info.json and features.json, LeRobot by meta/info.json."""
+"""Recognise RLDS data sets (dataset_info.json, features.json) and LeRobot data sets (meta/info.json)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RANGES = "gs://openpi-assets/droid/droid_sample_ranges_v1_0_1.json"
 _DROID_EPISODES, _DROID_STEPS = 95_658, 27_600_000
 _DROID_CAMERA = "exterior_1_left"
 _DROID_FEATURE, _BRIDGE_FEATURE = "steps/observation/exterior_image_1_left", "steps/observation/state"
-_DROID_NAMES = frozenset({"droid", "droid_100", "droid_101", "r2d2_faceblur"})  # as the sets call themselves
+_DROID_NAMES = frozenset({"droid", "droid_100", "droid_101", "r2d2_faceblur"})  # names in dataset_info.json
 _BRIDGE_NAMES = frozenset({"bridge", "bridge_dataset", "bridge_orig"})
 _BRIDGE_POSE = {
     "state": Knob([_BRIDGE_FEATURE], "x, y, z, three angles, the gripper"),
@@ -39,7 +39,7 @@ _BRIDGE_POSE = {
 }
 _DROID_RATE_HZ, _BRIDGE_RATE_HZ, _UNKNOWN_RATE_HZ = 15.0, 5.0, 10.0
 _VELOCITIES = "steps/action_dict/joint_velocity"
-_SAMPLED = 24  # records or episodes whose numbers are compared with their names
+_SAMPLED = 24  # number of records or episodes whose values are read to check what the column names suggest
 _NUMBERS = ("float", "int", "uint", "bool")
 _ALL_KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")
 _PATHS = frozenset({"file_path", "episode_id", "recording_folderpath"})
@@ -50,11 +50,11 @@ class _Feature:
     kind: str  # image, text, tensor
     dtype: str = ""
     width: int = 1
-    channels: int = 0  # of an image; 0: not said
+    channels: int = 0  # of an image; 0: unknown
 
 
 def droid() -> FoundData:
-    """Return what is known of DROID 1.0.1 without a look at it."""
+    """Return the properties of DROID 1.0.1 without reading the data set."""
     published = Knob("published", "openpi's ranges; they are valid for 1.0.1 only")
     return replace(
         like_droid(DROID, _DROID_EPISODES, "DROID 1.0.1"),
@@ -65,10 +65,10 @@ def droid() -> FoundData:
 
 
 def look_at_rlds(path: str) -> FoundData:
-    """Look at an RLDS data set.
+    """Read the properties of an RLDS data set.
 
     Raises:
-        InputError: It cannot be used, or has no images or no pose that could be recognized.
+        InputError: The data set cannot be read, or has no images or no measured numbers of the robot.
     """
     shards = find_shards(path)
     features = dict(_features(path))
@@ -83,7 +83,7 @@ def look_at_rlds(path: str) -> FoundData:
     is_bridge = name in _BRIDGE_NAMES and _BRIDGE_FEATURE in features
     rate = _rate(features, is_bridge=is_bridge)
     has_velocities = _VELOCITIES in features
-    texts = [name for name, one in features.items() if one.kind == "text"]
+    texts = [name for name, feature in features.items() if feature.kind == "text"]
     columns = {
         name: Column(one.width)
         for name, one in features.items()
@@ -95,7 +95,7 @@ def look_at_rlds(path: str) -> FoundData:
         if name.startswith("episode_metadata/") and (one.kind == "text" or one.dtype.startswith(("int", "uint", "str")))
     ]
     measured = measured_columns(columns)
-    records = _sampled(shards, [*measured, *texts_of_episode])
+    records = _sample_records(shards, [*measured, *texts_of_episode])
     pose = _BRIDGE_POSE if is_bridge else find_pose(columns, _samples(records, measured), control_rate_hz=rate.value)
     speed = f"{rate.value:g} steps a second{' (guessed)' * rate.is_guess}"
     return FoundData(
@@ -122,7 +122,7 @@ def look_at_rlds(path: str) -> FoundData:
 
 
 def like_droid(path: str, episodes: int, title: str) -> FoundData:
-    """Return what is known of DROID, or of the simulated arm, whose data sets have the same features."""
+    """Return the properties of a data set with the features of DROID, for example from the simulated arm."""
     return FoundData(
         source="rlds",
         path=path,
@@ -135,7 +135,7 @@ def like_droid(path: str, episodes: int, title: str) -> FoundData:
 
 
 def _rate(features: Mapping[str, _Feature], *, is_bridge: bool) -> Knob:
-    """Return the control rate: only the name of a known data set tells it."""
+    """Return the control rate, which RLDS does not store: it is known only for known data sets, otherwise a guess."""
     if is_bridge:
         return Knob(_BRIDGE_RATE_HZ, "RLDS does not say; BridgeData's")
     if _DROID_FEATURE in features:
@@ -145,7 +145,11 @@ def _rate(features: Mapping[str, _Feature], *, is_bridge: bool) -> Knob:
 
 
 def _features(path: str) -> Iterator[tuple[str, _Feature]]:
-    """Yield the features by their names in a record."""
+    """Yield the features of an RLDS data set with their names in a record.
+
+    Raises:
+        InputError: features.json does not exist or is no valid description.
+    """
     where = storage.join(path, "features.json")
     try:
         content = read_json_object(where, needed="a description as TFDS writes it")
@@ -154,37 +158,44 @@ def _features(path: str) -> Iterator[tuple[str, _Feature]]:
         needed = "the features, as TFDS writes them"
         raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
     try:
-        yield from _inside(content, "")
+        yield from _nested_features(content, "")
     except (AttributeError, TypeError, ValueError) as error:
         found = f"not a description of features ({error})"
         raise InputError(where=where, found=found, needed="the features, as TFDS writes them") from None
 
 
-def _inside(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
+def _nested_features(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
     if not isinstance(content, Mapping):
         return
     if "featuresDict" in content:
-        for key, one in dict(content["featuresDict"].get("features", {})).items():
-            yield from _inside(one, f"{name}/{key}" if name else key)
+        for key, feature in dict(content["featuresDict"].get("features", {})).items():
+            yield from _nested_features(feature, f"{name}/{key}" if name else key)
     elif "sequence" in content:
-        yield from _inside(content["sequence"].get("feature"), name)
+        yield from _nested_features(content["sequence"].get("feature"), name)
     else:
-        kind = next((one for one in ("image", "text", "tensor") if one in content), "")
+        kind = next((kind for kind in ("image", "text", "tensor") if kind in content), "")
         about = content.get(kind) or {}
         sizes = [int(size) for size in about.get("shape", {}).get("dimensions", [])]
         yield name, _Feature(kind, str(about.get("dtype", "")), math.prod(sizes), sizes[-1] if len(sizes) == 3 else 0)
 
 
 def _cameras(features: Mapping[str, _Feature]) -> tuple[list[str], list[str]]:
-    """Return the features with images of a camera, and those with depth maps or segmentations."""
-    images = {name: one for name, one in features.items() if one.kind == "image" and name.startswith("steps/")}
-    depth = [name for name, one in images.items() if is_no_camera(name) or one.dtype not in {"", "uint8"}]
-    colour = [name for name, one in images.items() if name not in depth and one.channels != 1]
+    """Return the features with camera images (colour, or grey if there are none), and those with depth maps."""
+    images = {name: feature for name, feature in features.items() if feature.kind == "image" and _is_of_step(name)}
+    depth = [name for name, image in images.items() if is_no_camera(name) or image.dtype not in {"", "uint8"}]
+    colour = [name for name, image in images.items() if name not in depth and image.channels != 1]
     return colour or [name for name in images if name not in depth], depth
 
 
-def _sampled(shards: Sequence[Shard], names: Sequence[str]) -> list[dict[str, tuple[Any, ...]]]:
-    """Return the values of features in the first records; of a record that cannot be read `data check` says why."""
+def _is_of_step(name: str) -> bool:
+    return name.startswith("steps/")
+
+
+def _sample_records(shards: Sequence[Shard], names: Sequence[str]) -> list[dict[str, tuple[Any, ...]]]:
+    """Return the values of features in the first records.
+
+    Reading stops at a record that cannot be read, without an error: `data check` reports it later.
+    """
     records: list[dict[str, tuple[Any, ...]]] = []
     with suppress(UserError, OSError):
         for shard in shards[:_SAMPLED]:
@@ -199,22 +210,22 @@ def _sampled(shards: Sequence[Shard], names: Sequence[str]) -> list[dict[str, tu
 
 
 def _samples(records: Sequence[Mapping[str, tuple[Any, ...]]], columns: Mapping[str, Column]) -> Samples:
-    """Return the numbers of each record, by column; without columns that a record does not have as described."""
+    """Return the numbers of each record, by column; columns whose width differs from the description are left out."""
     return {
-        name: [np.array(record[name], np.float64).reshape(-1, one.width) for record in records]
-        for name, one in columns.items()
-        if records and all(record.get(name) and len(record[name]) % one.width == 0 for record in records)
+        name: [np.array(record[name], np.float64).reshape(-1, column.width) for record in records]
+        for name, column in columns.items()
+        if records and all(record.get(name) and len(record[name]) % column.width == 0 for record in records)
     }
 
 
 def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[str]) -> Knob:
-    """Return the features that tell the sampled episodes apart; or `record`, where none do."""
+    """Return the features that identify the sampled episodes; `record` if no features do."""
     paths = [name for name in names if name.rsplit("/", 1)[-1] in _PATHS]
-    for some in (paths, names):
-        values = [tuple(record.get(name, ()) for name in some) for record in records]
+    for candidates in (paths, names):
+        values = [tuple(record.get(name, ()) for name in candidates) for record in records]
         is_named = all(any(part != b"" for feature in value for part in feature) for value in values)
-        if some and values and is_named and len(set(values)) == len(values):
-            return Knob(list(some), "what tells episodes apart", is_guess=True)
+        if candidates and values and is_named and len(set(values)) == len(values):
+            return Knob(list(candidates), "what tells episodes apart", is_guess=True)
     if not records and names:
         return Knob(list(paths or names), "what tells episodes apart; no record could be read", is_guess=True)
     why = "no feature tells the episodes apart; writing the set again may move episodes between train and test"
@@ -225,14 +236,14 @@ def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[
 
 _OURS = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "subtask_index"})
 _DROID_GRIPPER = "observation.state.gripper_position"
-_OF_DROID = frozenset({"building", "collector_id"})  # columns of its ports to LeRobot
+_OF_DROID = frozenset({"building", "collector_id"})  # columns of DROID's conversions to LeRobot
 
 
 def look_at_lerobot(path: str) -> FoundData:
-    """Look at a LeRobot data set.
+    """Read the properties of a LeRobot data set.
 
     Raises:
-        InputError: It cannot be used, or has no camera or no numbers of the robot.
+        InputError: The data set cannot be read, or has no camera or no measured numbers of the robot.
     """
     info = read_info(path)
     cameras = [name for name, one in info.features.items() if one.is_camera and not is_no_camera(name)]
@@ -270,7 +281,10 @@ def look_at_lerobot(path: str) -> FoundData:
 
 
 def _sampled_rows(info: DatasetInfo, columns: Mapping[str, Column]) -> Samples:
-    """Return the numbers of the first episodes; nothing if they cannot be read, which `data check` will explain."""
+    """Return the numbers of the first episodes, by column.
+
+    Reading stops at an episode that cannot be read, without an error: `data check` reports it later.
+    """
     read: dict[str, list[np.ndarray]] = {name: [] for name in columns}
     with suppress(UserError, OSError, KeyError):
         files = list_by_template(info.root, info.data_path)

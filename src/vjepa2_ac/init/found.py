@@ -1,4 +1,4 @@
-"""What was found in a data set, as values of a config with their reasons, and their text as YAML."""
+"""Config values that `init` derived from a data set, each with its reason, and their text as YAML."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from vjepa2_ac.config.loading import yaml_line
 from vjepa2_ac.errors import InputError, escaped
 
 GUESSED = "GUESSED: "
-_COLUMN = 34  # of the comments
+_COLUMN = 34  # text column at which comments start
 
 
 @dataclass(frozen=True)
 class Knob:
-    """A value, why it is that, and whether it was guessed."""
+    """The value of a config key, the reason for it, and whether it is a guess."""
 
     value: Any
     why: str = ""
@@ -28,66 +28,71 @@ Knobs = Mapping[str, "Knob | Knobs"]
 
 
 def as_yaml(head: Sequence[str], knobs: Knobs) -> str:
-    """Return knobs as the text of a config: a comment at the top, and one behind each value that has a reason."""
+    """Format config values as YAML, with a comment at the top and one after each value that has a reason.
+
+    Args:
+        head: Lines of the comment at the top.
+        knobs: Values by key, nested as in the config.
+    """
     lines = [f"# {escaped(line)}".rstrip() for line in head]
-    for name, one in knobs.items():
-        if not isinstance(one, Knob):
+    for name, entry in knobs.items():
+        if not isinstance(entry, Knob):
             lines.append("")
-        lines += _lines({name: one}, "")
+        lines += _lines({name: entry}, "")
     return "\n".join(lines) + "\n"
 
 
 def plain(knobs: Knobs) -> dict[str, Any]:
-    """Return the values alone, as reading their text gives them."""
-    return {name: one.value if isinstance(one, Knob) else plain(one) for name, one in knobs.items()}
+    """Return the values without reasons, as a nested mapping like the parsed YAML."""
+    return {name: entry.value if isinstance(entry, Knob) else plain(entry) for name, entry in knobs.items()}
 
 
 def guesses(knobs: Knobs, prefix: str = "") -> dict[str, str]:
-    """Return the value and the reason of all guesses, by dotted key."""
-    found: dict[str, str] = {}
-    for name, one in knobs.items():
-        if not isinstance(one, Knob):
-            found |= guesses(one, f"{prefix}{name}.")
-        elif one.is_guess:
-            value = yaml_line(name, one.value).removeprefix(f"{name}: ")
-            found[prefix + name] = f"{value}: {one.why}" if one.why else value
-    return found
+    """Return all guessed values with their reasons as text, by dotted key."""
+    texts: dict[str, str] = {}
+    for name, entry in knobs.items():
+        if not isinstance(entry, Knob):
+            texts |= guesses(entry, f"{prefix}{name}.")
+        elif entry.is_guess:
+            value = yaml_line(name, entry.value).removeprefix(f"{name}: ")
+            texts[prefix + name] = f"{value}: {entry.why}" if entry.why else value
+    return texts
 
 
 def _lines(knobs: Knobs, indent: str) -> Iterator[str]:
-    for name, one in knobs.items():
-        if not isinstance(one, Knob):
+    for name, entry in knobs.items():
+        if not isinstance(entry, Knob):
             yield f"{indent}{name}:"
-            yield from _lines(one, indent + "  ")
+            yield from _lines(entry, indent + "  ")
             continue
-        line, comment = indent + yaml_line(name, one.value), escaped(GUESSED * one.is_guess + one.why)
+        line, comment = indent + yaml_line(name, entry.value), escaped(GUESSED * entry.is_guess + entry.why)
         yield f"{line:<{_COLUMN}}  # {comment}" if comment else line
 
 
 @dataclass(frozen=True)
 class FoundData:
-    """A data set, as far as its descriptions tell."""
+    """The properties of a data set that were read from its description files."""
 
-    source: str  # form of data
+    source: str  # value of data.source
     path: str
-    knobs: Knobs  # of `data`, beyond source and path: cameras, names of columns
+    knobs: Knobs  # further keys of the section `data`: cameras, names of columns
     rate_hz: Knob  # control steps per second
     states: Literal["pose", "vector"] = "pose"
     episodes: int | None = None
     steps: int | None = None  # control steps of all episodes
-    usual_steps: int | None = None  # of an episode: the median
-    short_steps: int | None = None  # nine of ten episodes have more
-    own_splits: tuple[Split, ...] = ()  # validation and test, if the data set has them itself
-    idle: Knobs | None = None  # of `data.idle`; None: no rule
-    about: tuple[str, ...] = ()  # what a person should know of it
+    usual_steps: int | None = None  # median number of control steps per episode
+    short_steps: int | None = None  # 10th percentile of the number of control steps per episode
+    own_splits: tuple[Split, ...] = ()  # the splits among validation and test that the data set defines itself
+    idle: Knobs | None = None  # section `data.idle`; None: no rule
+    about: tuple[str, ...] = ()  # descriptions for the user
 
 
 def idle_rule(*, has_velocities: bool) -> Knobs:
-    """Return the section of `data.idle`: by the commanded velocities if there are any."""
+    """Return the section `data.idle`, with the rule for commanded velocities if the data set has them."""
     return {"rule": Knob("commands" if has_velocities else "motion", "pauses teach nothing")}
 
 
-# ---- which camera: a guess, from its name ----
+# ---- selection of a camera by its name ----
 
 _AT_THE_HAND = re.compile(r"wrist|hand|eih|gripper", re.I)
 _FROM_OUTSIDE = re.compile(r"ext|front|side|third|agent|base|scene|top|over|left|image_0|primary", re.I)
@@ -95,18 +100,18 @@ _NOT_SEEN = re.compile(r"depth|disparity|segment|mask|gelsight|tactile", re.I)
 
 
 def is_no_camera(feature: str) -> bool:
-    """Return whether a feature is called like a depth map or a segmentation."""
+    """Return whether the name of a feature suggests a depth map, a segmentation or a tactile sensor."""
     return _NOT_SEEN.search(feature) is not None
 
 
 def pick_camera(cameras: Sequence[str]) -> str:
-    """Return the camera that most resembles what the released weights saw: one that looks on from outside."""
+    """Return the camera that is most similar to those of the released weights' training data: an exterior camera."""
     outside = [name for name in cameras if not _AT_THE_HAND.search(name)]
     return next((name for name in outside if _FROM_OUTSIDE.search(name)), (outside or list(cameras))[0])
 
 
 def camera_knobs(features: Sequence[str], no_cameras: Sequence[str], where: str) -> tuple[Knob, Knob]:
-    """Return the keys `camera` and `cameras` of a config: the camera that is used, and the feature of each camera.
+    """Return the config keys `camera` (the selected camera) and `cameras` (the feature of each camera).
 
     Raises:
         InputError: There is no feature with images of a camera.
@@ -122,7 +127,7 @@ def camera_knobs(features: Sequence[str], no_cameras: Sequence[str], where: str)
 
 
 def camera_names(features: Sequence[str]) -> dict[str, str]:
-    """Return a short name for the camera of each feature: the last parts of the feature's name, as many as differ."""
+    """Return a short camera name for each feature: as many last parts of its name as are needed to be unique."""
     parts = {name: [re.sub(r"\W+", "_", part) for part in re.split(r"[./]", name)] for name in features}
     for count in range(1, 1 + max(map(len, parts.values()), default=0)):
         short = {name: "_".join(part[-count:]) or "camera" for name, part in parts.items()}

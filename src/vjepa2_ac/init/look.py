@@ -1,4 +1,4 @@
-"""Which form of data is there, what is in it, and how long its episodes are."""
+"""Recognise the form of a data set and read its properties: cameras, columns, rates and lengths of episodes."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from vjepa2_ac.init.described import droid, like_droid, look_at_lerobot, look_at
 from vjepa2_ac.init.found import FoundData, Knob, idle_rule, pick_camera, plain
 from vjepa2_ac.storage.places import BUILTIN
 
-_CONNECTIONS = 16  # reads at once
+_CONNECTIONS = 16  # number of parallel reads
 _CONVERTERS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "convert"
 
 
 def converters() -> dict[str, str]:
-    """Return what each converter makes of what, by its name."""
+    """Return the description of each converter script, by name."""
     texts = {path.stem: path.read_text(encoding="utf-8") for path in sorted(_CONVERTERS.glob("*.py"))}
     return {name: (ast.get_docstring(ast.parse(text)) or "").split("\n\n")[0] for name, text in texts.items()}
 
 
 def converter_text(name: str) -> str:
-    """Return a converter, whole.
+    """Return the source text of a converter script.
 
     Raises:
-        InputError: There is none of that name.
+        InputError: There is no converter with this name.
     """
     if name not in converters():
         needed = f"one of {', '.join(converters())}"
@@ -50,15 +50,15 @@ def converter_text(name: str) -> str:
 
 
 def way_by(name: str) -> str:
-    """Return the line that begins with a converter."""
+    """Return the commands with which a user starts with a converter script."""
     return f"`vjepa2-ac data converter {name} > {name}.py`, then `python {name}.py --help`"
 
 
 def look_at_npz(path: str) -> FoundData:
-    """Look at a folder of .npz files.
+    """Read the properties of a folder of .npz files from the first file.
 
     Raises:
-        InputError: There are none, or the first has no states, no rate or no frames.
+        InputError: There are no .npz files, or the first one has no states, no rate or no frames.
     """
     listed = [storage.join(folder, file.name) for folder, file in walk(path, _CONNECTIONS)]
     files = sorted(name for name in listed if name.endswith(".npz"))
@@ -68,9 +68,9 @@ def look_at_npz(path: str) -> FoundData:
     with opened_npz(where, where) as file:
         headers = {name: file.header(name) for name in file.names}
         missing = [name for name in ("states", "fps_hz") if name not in headers]
-        cameras = [name for name, one in headers.items() if one.dtype == np.uint8 and len(one.shape) == 4]
+        cameras = [name for name, array in headers.items() if array.dtype == np.uint8 and len(array.shape) == 4]
         if missing or not cameras or len(headers["states"].shape) != 2:
-            arrays = ", ".join(f"{name} {list(one.shape)} {one.dtype}" for name, one in headers.items())
+            arrays = ", ".join(f"{name} {list(array.shape)} {array.dtype}" for name, array in headers.items())
             needed = "states [steps, 7], fps_hz and frames [steps, height, width, 3] of uint8"
             raise InputError(where=where, found=arrays or "no arrays", needed=needed, fix=FORMAT_HELP)
         rate = float(np.asarray(file.array("fps_hz")).reshape(-1)[0])
@@ -90,7 +90,7 @@ def look_at_npz(path: str) -> FoundData:
 
 
 def look_at_raw(path: str) -> FoundData:
-    """Look at raw DROID; behind a URL its folders are not counted, for that takes long.
+    """Return the properties of raw DROID data. Behind a URL the episodes are not counted, because that is slow.
 
     Raises:
         InputError: There are no episodes.
@@ -117,25 +117,25 @@ LOOKS: dict[str, Callable[[str], FoundData]] = {
     "npz": look_at_npz,
     "raw": look_at_raw,
 }
-_MARKS = {"lerobot": INFO, "rlds": "dataset_info.json"}  # the file that describes a data set, by form
-_FIXES = {  # what to do with other data, by the end of a file's name
+_MARKS = {"lerobot": INFO, "rlds": "dataset_info.json"}  # description file of a data set, by form
+_FIXES = {  # advice for other formats, by file suffix
     (".mcap", ".db3", ".bag"): f"a ROS bag. {way_by('ros2_bag')} makes .npz files of it",
     (".lance",): f"LeRobot's tables in Lance. {way_by('lance_to_files')} makes files of them",
     (".mp4",): f"videos alone. {way_by('mp4_and_csv')} makes .npz files of videos and poses",
     (".hdf5", ".h5", ".zarr"): "HDF5 or Zarr: write one .npz for each episode (docs/data.md)",
 }
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
-_VERSION = re.compile(r"\d+(\.\d+)*")  # a folder of TFDS
-_DEEPEST = 2  # folders down, where a description may be
-_MOST_FOLDERS = 50  # looked into, of each folder
+_VERSION = re.compile(r"\d+(\.\d+)*")  # name of a version folder of TFDS
+_DEEPEST = 2  # levels of subfolders that are searched for a description file
+_MOST_FOLDERS = 50  # subfolders of each folder that are searched
 
 
 def look_at(path: str) -> FoundData:
-    """Look at a data set in a folder or at a URL; its form is recognized by its files.
+    """Recognise the form of a data set in a folder or at a URL by its files, and read its properties.
 
     Raises:
-        InputError: There is nothing of that kind; says what is there, and the way to what is read.
-        UnreachableError: It cannot be read.
+        InputError: There is no supported data set. The error names the files that exist and, if possible, a converter.
+        UnreachableError: The folder or URL cannot be read.
     """
     if path == droid().path:
         return droid()
@@ -143,19 +143,19 @@ def look_at(path: str) -> FoundData:
         fix = f"For a data set of the Hugging Face Hub: hf://datasets/{path}" if _HUB_NAME.fullmatch(path) else ""
         raise InputError(where=path, found="no such folder", needed="a folder, or a URL", fix=fix)
     with storage.user_can_read(path):
-        if found := _of_plugins(path):
-            return found
-        described = _described(path)
+        if data := _look_with_plugins(path):
+            return data
+        described = _find_described_sets(path)
         if not described:
-            return LOOKS[_recognized(path)](path)
-        form, newest, versions = _only_set(described, path)
-        found = LOOKS[form](newest)
+            return LOOKS[_recognize_form(path)](path)
+        form, newest, versions = _require_only_set(described, path)
+        data = LOOKS[form](newest)
         version_note = f"version {_name_of(newest)}, the newest of {', '.join(versions)}"
-        return replace(found, about=(*found.about, *[version_note] * (len(versions) > 1)))
+        return replace(data, about=(*data.about, *[version_note] * (len(versions) > 1)))
 
 
-def _of_plugins(path: str) -> FoundData | None:
-    """Return the data of a form of somebody else's, where its class recognizes them (docs/extending.md)."""
+def _look_with_plugins(path: str) -> FoundData | None:
+    """Return the properties of a data set if a third-party source recognises it (docs/extending.md)."""
     admit_forms_of_data(all_installed=True)
     for source, kind in DataConfig.kinds.items():
         if (values := kind.look(path)) is not None:
@@ -169,7 +169,7 @@ def _of_plugins(path: str) -> FoundData | None:
 
 
 def simulated(path: str) -> FoundData:
-    """Return what `vjepa2-ac simulate record` will make."""
+    """Return the properties of the data set that `vjepa2-ac simulate record` will write."""
     return replace(
         like_droid(path, episodes=60, title="the simulated arm"),
         steps=60 * 41,
@@ -179,9 +179,12 @@ def simulated(path: str) -> FoundData:
     )
 
 
-def _described(path: str) -> list[tuple[str, str]]:
-    """Return form and folder of each described set, at a path and up to two folders below, or in a version there."""
-    described: dict[str, tuple[str, str]] = {}  # by the absolute path: links lead to one set by several names
+def _find_described_sets(path: str) -> list[tuple[str, str]]:
+    """Return form and folder of each data set with a description file.
+
+    The path and two levels of subfolders are searched; at a third level only version folders are searched.
+    """
+    described: dict[str, tuple[str, str]] = {}  # by absolute path, because several links may lead to one data set
     folders = [path]
     for depth in range(_DEEPEST + 2):
         listed = zip(folders, in_parallel(storage.list_folder, folders, _CONNECTIONS), strict=True)
@@ -189,7 +192,7 @@ def _described(path: str) -> list[tuple[str, str]]:
         for folder, entries in listed:
             names = {entry.name for entry in entries}
             marked = [form for form, mark in _MARKS.items() if mark.partition("/")[0] in names]
-            if form := next((one for one in marked if storage.exists(storage.join(folder, _MARKS[one]))), None):
+            if form := next((form for form in marked if storage.exists(storage.join(folder, _MARKS[form]))), None):
                 described.setdefault(storage.absolute(folder), (form, folder))
                 continue
             inner = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
@@ -199,11 +202,11 @@ def _described(path: str) -> list[tuple[str, str]]:
     return list(described.values())
 
 
-def _only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[str, str, list[str]]:
-    """Return form and folder of the only data set, in its newest version, and the names of all its versions.
+def _require_only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[str, str, list[str]]:
+    """Return form and folder of the newest version of the only data set, and the names of all its versions.
 
     Raises:
-        InputError: There are several data sets: lists their folders.
+        InputError: There are several data sets. The error lists their folders.
     """
     sets: dict[str, list[tuple[str, str]]] = {}
     for form, folder in described:
@@ -213,7 +216,7 @@ def _only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[str, str
         found = f"{len(sets)} data sets: {', '.join(sorted(sets))}"
         fix = f"Name one: `{shell_command('init', min(sets))}`"
         raise InputError(where=path, found=found, needed="one data set", fix=fix)
-    versions = sorted(*sets.values(), key=lambda one: _as_version(_name_of(one[1])))
+    versions = sorted(*sets.values(), key=lambda version: _as_version(_name_of(version[1])))
     return *versions[-1], [_name_of(folder) for _, folder in versions]
 
 
@@ -222,11 +225,16 @@ def _name_of(folder: str) -> str:
 
 
 def _as_version(name: str) -> list[tuple[int, str]]:
-    """Return what sorts names with numbers in them, so that 1.10.0 comes after 1.9.0."""
+    """Return a sort key for names with numbers, with which 1.10.0 comes after 1.9.0."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name) if part]
 
 
-def _recognized(path: str) -> str:
+def _recognize_form(path: str) -> str:
+    """Return the form of a data set without a description file, by the names of its files.
+
+    Raises:
+        InputError: No form is recognised.
+    """
     names = _names_below(path)
     if any(name.endswith(".npz") for name in names):
         return "npz"
@@ -240,41 +248,42 @@ def _recognized(path: str) -> str:
 
 
 def _names_below(path: str) -> list[str]:
-    """Return names of files at a path and a few folders down, of the first folder of each."""
+    """Return the names of files and folders at a path, in its first subfolder, and so on, up to five levels."""
     names: list[str] = []
     for _ in range(5):
-        here = storage.list_names(path)
-        names += here
-        inner = next((name for name in sorted(here) if "." not in name), None)
+        names_in_folder = storage.list_names(path)
+        names += names_in_folder
+        inner = next((name for name in sorted(names_in_folder) if "." not in name), None)
         if inner is None:
             break
         path = storage.join(path, inner)
     return names
 
 
-def measured(found: FoundData, progress: Progress | None = None) -> FoundData:
-    """Return what was found with the numbers of the index; unchanged behind a URL, or if it cannot be built.
+def measured(data: FoundData, progress: Progress | None = None) -> FoundData:
+    """Add the numbers and lengths of episodes, and the splits, from the index of the data set.
 
-    `data check` explains why the index cannot be built.
+    The properties are returned unchanged for a URL, or if the index cannot be built; `data check` then shows the
+    reason.
     """
-    data = {"source": found.source, "path": found.path, "states": found.states, **plain(found.knobs)}
-    values = {"run_dir": "none", "data": data, "model": {"base": f"{BUILTIN}sim-tiny"}}
-    if storage.is_url(found.path):
-        return found
+    section = {"source": data.source, "path": data.path, "states": data.states, **plain(data.knobs)}
+    values = {"run_dir": "none", "data": section, "model": {"base": f"{BUILTIN}sim-tiny"}}
+    if storage.is_url(data.path):
+        return data
     try:
         config = parse_config(values, where="vjepa2-ac init").data
         table = EpisodeTable.of(open_source(config).infos(progress))
     except UserError:
-        return found
+        return data
     if not len(table):
-        return found
+        return data
     lengths, splits = table.num_steps, describe_splits(table, config)
     return replace(
-        found,
+        data,
         episodes=len(lengths),
         steps=int(lengths.sum()),
         usual_steps=int(np.median(lengths)),
         short_steps=int(np.quantile(lengths, 0.1)),
         own_splits=tuple(held_out_by(table, config)),
-        about=(*found.about, f"splits: {splits}") if splits else found.about,
+        about=(*data.about, f"splits: {splits}") if splits else data.about,
     )

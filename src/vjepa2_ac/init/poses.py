@@ -1,4 +1,4 @@
-"""Recognise the pose of the robot among the columns of a data set: by names, by widths, and by the numbers."""
+"""Recognise the measured pose among the columns of a data set, by column names, widths and sampled values."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from vjepa2_ac.inspection.motion import FASTEST_RAD_S
 from vjepa2_ac.spaces import ANGLE_RAD, REACH_M
 
 Numbers = Float[np.ndarray, "steps _"]
-Samples = Mapping[str, Sequence[Numbers]]  # the numbers of some episodes, by column; without a column: not read
-Range = tuple[float, float]  # the least and the greatest value
+Samples = Mapping[str, Sequence[Numbers]]  # values of some episodes, by column; columns that were not read are missing
+Range = tuple[float, float]  # minimum and maximum
 
 _NAMES_OF_DROID = ["x", "y", "z", "roll", "pitch", "yaw"]
 _MAX_GRIPPER_M, _MAX_SHARE = 0.15, 1.05  # largest values of a gripper's opening in metres, and of a share
@@ -26,16 +26,16 @@ _RATE = r"vel|speed|force|torque|effort|accel|wrench|current(?!_?(?:tcp|ee|pose|
 _NO_RATE = re.compile(_RATE, re.I)
 _NO_POSE = re.compile(rf"joint|motor|shoulder|elbow|qpos|{_RATE}", re.I)
 _NO_STATE = re.compile(r"action|timestamp|index|reward|done", re.I)
-_NOT_MEASURED = re.compile(  # a pose of these is commanded, of another time, or relative
+_NOT_MEASURED = re.compile(  # words of poses that are commanded, of another time, or relative
     r"target|cmd|command(ed)?|goal|desired|des|setpoint|action|ref(erence)?|prev(ious)?|last|next|delta|rel|relative|"
     r"err|error|start|init|initial|demo|leader|master"
 )
 _NO_HAND = re.compile(r"object|obj|cube|block|camera|cam|base|mobile|head|torso|world|tag|marker|aruco")
-_HAND = re.compile(r"|left|right|l|r|(robot|arm)_?\d*")  # a group whose pose is certainly that of a hand
+_HAND = re.compile(r"|left|right|l|r|(robot|arm)_?\d*")  # names of groups that certainly belong to an end effector
 _POSE = re.compile(r"cartesian|ee_?f?(_|\.|$|pose|pos)|tcp|pose|state", re.I)
 _GRIPPER = re.compile(r"grip|finger", re.I)
 
-_KINDS = (  # by the end of a number's name; the group is the axis
+_KINDS = (  # kind of a number by the end of its name; the regex group is the axis
     ("euler_xyz", r"(?:^|_)(roll|pitch|yaw)$"),
     ("rotation_vector", r"(?:axis_?angle|axang|rot_?vec|rotation_vector|rvec)_?([xyz0-3])$"),
     ("rotation_vector", r"(?:^|_)w([xyz])$"),
@@ -47,10 +47,10 @@ _KINDS = (  # by the end of a number's name; the group is the axis
     ("position", r"(?:pos|position|trans|translation|xyz)_?([xyz0-3])$"),
     ("position", r"(?:^|_)(?:p_?)?([xyz])$"),
 )
-_COUNTS = {"rotation": (3, 4), "quaternion": (4,)}  # of numbers with different axes; of other kinds 3
+_COUNTS = {"rotation": (3, 4), "quaternion": (4,)}  # valid numbers of axes; 3 for all other kinds
 _AXES = {"roll": "x", "pitch": "y", "yaw": "z"}
 _UNITS = frozenset({"mm", "cm", "m", "rad", "radians", "deg", "degrees"})
-_NEUTRAL = re.compile(  # parts of names that do not tell arms apart
+_NEUTRAL = re.compile(  # parts of names that do not distinguish arms
     r"pos|position|ee|eef|end|effector|tcp|pose|rot|rotation|ori|orient|orientation|quat|quaternion|euler|rpy|state|obs|"
     r"observations?|steps|measured|actual|cartesian|robot|arm|flange|hand|tool|gripper|fingers?|width|opening|qpos|"
     r"closed|closedness|open|openness|value|values|axis|angle|axisangle|rotvec|joints?|motor"
@@ -59,7 +59,7 @@ _NEUTRAL = re.compile(  # parts of names that do not tell arms apart
 
 @dataclass(frozen=True)
 class Column:
-    """A column of numbers: its width per step, and the names of the numbers if the data set has them."""
+    """A column of numbers: its width per control step, and the names of the numbers if the data set defines them."""
 
     width: int
     names: tuple[str, ...] = ()
@@ -67,15 +67,15 @@ class Column:
 
 @dataclass(frozen=True)
 class _Number:
-    """One number of a column, and what its name says."""
+    """One number of a column, with the properties that its name implies."""
 
     column: str
     index: int
     name: str
     kind: str  # position, gripper, quaternion, rotation (names that fit several formats), or a rotation format
     axis: str = ""  # x, y, z, w or a digit
-    group: str = ""  # the part of its name that tells arms apart; empty: nothing does
-    prefix: str = ""  # all of its name before the kind
+    group: str = ""  # the part of its name that distinguishes arms; may be empty
+    prefix: str = ""  # the part of its name before the kind
     unit: str = ""
     is_named: bool = True  # False: recognised by the width of its column
 
@@ -83,11 +83,11 @@ class _Number:
 def find_pose(
     columns: Mapping[str, Column], samples: Samples | None = None, *, control_rate_hz: float = 10.0
 ) -> dict[str, Knob] | None:
-    """Return the keys of a config section that probably read the measured pose; None: no pose was recognised.
+    """Return the keys of a config section that select the measured pose; None if no pose is recognised.
 
     Args:
         columns: All columns of numbers.
-        samples: The numbers of some episodes, against which the names are checked; None: not read.
+        samples: Values of some episodes, with which the interpretation of the names is checked; None: not read.
         control_rate_hz: Control steps per second.
     """
     measured, samples = measured_columns(columns), samples or {}
@@ -104,10 +104,10 @@ def find_pose(
 
 
 def vector_state(columns: Mapping[str, Column], where: str) -> dict[str, Knob]:
-    """Return the key that reads a column of any numbers, if no pose was recognised: called state, or the widest.
+    """Return the key that selects a state vector if no pose is recognised: the column named `state`, or the widest one.
 
     Raises:
-        InputError: No column has measured numbers of the robot.
+        InputError: No column contains measured numbers of the robot.
     """
     measured = [name for name in columns if re.search(r"observation|\bstate", name)]
     if not measured:
@@ -119,7 +119,7 @@ def vector_state(columns: Mapping[str, Column], where: str) -> dict[str, Knob]:
 
 
 def measured_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
-    """Return the columns that may hold a measured pose or gripper: no actions, joints or velocities."""
+    """Return the columns that may contain a measured pose or gripper: no actions, joints or velocities."""
     return {
         name: one
         for name, one in columns.items()
@@ -127,7 +127,7 @@ def measured_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
     }
 
 
-# ---- what each number is ----
+# ---- the kind of each number ----
 
 
 def _last_part(column: str) -> str:
@@ -135,7 +135,7 @@ def _last_part(column: str) -> str:
 
 
 def _words(name: str) -> str:
-    """Return a name in lower case with single underscores between its words: ee.gripperPos is ee_gripper_pos."""
+    """Return a name in snake case: ee.gripperPos becomes ee_gripper_pos."""
     return re.sub(r"[^a-z0-9]+", "_", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()).strip("_")
 
 
@@ -145,22 +145,22 @@ def _group_in(words: str) -> str:
     return "_".join(part for part in parts if part and not _NEUTRAL.fullmatch(part))
 
 
-def _numbers_of(column: str, one: Column, samples: Sequence[Numbers]) -> list[_Number]:
-    """Return the numbers of a pose in a column: by their names, or by the column's width if it has no usable names."""
-    if len(one.names) == one.width and (one.width > 1 or not _GRIPPER.search(column)):
-        numbers = _named(column, one.names)
+def _numbers_of(name: str, column: Column, samples: Sequence[Numbers]) -> list[_Number]:
+    """Return the numbers in a column that may be part of a pose, by their names, or else by the column's width."""
+    if len(column.names) == column.width and (column.width > 1 or not _GRIPPER.search(name)):
+        numbers = _named(name, column.names)
         quaternions = [part for part in _parts(numbers) if len(part) == 4]
-        if not samples or all(_are_unit(samples, [one.index for one in part]) for part in quaternions):
+        if not samples or all(_are_unit(samples, [number.index for number in part]) for part in quaternions):
             return numbers
-    elif any(map(_NO_POSE.search, one.names)):
+    elif any(map(_NO_POSE.search, column.names)):
         return []
-    names = _usual_names(column, one.width, samples)
-    is_named = len(names) == 1 or names == _NAMES_OF_DROID  # one number is a gripper
-    return [replace(number, name=f"{column}[{number.index}]", is_named=is_named) for number in _named(column, names)]
+    names = _usual_names(name, column.width, samples)
+    is_named = len(names) == 1 or names == _NAMES_OF_DROID  # a single number is a gripper
+    return [replace(number, name=f"{name}[{number.index}]", is_named=is_named) for number in _named(name, names)]
 
 
 def _named(column: str, names: Sequence[str]) -> list[_Number]:
-    """Return those numbers of a column whose names are of a part of a pose."""
+    """Return the numbers of a column whose names are those of a position, a rotation or a gripper."""
     numbers = []
     all_words = [_words(name) for name in names]
     has_rates = any(re.search(r"(?:^|_)v[xyz]$", words) for words in all_words)
@@ -181,7 +181,7 @@ def _named(column: str, names: Sequence[str]) -> list[_Number]:
 
 
 def _kind_of(words: str) -> tuple[str, str, str]:
-    """Return kind and axis of a number by the words of its name, and the other words; without a kind: of no pose."""
+    """Return kind, axis and prefix of a number from its name in snake case; an empty kind means no part of a pose."""
     if _GRIPPER.search(words):
         return ("", "", "") if _NO_RATE.search(words) else ("gripper", "", words.rstrip("0123456789"))
     words = re.sub(r"_(?:pos|position)$", "", words)
@@ -193,7 +193,7 @@ def _kind_of(words: str) -> tuple[str, str, str]:
 
 
 def _usual_names(column: str, width: int, samples: Sequence[Numbers]) -> list[str]:
-    """Return the names that the numbers of a column of this name and width usually have."""
+    """Return the usual names of the numbers in an unnamed column, from its name, width and sampled values."""
     name = _last_part(column)
     if _GRIPPER.search(name):
         return [name] if width <= 2 else []
@@ -213,22 +213,23 @@ def _usual_names(column: str, width: int, samples: Sequence[Numbers]) -> list[st
 
 
 def _are_unit(samples: Sequence[Numbers], indexes: list[int]) -> bool:
-    """Return whether some numbers have length 1 at 90 % of the steps; without empty measurements (NaN or zeros)."""
+    """Return whether the vectors at some indexes have length 1 at 90 % of the steps, without NaN and zero vectors."""
     lengths = np.linalg.norm(np.concatenate(list(samples))[:, indexes], axis=1)
     lengths = lengths[np.isfinite(lengths) & (lengths > 0)]
     return len(lengths) > 0 and bool((abs(lengths - 1) < 0.01).mean() > 0.9)
 
 
-# ---- which numbers belong together ----
+# ---- grouping of numbers into poses ----
 
-_Numbers = tuple[_Number, ...]  # of a candidate: position (3), rotation (3 or 4), gripper (1)
+_Numbers = tuple[_Number, ...]  # a candidate: position (3), rotation (3 or 4), gripper (1)
 
 
 def _parts(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
-    """Yield positions and rotations: the numbers of an arm, a column and a kind in the order of their axes, w last."""
+    """Yield positions and rotations: the numbers of one arm, column and kind in the order of their axes, w last."""
     parts: dict[tuple[str, str, str, str], dict[str, _Number]] = {}
-    for one in numbers:
-        parts.setdefault((one.group, one.column, one.kind, one.prefix), {}).setdefault(one.axis, one)
+    for number in numbers:
+        key = number.group, number.column, number.kind, number.prefix
+        parts.setdefault(key, {}).setdefault(number.axis, number)
     for (_, _, kind, _), by_axis in parts.items():
         if len(by_axis) in _COUNTS.get(kind, (3,)):
             yield tuple(by_axis[axis] for axis in "01234xyzw" if axis in by_axis)
@@ -257,31 +258,31 @@ def _may_be_rate(number: _Number) -> bool:
 
 
 def _rank(candidate: _Numbers) -> tuple[bool, bool, bool, int]:
-    """Return what decides between candidates: measured, named, without the name of an arm, few columns."""
-    is_named = all(one.is_named for one in candidate)
-    columns = {one.column for one in candidate}
+    """Return a sort key: measured before commanded, named before unnamed, no arm name before one, few columns first."""
+    is_named = all(number.is_named for number in candidate)
+    columns = {number.column for number in candidate}
     return _is_not_measured(candidate), not is_named, bool(candidate[0].group), len(columns)
 
 
 def _is_not_measured(candidate: _Numbers) -> bool:
-    return any(_NOT_MEASURED.fullmatch(part) for one in candidate for part in one.group.split("_"))
+    return any(_NOT_MEASURED.fullmatch(part) for number in candidate for part in number.group.split("_"))
 
 
 def _left_out(chosen: _Numbers, numbers: Sequence[_Number]) -> list[str]:
-    """Return the names of the numbers of other arms or commands, and of those called like the chosen ones."""
+    """Return the names of numbers that are not used: those of other arms or commands, or of the same columns."""
     columns = {one.column for one in chosen}
     rest = [one for one in numbers if one not in chosen and (one.group != chosen[0].group or one.column in columns)]
     groups = {one.group for one in rest if one.kind == "position"}
     return [one.name if one.column in columns else f"{one.column}: {one.name}" for one in rest if one.group in groups]
 
 
-# ---- how the numbers are written ----
+# ---- units and rotation formats ----
 
 
 def _keys_of(
     chosen: _Numbers, left_out: Sequence[str], columns: Mapping[str, Column], samples: Samples, control_rate_hz: float
 ) -> dict[str, Knob]:
-    """Return the keys that read the chosen numbers, with formats checked against the samples."""
+    """Return the config keys that select the chosen numbers, with formats that were checked with the samples."""
     used = list(dict.fromkeys(one.column for one in chosen))
     concatenated = [(name, index) for name in used for index in range(columns[name].width)]
     select = [concatenated.index((one.column, one.index)) for one in chosen]
@@ -312,14 +313,14 @@ def _keys_of(
 
 
 def _values(numbers: _Numbers, samples: Samples) -> list[Numbers]:
-    """Return the finite sampled values of some numbers of a column for each episode; empty if it was not read."""
+    """Return the finite sampled values of some numbers of one column, for each episode; empty if it was not read."""
     indexes = [one.index for one in numbers]
     episodes = [episode[:, indexes] for episode in samples.get(numbers[0].column, ())]
     return [finite for one in episodes if len(finite := one[np.isfinite(one).all(axis=1)])]
 
 
 def _usual_size(values: Sequence[Numbers]) -> float:
-    """Return the size that 95 % of the steps do not exceed, so that single wrong values do not count."""
+    """Return the 95th percentile over steps of the largest absolute value; single wrong values do not affect it."""
     return float(np.quantile(np.concatenate([abs(one).max(axis=1) for one in values]), 0.95)) if values else 0.0
 
 
@@ -351,7 +352,7 @@ def _rotation_format(rotation: _Numbers, samples: Samples, control_rate_hz: floa
 
 
 def _position_unit(position: _Numbers, samples: Samples) -> Knob:
-    """Return the unit of the position; without a unit in the names: no arm reaches 5 m, or 2.5 m in centimetres."""
+    """Return the unit of the position, from the names or else from the largest values that an arm can reach."""
     if position[0].unit in {"m", "cm", "mm"}:
         return Knob(position[0].unit)
     largest = _usual_size(_values(position, samples))
@@ -365,11 +366,11 @@ def _position_unit(position: _Numbers, samples: Samples) -> Knob:
 
 
 def gripper_knobs(name: str, ranges: Range | None) -> dict[str, Knob]:
-    """Return which values are open and closed, by the range of the gripper's numbers and its name.
+    """Return the values of the open and the closed gripper, guessed from its name and the range of its values.
 
     Args:
-        name: What the data set calls its number.
-        ranges: The least and the greatest value; None: not known.
+        name: Name of the gripper's number in the data set.
+        ranges: Minimum and maximum of its values; None: unknown.
     """
     opened, closed, why = 0.0, 1.0, "the range of its numbers is not known"
     if ranges is not None:
