@@ -1,4 +1,4 @@
-"""About a server: the goals that it keeps, what it tells on connect, and its first decision, before a robot comes."""
+"""Server metadata, named goals, and a first decision before a robot connects."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from vjepa2_ac.planning.goals import GOALS_FILE, SubGoal, read_goal_folder
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.serving.session import Session
 
-PROTOCOL = 2  # incremented when a client would have to change
-_MOST_NAMES = 60  # of goals that are told
-_SIZE = 180, 320  # of a view in the picture of the first decision
-_SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])
+PROTOCOL = 2  # incremented at changes that require changes of clients
+_MOST_NAMES = 60  # names of goals in the metadata
+_SIZE = 180, 320  # height and width of each view in the first decision
+_SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])  # a reachable pose, for the first decision
 
 
 def metadata_of(loaded: Subject, session: Session) -> dict[str, Any]:
-    """Return what a client may know of the server: plain values, without a path of this machine."""
+    """Return the metadata that clients receive on connect, as plain values without local paths."""
     planning, options, model = loaded.config.planning, session.options, loaded.as_dict()["model"]
     sections = (getattr(loaded.config.data, name) for name in loaded.config.data.own_sections())
-    rates = (getattr(one, "control_rate_hz", None) for one in sections)
-    rate = next((rate for rate in rates if rate is not None), None)  # None: only the data set knows
+    rates = (getattr(section, "control_rate_hz", None) for section in sections)
+    rate = next((rate for rate in rates if rate is not None), None)  # None: it is stored in the data set only
     return {
         "policy": "vjepa2-ac",
         "protocol": PROTOCOL,
@@ -52,7 +52,7 @@ def metadata_of(loaded: Subject, session: Session) -> dict[str, Any]:
 
 
 def action_space(session: Session) -> str:
-    """Return what the numbers of an action are, in the words of RoboArena."""
+    """Return the name of the action space, in the terms of RoboArena."""
     space = session.controller.spaces
     if session.options.actions == "pose":
         return "cartesian_position"
@@ -60,7 +60,7 @@ def action_space(session: Session) -> str:
 
 
 def in_words(about: Mapping[str, Any], subject: str) -> str:
-    """Return a line for whoever started the server."""
+    """Return a line that describes the server, for its console."""
     limits = about["limits"]
     box = "no workspace box" if limits["workspace"] is None else f"workspace {limits['workspace']}"
     goals = f"goals: {', '.join(about['goals'])}" if about["goals"] else "no goals of its own"
@@ -69,10 +69,10 @@ def in_words(about: Mapping[str, Any], subject: str) -> str:
 
 
 def warm_up(controller: Controller) -> float:
-    """Make a decision about two pictures of noise; return how many seconds it took. Libraries and caches are then warm.
+    """Make a decision with two noise images, which initialises libraries and caches; return its duration in seconds.
 
     Raises:
-        InputError: The model gives no finite energy: it is broken.
+        InputError: The model returns no finite energy.
     """
     began, rng = time.perf_counter(), np.random.default_rng(0)
     height, width = _SIZE
@@ -91,36 +91,37 @@ def warm_up(controller: Controller) -> float:
 
 KeptGoals = Mapping[str, tuple[SubGoal, ...]]
 
-_PICTURES = {".png", ".jpg", ".jpeg"}
+_IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
 
 
 def read_kept_goals(folder: Path) -> KeptGoals:
-    """Return the goals of a folder: itself an order of goals; or pictures, and folders with such an order.
+    """Read the named goals in a folder.
 
-    A picture `cup.png` is a goal of the name `cup`; an order of goals has its folder's name.
+    The folder contains goals.json, which makes it one sequence of goals; or it contains images and folders with a
+    goals.json. An image `cup.png` is a goal with the name `cup`. A sequence of goals has the name of its folder.
 
     Raises:
-        InputError: There is no goal, two have one name, or a file cannot be used.
+        InputError: There is no goal, two goals have the same name, or a file cannot be read.
     """
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
         raise InputError(where=f"--goals {folder}", found=found, needed="a folder with goal images")
     if (folder / GOALS_FILE).is_file():
         return {folder.resolve().name: read_goal_folder(folder)}
-    kept: dict[str, tuple[SubGoal, ...]] = {}
+    goals: dict[str, tuple[SubGoal, ...]] = {}
     for path in sorted(folder.iterdir()):
-        is_order, is_picture = (path / GOALS_FILE).is_file(), path.suffix.lower() in _PICTURES and path.is_file()
-        if not is_order and not is_picture:
+        is_sequence, is_image = (path / GOALS_FILE).is_file(), path.suffix.lower() in _IMAGE_SUFFIXES and path.is_file()
+        if not is_sequence and not is_image:
             continue
-        if path.stem in kept:
+        if path.stem in goals:
             raise InputError(where=str(path), found=f"two goals named {path.stem!r}", fix="Rename one of them")
-        if is_order:
-            kept[path.stem] = read_goal_folder(path)
+        if is_sequence:
+            goals[path.stem] = read_goal_folder(path)
         else:
             require_image(image := read_image(path), where=str(path))
             require_contrast([image], where=str(path))
-            kept[path.stem] = (SubGoal(image, name=path.stem),)
-    if not kept:
+            goals[path.stem] = (SubGoal(image, name=path.stem),)
+    if not goals:
         needed = f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)"
         raise InputError(where=f"--goals {folder}", found="no goal", needed=needed)
-    return kept
+    return goals

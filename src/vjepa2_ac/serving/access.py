@@ -1,4 +1,4 @@
-"""Where a websocket server listens, and who may reach it: decided from headers alone, before a message is read."""
+"""Access rules and listening address of a websocket server. Access is decided from headers, before any message."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)
 
-LEAST_KEY = 16  # characters
-END_S = 1.5  # for connections and computations, when a server ends
+LEAST_KEY = 16  # minimum number of characters of a key
+END_S = 1.5  # seconds that a stopping server waits for connections and computations
 _Result = TypeVar("_Result")
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:]+))(?::[0-9]*)?|([0-9a-f:]+)")  # [address]:port, name:port, address
-_SCHEMES = ("api-key", "bearer")  # openpi's clients send the first one
+_SCHEMES = ("api-key", "bearer")  # openpi's clients send api-key
 
 
 @dataclass(frozen=True)
 class Access:
-    """The rules of one server.
+    """The access rules of a server.
 
     Raises:
-        InputError: The address can be reached from elsewhere, and there is neither a key nor an explicit choice.
+        InputError: Other machines can reach the address, and there is neither a key nor `is_insecure`.
     """
 
-    host: str  # which it listens on
-    key: str | None = None  # that a client must send
-    is_insecure: bool = False  # whether another address than this machine's own needs no key
-    names: Collection[str] = ()  # under which it is reached besides: of a proxy
+    host: str  # the address to listen on
+    key: str | None = None  # the key that a client must send
+    is_insecure: bool = False  # whether no key is required although other machines can reach the address
+    names: Collection[str] = ()  # further host names, for example of a proxy
 
     def __post_init__(self) -> None:
         if not is_loopback(self.host) and self.key is None and not self.is_insecure:
@@ -49,11 +49,12 @@ class Access:
             raise InputError(where=f"--host {self.host}", found=found, needed=needed, fix=fix)
 
     def why_not(self, host: str | None, authorization: str | None) -> tuple[int, str] | None:
-        """Return the HTTP status and the reason why a request is refused; None: it may come in.
+        """Return the HTTP status and the reason for which a request is rejected; None if it is accepted.
 
         Args:
-            host: Its header `Host`: a page in a browser may know this machine by a name of its own.
-            authorization: Its header `Authorization`.
+            host: The header `Host`. An unknown name is rejected, because a web page can resolve its own name to this
+                machine (DNS rebinding).
+            authorization: The header `Authorization`.
         """
         if not self._is_known(host):
             return 403, "this server is not known by that name (--allow-host NAME)"
@@ -62,23 +63,23 @@ class Access:
         return None
 
     def _is_known(self, host: str | None) -> bool:
-        """Return whether a request names this server by an address, or by a name that is its own."""
+        """Return whether the header `Host` is an IP address or one of this server's names."""
         parts = _HOST.fullmatch((host or "").strip().lower())
         if parts is None:
             return False
         name = parts[1] or parts[2] or parts[3]
-        own = {"localhost", self.host.lower(), *(one.lower() for one in self.names)}
-        return name in own or _address(name) is not None
+        known_names = {"localhost", self.host.lower(), *(known.lower() for known in self.names)}
+        return name in known_names or _address(name) is not None
 
     def _has_key(self, authorization: str | None) -> bool:
-        scheme, _, given = (authorization or "").partition(" ")
+        scheme, _, key = (authorization or "").partition(" ")
         expected = (self.key or "").encode()
-        is_same = hmac.compare_digest(given.strip().encode(errors="surrogateescape"), expected)
+        is_same = hmac.compare_digest(key.strip().encode(errors="surrogateescape"), expected)
         return is_same and scheme.lower() in _SCHEMES
 
 
 def read_key(path: Path) -> str:
-    """Return the key in a file: its first line.
+    """Return the key in a file, which is its first line.
 
     Raises:
         InputError: The file cannot be read, or the key is short or not plain text.
@@ -101,7 +102,7 @@ def read_key(path: Path) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches an address; a name but `localhost` may be any machine's."""
+    """Return whether an address can be reached from this machine only. Of the names only `localhost` counts as such."""
     address = _address(host)
     return host == "localhost" or (address is not None and address.is_loopback)
 
@@ -114,17 +115,17 @@ def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def single_header(request: Any, name: str) -> str | None:
-    """Return the value of a header that a request has once; None: it has none, or several."""
+    """Return the value of a header; None if the request does not contain it exactly once."""
     values = request.headers.get_all(name)
     return values[0] if len(values) == 1 else None
 
 
 @contextmanager
 def listening_on(access: Access, port: int) -> Iterator[None]:
-    """Turn the error of an address that cannot be listened on into one for users.
+    """Convert an OSError within the context into an error that names the address.
 
     Raises:
-        InputError: Names the address.
+        InputError: The server cannot listen on the address.
     """
     try:
         yield
@@ -134,19 +135,22 @@ def listening_on(access: Access, port: int) -> Iterator[None]:
 
 
 def url_of(server: Any, scheme: str) -> str:
-    """Return the address at which a server listens."""
+    """Return the URL at which a server listens."""
     host, port = server.sockets[0].getsockname()[:2]
     return f"{scheme}://{f'[{host}]' if ':' in str(host) else host}:{port}"
 
 
 async def ends(*ending: Awaitable[Any]) -> bool:
-    """Wait until all are done, for `END_S` at most; return whether they are."""
-    _, late = await asyncio.wait([asyncio.ensure_future(one) for one in ending], timeout=END_S)
-    return not late
+    """Wait for awaitables, at most `END_S` seconds; return whether all have finished."""
+    _, pending = await asyncio.wait([asyncio.ensure_future(item) for item in ending], timeout=END_S)
+    return not pending
 
 
 def until_signalled(run: Callable[[asyncio.Event], Coroutine[Any, Any, _Result]]) -> _Result:
-    """Run until SIGTERM or SIGINT, which set the event that `run` receives; in the main thread only."""
+    """Run a coroutine with an event that SIGTERM and SIGINT set, and return its result.
+
+    Outside the main thread, signals are not handled.
+    """
 
     async def running() -> _Result:
         stop, loop = asyncio.Event(), asyncio.get_running_loop()

@@ -1,4 +1,4 @@
-"""A client of the planning server, for Python without openpi."""
+"""A Python client of the planning server that does not need openpi."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
 from vjepa2_ac.serving.wire import MOST_BYTES, pack, require_msgpack, unpack
 
-_HELLO_S = 30.0  # for what a server tells on connect: it listens when its model is loaded
-_ANSWER_S = 120.0
+_HELLO_S = 30.0  # timeout for the metadata after connecting; a server only listens once its model is loaded
+_ANSWER_S = 120.0  # default timeout for a reply
 
 
 class PlanningClient(ExitStack):
-    """A connection to a server; `close` ends it.
+    """A connection to a planning server; `close` ends it.
 
     Example:
         >>> with PlanningClient("ws://127.0.0.1:8000") as client:
@@ -21,15 +21,16 @@ class PlanningClient(ExitStack):
     """
 
     def __init__(self, url: str, key: str | None = None, *, timeout_s: float | None = None) -> None:
-        """Connect.
+        """Connect to a server and receive its metadata.
 
         Args:
             url: ws://HOST:PORT, or wss://.
-            key: Of the server, if it needs one.
-            timeout_s: For an answer; None: 120 s, or twice the server's deadline if that is longer.
+            key: The server's key, if it requires one.
+            timeout_s: Timeout of a reply in seconds; None: 120 s, or twice the server's deadline if that is longer.
 
         Raises:
-            UnreachableError: There is no server, or it refuses; or a library of the extra `serve` is missing.
+            UnreachableError: There is no server, it rejects the connection, or a library of the extra `serve` is
+                missing.
         """
         super().__init__()
         self.url = url
@@ -43,19 +44,19 @@ class PlanningClient(ExitStack):
             self.metadata = unpack(self._connection.recv(timeout=_HELLO_S))
         except Exception as error:
             self.close()
-            body = getattr(getattr(error, "response", None), "body", None)  # the server's words, where it refuses
+            body = getattr(getattr(error, "response", None), "body", None)  # the server's reason for a rejection
             found = f"{_reason(error)}: {body.decode(errors='replace').strip()}" if body else _reason(error)
             raise UnreachableError(where=url, found=found, needed="a server (`vjepa2-ac serve`)") from None
         deadline_s = self.metadata.get("deadline_s")
         self._timeout_s = timeout_s or max(_ANSWER_S, 2 * deadline_s if isinstance(deadline_s, float) else 0.0)
 
     def infer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the answer to a request (docs/serving_reference.md).
+        """Send a request and return the server's reply (docs/serving_reference.md).
 
         Raises:
-            InputError: The server refuses it.
-            UnreachableError: The connection is lost, or there is no answer in time, which closes the connection: a late
-                answer would be taken for the answer to the next request.
+            InputError: The server rejects the request.
+            UnreachableError: The connection is lost, or there is no reply in time. After a timeout the connection is
+                closed, because a late reply would be read as the reply to the next request.
         """
         try:
             self._connection.send(pack(request))

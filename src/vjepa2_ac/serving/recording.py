@@ -1,4 +1,4 @@
-"""Recording: every decision of a server as a line of JSON, with its images."""
+"""Record every decision of a server as a line of JSON, with its images."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from vjepa2_ac.storage.structured import json_text, plain, utc_now
 logger = logging.getLogger(__name__)
 
 ABOUT, DECISIONS, IMAGES = "server.json", "decisions.jsonl", "images"
-FORMAT = 2  # incremented when a reader would have to change
-MOST_BYTES = 2 * 10**9  # of a folder
+FORMAT = 2  # incremented at changes that require changes of readers
+MOST_BYTES = 2 * 10**9  # default size limit of a recording
 
 
 class Recorder:
-    """Writes decisions to a folder until it has its largest size. A disk that fails ends the record, not the server.
+    """Writes decisions to a folder until the size limit is reached. A disk error ends the recording, not the server.
 
     Raises:
-        InputError: The folder holds something already, or cannot be written.
+        InputError: The folder is not empty, or cannot be written.
     """
 
     def __init__(self, folder: Path, about: Mapping[str, Any], most_bytes: int = MOST_BYTES) -> None:
-        """Make the folder.
+        """Create the folder and write the description of the server.
 
         Args:
-            folder: A new one.
-            about: The server: model, settings, options.
-            most_bytes: Largest size of the folder.
+            folder: A new or empty folder.
+            about: Description of the server: model, config, options.
+            most_bytes: Size limit of the folder in bytes.
         """
         self.folder, self._left = folder, most_bytes
-        self._goals: tuple[np.ndarray, ...] = ()  # images of the present goals, then the mask
+        self._goals: tuple[np.ndarray, ...] = ()  # images of the current goals, then the mask
         self._episode = 0
         self._is_on = True
         require_new_folder(folder)
@@ -48,23 +48,23 @@ class Recorder:
             write_atomically(folder / ABOUT, json_text({"format": FORMAT, **about}))
 
     def goal(self, goals: Sequence[SubGoal], mask: np.ndarray | None) -> None:
-        """Keep the goals of the next decisions."""
+        """Set the goals of the next decisions, and start a new episode of the recording."""
         masks = () if mask is None else (np.repeat(np.uint8(255) * (mask > 0)[..., None], 3, axis=-1),)
         self._goals, self._episode = (*(goal.image for goal in goals), *masks), self._episode + 1
 
     def decision(self, frame: np.ndarray, state: np.ndarray, answer: Mapping[str, Any]) -> None:
-        """Write a decision: what was measured, and what was sent.
+        """Record a decision: the observation and the reply.
 
         Args:
-            frame: Of the camera.
-            state: Of the robot.
-            answer: To the robot.
+            frame: The camera image.
+            state: The measured state.
+            answer: The reply to the robot.
         """
         if not self._is_on:
             return
         try:
             line = {"time": utc_now(), "episode": self._episode, "frame": self._image(frame), "state": plain(state)}
-            line |= {"goals": [self._image(one) for one in self._goals], "answer": plain(answer)}
+            line |= {"goals": [self._image(image) for image in self._goals], "answer": plain(answer)}
             text = json.dumps(line, allow_nan=False) + "\n"
             self._count(len(text.encode()))
             with (self.folder / DECISIONS).open("a") as file:
@@ -74,7 +74,7 @@ class Recorder:
             logger.warning("the record in %s ends here, the server continues: %s", self.folder, error.strerror or error)
 
     def _image(self, pixels: np.ndarray) -> str:
-        """Write an image unless the folder has it; return its name in the folder."""
+        """Write an image unless the folder contains it already; return its name in the folder."""
         digest = hashlib.sha256(repr(pixels.shape).encode() + np.ascontiguousarray(pixels).tobytes()).hexdigest()[:24]
         name = f"{IMAGES}/{digest}.png"
         if not (self.folder / name).exists():

@@ -1,4 +1,4 @@
-"""Requests: what a client asks for, in the dialects of openpi's clients, as one record."""
+"""Parse a client's message, in any of the formats of openpi's clients, into one record."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from vjepa2_ac.policies.score import ChunkForm
 from vjepa2_ac.storage.structured import record_of
 
 IMAGE_KEYS = ("observation/exterior_image_1_left", "observation/exterior_image_0_left", "observation/image")
-"""Where the picture of the camera is looked for: the first that is there. DROID's, RoboArena's, everybody's."""
+"""Keys of the camera image, of which the first in a message is used: those of DROID, of RoboArena, and a generic one."""
 
-MOST_GOALS = 32  # of one request
+MOST_GOALS = 32  # goal images of one request
 
 _STATE, _POSE, _GRIPPER = "observation/state", "observation/cartesian_position", "observation/gripper_position"
 _GOAL = "goal/"
-_WAYS = ("goal/image", "goal/images", "goal/name")
-_MORE = ("goal/rules", "goal/mask")
+_MAIN_KEYS = ("goal/image", "goal/images", "goal/name")
+_FURTHER_KEYS = ("goal/rules", "goal/mask")
 _ENDPOINTS = ("infer", "reset", "score")
 _CHUNKS, _FORM, _FORMS = "policy/chunks", "policy/form", get_args(ChunkForm)
-MOST_CHUNKS, MOST_CHUNK_STEPS = 1024, 256  # of one request; control steps of each
+MOST_CHUNKS, MOST_CHUNK_STEPS = 1024, 256  # action chunks of one request, and control steps of a chunk
 
 
 @dataclass(frozen=True)
 class GoalRule:
-    """What applies to one goal image, as in goals.json; all may be left out."""
+    """The rule of one goal image, as in goals.json; all fields are optional."""
 
     name: str = ""
     at_least: int = 1
@@ -42,21 +42,21 @@ class GoalRule:
 
 @dataclass(frozen=True, eq=False)
 class GivenGoal:
-    """A goal whose pictures came with the request; or the name of one that the server keeps."""
+    """The goal of a request: images with rules, or the name of a goal that is stored on the server."""
 
     goals: tuple[SubGoal, ...] = ()
-    mask: np.ndarray | None = None  # height x width, true or 1 where it counts
+    mask: np.ndarray | None = None  # height x width; nonzero where the goal image counts
     name: str | None = None
 
     @property
     def fingerprint(self) -> str:
-        """The same for the same name, or bytes: a client may send its goal with every request."""
+        """A hash of the name, or of images, rules and mask. A client may send the same goal with every request."""
         digest = hashlib.sha256(repr(self.name).encode())
         for goal in self.goals:
             digest.update(repr((goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper)).encode())
-        for one in (*(goal.image for goal in self.goals), *(() if self.mask is None else (self.mask,))):
-            digest.update(repr((one.shape, one.dtype.str)).encode())
-            digest.update(np.ascontiguousarray(one).tobytes())
+        for array in (*(goal.image for goal in self.goals), *(() if self.mask is None else (self.mask,))):
+            digest.update(repr((array.shape, array.dtype.str)).encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
 
@@ -64,25 +64,25 @@ class GivenGoal:
 class Request:
     """One message of a client."""
 
-    episode: str | None = None  # its session_id: a new one begins an episode
-    begins: bool = False  # whether it begins an episode: reset
-    goal: GivenGoal | None = None  # None: the one of before
-    frame: UInt8[np.ndarray, "height width 3"] | None = None  # None: a reset, which asks for no action
-    state: Float[np.ndarray, " dim"] | None = None  # likewise
-    chunks: Float[np.ndarray, "chunks steps dim"] | None = None  # what a policy would do, at control rate
-    form: ChunkForm = "targets"  # what their numbers mean
-    is_score: bool = False  # the chunks are to be scored; else a search starts from them
+    episode: str | None = None  # the message's session_id; a new one starts an episode
+    begins: bool = False  # whether the message starts an episode (reset)
+    goal: GivenGoal | None = None  # None: the previous goal
+    frame: UInt8[np.ndarray, "height width 3"] | None = None  # None: a reset, which requests no action
+    state: Float[np.ndarray, " dim"] | None = None  # None: a reset
+    chunks: Float[np.ndarray, "chunks steps dim"] | None = None  # action chunks of a policy, at control rate
+    form: ChunkForm = "targets"  # meaning of the numbers in chunks
+    is_score: bool = False  # whether to score the chunks; otherwise a search starts from them
 
 
 def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_KEYS) -> Request:
-    """Return what a message asks for. Other keys than these are another policy's, and do not matter here.
+    """Parse a message. Unknown keys are ignored, except those that start with goal/.
 
     Args:
-        message: From the wire: keys as in docs/serving_reference.md.
-        image_keys: Where the camera's picture may be, in the order in which they are looked for.
+        message: The decoded message, with the keys of docs/serving_reference.md.
+        image_keys: Keys of the camera image; the first one in the message is used.
 
     Raises:
-        InputError: Something that is needed is missing, or of another kind.
+        InputError: A required value is missing or has a wrong type.
     """
     endpoint, reset, episode = message.get("endpoint", "infer"), message.get("reset", False), message.get("session_id")
     if not isinstance(endpoint, str) or endpoint not in _ENDPOINTS:
@@ -108,15 +108,15 @@ def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_K
     return Request(episode, reset, goal, frame, state, chunks, cast("ChunkForm", form), endpoint == "score")
 
 
-def _is_chunks(found: Any) -> bool:
-    is_array = isinstance(found, np.ndarray) and found.ndim == 3 and found.dtype.kind == "f" and found.size > 0
-    return is_array and len(found) <= MOST_CHUNKS and found.shape[1] <= MOST_CHUNK_STEPS
+def _is_chunks(value: Any) -> bool:
+    is_array = isinstance(value, np.ndarray) and value.ndim == 3 and value.dtype.kind == "f" and value.size > 0
+    return is_array and len(value) <= MOST_CHUNKS and value.shape[1] <= MOST_CHUNK_STEPS
 
 
-def _image(found: Any, where: str) -> np.ndarray:
-    if not isinstance(found, np.ndarray) or found.ndim != 3 or found.shape[2] != 3 or found.dtype != np.uint8:
-        raise _wrong(where, found, "an RGB image: height x width x 3, uint8")
-    return found
+def _image(value: Any, where: str) -> np.ndarray:
+    if not isinstance(value, np.ndarray) or value.ndim != 3 or value.shape[2] != 3 or value.dtype != np.uint8:
+        raise _wrong(where, value, "an RGB image: height x width x 3, uint8")
+    return value
 
 
 def _state(message: Mapping[str, Any]) -> np.ndarray:
@@ -132,36 +132,36 @@ def _state(message: Mapping[str, Any]) -> np.ndarray:
     return np.concatenate([pose, gripper])
 
 
-def _numbers(found: Any, where: str) -> np.ndarray:
-    """Return one row of float64 numbers; a number alone is a row of one."""
-    plain = found if isinstance(found, list) else [found]
-    if isinstance(found, np.ndarray):
-        if found.dtype.kind in "iuf" and found.ndim <= 1:
-            return np.atleast_1d(found).astype(np.float64)
-    elif all(type(one) in (int, float) for one in plain):
-        return np.array(plain, dtype=np.float64)
-    raise _wrong(where, found, "a row of numbers")
+def _numbers(value: Any, where: str) -> np.ndarray:
+    """Return a one-dimensional float64 array from an array, a list or a single number."""
+    numbers = value if isinstance(value, list) else [value]
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind in "iuf" and value.ndim <= 1:
+            return np.atleast_1d(value).astype(np.float64)
+    elif all(type(number) in (int, float) for number in numbers):
+        return np.array(numbers, dtype=np.float64)
+    raise _wrong(where, value, "a row of numbers")
 
 
 def _goal(message: Mapping[str, Any]) -> GivenGoal | None:
-    """Return the goal of a request; a prompt is a goal's name, unless the request says its goal in another way."""
-    given = sorted(key for key in message if key.startswith(_GOAL))
-    for key in given:
-        if key not in {*_WAYS, *_MORE}:
-            raise _wrong("request", key, ", ".join(sorted((*_WAYS, *_MORE))))
-    ways = [key for key in _WAYS if key in message]
-    if len(ways) > 1 or (given and not ways):
-        raise InputError(where="goal", found=", ".join(given), needed="one of goal/image, goal/images, goal/name")
-    if ways and ways != ["goal/name"]:
+    """Return the goal of a request; without goal keys the prompt is the name of the goal."""
+    goal_keys = sorted(key for key in message if key.startswith(_GOAL))
+    for key in goal_keys:
+        if key not in {*_MAIN_KEYS, *_FURTHER_KEYS}:
+            raise _wrong("request", key, ", ".join(sorted((*_MAIN_KEYS, *_FURTHER_KEYS))))
+    main_keys = [key for key in _MAIN_KEYS if key in message]
+    if len(main_keys) > 1 or (goal_keys and not main_keys):
+        raise InputError(where="goal", found=", ".join(goal_keys), needed="one of goal/image, goal/images, goal/name")
+    if main_keys and main_keys != ["goal/name"]:
         return GivenGoal(
-            _in_order(_images(message, ways[0]), message.get("goal/rules")), _mask(message.get("goal/mask"))
+            _in_order(_images(message, main_keys[0]), message.get("goal/rules")), _mask(message.get("goal/mask"))
         )
-    if len(given) > 1:
-        found = ", ".join(given)
+    if len(goal_keys) > 1:
+        found = ", ".join(goal_keys)
         raise InputError(where="goal", found=found, needed="goal/name alone: the server knows the rest")
-    key = "goal/name" if ways else "prompt"
+    key = "goal/name" if main_keys else "prompt"
     name = message.get(key)
-    if name is None and not ways:
+    if name is None and not main_keys:
         return None
     if not isinstance(name, str):
         raise _wrong(key, name, "a text: the name of a goal")
@@ -169,38 +169,38 @@ def _goal(message: Mapping[str, Any]) -> GivenGoal | None:
 
 
 def _images(message: Mapping[str, Any], key: str) -> tuple[np.ndarray, ...]:
-    found = message[key]
+    value = message[key]
     if key == "goal/image":
-        return (_image(found, key),)
-    rows = list(found) if isinstance(found, np.ndarray) and found.ndim == 4 else found
-    if not isinstance(rows, list) or not 1 <= len(rows) <= MOST_GOALS:
-        raise _wrong(key, found, f"1 to {MOST_GOALS} images of one size, in order")
-    return tuple(_image(image, f"{key}[{place}]") for place, image in enumerate(rows))
+        return (_image(value, key),)
+    images = list(value) if isinstance(value, np.ndarray) and value.ndim == 4 else value
+    if not isinstance(images, list) or not 1 <= len(images) <= MOST_GOALS:
+        raise _wrong(key, value, f"1 to {MOST_GOALS} images of one size, in order")
+    return tuple(_image(image, f"{key}[{index}]") for index, image in enumerate(images))
 
 
 def _in_order(images: Sequence[np.ndarray], rules: Any) -> tuple[SubGoal, ...]:
-    """Return images as goals with their rules; without rules none has a bound."""
+    """Combine goal images with their rules; without rules the defaults of `GoalRule` apply."""
     needed = f"a map for each of {counted(len(images), 'image')}: {', '.join(field.name for field in fields(GoalRule))}"
     rules = [{}] * len(images) if rules is None else rules
     if not isinstance(rules, list) or len(rules) != len(images) or not all(map(_is_rule, rules)):
         raise _wrong("goal/rules", rules, needed)
     goals = []
-    for place, (image, values) in enumerate(zip(images, rules, strict=True)):
-        rule = record_of(GoalRule, values, where=f"goal/rules[{place}]", needed=needed)
-        name = rule.name or str(place)
+    for index, (image, values) in enumerate(zip(images, rules, strict=True)):
+        rule = record_of(GoalRule, values, where=f"goal/rules[{index}]", needed=needed)
+        name = rule.name or str(index)
         goals.append(SubGoal(image, name, rule.at_least, rule.at_most, rule.share, rule.gripper))
     return tuple(goals)
 
 
-def _is_rule(found: Any) -> bool:
-    return isinstance(found, dict) and all(isinstance(one, str | int | float | None) for one in found.values())
+def _is_rule(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(field, str | int | float | None) for field in value.values())
 
 
-def _mask(found: Any) -> np.ndarray | None:
-    if found is not None and (not isinstance(found, np.ndarray) or found.ndim != 2 or found.dtype.kind not in "bu"):
+def _mask(value: Any) -> np.ndarray | None:
+    if value is not None and (not isinstance(value, np.ndarray) or value.ndim != 2 or value.dtype.kind not in "bu"):
         needed = "height x width, of the goal's size, bool or whole numbers: 0 where the image does not count"
-        raise _wrong("goal/mask", found, needed)
-    return found
+        raise _wrong("goal/mask", value, needed)
+    return value
 
 
 def _missing(message: Mapping[str, Any], needed: str) -> InputError:
@@ -208,8 +208,8 @@ def _missing(message: Mapping[str, Any], needed: str) -> InputError:
     return InputError(where="request", found=found, needed=needed)
 
 
-def _wrong(where: str, found: Any, needed: str) -> InputError:
-    if isinstance(found, np.ndarray):
-        return InputError(where=where, found=f"an array of shape {found.shape} and type {found.dtype}", needed=needed)
-    text = repr(found)
+def _wrong(where: str, value: Any, needed: str) -> InputError:
+    if isinstance(value, np.ndarray):
+        return InputError(where=where, found=f"an array of shape {value.shape} and type {value.dtype}", needed=needed)
+    text = repr(value)
     return InputError(where=where, found=text if len(text) <= 80 else f"{text[:79]}…", needed=needed)

@@ -17,48 +17,51 @@ from vjepa2_ac.serving.access import Access, ends, listening_on, single_header, 
 from vjepa2_ac.serving.session import GoneError, Session
 from vjepa2_ac.serving.wire import MOST_BYTES, pack
 
-_OPEN_S = 10.0  # that a handshake may take
-_PING_S = 20.0  # between pings; a client that does not answer one for as long is gone
-_WAITING = 2  # messages of a client that are read before they are answered
+_OPEN_S = 10.0  # timeout of a handshake
+_PING_S = 20.0  # interval of pings, and the timeout of their replies
+_WAITING = 2  # messages of a client that are received before the previous ones are answered
 
 Load = Callable[[], tuple[Session, Mapping[str, Any]]]
-"""Loads the model and makes a first decision; returns the session, and what a robot is told on connect."""
+"""Loads the model and makes a first decision; returns the session, and the metadata that is sent on connect."""
 
 
 class PlanningServer:
-    """Serves a planner to one robot at a time."""
+    """A websocket server that plans for one robot at a time."""
 
     def __init__(self, access: Access, port: int, tell: Callable[[str], None]) -> None:
-        """Prepare; nothing is loaded yet.
+        """Create a server; nothing is loaded yet.
 
         Args:
-            access: Where it listens, and for whom.
-            port: 0: a free one.
-            tell: Takes a line for whoever started it.
+            access: Listening address and access rules.
+            port: The port; 0: a free one.
+            tell: Prints a status line.
         """
         self._access, self._port, self._tell = access, port, tell
         self._planning = ThreadPoolExecutor(1, "planning")
-        self._robot: str | None = None  # the address of the one that is served
-        self._turned_away: Counter[str] = Counter()  # by HTTP status
+        self._robot: str | None = None  # address of the connected robot
+        self._rejected: Counter[str] = Counter()  # number of rejected connections by HTTP status
 
     async def run(self, load: Load, stop: asyncio.Event) -> bool:
-        """Take the port, load, then listen until `stop`; return whether the planning thread has ended, too.
+        """Reserve the port, load the model, then listen until `stop` is set.
 
         Args:
-            load: Runs in the planning thread.
-            stop: Ends it.
+            load: Loads the session, in the planning thread.
+            stop: Ends the server.
+
+        Returns:
+            Whether the planning thread has ended, too.
 
         Raises:
-            InputError: What is to be served cannot be loaded, or the address cannot be listened on.
+            InputError: The model cannot be loaded, or the server cannot listen on the address.
         """
         library = require_library("websockets.asyncio.server", where="serve", called="websockets", extra="serve")
         with listening_on(self._access, self._port):
             server = await library.serve(
-                self._robot_came,
+                self._serve_robot,
                 self._access.host,
                 self._port,
-                start_serving=False,  # only the address is taken
-                process_request=self._asked,
+                start_serving=False,  # only binds the address
+                process_request=self._handle_http,
                 max_size=MOST_BYTES,
                 max_queue=_WAITING,
                 open_timeout=_OPEN_S,
@@ -73,41 +76,44 @@ class PlanningServer:
             await _first_of(loading, stopping)
             if not stop.is_set():
                 self._session, self._metadata = loading.result()
-                with listening_on(self._access, self._port):  # another program may have been faster
+                with listening_on(self._access, self._port):  # another program may listen on the port by now
                     await server.start_serving()
                 self._tell(f"listening on {url_of(server, 'ws')}")
                 await stopping
         finally:
-            server.close()  # its clients are gone, which ends what is computed for them
+            server.close()  # disconnects the clients, which cancels their searches
             last = asyncio.wrap_future(self._planning.submit(int))
             self._planning.shutdown(wait=False)
             has_ended = await ends(server.wait_closed(), last)
         return has_ended
 
-    def _asked(self, connection: Any, request: Any) -> Any:
-        """Answer what comes over HTTP, and refuse who may not come in; None: a robot may begin."""
+    def _handle_http(self, connection: Any, request: Any) -> Any:
+        """Handle an HTTP request; return None to accept a websocket connection.
+
+        Health checks need no key. A robot is rejected while another one is connected.
+        """
         path, status = request.path.partition("?")[0], http.HTTPStatus
         host, authorization = (single_header(request, name) for name in ("Host", "Authorization"))
         if path in {"/healthz", "/readyz"}:
             return connection.respond(status.OK, "OK\n")
-        refused = self._access.why_not(host, authorization)
-        if refused is None and path == "/metrics":
+        rejection = self._access.why_not(host, authorization)
+        if rejection is None and path == "/metrics":
             return connection.respond(status.OK, self._metrics())
-        if refused is None and path != "/":
+        if rejection is None and path != "/":
             return connection.respond(status.NOT_FOUND, "no such page\n")
-        if refused is None and request.headers.get_all("Upgrade"):
+        if rejection is None and request.headers.get_all("Upgrade"):
             if request.headers.get_all("Origin"):
-                refused = status.FORBIDDEN.value, "a page in a browser moves no robot"
+                rejection = status.FORBIDDEN.value, "a page in a browser moves no robot"
             elif self._robot is not None:
-                refused = status.SERVICE_UNAVAILABLE.value, _busy(self._robot)
-        if refused is None:
+                rejection = status.SERVICE_UNAVAILABLE.value, _busy(self._robot)
+        if rejection is None:
             return None
-        self._turned_away[str(refused[0])] += 1
-        return connection.respond(status(refused[0]), f"{refused[1]}\n")
+        self._rejected[str(rejection[0])] += 1
+        return connection.respond(status(rejection[0]), f"{rejection[1]}\n")
 
-    async def _robot_came(self, connection: Any) -> None:
-        """Serve a robot until it leaves."""
-        if self._robot is not None:  # both came at once
+    async def _serve_robot(self, connection: Any) -> None:
+        """Serve a robot until it disconnects."""
+        if self._robot is not None:  # two robots connected at the same time
             await connection.close(1013, _busy(self._robot)[:100])
             return
         self._robot = _name(connection)
@@ -129,7 +135,7 @@ class PlanningServer:
             left.cancel()
 
     async def _answer(self, message: bytes, left: asyncio.Future[None]) -> bytes | str | None:
-        """Return the answer to a message; None: the robot has left, and its search ends within an iteration."""
+        """Return the reply to a message; None if the robot has disconnected, which cancels its search."""
         gone = threading.Event()
         answering = asyncio.wrap_future(self._planning.submit(lambda: self._session.answer(message, gone.is_set)))
         try:
@@ -155,16 +161,16 @@ class PlanningServer:
             "decision_seconds_sum": counts.seconds,
             "decision_seconds_count": counts.decisions.total(),
             **{f'decisions_total{{why="{why}"}}': number for why, number in sorted(counts.decisions.items())},
-            **{f'connections_refused_total{{status="{one}"}}': n for one, n in sorted(self._turned_away.items())},
+            **{f'connections_refused_total{{status="{code}"}}': n for code, n in sorted(self._rejected.items())},
         }
         return "".join(f"vjepa2_ac_{name} {value}\n" for name, value in values.items())
 
 
 def serve(load: Load, access: Access, port: int, tell: Callable[[str], None]) -> bool:
-    """Serve until SIGTERM or SIGINT; return whether the planning thread has ended, too.
+    """Run a planning server until SIGTERM or SIGINT; return whether the planning thread has ended, too.
 
     Raises:
-        InputError: As `PlanningServer.run`.
+        InputError: As for `PlanningServer.run`.
     """
     return until_signalled(partial(PlanningServer(access, port, tell).run, load))
 

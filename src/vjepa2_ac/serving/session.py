@@ -1,8 +1,8 @@
-"""The session: one robot's requests, answered by a controller. It knows no sockets.
+"""Answer the requests of one robot with a controller, independently of the network.
 
-Whatever is wrong or doubtful, nobody moves: a request that cannot be used is answered by a sentence, which openpi's
-clients raise as an error, and a decision without a result by an action of zeros. No action is ever sent twice, and each
-is checked once more, independently of how it was planned.
+On any error the robot does not move. An invalid request is answered with a sentence, which openpi's clients raise as an
+error. A decision without a plan is answered with the zero action. No action is sent twice, and each planned action is
+checked against the limits once more, independently of the planner.
 """
 
 from __future__ import annotations
@@ -35,48 +35,48 @@ from vjepa2_ac.storage.structured import plain
 logger = logging.getLogger(__name__)
 
 ActionForm = Literal["delta", "pose"]
-Clock = Callable[[], float]  # seconds, from anywhere
+Clock = Callable[[], float]  # seconds since an arbitrary time
 
-_MOST_NAMES = 20  # of goals in a message
+_MOST_NAMES = 20  # names of goals in an error message
 LATE = "past the deadline"
 _ALARM = "what the camera sees departs from what was predicted: look at the robot"
-_BAR = 0.05  # share of an image's height, black at the top and at the bottom: a padded image
+_BAR = 0.05  # share of the height; an image that is black at top and bottom over this share is padded
 
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """How a session answers."""
+    """The options of a session."""
 
     actions: ActionForm = "delta"
-    control_steps: int = 4  # of a model step: as many waypoints has an answer of poses
+    control_steps: int = 4  # control steps per model step; with `actions="pose"` the number of waypoints per reply
     image_keys: tuple[str, ...] = IMAGE_KEYS
-    deadline_s: float = 60.0  # for a decision, its goal's encoding included; then the action is zero
-    dry_run: bool = False  # plans, and sends zeros
-    is_blind: bool = False  # the model ranks true actions no better than chance: it names no best chunk
+    deadline_s: float = 60.0  # for a decision, including the encoding of its goal; afterwards the action is zero
+    dry_run: bool = False  # whether to plan but send the zero action
+    is_blind: bool = False  # whether the model ranks actions no better than chance; then no best chunk is returned
 
 
 @dataclass
 class Counts:
-    """What a session has done, for whoever watches it."""
+    """Counters of a session, for the metrics page of the server."""
 
-    decisions: Counter[str] = field(default_factory=Counter)  # by their reason
-    refused: int = 0
-    failed: int = 0
+    decisions: Counter[str] = field(default_factory=Counter)  # number of decisions by reason
+    refused: int = 0  # invalid requests
+    failed: int = 0  # requests that ended in an internal error
     episodes: int = 0
-    alarms: int = 0  # frames that departed from what was predicted
-    surprise: float = 0.0  # of the last frame that was compared
-    seconds: float = 0.0  # that all decisions took
+    alarms: int = 0  # frames whose surprise was above the threshold
+    surprise: float = 0.0  # of the last monitored frame
+    seconds: float = 0.0  # total duration of all decisions
 
 
 class GoneError(Exception):
-    """Nobody waits for the answer any more."""
+    """The client has disconnected, so that no reply is needed."""
 
 
 class Session:
-    """Answers the requests of one robot after another.
+    """Answers the requests of one robot at a time.
 
     Raises:
-        InputError: Poses are to be sent, and states are none.
+        InputError: `actions` is "pose", but the model's states are not poses.
     """
 
     def __init__(
@@ -86,47 +86,47 @@ class Session:
         options: SessionOptions | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
-        """Begin without a robot.
+        """Create a session without a robot.
 
         Args:
-            controller: Plans.
-            goals: That a client may name.
-            options: How it answers.
+            controller: Plans the actions.
+            goals: Goals that a client can select by name.
+            options: Options of the session.
             clock: Measures the deadline.
         """
         self.controller, self.options = controller, options or SessionOptions()
         self.goals = goals or {}
         self.counts = Counts()
-        self.recorder: Recorder | None = None  # writes every decision down
+        self.recorder: Recorder | None = None  # records every decision
         self._clock = clock
         self._episode: str | None = None
-        self._has_begun = False  # whether there was an episode of this robot
-        self._goal: str | None = None  # fingerprint of the present one
-        self._names: tuple[str, ...] = ()  # of its parts
-        self._notes: list[str] = []  # that hold for this episode
+        self._has_begun = False  # whether this robot has started an episode
+        self._goal: str | None = None  # fingerprint of the current goal
+        self._names: tuple[str, ...] = ()  # names of its sub-goals
+        self._notes: list[str] = []  # notes for the client in this episode
         self._last_ms: float | None = None
         if self.options.actions == "pose" and not controller.spaces.state.is_pose:
             found = "a model whose states are not poses"
             raise InputError(where="--actions pose", found=found, needed="--actions delta, or a model of poses")
 
     def begin(self) -> None:
-        """Begin with another robot: nothing of the last one is left."""
+        """Reset the state of the session for another robot."""
         self._episode, self._has_begun, self._last_ms = None, False, None
 
     def answer(self, message: bytes, is_gone: Callable[[], bool] = lambda: False) -> bytes | str:
-        """Return the answer to a message: a map, or the sentence of an error.
+        """Return the reply to a message: an encoded map, or the text of an error.
 
         Args:
-            message: From the wire.
-            is_gone: Whether nobody waits for the answer any more.
+            message: The received bytes.
+            is_gone: Returns whether the client has disconnected.
 
         Raises:
-            GoneError: Nobody does.
+            GoneError: The client disconnected during the search.
         """
         began = self._clock()
         try:
             request = read_request(unpack(message), self.options.image_keys)
-            found = self._answered(request, began, is_gone)
+            reply = self._answered(request, began, is_gone)
         except (WireError, InputError) as error:
             self.counts.refused += 1
             return str(error)
@@ -137,7 +137,7 @@ class Session:
             logger.exception("a request could not be answered")
             return "the server failed at this request; its log says more"
         self._last_ms = 1e3 * (self._clock() - began)
-        return pack(found)
+        return pack(reply)
 
     def _answered(self, request: Request, began: float, is_gone: Callable[[], bool]) -> dict[str, Any]:
         if request.begins or not self._has_begun or request.episode not in (None, self._episode):
@@ -155,13 +155,13 @@ class Session:
             return self._sent(request.frame, request.state, (None, LATE), (began, began))
 
     def _carried_out(self, request: Request, began: float, cancelled: Cancelled) -> dict[str, Any]:
-        """Return the answer to a request.
+        """Set the goal of a request if it is new, then decide or score, and return the reply.
 
         Raises:
-            SearchCancelledError: It was cancelled.
+            SearchCancelledError: The search was cancelled.
         """
         if request.goal is not None and (fingerprint := request.goal.fingerprint) != self._goal:
-            self._goal, self._notes = None, []  # a goal that cannot be used leaves none
+            self._goal, self._notes = None, []  # after an invalid goal there is no goal
             self._set(request.goal, cancelled)
             self._goal = fingerprint
         if request.frame is None or request.state is None:
@@ -169,18 +169,18 @@ class Session:
         if self._goal is None:
             needed = f"a goal first: goal/image, goal/images or goal/name{self._known_names()}"
             raise InputError(where="request", found="no goal in this episode", needed=needed)
-        changes, planning_began, seen = self._changes(request), self._clock(), (request.frame, request.state)
-        if request.is_score and changes is not None:  # nothing moves, and no decision is counted
-            found = self.controller.score(*seen, changes, cancelled=cancelled)
-            return {**found.as_dict(is_blind=self.options.is_blind), "goal": found.goal}
-        self.controller.act(*seen, samples=changes, cancelled=cancelled)
+        changes, planning_began, observation = self._changes(request), self._clock(), (request.frame, request.state)
+        if request.is_score and changes is not None:  # the robot does not move, and no decision is counted
+            scores = self.controller.score(*observation, changes, cancelled=cancelled)
+            return {**scores.as_dict(is_blind=self.options.is_blind), "goal": scores.goal}
+        self.controller.act(*observation, samples=changes, cancelled=cancelled)
         decision, why = self._checked(request.state)
         self._note(request.frame)
         self._watch(decision)
-        return self._sent(*seen, (decision, why), (began, planning_began))
+        return self._sent(*observation, (decision, why), (began, planning_began))
 
     def _changes(self, request: Request) -> Float[np.ndarray, "chunks model_steps dim"] | None:
-        """Return what a policy would do as changes of model steps."""
+        """Convert the action chunks of a request into changes per model step; None if there are none."""
         if request.chunks is None or request.state is None:
             return None
         steps, space = self.options.control_steps, self.controller.spaces.state
@@ -193,45 +193,45 @@ class Session:
         decided: tuple[Decision | None, str],
         began: tuple[float, float],
     ) -> dict[str, Any]:
-        """Return the answer to a request for an action; it is counted and recorded.
+        """Return the reply to a request for an action; count and record it.
 
         Args:
-            frame: What the camera saw.
-            state: Measured.
+            frame: The camera image.
+            state: The measured state.
             decided: The decision, if there is one, and its reason.
-            began: When the request and its planning began.
+            began: Start times of the request and of the planning.
         """
-        found, now = self._message(decided[0], state, why := decided[1]), self._clock()
-        found["server_timing"], found["policy_timing"] = ({"infer_ms": 1e3 * (now - one)} for one in began)
+        reply, now = self._message(decided[0], state, why := decided[1]), self._clock()
+        reply["server_timing"], reply["policy_timing"] = ({"infer_ms": 1e3 * (now - start)} for start in began)
         if self._last_ms is not None:
-            found["server_timing"]["prev_total_ms"] = self._last_ms
+            reply["server_timing"]["prev_total_ms"] = self._last_ms
         self.counts.decisions[why] += 1
         self.counts.seconds += now - began[0]
         if self.recorder is not None:
-            self.recorder.decision(frame, state, found)
-        return found
+            self.recorder.decision(frame, state, reply)
+        return reply
 
     def _checked(self, state: np.ndarray) -> tuple[Decision, str]:
-        """Return the decision, and why it is so; without a plan where that must not be sent."""
+        """Return the decision and its reason; the plan is removed if the limits do not allow to send it."""
         decision, controller = self.controller.decision, self.controller
         if decision is None:
             raise ValueError("a controller that acted has decided")
         if decision.plan is None:
             return decision, decision.why
         changes = decision.plan.actions.double().numpy()
-        wrong = why_not_sent(state, changes, controller.config.limits, controller.spaces.state)
-        if not wrong:
+        reason = why_not_sent(state, changes, controller.config.limits, controller.spaces.state)
+        if not reason:
             return decision, decision.why
-        logger.error("a planned action is not sent: %s", wrong)
-        return replace(decision, plan=None, states=None), f"not sent: {wrong}"
+        logger.error("a planned action is not sent: %s", reason)
+        return replace(decision, plan=None, states=None), f"not sent: {reason}"
 
     def _message(self, decision: Decision | None, state: np.ndarray, why: str) -> dict[str, Any]:
-        """Return an answer. Its arrays have one row an action, and all else is plain: clients take rows of arrays.
+        """Return the reply for a decision. Only arrays with one row per action are arrays, because clients slice these.
 
-        Without a decision, or a plan in it, nobody moves.
+        Without a decision, or without a plan in it, the action is zero.
         """
         planned, changes = np.atleast_2d(state), np.zeros((self.controller.space.steps, self.controller.space.dim))
-        found: dict[str, Any] = {
+        reply: dict[str, Any] = {
             "target": planned, "why": why, "goal": None, "done": False, "energy": {"now": None, "plan": None},
             "notes": self._notes,
         }  # fmt: skip
@@ -240,19 +240,23 @@ class Session:
             name = self._names[progress.place]
             goal = {"index": progress.place, "name": name, "since": progress.since, "changed": progress.changed}
             energy = {"now": decision.energy_now, "plan": None if plan is None else plan.energy}
-            found |= {"goal": goal, "done": decision.done, "energy": energy}
-            if (seen := decision.surprise) is not None:
-                found["surprise"] = {"score": seen.score, "is_alarm": seen.is_alarm}
-                if seen.is_alarm:
-                    found["notes"] = [*self._notes, _ALARM]
+            reply |= {"goal": goal, "done": decision.done, "energy": energy}
+            if (surprise := decision.surprise) is not None:
+                reply["surprise"] = {"score": surprise.score, "is_alarm": surprise.is_alarm}
+                if surprise.is_alarm:
+                    reply["notes"] = [*self._notes, _ALARM]
             planned = planned if decision.states is None else decision.states[1:]
             if plan is not None and not self.options.dry_run:
                 changes = plan.actions.double().numpy()
-        found |= {"dry_run": True, "planned": planned} if self.options.dry_run else {"target": planned}
-        return {"actions": self._actions(state, changes), **plain(found)}
+        reply |= {"dry_run": True, "planned": planned} if self.options.dry_run else {"target": planned}
+        return {"actions": self._actions(state, changes), **plain(reply)}
 
     def _actions(self, state: np.ndarray, changes: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "rows dim"]:
-        """Return changes as the robot wants them: waypoints to the first target, or what each model step does."""
+        """Convert the changes of the plan into the format of the reply.
+
+        With `actions="pose"` these are waypoints to the first target. Otherwise they are one row per model step: target
+        states if the data's actions follow the target, else changes.
+        """
         if self.options.actions == "pose":
             return waypoints(state, changes[0], self.options.control_steps)
         if self.controller.spaces.action.follows == "target":
@@ -265,7 +269,7 @@ class Session:
             raise InputError(where="goal", found=f"{goal.name!r}, which names no goal", needed=needed)
         goals = goal.goals if goal.name is None else self.goals[goal.name]
         self.controller.follow(goals, mask=goal.mask, cancelled=cancelled)
-        self._names = tuple(one.name for one in goals)
+        self._names = tuple(sub_goal.name for sub_goal in goals)
         if self.recorder is not None:
             self.recorder.goal(goals, goal.mask)
 
@@ -275,11 +279,11 @@ class Session:
         return f" (this server keeps {', '.join(names[:_MOST_NAMES])}{more})" if names else ""
 
     def _watch(self, decision: Decision) -> None:
-        if (found := decision.surprise) is not None:
-            self.counts.surprise = found.score
-            self.counts.alarms += found.is_alarm
-            if found.is_alarm:
-                logger.warning("surprise %.4g: what is seen departs from what was predicted", found.score)
+        if (surprise := decision.surprise) is not None:
+            self.counts.surprise = surprise.score
+            self.counts.alarms += surprise.is_alarm
+            if surprise.is_alarm:
+                logger.warning("surprise %.4g: what is seen departs from what was predicted", surprise.score)
 
     def _note(self, frame: np.ndarray) -> None:
         text = "black bars at the top and the bottom of the picture: send whole frames, not padded ones"
@@ -289,7 +293,7 @@ class Session:
 
 
 def has_black_bars(frame: np.ndarray) -> bool:
-    """Return whether an image was padded at its top and its bottom, as openpi's `resize_with_pad` does."""
+    """Return whether an image is padded with black bars at the top and bottom, as by openpi's `resize_with_pad`."""
     rows = max(1, int(_BAR * len(frame)))
     return not frame[:rows].any() and not frame[-rows:].any() and bool(frame.any())
 
@@ -297,38 +301,39 @@ def has_black_bars(frame: np.ndarray) -> bool:
 def waypoints(
     state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], steps: int
 ) -> Float[np.ndarray, "steps 7"]:
-    """Return evenly spaced poses to the target, which is the last: x, y, z, extrinsic xyz angles, closedness 0 .. 1.
+    """Return evenly spaced poses from a state to its target, which is the last one.
 
-    Positions go straight, rotations about one axis at one speed (R_delta^share @ R).
+    A pose is x, y, z in metres, extrinsic xyz angles in radians, and closedness from 0 to 1. The position moves along a
+    straight line; the rotation is about one axis with constant speed (R_delta^share @ R).
 
     Args:
-        state: Measured: metres, radians, closedness.
-        action: Its change in a model step.
-        steps: Control steps of a model step.
+        state: The measured pose.
+        action: The change of the pose in one model step.
+        steps: Control steps per model step.
     """
     shares = np.arange(1, steps + 1)[:, None] / steps
     turn = Rotation.from_matrix(matrices_from_euler(action[3:6])).as_rotvec()
     turns = Rotation.from_rotvec(shares * turn).as_matrix()
     positions, gripper = (state[part] + shares * action[part] for part in (slice(0, 3), slice(6, 7)))
     poses = np.concatenate([positions, euler_from_matrices(turns @ matrices_from_euler(state[3:6])), gripper], axis=1)
-    poses[-1] = apply_action(state, action)  # to the last bit
+    poses[-1] = apply_action(state, action)  # bit-identical to the target of the plan
     poses[:, 6] = poses[:, 6].clip(0.0, 1.0)
     return poses
 
 
-_ROUNDING = 1e-6  # limits are float32 where actions are searched
+_ROUNDING = 1e-6  # tolerance, because the search uses float32 limits
 
 
 def why_not_sent(
     state: Float[np.ndarray, " dim"], changes: Float[np.ndarray, "steps dim"], limits: LimitsConfig, space: StateSpace
 ) -> str:
-    """Return why changes of a state must not be sent to a robot, as text; empty: they may.
+    """Return the reason for which planned changes must not be sent to a robot; empty if they may be sent.
 
     Args:
-        state: Measured.
-        changes: Of each model step, one after another.
-        limits: Which they have to be within.
-        space: What the numbers are.
+        state: The measured state.
+        changes: The change of the state in each model step.
+        limits: The limits of actions.
+        space: The meaning of the numbers of a state.
     """
     if not np.isfinite(changes).all():
         return "a number that is not finite"
@@ -339,7 +344,7 @@ def why_not_sent(
         return "more than planning.limits.xyz or l1"
     if (abs(changes[:, 3:6]) > min(limits.rotation + _ROUNDING, math.pi)).any():
         return "more than planning.limits.rotation"
-    if abs(changes[:, 6]).max() > 1.0:  # open and close are changes of 1, whatever the limit
+    if abs(changes[:, 6]).max() > 1.0:  # opening and closing are changes of 1, independently of the limit
         return "more than a gripper can change"
     box, targets = Workspace.of(limits, space), state[:3] + np.cumsum(changes[:, :3], axis=0)
     is_out = box is not None and changes[:, :3].any() and (abs(box.way_back(targets)) > _ROUNDING).any()
