@@ -16,7 +16,7 @@ from vjepa2_ac.policies.score import ChunkForm
 from vjepa2_ac.storage.structured import record_of
 
 IMAGE_KEYS = ("observation/exterior_image_1_left", "observation/exterior_image_0_left", "observation/image")
-"""Keys of the camera image, of which the first in a message is used: those of DROID, of RoboArena, and a generic one."""
+"""Keys of the camera image (DROID, RoboArena, generic); the first one that a message contains is used."""
 
 MOST_GOALS = 32  # goal images of one request
 
