@@ -1,1 +1,1 @@
-"""The interactive page: a person drives a model's predictions in a browser."""
+"""The interactive page of `vjepa2-ac explore`, which shows a model's predictions for commanded motions."""

@@ -1,4 +1,4 @@
-"""The models, the decoder and the held-out episodes of `explore`; and the prediction of one more step."""
+"""Models, decoder and held-out episodes of an `explore` session, and the prediction of one more step."""
 
 from __future__ import annotations
 
@@ -35,51 +35,51 @@ from vjepa2_ac.planning.search_space import SearchSpace, search_space
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces, counterfactual_states, feasible_actions
 
-MOST_STEPS = 16  # of a path: as many as the released model was trained on
-_KEPT_STEPS = 128  # of each model, for undo and for other branches
-_SAME = 2e-5  # of numbers of an action: links are rounded
+MOST_STEPS = 16  # longest path in model steps, as in the training of the released model
+_KEPT_STEPS = 128  # cached predictions per model, for undo and for other branches
+_SAME = 2e-5  # tolerance for equal actions, because links to the page contain rounded numbers
 Pixels = UInt8[np.ndarray, "size size 3"]
 Actions = tuple[tuple[float, ...], ...]
 Simulate = Callable[[int, int, Actions, Cancelled], tuple[np.ndarray, np.ndarray, bool]]
-"""Episode, control step, actions, whether it is cancelled -> frame, state, and whether the arm reached its target."""
+"""(episode, control step, actions, cancelled) -> (frame, state, whether the arm reached its target)."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a person is: the given frame, and the actions that were taken from there."""
+    """A position in a rollout: the start frame, and the actions since then."""
 
-    episode: int  # among those that are shown
+    episode: int  # index among the episodes of the page
     start: int  # control step
     actions: Actions = ()
 
     @property
     def before(self) -> Place:
-        """The place before the last action."""
+        """The position before the last action."""
         return Place(self.episode, self.start, self.actions[:-1])
 
     def after(self, action: tuple[float, ...]) -> Place:
-        """Return the place after one more action."""
+        """Return the position after one more action."""
         return Place(self.episode, self.start, (*self.actions, action))
 
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A true frame, and the state that was measured then."""
+    """A true observation: a frame with its latents, and the state at the same time."""
 
-    pixels: Pixels  # as the encoder sees it
+    pixels: Pixels  # the input of the encoder
     latents: Float[Tensor, "tokens dim"]
     state: Float[np.ndarray, " state_dim"]
-    action: tuple[float, ...] | None = None  # that was recorded, to the next moment; None: nobody knows
-    extrinsics: Float[Tensor, " 6"] | None = None  # of the camera, where the model uses them
-    is_simulated: bool = False  # else recorded
-    reached: bool = True  # whether the arm could do the last action
+    action: tuple[float, ...] | None = None  # the recorded action that leads to the next frame; None: unknown
+    extrinsics: Float[Tensor, " 6"] | None = None  # pose of the camera, if the model uses it
+    is_simulated: bool = False  # whether the frame is simulated; otherwise it was recorded
+    reached: bool = True  # whether the arm could carry out the last action
 
 
 class Explorer:
-    """Imagines what follows from a held-out frame, one action after another, for each of some models.
+    """Predicts rollouts from held-out frames, one action at a time, with each of several models.
 
-    A path is a pure function of its `Place`: two pages, undo and a link need no state here. What was computed is kept
-    for a while.
+    A prediction is a pure function of its `Place`, so several pages, undo and links need no state on the server.
+    Predictions are cached.
     """
 
     def __init__(
@@ -91,18 +91,18 @@ class Explorer:
         autocast: Callable[[], Any],
         simulate: Simulate | None = None,
     ) -> None:
-        """Prepare; `open_explorer` loads the parts.
+        """Create an explorer; `open_explorer` loads its parts.
 
         Args:
             models: The models, on their device.
-            decoder: Of their latents.
-            dataset: Clips of two frames of one camera.
-            episodes: Those that are shown, by their places in the data set.
-            autocast: Within which models compute.
-            simulate: Simulates what was not recorded; None: the data were not simulated.
+            decoder: The decoder of their latents.
+            dataset: A data set with clips of two frames of one camera.
+            episodes: Indices of the episodes of the page in the data set.
+            autocast: Returns the precision context for the models.
+            simulate: Simulates the outcome of other actions; None: the data were not simulated.
 
         Raises:
-            InputError: Nobody knows which state follows from an action.
+            InputError: The data do not define which state follows from an action.
         """
         self.world_model, self.contenders, self.notes = models.world_model, models.contenders, models.notes
         self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
@@ -116,17 +116,17 @@ class Explorer:
 
     @property
     def spaces(self) -> Spaces:
-        """What states and actions are."""
+        """The spaces of states and actions."""
         return self.dataset.spaces
 
     @property
     def stride(self) -> int:
-        """Control steps of a model step."""
+        """Control steps per model step."""
         return self.dataset.config.model_stride
 
     @property
     def device(self) -> torch.device:
-        """Where the models are."""
+        """The device of the models."""
         return self.world_model.device
 
     def name(self, episode: int) -> str:
@@ -134,14 +134,14 @@ class Explorer:
         return self.dataset.table.identity(self.episodes[episode])
 
     def steps(self, episode: int) -> int:
-        """Return the control steps of an episode."""
+        """Return the number of control steps of an episode."""
         return int(self.dataset.table.num_steps[self.episodes[episode]])
 
     def require(self, place: Place) -> Place:
-        """Return a place with its actions as they are understood: close to a recorded one, the recorded one.
+        """Check a position, and replace actions that are equal to the recorded one up to rounding by the recorded one.
 
         Raises:
-            InputError: There is no such frame, or an action is none.
+            InputError: There is no such frame, or an action is invalid.
         """
         if place.episode >= len(self.episodes):
             needed = f"0 to {len(self.episodes) - 1}"
@@ -152,39 +152,42 @@ class Explorer:
         if len(place.actions) > MOST_STEPS:
             fix = "Undo some, or begin anew from another frame"
             raise InputError(where="actions", found=f"{len(place.actions)}", needed=f"at most {MOST_STEPS}", fix=fix)
-        width, understood = len(self.spaces.state), Place(place.episode, place.start)
+        width, checked = len(self.spaces.state), Place(place.episode, place.start)
         for action in place.actions:
             if len(action) != width or not np.isfinite(action).all() or np.abs(action).max() > np.pi:
                 needed = f"{width} numbers of one step, in metres, radians and closedness"
                 raise InputError(where="actions", found=f"{len(action)} numbers", needed=needed)
-            recorded = self.recorded_next(understood)
-            is_it = recorded is not None and np.allclose(action, recorded, atol=_SAME)
-            understood = understood.after(recorded if is_it and recorded is not None else action)
-        return understood
+            recorded = self.recorded_next(checked)
+            is_recorded = recorded is not None and np.allclose(action, recorded, atol=_SAME)
+            checked = checked.after(recorded if is_recorded and recorded is not None else action)
+        return checked
 
-    # ---- what is recorded ----
+    # ---- true frames ----
 
     def moment(self, episode: int, step: int) -> Moment:
-        """Return the recorded moment at a control step."""
+        """Return the recorded observation at a control step."""
         last = self.steps(episode) - 1 - self.stride
         return self._pair(episode, step)[0] if step <= last else self._pair(episode, step - self.stride)[1]
 
     def along(self, place: Place) -> list[Moment | None]:
-        """Return what is recorded at the start and after each action; None: the recording ended, or went elsewhere."""
+        """Return the recorded observations at the start and after each action.
+
+        An entry is None from the first action on that differs from the recorded one, and after the end of the episode.
+        """
         step = place.start
-        found: list[Moment | None] = [self.moment(place.episode, step)]
+        moments: list[Moment | None] = [self.moment(place.episode, step)]
         for action in place.actions:
-            before, step = found[-1], step + self.stride
-            goes_there = before is not None and action == before.action and step < self.steps(place.episode)
-            found.append(self.moment(place.episode, step) if goes_there else None)
-        return found
+            before, step = moments[-1], step + self.stride
+            is_recorded = before is not None and action == before.action and step < self.steps(place.episode)
+            moments.append(self.moment(place.episode, step) if is_recorded else None)
+        return moments
 
     def recorded(self, place: Place) -> Moment | None:
-        """Return the recorded moment at a place; None: the recording ended, or did something else."""
+        """Return the recorded observation at a position; None if the actions differ from the recorded ones."""
         return self.along(place)[-1]
 
     def recorded_next(self, place: Place) -> tuple[float, ...] | None:
-        """Return the recorded action at a place; None: there is none."""
+        """Return the recorded action at a position; None if there is none."""
         moment = self.recorded(place)
         return None if moment is None else moment.action
 
@@ -194,7 +197,7 @@ class Explorer:
         with self.autocast():
             encoded = encode_batch(self.world_model, batch, device=self.device, chunk=2)
         if batch.frames is None:
-            raise ValueError("a cache was refused")
+            raise ValueError("a cache was refused")  # `open_explorer` has checked that the data have frames
         pixels = frames_as_seen(batch.frames[0].numpy(), self.world_model.image_size)
         states = batch.states[0].double().numpy()
         action = batch.actions[0, 0].double().numpy()
@@ -206,10 +209,10 @@ class Explorer:
 
     @torch.no_grad()
     def truth(self, place: Place, cancelled: Cancelled = lambda: False) -> Moment | None:
-        """Return what is true at a place: recorded, else simulated; None: it is unknown.
+        """Return the true observation at a position, recorded or else simulated; None if it is unknown.
 
         Raises:
-            SearchCancelledError: It was cancelled.
+            SearchCancelledError: The simulation was cancelled.
         """
         recorded = self.recorded(place)
         if recorded is not None or self.simulate is None:
@@ -221,10 +224,10 @@ class Explorer:
         (pixels,) = frames_as_seen(view(frame[None], crop), self.world_model.image_size)
         return Moment(pixels, latents, state, is_simulated=True, reached=reached)
 
-    # ---- what is imagined ----
+    # ---- predictions ----
 
     def states(self, place: Place) -> Float[np.ndarray, "time state_dim"]:
-        """Return the states along a path: recorded as far as the recording goes that way, then integrated."""
+        """Return the states along a path: recorded while the actions are the recorded ones, then integrated."""
         states = [self.moment(place.episode, place.start).state]
         for action, recorded in zip(place.actions, self.along(place)[1:], strict=True):
             following = counterfactual_states(states[-1], np.array([action]), self.spaces.state)[1]
@@ -232,44 +235,49 @@ class Explorer:
         return np.stack(states)
 
     def imagined(self, teller: int, place: Place) -> Float[Tensor, "tokens dim"]:
-        """Return the latents at the end of a path as a model imagines them; without actions the true ones."""
+        """Return the predicted latents at the end of a path; without actions the true ones.
+
+        Args:
+            teller: Index of the model in `contenders`.
+            place: The start frame and the actions.
+        """
         return self._end(teller, place)[0]
 
     @torch.no_grad()
     def _imagine(self, teller: int, place: Place) -> tuple[Float[Tensor, "tokens dim"], KeyValueCache]:
-        """Return the latents at the end of a path, and the cache of the steps before."""
+        """Return the predicted latents at the end of a path, and the key/value cache of all its steps."""
         if not place.actions:
             return self.moment(place.episode, place.start).latents, KeyValueCache()
         (before, cache), states = self._end(teller, place.before), self.states(place)
-        given = states[-1]
+        values = states[-1]
         if self.spaces.action.follows != "target":
-            given = np.array(place.actions[-1])
-            if self.recorded(place) is None:  # its gripper changes as far as it can
-                given = feasible_actions(states[-2], given[None], self.spaces.state)[0]
+            values = np.array(place.actions[-1])
+            if self.recorded(place) is None:  # limits the change of the gripper to what is possible
+                values = feasible_actions(states[-2], values[None], self.spaces.state)[0]
         cache, camera = cache.copy(), self.camera(place)
-        action, state = (torch.as_tensor(one, dtype=torch.float32, device=self.device) for one in (given, states[-2]))
-        seen = before[None, None], action[None, None], state[None, None]
+        action, state = (torch.as_tensor(x, dtype=torch.float32, device=self.device) for x in (values, states[-2]))
+        inputs = before[None, None], action[None, None], state[None, None]
         with self.autocast(), self.contenders[teller].switched():
-            predicted = self.model(teller).predict(*seen, None if camera is None else camera[None, None], cache)
+            predicted = self.model(teller).predict(*inputs, None if camera is None else camera[None, None], cache)
         return predicted[0, 0].float(), cache
 
     def model(self, teller: int) -> WorldModel:
-        """Return what imagines; it counts within `contenders[teller].switched()`."""
+        """Return a model. Use it within `contenders[teller].switched()`, because models share weights."""
         model = self.contenders[teller].model
         assert isinstance(model, WorldModel)  # noqa: S101  # `load_subject` loads no other
         return model
 
     def camera(self, place: Place) -> Float[Tensor, " 6"] | None:
-        """Return the camera's pose, where the models use it."""
+        """Return the pose of the camera, if the models use it."""
         return self.moment(place.episode, place.start).extrinsics
 
     def decoded(self, latents: Float[Tensor, "tokens dim"]) -> Pixels:
-        """Return latents as an image for people."""
+        """Decode latents into an image."""
         return np.asarray(shown(self.decoder.decoder, latents[None])[0])
 
 
 def relative_spread(latents: Float[Tensor, "tokens dim"], like: Float[Tensor, "tokens dim"]) -> float:
-    """Return the variance of latents over the patches of a frame, as a share of another frame's; 1: as varied."""
+    """Return the variance of latents over the patches of a frame, relative to that of another frame."""
     return float(latents.var(dim=0).sum() / like.var(dim=0).sum())
 
 
@@ -281,21 +289,21 @@ def open_explorer(
     simulate: Callable[[Dataset], Simulate | None] = lambda _: None,
     reporter: Reporter = SILENT,
 ) -> Explorer:
-    """Load everything, on the device of the config.
+    """Load the models and open the data of an explorer, on the device of the config.
 
     Args:
-        config: With the data.
-        decoder: Of the latents of the models.
-        split: Whose episodes are shown.
+        config: The config with the data.
+        decoder: The decoder of the models' latents.
+        split: The split whose episodes are shown.
         load: Loads the models.
-        simulate: Returns what simulates a data set.
+        simulate: Returns the simulator of a data set; None if the data were not simulated.
         reporter: Shows the progress.
 
     Raises:
-        InputError: Models or data cannot be used, or the decoder is that of another encoder.
+        InputError: Models or data cannot be used, or the decoder belongs to another encoder.
     """
-    one = {"frames": 2, "camera": config.data.cameras[0], "workers": 0}
-    config = config.model_copy(update={"data": config.data.model_copy(update=one)})
+    changes = {"frames": 2, "camera": config.data.cameras[0], "workers": 0}
+    config = config.model_copy(update={"data": config.data.model_copy(update=changes)})
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     require_frames(config.data, to="show what is true")
@@ -305,35 +313,35 @@ def open_explorer(
     decoder.to(accelerator.device)
     members = dataset.members(split)[dataset.episodes]
     long_enough = dataset.table.num_steps[dataset.episodes] > config.data.model_stride
-    episodes = tuple(int(one) for one in dataset.episodes[members & long_enough])
+    episodes = tuple(int(index) for index in dataset.episodes[members & long_enough])
     if not episodes:
-        dataset.windows(split)  # says why
+        dataset.windows(split)  # raises an error with the reason
     return Explorer(models, decoder, dataset, episodes, accelerator.autocast, simulate(dataset))
 
 
 # ---- energies and plans ----
 
-_NODES = 7  # of an energy map along each axis
+_NODES = 7  # points of an energy map along each axis
 
 
 @dataclass(frozen=True, eq=False)
 class PlanFound:
-    """A plan, and what its search saw."""
+    """A plan, and the best sample of each iteration of its search."""
 
     plan: Plan
-    energy_now: float  # of what is imagined now
-    best: tuple[Float[Tensor, "tokens dim"], ...]  # imagined end of the best sample of each iteration
+    energy_now: float  # energy of the predicted frame before the plan
+    best: tuple[Float[Tensor, "tokens dim"], ...]  # predicted last frame of the best sample of each iteration
 
 
 class Search:
-    """Searches from places that are imagined."""
+    """Plans and energy maps that start from predicted frames."""
 
     def __init__(self, explorer: Explorer, config: PlanningConfig) -> None:
-        """Prepare.
+        """Create a search.
 
         Args:
-            explorer: With the models.
-            config: How plans are searched, and what energy is.
+            explorer: The explorer with the models.
+            config: The planning config, with the energy.
         """
         self._explorer, self.config = explorer, config
 
@@ -350,21 +358,29 @@ class Search:
 
     @property
     def axes(self) -> tuple[int, ...]:
-        """The numbers of an action over which energy is shown: of a pose the position, else the first ones."""
+        """The axes of the energy maps, as indices of an action: the position of a pose, or the first free numbers."""
         is_pose = self._explorer.spaces.state.is_pose
         return (0, 1, 2) if is_pose else tuple(self.space().free[:3].tolist())
 
     def energy(self, latents: Float[Tensor, "tokens dim"], goal: Float[Tensor, "tokens dim"]) -> float:
-        """Return the distance of a frame to a goal."""
+        """Return the energy of a frame: its distance to the goal frame."""
         return float(distance(latents[None], goal[None], self.config.energy))
 
     def maps(
         self, teller: int, place: Place, goal: Tensor, action: Sequence[float], progress: Progress, cancelled: Cancelled
     ) -> tuple[EnergySlice, ...]:
-        """Return the energy after one more action, over each pair of its numbers.
+        """Return the energy after one more action, as maps over each pair of the numbers in `axes`.
+
+        Args:
+            teller: Index of the model.
+            place: The position to start from.
+            goal: Latents of the goal frame.
+            action: The action in the middle of the maps.
+            progress: Called with the number of evaluated actions.
+            cancelled: Returns whether to cancel.
 
         Raises:
-            InputError: There are no limits.
+            InputError: The config has no limits of actions.
             SearchCancelledError: It was cancelled.
         """
         around = torch.tensor([list(action)], dtype=torch.float32)
@@ -375,11 +391,11 @@ class Search:
     def plan(
         self, teller: int, place: Place, goal: Tensor, steps: int, progress: Progress, cancelled: Cancelled
     ) -> PlanFound:
-        """Return a plan of some steps.
+        """Plan `steps` model steps towards a goal frame.
 
         Raises:
-            InputError: There are no limits.
-            SearchCancelledError: It was cancelled.
+            InputError: The config has no limits of actions.
+            SearchCancelledError: The search was cancelled.
         """
         planner = Planner(self._of(steps), self.space(steps), progress=progress)
         with self._cost(teller, place, goal) as cost, torch.no_grad():
@@ -391,7 +407,7 @@ class Search:
 
     @contextmanager
     def _cost(self, teller: int, place: Place, goal: Tensor) -> Iterator[WorldModelCost]:
-        """Yield the energy from a place; what is imagined there counts as seen."""
+        """Yield the cost function of a search from a position, whose predicted frame is used like an observed one."""
         explorer = self._explorer
         state = torch.from_numpy(np.array(explorer.states(place)[-1], dtype=np.float32))
         scene = Scene(explorer.imagined(teller, place), state, explorer.camera(place))

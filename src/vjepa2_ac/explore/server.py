@@ -1,4 +1,4 @@
-"""The server of the page: a socket for each page; one thread computes, and the newest request of a page wins."""
+"""The server of the page: one socket per page, and one thread that computes the newest request of each page."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-_MOST_PAGES = 8
+_MOST_PAGES = 8  # pages that may be open at the same time
 
 
 @dataclass
 class _Client:
-    """One page: the request that waits, and whether the running one is wanted any more."""
+    """One page: its pending request, and whether a newer request has replaced the running one."""
 
     waiting: PageRequest | None = None
     arrived: asyncio.Event = field(default_factory=asyncio.Event)
@@ -48,29 +48,33 @@ class _Client:
 
 
 class ExploreServer:
-    """Serves `Views` to the pages of this machine's browsers."""
+    """Serves `Views` to browsers on this machine."""
 
     def __init__(self, views: Views, port: int = 0) -> None:
-        """Prepare.
+        """Create a server; it does not listen yet.
 
         Args:
-            views: Answers requests.
-            port: Of this machine; 0: a free one.
+            views: Answers the requests of pages.
+            port: The port; 0: a free one.
         """
         self._views, self._access, self._port = views, Access("127.0.0.1"), port
         self._computing = ThreadPoolExecutor(1, "imagining")
         self._pages = 0
 
     async def run(self, stop: asyncio.Event, ready: Callable[[str], None]) -> None:
-        """Listen until `stop`; tell the page's address once it can be opened.
+        """Listen until `stop` is set.
+
+        Args:
+            stop: Ends the server.
+            ready: Called with the URL of the page, once it can be opened.
 
         Raises:
-            InputError: The address cannot be listened on.
+            InputError: The server cannot listen on the address.
         """
         library = require_library("websockets.asyncio.server", where="explore", called="websockets", extra="explore")
         how = {"process_request": self._respond, "max_size": MOST_BYTES, "compression": None, "server_header": None}
         with listening_on(self._access, self._port):
-            server = await library.serve(self._came, self._access.host, self._port, **how)
+            server = await library.serve(self._serve_client, self._access.host, self._port, **how)
         ready(f"{url_of(server, 'http')}/")
         try:
             await stop.wait()
@@ -80,21 +84,21 @@ class ExploreServer:
             self._computing.shutdown(wait=False, cancel_futures=True)
 
     def _respond(self, connection: Any, request: Any) -> Any:
-        """Return the HTTP response to a request; None: the socket of a page may open.
+        """Return the HTTP response to a request; None to accept the websocket of a page.
 
-        The socket is only for this server's own page: `Origin` has to name the host of the request.
+        Only the page of this server may open a websocket: the header `Origin` must name the host of the request.
         """
         path, host, status = request.path.partition("?")[0], single_header(request, "Host"), http.HTTPStatus
         if self._access.why_not(host, None) is not None:
             return connection.respond(status.FORBIDDEN, "the page is for this machine only, under its own names\n")
         if path == "/socket":
-            is_own = single_header(request, "Origin") == f"http://{host}"
-            return None if is_own else connection.respond(status.FORBIDDEN, "not this server's page\n")
+            is_same_origin = single_header(request, "Origin") == f"http://{host}"
+            return None if is_same_origin else connection.respond(status.FORBIDDEN, "not this server's page\n")
         if path not in _FILES:
             return connection.respond(status.NOT_FOUND, "no such page\n")
         return _file(connection, *_FILES[path])
 
-    async def _came(self, connection: Any) -> None:
+    async def _serve_client(self, connection: Any) -> None:
         if self._pages >= _MOST_PAGES:
             await connection.close(1013, f"{_MOST_PAGES} pages are open")
             return
@@ -105,8 +109,8 @@ class ExploreServer:
         try:
             with contextlib.suppress(closed.exceptions.ConnectionClosed):
                 async for message in connection:
-                    if wrong := self._take(client, message):
-                        await connection.send(wrong)
+                    if error_message := self._take(client, message):
+                        await connection.send(error_message)
         finally:
             self._pages -= 1
             client.replaced.set()
@@ -116,7 +120,7 @@ class ExploreServer:
                     logger.error("a page was given up", exc_info=error)
 
     def _take(self, client: _Client, message: str | bytes) -> bytes | None:
-        """Put a request in the place of the one that waits; return the answer to what is none."""
+        """Set the pending request of a page, which cancels the running one; return an error if it is invalid."""
         try:
             client.waiting = read_request(message)
         except InputError as error:
@@ -160,7 +164,7 @@ class ExploreServer:
 
 
 def _file(connection: Any, name: str, kind: str) -> Any:
-    """Return the response with a file of the page."""
+    """Return the response that contains a file of the page."""
     response = connection.respond(http.HTTPStatus.OK, "")
     response.body = files("vjepa2_ac").joinpath("explore/page", name).read_bytes()
     del response.headers["Content-Type"], response.headers["Content-Length"]
@@ -170,10 +174,10 @@ def _file(connection: Any, name: str, kind: str) -> Any:
 
 
 def serve_page(views: Views, port: int, ready: Callable[[str], None]) -> None:
-    """Serve until SIGTERM or SIGINT.
+    """Serve the page until SIGTERM or SIGINT.
 
     Raises:
-        InputError: As `ExploreServer.run`.
+        InputError: As for `ExploreServer.run`.
     """
     server = ExploreServer(views, port)
     until_signalled(lambda stop: server.run(stop, ready))

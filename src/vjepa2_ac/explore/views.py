@@ -1,4 +1,4 @@
-"""What a page is told: of a model and its data, of an episode, of a place, of energies and plans."""
+"""Messages between the page and the server: requests, and answers with predictions, energies and plans."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from vjepa2_ac.planning.planner import Cancelled
 from vjepa2_ac.spaces import Space
 from vjepa2_ac.storage.structured import plain, record_of
 
-_QUICK = {"samples": 64, "iterations": 4}  # of a plan: docs/planning.md says how good it is
-_MOST_FRAMES = 16  # of a film strip
-_MOST_EPISODES = 500
-_SEARCHED = 32  # episodes, for the one with the most motion, and for the sizes of usual steps
-_USUAL = 90.0  # percentile of recorded changes, of those that are more than a share of the largest: a gripper rests
-_MOVES_FROM = 0.1
-_UNKNOWN = 0.05, 0.1, 0.5, 0.05  # step of a position, rotation, gripper, other number that the data never change
+_QUICK = {"samples": 64, "iterations": 4}  # size of a search on a CPU; docs/planning.md rates its plans
+_MOST_FRAMES = 16  # frames of an image strip
+_MOST_EPISODES = 500  # episodes in the list of the page
+_SEARCHED = 32  # episodes that are read to find the one with the most motion, and usual step sizes
+_USUAL = 90.0  # percentile of the recorded changes that is proposed as step size
+_MOVES_FROM = 0.1  # changes below this share of the largest change count as rest
+_UNKNOWN = 0.05, 0.1, 0.5, 0.05  # step of positions, rotations, grippers, other numbers that never change in the data
 _MOVES: tuple[tuple[str, int | None, int], ...] = (
     ("forward", 0, 1), ("back", 0, -1), ("left", 1, 1), ("right", 1, -1), ("up", 2, 1), ("down", 2, -1),
     ("turn left", 5, 1), ("turn right", 5, -1), ("open", 6, -1), ("close", 6, 1), ("still", None, 0),
@@ -43,7 +43,7 @@ _MOVES: tuple[tuple[str, int | None, int], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Answers a page's requests. It knows no sockets."""
+    """Answers the requests of a page, independently of the network."""
 
     subject: str
     explorer: Explorer
@@ -51,37 +51,37 @@ class Views:
 
     @classmethod
     def of(cls, subject: str, explorer: Explorer, config: Config) -> Views:
-        """Return the views of an explorer; on a CPU plans are searched quickly, unless the config says how."""
+        """Return the views of an explorer. On a CPU the search is small, unless the config changes `planning`."""
         planning = config.planning
         if explorer.device.type == "cpu" and planning == PlanningConfig(limits=planning.limits):
             planning = planning.model_copy(update=_QUICK)
         return cls(subject, explorer, Search(explorer, planning))
 
     def answer(self, request: PageRequest, progress: Progress, cancelled: Cancelled) -> bytes:
-        """Return the answer to a request.
+        """Return the encoded answer to a request.
 
         Args:
-            request: From a page.
-            progress: Of a search.
-            cancelled: Asked during a search or a simulation, whether its result is still needed.
+            request: The request of a page.
+            progress: Called during a search.
+            cancelled: Returns whether to cancel a search or a simulation.
 
         Raises:
-            InputError: There is no such place, goal or model.
+            InputError: There is no such position, goal or model.
             SearchCancelledError: It was cancelled.
         """
         if request.kind == "episode":
             return self._episode(request)
-        actions = tuple(tuple(one) for one in request.actions)
+        actions = tuple(tuple(action) for action in request.actions)
         place = self.explorer.require(Place(request.episode, request.start, actions))
         if request.kind == "look":
             return self._look(request, place, cancelled)
         return self._searched(request, place, progress, cancelled)
 
     def hello(self) -> bytes:
-        """Return what a page is told first."""
+        """Return the first message to a page: models, episodes, units, moves, and a proposed start and goal."""
         explorer, space = self.explorer, self.explorer.spaces.state
         episode, goal = self._proposed
-        told = {
+        content = {
             "subject": self.subject,
             "notes": explorer.notes,
             "tellers": [{"id": one.name, "label": one.name} for one in explorer.contenders],
@@ -102,28 +102,28 @@ class Views:
             "place": {"episode": episode, "start": 0},
             "goal": {"episode": episode, "step": goal},
         }
-        return packed("hello", None, told)
+        return packed("hello", None, content)
 
     @cached_property
     def episode_names(self) -> list[str]:
-        """The names of the episodes, as short as they differ."""
-        names = [self.explorer.name(one) for one in range(len(self.explorer.episodes))]
+        """The names of the episodes, shortened to the parts in which they differ."""
+        names = [self.explorer.name(index) for index in range(len(self.explorer.episodes))]
         short = short_names(names)
         return [short[name] for name in names]
 
-    # ---- what can be done ----
+    # ---- actions and moves ----
 
     @cached_property
     def numbers(self) -> list[dict[str, Any]]:
-        """The numbers of an action, with the largest one that can be chosen, and a usual step."""
+        """The numbers of an action: name, unit, usual step size, and the largest value that can be selected."""
         space, usual = self.explorer.spaces.state, self._usual_changes
         steps = []
         for number in range(len(space)):
             kind = {"m": 0, "rad": 1}.get(space.units[number], 2 if number == space.gripper else 3)
             steps.append(float(usual[number]) if usual[number] > _UNKNOWN[kind] / 10 else _UNKNOWN[kind])
-        for alike in (space.position, space.rotation):
-            if alike is not None:
-                steps[alike] = [max(steps[alike])] * len(steps[alike])
+        for part in (space.position, space.rotation):
+            if part is not None:
+                steps[part] = [max(steps[part])] * len(steps[part])
         return [
             {**unit, "name": name, "step": step, "most": 2 * step}
             for unit, name, step in zip(shown_units(space), space.change_names, steps, strict=True)
@@ -131,7 +131,7 @@ class Views:
 
     @property
     def moves(self) -> list[dict[str, Any]]:
-        """The moves of a person, by name: an axis of an action, and a sign."""
+        """The moves that a user can command: name, axis of the action, and sign."""
         space, moves = self.explorer.spaces.state, _MOVES
         if not space.is_base_pose:
             names = enumerate(space.change_names)
@@ -142,31 +142,31 @@ class Views:
     @cached_property
     def _recorded_changes(self) -> list[Float[np.ndarray, "steps dim"]]:
         """The changes of the state in each model step of some episodes."""
-        explorer, found = self.explorer, []
+        explorer, changes = self.explorer, []
         for episode in explorer.episodes[:_SEARCHED]:
             states = np.asarray(explorer.dataset.source.read(episode).states, dtype=np.float64)
-            found.append(explorer.spaces.state.differences(states[:: explorer.stride]))
-        return found
+            changes.append(explorer.spaces.state.differences(states[:: explorer.stride]))
+        return changes
 
     @property
     def _usual_changes(self) -> Float[np.ndarray, " dim"]:
         sizes = np.abs(np.concatenate(self._recorded_changes)).T
-        return np.array([np.percentile(one[one >= _MOVES_FROM * one.max()], _USUAL) for one in sizes])
+        return np.array([np.percentile(axis[axis >= _MOVES_FROM * axis.max()], _USUAL) for axis in sizes])
 
     @property
     def _proposed(self) -> tuple[int, int]:
-        """The episode with the most motion, and its last frame for a goal."""
+        """The proposed start and goal: the episode with the most motion, and its last control step."""
         size = self.explorer.spaces.state.sized
-        ways = [float(np.linalg.norm(one[:, size], axis=1).sum()) for one in self._recorded_changes]
-        episode = int(np.argmax(ways))
+        lengths = [float(np.linalg.norm(changes[:, size], axis=1).sum()) for changes in self._recorded_changes]
+        episode = int(np.argmax(lengths))
         return episode, self.explorer.steps(episode) - 1
 
     @cached_property
     def step_seconds(self) -> float:
-        """How long a step takes here, with its image: measured once, warm."""
-        still = (0.0,) * len(self.explorer.spaces.state)
-        for tried in range(2):
-            began, place = time.perf_counter(), Place(0, 0, (still,) * (tried + 1))
+        """Seconds for the prediction and decoding of one step with all models, measured once after a warm-up."""
+        zero_action = (0.0,) * len(self.explorer.spaces.state)
+        for attempt in range(2):
+            began, place = time.perf_counter(), Place(0, 0, (zero_action,) * (attempt + 1))
             for teller in range(len(self.explorer.contenders)):
                 self.explorer.decoded(self.explorer.imagined(teller, place))
         return time.perf_counter() - began
@@ -177,7 +177,7 @@ class Views:
         explorer, index = self.explorer, request.episode
         explorer.require(Place(index, 0))
         last, stride = explorer.steps(index) - 1, explorer.stride
-        steps = [place * stride for place in spread_with_ends(last // stride + 1, _MOST_FRAMES)]
+        steps = [index * stride for index in spread_with_ends(last // stride + 1, _MOST_FRAMES)]
         images = [
             Image(f"frame-{number}", explorer.moment(index, step).pixels, f"recorded at control step {step}")
             for number, step in enumerate(steps)
@@ -206,7 +206,7 @@ class Views:
                 "energy": None if goal is None else self.search.energy(latents, goal.latents),
             })  # fmt: skip
         position = explorer.spaces.state.position
-        told = {
+        content = {
             "episode": place.episode,
             "start": place.start,
             "actions": place.actions,
@@ -220,10 +220,14 @@ class Views:
             "tellers": tellers,
             "copying": None if outcome is None else float(mean_difference(start.latents, outcome.latents).mean()),
         }
-        return packed("look", request.seq, told, images)
+        return packed("look", request.seq, content, images)
 
     def _goal(self, request: PageRequest) -> Moment | None:
-        """Return the frame to be reached; None: there is none."""
+        """Return the goal frame of a request; None if there is none.
+
+        Raises:
+            InputError: There is no such frame.
+        """
         explorer, goal = self.explorer, request.goal
         if goal is None:
             return None
@@ -238,42 +242,43 @@ class Views:
         return error_colours(errors.float().reshape(grid, grid).cpu().numpy(), (size, size)).astype(np.uint8)
 
     def _searched(self, request: PageRequest, place: Place, progress: Progress, cancelled: Cancelled) -> bytes:
-        names = [one.name for one in self.explorer.contenders]
+        names = [contender.name for contender in self.explorer.contenders]
         moment = self._goal(request)
         if moment is None or request.teller not in names:
             raise InputError(where=request.kind, found="no goal, or no model", needed="both")
         goal, teller = moment.latents, names.index(request.teller)
         if request.kind == "plan":
-            found = self.search.plan(teller, place, goal, request.steps, progress, cancelled)
-            told = {
-                "actions": found.plan.actions.double(),
-                "energy_now": found.energy_now,
-                "energy_plan": found.plan.energy,
-                "iterations": [{"lowest": one.lowest} for one in found.plan.iterations if len(one.elites)],
+            result = self.search.plan(teller, place, goal, request.steps, progress, cancelled)
+            iterations = [iteration for iteration in result.plan.iterations if len(iteration.elites)]
+            content = {
+                "actions": result.plan.actions.double(),
+                "energy_now": result.energy_now,
+                "energy_plan": result.plan.energy,
+                "iterations": [{"lowest": iteration.lowest} for iteration in iterations],
             }
-            best = [self.explorer.decoded(one) for one in found.best]
             images = [
-                Image(f"best-{number}", one, f"best of iteration {number + 1}") for number, one in enumerate(best)
+                Image(f"best-{number}", self.explorer.decoded(latents), f"best of iteration {number + 1}")
+                for number, latents in enumerate(result.best)
             ]
-            return packed("plan", request.seq, told, images)
+            return packed("plan", request.seq, content, images)
         width = len(self.explorer.spaces.state)
         action = request.action if len(request.action) == width else [0.0] * width
         maps = self.search.maps(teller, place, goal, action, progress, cancelled)
         shown = [
             {
-                "across": one.axes[0], "up": one.axes[1], "across_values": one.across, "up_values": one.up,
-                "energy": one.energy,
+                "across": plane.axes[0], "up": plane.axes[1], "across_values": plane.across, "up_values": plane.up,
+                "energy": plane.energy,
             }
-            for one in maps
+            for plane in maps
         ]  # fmt: skip
         now = self.search.energy(self.explorer.imagined(teller, place), goal)
         return packed("energy", request.seq, {"maps": shown, "now": now}, ())
 
 
-# ---- messages between page and server: requests in JSON; answers with a header in JSON, and images behind it ----
+# ---- message format: a request is JSON; an answer is a JSON header followed by images ----
 
-MOST_BYTES = 1 << 16  # of a request
-_QUALITY = 90
+MOST_BYTES = 1 << 16  # size limit of a request
+_QUALITY = 90  # JPEG quality
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Action = Annotated[list[Number], Field(max_length=64)]
@@ -282,7 +287,7 @@ Index = Annotated[int, Field(ge=0, le=1 << 40)]
 
 @dataclass(frozen=True)
 class GoalFrame:
-    """The frame of an episode that is to be reached."""
+    """A goal frame: an episode and a control step."""
 
     episode: Index
     step: Index  # control step
@@ -290,7 +295,7 @@ class GoalFrame:
 
 @dataclass(frozen=True)
 class PageRequest:
-    """What a page asks for; which of the fields count depends on the kind."""
+    """A request of a page; `kind` determines which fields are used."""
 
     seq: Index
     kind: Literal["episode", "look", "energy", "plan"]
@@ -298,16 +303,16 @@ class PageRequest:
     start: Index = 0  # control step of the given frame
     actions: Annotated[list[Action], Field(max_length=MOST_STEPS)] = field(default_factory=list)
     goal: GoalFrame | None = None
-    teller: Annotated[str, Field(max_length=200)] = ""  # whose energy it is
-    action: Action = field(default_factory=list)  # around which it is shown
-    steps: Annotated[int, Field(ge=1, le=8)] = 1  # of a plan
+    teller: Annotated[str, Field(max_length=200)] = ""  # name of the model, for energy and plan
+    action: Action = field(default_factory=list)  # the action in the middle of the energy maps
+    steps: Annotated[int, Field(ge=1, le=8)] = 1  # model steps of a plan
 
 
 def read_request(text: str | bytes) -> PageRequest:
-    """Return a request.
+    """Parse a request.
 
     Raises:
-        InputError: It is none.
+        InputError: The text is not a valid request.
     """
     try:
         values = json.loads(text)
@@ -318,30 +323,32 @@ def read_request(text: str | bytes) -> PageRequest:
 
 @dataclass(frozen=True)
 class Image:
-    """A picture of an answer."""
+    """An image of an answer."""
 
     name: str
     pixels: UInt8[np.ndarray, "height width 3"]
-    alt: str  # what it shows, in words
+    alt: str  # text description
 
 
 def packed(kind: str, seq: int | None, values: dict[str, Any], images: Sequence[Image] = ()) -> bytes:
-    """Return an answer: the length of the header in 4 bytes, the header, and the images as JPEG.
+    """Encode an answer: the length of the header in 4 bytes, the JSON header, and the images as JPEG.
 
     Args:
-        kind: Of the answer.
-        seq: Of its request; None: there was none.
-        values: The rest of the header; numbers that are not finite become null.
-        images: What follows it.
+        kind: The kind of the answer.
+        seq: The number of the request; None for a message without a request.
+        values: Further values of the header; numbers that are not finite become null.
+        images: The images after the header.
     """
-    jpegs = [encode_jpeg(one.pixels, quality=_QUALITY) for one in images]
-    about = [{"name": one.name, "bytes": len(data), "alt": one.alt} for one, data in zip(images, jpegs, strict=True)]
+    jpegs = [encode_jpeg(image.pixels, quality=_QUALITY) for image in images]
+    about = [
+        {"name": image.name, "bytes": len(data), "alt": image.alt} for image, data in zip(images, jpegs, strict=True)
+    ]
     text = json.dumps(plain({"kind": kind, "seq": seq, "images": about, **values}), allow_nan=False).encode()
     return b"".join([len(text).to_bytes(4, "big"), text, *jpegs])
 
 
 def shown_units(space: Space) -> list[dict[str, Any]]:
-    """Return, for each number of a state or an action: its name and unit, and the unit and factor for people."""
+    """Return the name, unit, displayed unit and conversion factor of each number of a state or an action."""
     shown = {"m": ("cm", 100.0), "rad": ("°", 180 / math.pi)}
     units = [(name, unit, *shown.get(unit, (unit, 1.0))) for name, unit in zip(space.names, space.units, strict=True)]
     return [dict(zip(("name", "unit", "shown_unit", "factor"), one, strict=True)) for one in units]
