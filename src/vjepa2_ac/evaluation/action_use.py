@@ -1,4 +1,4 @@
-"""Action use: does the model distinguish the true action from others?"""
+"""Action use: action-ranking error and energy landscapes, to measure whether the model distinguishes actions."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ from vjepa2_ac.intervals import mean_of, ratio
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.spaces import POSE, ActionSpace, vector_states
 
-_ROOM = 1.25  # extent of a landscape's grid relative to the largest true action
-_AXES = slice(0, 3)  # of the grid: of poses, the position
+_MARGIN = 1.25  # half-width of a landscape's grid relative to the largest true action
+_AXES = slice(0, 3)  # components of an action that span the grid; the position for poses
 
 
 @dataclass(frozen=True)
 class RolloutStart:
-    """One frame of a held-out clip, and the true next frame: the state of a planner before an action."""
+    """A frame of a held-out clip, the action, and the true frame after it: the start of a one-step prediction."""
 
     episode_id: str
     first_step: int  # control step at which the clip begins
     frame: Float[Tensor, "tokens dim"]
-    following: Float[Tensor, "tokens dim"]  # the next frame
+    following: Float[Tensor, "tokens dim"]  # the frame after the action
     state: Float[Tensor, " state_dim"]
-    action: Float[Tensor, " action_dim"]  # that led to it
+    action: Float[Tensor, " action_dim"]
     extrinsics: Float[Tensor, " 6"] | None
 
     @property
     def true(self) -> Float[np.ndarray, " action_dim"]:
-        """The action, in float64."""
+        """The true action in float64."""
         return np.asarray(self.action.cpu().numpy().astype(np.float64))
 
     @property
     def persistence(self) -> float:
-        """The L1 error of predicting that nothing changes."""
+        """The L1 error of persistence."""
         return float(absolute_difference(self.frame, self.following).mean())
 
     def generator(self, seed: int) -> np.random.Generator:
-        """Return a random generator that depends only on the seed and the name of this clip, not on those before it."""
+        """Return a random generator that depends only on the seed and on the episode and first step of this clip."""
         digest = hashlib.blake2b(f"{self.episode_id} {self.first_step}".encode(), digest_size=8).digest()
         return np.random.default_rng([seed, int.from_bytes(digest, "big")])
 
@@ -56,7 +56,15 @@ class RolloutStart:
 def start_of(
     batch: LatentBatch, row: int, step: int, *, end: int | None = None, action: Tensor | None = None
 ) -> RolloutStart:
-    """Return a step of a clip in a batch as a start; or two of its frames, and the action that leads to the second."""
+    """Return frame `step` of a clip in a batch as a start.
+
+    Args:
+        batch: The clips.
+        row: Index of the clip in the batch.
+        step: Index of the frame.
+        end: Index of the frame after the action; None: the next frame.
+        action: The action between the two frames; None: the recorded action of this step.
+    """
     return RolloutStart(
         episode_id=batch.episode_ids[row],
         first_step=batch.starts[row],
@@ -69,74 +77,76 @@ def start_of(
 
 
 def gathered_starts(starts: Sequence[RolloutStart], device: torch.device) -> list[RolloutStart]:
-    """Return the starts of all processes that share work, on the device of this one."""
-    return [_on(device, one) for one in gathered([_on("cpu", one) for one in starts])]
+    """Return the starts of all processes that share the work, on the device of this process."""
+    return [_on(device, start) for start in gathered([_on("cpu", start) for start in starts])]
 
 
 def _on(device: torch.device | str, start: RolloutStart) -> RolloutStart:
-    moved: dict[str, Any] = {name: one.to(device) for name, one in vars(start).items() if isinstance(one, Tensor)}
+    moved: dict[str, Any] = {name: value.to(device) for name, value in vars(start).items() if isinstance(value, Tensor)}
     return replace(start, **moved)
 
 
 def moves_of(batch: LatentBatch, row: int, space: ActionSpace, reach: float) -> tuple[RolloutStart, ...]:
-    """Return two moves of a clip as starts: the longest within reach, from one of its frames to another, and back.
+    """Return the largest move of a clip within reach, forwards and backwards in time, as two starts.
 
-    The world around an arm that moves slowly is what its pose makes it: frames that are several steps apart show what
-    one larger action does, and in reverse order what the opposite one does. (What falls or was dropped does not go
-    back: such clips are harder for every model alike.) If all moves are longer, the shortest is taken. Commands that
-    are no changes of the state cannot be joined or turned back: then it is the clip's largest step, as it is.
+    A move is the change of the state between two frames of the clip, used as one action. If the arm is slow, the scene
+    depends only on its pose: two frames several steps apart show the effect of one larger action, and in reverse order
+    the effect of the opposite action. (Falling objects break this assumption; such clips are equally hard for all
+    models.) If all moves exceed the reach, the shortest move is used. Actions that are not changes of the state cannot
+    be added up or reversed; then only the clip's largest single step is returned.
 
     Args:
-        batch: Of clips.
-        row: The clip's, in the batch.
-        space: Of its actions.
-        reach: Of a move, in metres; of vectors every move is within it.
+        batch: The clips.
+        row: Index of the clip in the batch.
+        space: Meaning of the actions.
+        reach: Largest length of a move, in metres; not used for vectors.
     """
     if space.follows != "change":
         return (start_of(batch, row, int(batch.actions[row].norm(dim=-1).argmax())),)
     states = batch.states[row].cpu().numpy().astype(np.float64)
-    kind = vector_states(states.shape[1]) if space.position is None else POSE
+    state_space = vector_states(states.shape[1]) if space.position is None else POSE
     pairs = [(first, last) for first in range(len(states)) for last in range(first + 1, len(states))]
-    changes = np.concatenate([kind.differences(states[[first, last]]) for first, last in pairs])
-    lengths = np.linalg.norm(changes[:, kind.sized], axis=1)
+    changes = np.concatenate([state_space.differences(states[[first, last]]) for first, last in pairs])
+    lengths = np.linalg.norm(changes[:, state_space.sized], axis=1)
     within = lengths <= (np.inf if space.position is None else reach)
     ends = pairs[int(np.where(within, lengths, -1.0).argmax() if within.any() else lengths.argmin())]
-    found = []
+    moves = []
     for first, last in (ends, ends[::-1]):
-        change = torch.from_numpy(kind.differences(states[[first, last]])[0]).to(batch.actions)
-        found.append(start_of(batch, row, first, end=last, action=change))
-    return tuple(found)
+        change = torch.from_numpy(state_space.differences(states[[first, last]])[0]).to(batch.actions)
+        moves.append(start_of(batch, row, first, end=last, action=change))
+    return tuple(moves)
 
 
 @torch.no_grad()
 def evaluate_actions(
     model: Predictor, start: RolloutStart, actions: Float[np.ndarray, "samples action_dim"], *, at_once: int
 ) -> Float[np.ndarray, "2 samples"]:
-    """Predict one step from one frame under each action; with the true state and camera.
+    """Predict one step from a frame with each action, and return the predictions' distances to two references.
 
     Args:
         model: The predictor.
-        start: The frame.
-        actions: In the units of the data.
-        at_once: Samples per batch: limits the memory.
+        start: The frame, with its state and camera pose.
+        actions: The actions, in the units of the data.
+        at_once: Samples per batch; limits the memory.
 
     Returns:
-        Energies, and changes: the L1 distances of each prediction to the true next frame, and to the prediction with
-        the true action.
+        Energies and changes: the L1 distance of each prediction to the true next frame, and to the prediction for the
+        true action.
     """
     expected = _predict(model, start, start.action[None])[0]
-    found = []
+    parts = []
     for part in torch.from_numpy(actions.astype(np.float32)).to(start.action).split(at_once):  # type: ignore[no-untyped-call]  # torch
         predicted = _predict(model, start, part)
-        distances = [absolute_difference(predicted, to).mean(dim=(1, 2)) for to in (start.following, expected)]
-        found.append(torch.stack(distances))
-    return np.asarray(torch.cat(found, dim=1).cpu().numpy().astype(np.float64))
+        references = (start.following, expected)
+        distances = [absolute_difference(predicted, reference).mean(dim=(1, 2)) for reference in references]
+        parts.append(torch.stack(distances))
+    return np.asarray(torch.cat(parts, dim=1).cpu().numpy().astype(np.float64))
 
 
 def _predict(
     model: Predictor, start: RolloutStart, actions: Float[Tensor, "samples action_dim"]
 ) -> Float[Tensor, "samples tokens dim"]:
-    """Return the predictions in float32. Keys are not shared: the only frame has its action beside it."""
+    """Return the predictions in float32. No keys are shared between samples, since the frame attends to its action."""
     count = len(actions)
     camera = None if start.extrinsics is None else start.extrinsics.expand(count, 1, -1)
     frames = start.frame.expand(count, 1, *start.frame.shape)
@@ -150,19 +160,19 @@ def alternatives(
     probes: ProbeOptions,
     generator: np.random.Generator,
 ) -> Float[np.ndarray, "twice_samples action_dim"]:
-    """Draw actions for a move: first some that are uniform in the box, then as many on the shell.
+    """Draw alternative actions for a move: first uniform ones in the box, then the same number on the shell.
 
-    The box: for poses (dx, dy, dz) within reach, the rest being true; for vectors every number. The shell: as long as
-    the true action, in any direction; of poses (dx, dy, dz), the rest being true. A model that only knows whether the
-    robot moves ranks the true action high in the box, and by chance on the shell. Each number of a vector is measured
-    in its largest size.
+    Box: for poses (dx, dy, dz) within reach, other components as in the true action; for vectors all components within
+    their largest sizes. Shell: actions as long as the true action in random directions; for poses (dx, dy, dz), other
+    components as in the true action. A model that only predicts whether the robot moves ranks the true action well in
+    the box, but at chance level on the shell. Each component of a vector is measured in units of its largest size.
 
     Args:
         true: The action of the move.
-        largest: The largest size of each number in all moves; of vectors it bounds the box.
-        space: Of the actions.
-        probes: Their `samples` of each kind, and `reach_cm`.
-        generator: Of the draws.
+        largest: The largest size of each component in all moves; bounds the box for vectors.
+        space: Meaning of the actions.
+        probes: Number of `samples` of each type, and `reach_cm`.
+        generator: Random generator.
     """
     box, shell = (np.tile(true, (probes.samples, 1)) for _ in range(2))
     drawn = generator.uniform(-1.0, 1.0, size=box.shape)
@@ -186,14 +196,14 @@ def rank_actions(
     seed: int,
     progress: Progress = no_progress,
 ) -> ActionRanking:
-    """Rank the true action of each move among alternatives in the box and of the same length.
+    """Measure the action-ranking error: rank the true action of each move among `alternatives`.
 
     Args:
         model: The predictor.
-        moves: One or more; of vectors, the largest of each number bounds the box.
-        space: Of the actions.
-        probes: Their `reach_cm`, half the width of the box (of poses only), `samples` of each kind, and `at_once`.
-        seed: Of the alternatives: a move gets the same ones whatever else is measured.
+        moves: One or more; for vectors, the largest size of each component bounds the box.
+        space: Meaning of the actions.
+        probes: `reach_cm`, half the width of the box (poses only), `samples` of each type, and `at_once`.
+        seed: Seed of the alternatives, which do not depend on the other moves.
         progress: Called with the number of finished moves.
     """
     ids = tuple(move.episode_id for move in moves)
@@ -205,7 +215,7 @@ def rank_actions(
         (true, *others), (_, *changes) = evaluate_actions(model, move, evaluated, at_once=probes.at_once)
         energies = np.reshape(others, (2, -1))
         is_same = np.abs(energies - true) <= SAME_ENERGY * max(abs(true), 1e-12)
-        # A prediction that is not finite is the farthest: of the true action, no alternative is farther.
+        # A prediction that is not finite counts as the farthest: all alternatives are closer than such a true action.
         is_closer = energies < true if np.isfinite(true) else np.ones_like(energies)
         box, shell = np.where(is_same, 0.5, is_closer).mean(axis=1)
         return box, shell, np.mean(changes[: probes.samples]), energies[0].std(), move.persistence
@@ -232,26 +242,26 @@ def measure_landscapes(
     probes: ProbeOptions,
     progress: Progress = no_progress,
 ) -> Landscapes:
-    """Compute the energy over a grid of the first three numbers of the action, the others being the true ones.
+    """Compute the energy over a grid of the action's first three components; the other components are the true ones.
 
     Args:
         model: The predictor.
-        starts: One frame of each clip; one or more, with actions of three numbers or more.
-        space: Of the actions; positions are reported in cm.
-        probes: Their `nodes` of the grid along each axis, three or more, and `at_once`; of poses the grid spans at
-            least `reach_cm` in both directions.
+        starts: One frame of each clip; one or more, whose actions have at least three components.
+        space: Meaning of the actions; positions are reported in cm.
+        probes: `nodes` of the grid along each axis, three or more, and `at_once`. For poses the grid spans at least
+            `reach_cm` in both directions.
         progress: Called with the number of finished starts.
     """
     trues = np.stack([start.true[_AXES] for start in starts])
     nodes, reach = probes.nodes, 0.0 if space.position is None else probes.reach_cm / 100
-    half = max(reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
+    half = max(reach, _MARGIN * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
 
     def landscape(start: RolloutStart) -> Landscape:
         true = start.true[_AXES]
         return _landscape(model, start, grid_axes(true, half, nodes), true, space.shown_factor, probes.at_once)
 
     maps = shared(starts, landscape, progress)
-    chance = np.mean([np.linalg.norm(_places_of(one.axes) - one.true, axis=1).mean() for one in maps])
+    chance = np.mean([np.linalg.norm(_nodes_of(each.axes) - each.true, axis=1).mean() for each in maps])
     return Landscapes(
         axis_names=space.names[_AXES],
         unit=space.shown_unit,
@@ -261,14 +271,14 @@ def measure_landscapes(
 
 
 def grid_axes(true: Float[np.ndarray, " 3"], half: float, nodes: int) -> Float[np.ndarray, "3 nodes"]:
-    """Return the values along each axis: equally spaced, from about -half to half, one of them exactly the true one."""
+    """Return equally spaced values along each axis, from about -half to half, that include exactly the true value."""
     distance = 2 * half / (nodes - 1)
-    place = np.clip(np.round((true + half) / distance), 0, nodes - 1)
-    return true[:, None] + distance * (np.arange(nodes)[None] - place[:, None])
+    true_node = np.clip(np.round((true + half) / distance), 0, nodes - 1)
+    return true[:, None] + distance * (np.arange(nodes)[None] - true_node[:, None])
 
 
 def lowest(energy: Float[np.ndarray, ...]) -> Bool[np.ndarray, ...]:
-    """Return where the energy is lowest; everywhere, if it is flat."""
+    """Return a mask of the nodes with the lowest energy, up to rounding; all nodes if the energy is flat."""
     least = energy.min()
     return np.asarray(energy <= least + SAME_ENERGY * abs(least))
 
@@ -278,7 +288,7 @@ def _landscape(
 ) -> Landscape:
     nodes = axes.shape[1]
     evaluated = np.tile(start.true, (nodes**3, 1))
-    evaluated[:, _AXES] = _places_of(axes)
+    evaluated[:, _AXES] = _nodes_of(axes)
     energy = evaluate_actions(model, start, evaluated, at_once=at_once)[0].reshape(nodes, nodes, nodes)
     minimum = evaluated[lowest(energy).ravel(), _AXES].mean(axis=0)
     return Landscape(
@@ -291,6 +301,6 @@ def _landscape(
     )
 
 
-def _places_of(axes: Float[np.ndarray, "3 nodes"]) -> Float[np.ndarray, "places 3"]:
-    """Return every node, the third axis fastest: the order of a flattened energy."""
+def _nodes_of(axes: Float[np.ndarray, "3 nodes"]) -> Float[np.ndarray, "all_nodes 3"]:
+    """Return the coordinates of all nodes in the order of a flattened energy: the third axis varies fastest."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,12 +1,13 @@
-"""Decoded rollouts of several models on the same clips: PSNR and SSIM, and those of the references around them.
+"""PSNR, SSIM and Fréchet distance of the decoded rollouts of several models on the same clips, and of baselines.
 
-Two references: the *truth* is what a user sees, the *decoded truth* (the same decoder on the true latents) tells what
-the model did. PSNR and SSIM reward blur: an object that is smeared over every place where it may be scores better than
-a sharp one in the wrong place. They are therefore given where something moves, too, and beside `spread`.
+Images are compared with two references: the camera's frames (*truth*), and the decoded true latents (*decoded truth*),
+which exclude the decoder's error. PSNR and SSIM reward blur: an object that is smeared over all its possible positions
+scores better than a sharp object in a wrong position. Both are therefore also computed for the moving region only, and
+should be read together with `spread`.
 
-Every image comes out of one decoder, in float32 and without autocast, in batches of one shape: a perfect prediction
-gives the bits of the decoded truth. Images are compared at the encoder's size, not rounded to 8 bits. One pass, batch
-by batch: only numbers per clip are stored.
+All images are decoded by the same decoder in float32, without autocast and in batches of equal shape, so that a perfect
+prediction equals the decoded truth bit for bit. Images are compared at the encoder's size, without rounding to 8 bits.
+The clips are read once, batch by batch; only numbers per clip are stored.
 """
 
 from __future__ import annotations
@@ -53,19 +54,19 @@ def measure_decoded(
     encode: Encode | None = None,
     reporter: Reporter = SILENT,
 ) -> DecodedRollouts:
-    """Decode the rollouts of all models under the true actions, and measure them beside their neighbours.
+    """Decode the rollouts of all models with the true actions, and measure them and the baselines in `NEIGHBOURS`.
 
     Args:
-        contenders: In the order of the table.
-        clips: What to measure on; they are read once.
-        decoder: Makes images of latents.
+        contenders: The models, in the order of the table.
+        clips: The clips, which are read once.
+        decoder: Decodes latents to images.
         examples: Clips whose images are returned, too.
         encode: The frozen encoder, for the Fréchet distance of images; None: it is not measured.
         reporter: Shows the progress.
     """
     progress = reporter.task("decoded rollouts")
-    wanted = {(one.episode_id, one.start): one for one in examples}
-    shown = [one.name for one in contenders if one.role != "other"]
+    example_of = {(example.episode_id, example.start): example for example in examples}
+    shown = [contender.name for contender in contenders if contender.role != "other"]
     ids: list[str] = []
     values: dict[tuple[str, str], list[Float[np.ndarray, "batch horizon"]]] = {}  # by source and metric
     strips: dict[ClipName, DecodedStrip] = {}
@@ -76,46 +77,46 @@ def measure_decoded(
         for key, metric in _measured(images).items():
             values.setdefault(key, []).append(metric.double().cpu().numpy())
         if encode is not None:
-            shown_again = {name: encode(one) for name, one in images.sources.items() if name != RAW_PERSISTENCE}
-            for source, latents in {TRUE_FRAMES: batch.latents[:, 1:], **shown_again}.items():
+            encoded = {name: encode(decoded) for name, decoded in images.sources.items() if name != RAW_PERSISTENCE}
+            for source, latents in {TRUE_FRAMES: batch.latents[:, 1:], **encoded}.items():
                 features.setdefault(source, []).append(latents.mean(dim=(1, 2)).double().cpu().numpy())
         for row, clip in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
-            if clip in wanted:
-                strips[clip] = images.strip(row, wanted[clip], shown)
+            if clip in example_of:
+                strips[clip] = images.strip(row, example_of[clip], shown)
         progress(len(ids), len(clips.names))
     arrays, by_source = (_joined(gathered([parts] if ids else [])) for parts in (values, features))
     ids, strips = gathered(ids), dict(gathered(list(strips.items())))
     left_out = {}
     for (source, name), array in arrays.items():
         count = int((~np.isfinite(array[:, -1])).sum())
-        if count and not (name.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # its own reference
+        if count and not (name.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # always identical to itself
             left_out[name] = f"{name}, at the last horizon: {count} {_LEFT_OUT}"
-    card, sources = decoder.card, (*NEIGHBOURS, *(one.name for one in contenders))
-    kept = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
+    card, sources = decoder.card, (*NEIGHBOURS, *(contender.name for contender in contenders))
+    card_keys = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
     return DecodedRollouts(
-        decoder={"folder": decoder.name, "size": card.shape.size} | {name: asdict(card)[name] for name in kept},
-        sources=tuple(one for one in sources if one in {source for source, _ in arrays}),
-        curves={key: _means(found, ids) for key, found in arrays.items()},
+        decoder={"folder": decoder.name, "size": card.shape.size} | {name: asdict(card)[name] for name in card_keys},
+        sources=tuple(name for name in sources if name in {source for source, _ in arrays}),
+        curves={key: _means(array, ids) for key, array in arrays.items()},
         fvd={
-            source: frechet_distance(found, by_source[TRUE_FRAMES])
-            for source, found in by_source.items()
+            source: frechet_distance(array, by_source[TRUE_FRAMES])
+            for source, array in by_source.items()
             if source != TRUE_FRAMES
         },
-        strips=tuple(strips[name] for name in wanted if name in strips),
+        strips=tuple(strips[name] for name in example_of if name in strips),
         notes=(*([] if clips.has_frames else [_CACHE]), *left_out.values()),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """The images of a batch, in 0 .. 1."""
+    """The images of a batch, with values from 0 to 1."""
 
-    sources: Mapping[str, Images]  # neighbours and models, after frame 0
+    sources: Mapping[str, Images]  # baselines and models, without frame 0
     decoded_first: Float[Tensor, "batch 1 3 size size"]
-    true: Float[Tensor, "batch time 3 size size"] | None  # as the encoder saw them; None: from a cache
+    true: Float[Tensor, "batch time 3 size size"] | None  # the encoder's input; None for cached latents
 
     def strip(self, row: int, example: Example, models: Sequence[str]) -> DecodedStrip:
-        """Return whole clips of one row, the given frame included."""
+        """Return the images of the clip in one row, frame 0 included."""
         rows = {} if self.true is None else {TRUE_FRAMES: as_pixels(self.true[row])}
         for source in (DECODED_TRUTH, *models):
             rows[source] = as_pixels(torch.cat([self.decoded_first[row], self.sources[source][row]]))
@@ -127,11 +128,11 @@ def _decoded(
 ) -> _Images:
     decoder, latents = trained.decoder, batch.latents
     rollouts = {DECODED_TRUTH: latents[:, 1:], DECODED_PERSISTENCE: latents[:, :1].expand_as(latents[:, 1:])}
-    for one in contenders:
-        with one.switched():
-            rollouts[one.name] = prediction(one.model, batch)
+    for contender in contenders:
+        with contender.switched():
+            rollouts[contender.name] = prediction(contender.model, batch)
     with torch.autocast(latents.device.type, enabled=False):
-        sources = {source: decoder.decode(one.float()) for source, one in rollouts.items()}
+        sources = {source: decoder.decode(rollout.float()) for source, rollout in rollouts.items()}
         first = decoder.decode(latents[:, :1].float())
     if frames_of_row is None:
         return _Images(sources, first, None)
@@ -142,30 +143,30 @@ def _decoded(
 
 
 def _measured(images: _Images) -> dict[tuple[str, str], Float[Tensor, "batch horizon"]]:
-    """Return every metric of every source and reference.
+    """Return all metrics of all sources, for each reference.
 
-    PSNR of identical images is infinite; where nothing moves, the region's values are NaN.
+    PSNR of identical images is infinite. If nothing moves, the values of the moving region are NaN.
     """
     references, moving = {DECODED_TRUTH: images.sources[DECODED_TRUTH]}, None
     if images.true is not None:
         references, moving = {TRUE_FRAMES: images.true[:, 1:], **references}, moving_region(images.true)
     regions = {"whole": None} if moving is None else {"whole": None, "moving": moving}
-    found: dict[tuple[str, str], Tensor] = {}
+    metrics: dict[tuple[str, str], Tensor] = {}
     for reference, true in references.items():
-        for source, shown in images.sources.items():
-            similar = ssim_map(shown, true)
-            for region, where in regions.items():
-                found[source, f"psnr_db.{region}.{reference}"] = psnr(shown, true, where)
-                found[source, f"ssim.{region}.{reference}"] = mean_where(similar, where)
-    return found
+        for source, decoded in images.sources.items():
+            similarity = ssim_map(decoded, true)
+            for region, mask in regions.items():
+                metrics[source, f"psnr_db.{region}.{reference}"] = psnr(decoded, true, mask)
+                metrics[source, f"ssim.{region}.{reference}"] = mean_where(similarity, mask)
+    return metrics
 
 
 def _joined(parts: Sequence[Mapping[_Key, Sequence[np.ndarray]]]) -> dict[_Key, np.ndarray]:
-    """Return the arrays of all processes and batches."""
+    """Concatenate the arrays of all processes and batches."""
     return {key: np.concatenate([array for part in parts for array in part[key]]) for key in parts[0]}
 
 
 def _means(values: Float[np.ndarray, "clips horizon"], ids: Sequence[str]) -> tuple[Estimate, ...]:
-    """Return means over the clips that have a value."""
+    """Return the mean at each horizon, over the clips whose value is finite."""
     finite = np.isfinite(values)
     return ratios(np.where(finite, values, 0.0), finite.astype(np.float64), ids)

@@ -1,21 +1,21 @@
-"""Distribution of predicted latents over clips, compared with the true ones: spread, MMD and Fréchet distance.
+"""Distribution of predicted latents over clips, compared with the true latents: spread, MMD and Fréchet distance.
 
-A prediction that averages possible futures is nearer to each of them and less varied than they are: its error falls,
-and a decoded frame is blurred. `spread` is the trace of the covariance over clips of the predicted latents (per token
-and number: the mean squared deviation from the mean over clips), over that of the true latents at the same horizon.
-1: as varied as the truth; below 1: smoothed. It says nothing about the error: persistence, too, is about 1.
+A prediction that averages possible futures is closer to each of them but varies less over clips: its error is lower,
+and the decoded frame is blurred. `spread` is the trace of the covariance over clips of the predicted latents, divided
+by that of the true latents at the same horizon. 1: as varied as the true latents; below 1: smoothed. The spread does
+not measure the error: the spread of persistence is about 1, too.
 
-`mmd` is the squared maximum mean discrepancy of features, unbiased over episodes. Its kernel is JEDi's,
-k(x, y) = (<x, y> / dim)^2, so it is the squared Frobenius distance of the second moments, over dim^2: it sees means and
-covariances, and not a sign that all features share. **The estimate is not JEDi's**: that one counts pairs of a clip
-with itself, which favours predictions of less spread when clips are few. Here no pair of clips of one episode counts,
-which excludes a prediction and its own truth, too. So the estimate is 0 in expectation if the distributions are equal,
-and may be below 0. It is times 100.
+`mmd` is the squared maximum mean discrepancy of features, times 100, unbiased over episodes. The kernel is JEDi's,
+k(x, y) = (<x, y> / dim)^2, so that it is the squared Frobenius distance of the second moments, divided by dim^2. It
+depends on means and covariances, but not on a common sign of all features. **The estimator is not JEDi's**, which
+counts pairs of a clip with itself and so favours predictions with less spread if there are few clips. Here pairs of
+clips from the same episode are excluded, including a prediction and its own true latents. The expectation is 0 if the
+distributions are equal, and single estimates may be negative.
 
-`fvd` is the Fréchet distance of FVD, with the frozen encoder's features in place of I3D's: a clip's latents averaged
-over tokens and frames. It is biased upwards, the more the fewer clips there are, so it is reported with their number
-and with the distance between two halves of the true clips. All three depend on the encoder, the clips, frames and
-stride: compare only where these are equal.
+`fvd` is the Fréchet distance as in FVD, with features of the frozen encoder instead of I3D: the latents of a clip,
+averaged over tokens and frames. It is biased upwards, more so with fewer clips, and is therefore reported with the
+number of clips and with the distance between two halves of the true clips. All three metrics depend on the encoder, the
+clips, the number of frames and the stride: compare values only if these are equal.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from torch import Tensor
 from vjepa2_ac.evaluation.result import LatentDistribution
 from vjepa2_ac.intervals import Estimate, bootstrapped_by_weights
 
-_SCALE = 100.0  # of the MMD
+_SCALE = 100.0  # factor of the reported MMD
 
 
 class LatentSums:
-    """Sums of one kind of latents over clips: those that one model predicts in a rollout, or the true ones.
+    """Running sums of latents over clips, for the rollouts of one model or for the true latents.
 
-    Stored are, by horizon: of each clip the mean over tokens [dim]; the sum over clips [tokens dim] and the sum of
-    squared norms, in float64. No clip's latents are stored. A covariance does not depend on where the origin is: norms
-    and sums are of the distance to an origin, so they are small; that of the first batch by default. Sums that are
-    `joined` have one.
+    For each horizon these are stored: the mean over tokens of each clip [dim], the sum over clips [tokens dim], and the
+    sum of squared norms, in float64. The latents themselves are not stored. Sums and norms are of the difference to an
+    origin (default: the mean of the first batch), which keeps them small and does not change the covariance. Sums that
+    are `joined` must have the same origin.
     """
 
     def __init__(self, origin: Float[Tensor, "horizon tokens_dim"] | None = None) -> None:
@@ -64,7 +64,7 @@ class LatentSums:
 
     @classmethod
     def joined(cls, parts: Sequence[LatentSums]) -> LatentSums:
-        """Return the sums of all clips of some parts of one origin."""
+        """Return the sums over the clips of all parts, which must have the same origin."""
         whole = cls()
         for part in parts:
             whole.episode_ids += part.episode_ids
@@ -79,7 +79,7 @@ class LatentSums:
         return np.concatenate(self._pooled)
 
     def variances(self) -> Float[np.ndarray, " horizon"]:
-        """Return the trace of the covariance over clips, by horizon; 0 where it is no more than rounding."""
+        """Return the trace of the covariance over clips, by horizon; 0 if it is within rounding errors."""
         clips = len(self.episode_ids)
         squares, mean = torch.as_tensor(self._squares / clips), torch.as_tensor(self._total / clips)
         traces = squares - mean.square().sum(dim=1)
@@ -92,7 +92,7 @@ class LatentSums:
 
 
 def distribution_of(predicted: LatentSums, true: LatentSums) -> LatentDistribution:
-    """Return how predicted latents are distributed, compared with the true ones of the same clips."""
+    """Compare the distribution of predicted latents with that of the true latents of the same clips."""
     pairs = zip(predicted.pooled.swapaxes(0, 1), true.pooled.swapaxes(0, 1), strict=True)
     return LatentDistribution(
         spread=spread_of(predicted, true),
@@ -104,10 +104,10 @@ def distribution_of(predicted: LatentSums, true: LatentSums) -> LatentDistributi
 
 
 def frechet_distance(one: Float[np.ndarray, "clips dim"], other: Float[np.ndarray, "others dim"]) -> float:
-    """Return |mean - mean'|^2 + tr C + tr C' - 2 tr (C C')^(1/2) of two sets of features; NaN of a single clip.
+    """Return |mean - mean'|^2 + tr C + tr C' - 2 tr (C C')^(1/2) of two sets of features; NaN for a single clip.
 
-    With fewer clips than numbers the covariances are singular. The last trace is exact all the same: C = A'A and
-    C' = B'B, and it is the sum of the singular values of A B'.
+    With fewer clips than dimensions the covariances are singular. The last trace is exact in this case, too: with
+    C = A'A and C' = B'B it is the sum of the singular values of A B'.
 
     Source: Dowson and Landau (1982), The Fréchet distance between multivariate normal distributions; as a metric of
     videos, Unterthiner et al. (2018), FVD.
@@ -123,16 +123,16 @@ def frechet_distance(one: Float[np.ndarray, "clips dim"], other: Float[np.ndarra
 
 
 def distance_of_halves(true: LatentSums) -> float:
-    """Return the Fréchet distance between the true clips of every second episode and those of the others."""
+    """Return the Fréchet distance between the true clips of every second episode and the remaining true clips."""
     _, episode_of = np.unique(np.array(true.episode_ids), return_inverse=True)
     is_even = episode_of % 2 == 0
     return frechet_distance(true.features[is_even], true.features[~is_even])
 
 
 def spread_of(predicted: LatentSums, true: LatentSums) -> tuple[Estimate, ...]:
-    """Return the trace of the covariance over clips, predicted over true, by horizon, without intervals.
+    """Return the spread at each horizon: trace of the covariance over clips, predicted divided by true; no intervals.
 
-    It is NaN of one clip.
+    The values are NaN for a single clip.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.where(true.variances() > 0, predicted.variances() / true.variances(), np.nan)
@@ -144,7 +144,7 @@ def mmd(
 ) -> Estimate:
     """Return the squared maximum mean discrepancy of predicted and true features of the same clips, times 100.
 
-    Near 0 the estimate is degenerate and its interval over episodes too wide. There is none from one episode.
+    Near 0 the estimate is degenerate, and its interval over episodes is too wide. One episode gives no estimate.
 
     Source: Gretton et al. (2012), A Kernel Two-Sample Test, lemma 6, with pairs of one episode left out as pairs of one
     sample are there; the kernel: Luo et al. (2410.05203), JEDi.
@@ -163,7 +163,7 @@ def mmd(
 def _summed(
     kernel: Float[np.ndarray, "clips clips"], episode_ids: Sequence[str]
 ) -> Float[np.ndarray, "episodes episodes"]:
-    """Return the sums over the clips of each pair of episodes, by their sorted names; 0 of an episode with itself."""
+    """Return the sum of the kernel over the clips of each pair of episodes, sorted by name; 0 on the diagonal."""
     names, episode_of = np.unique(np.array(episode_ids), return_inverse=True)
     member = np.eye(len(names))[episode_of]
     sums = member.T @ kernel @ member
@@ -179,5 +179,5 @@ def _kernel(
 def _quadratic(
     weights: Float[np.ndarray, "draws episodes"], matrix: Float[np.ndarray, "episodes episodes"]
 ) -> Float[np.ndarray, " draws"]:
-    """Return w' M w of each draw."""
+    """Return w' M w for each draw."""
     return np.asarray(((weights @ matrix) * weights).sum(axis=1))

@@ -1,4 +1,4 @@
-"""Evaluation of models: a trained model, its base and others on the same clips of held-out episodes."""
+"""Measurement of several models (the trained model, its base model, others) on the same held-out clips."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, matrices_from_euler
 
 _CPU = torch.device("cpu")
 ClipName = tuple[str, int]  # id of the episode, first control step
-FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the current batch
+FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # row of the current batch -> frames
 
 
 @dataclass(frozen=True)
@@ -73,14 +73,14 @@ class Contender:
 
 @dataclass(frozen=True)
 class RepeatableClips:
-    """Clips that can be read repeatedly: all of them, or some by name; batches of latents with their frames."""
+    """Clips that can be read repeatedly, as batches of latents with their frames."""
 
-    names: Sequence[ClipName]  # of all
-    read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]
-    space: ActionSpace = POSE_CHANGE  # of the actions
-    has_frames: bool = True  # False: of cached latents there are only small ones
-    before: Float[Tensor, "1 time action_dim"] | None = None  # of the part of this process, as of `with_other_actions`
-    device: torch.device = _CPU  # of the latents
+    names: Sequence[ClipName]  # all clips
+    read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]  # None: all of this process
+    space: ActionSpace = POSE_CHANGE  # meaning of the actions
+    has_frames: bool = True  # False for cached latents, which have small frames only
+    before: Float[Tensor, "1 time action_dim"] | None = None  # see `with_other_actions`
+    device: torch.device = _CPU  # device of the latents
 
 
 def evaluate(
@@ -95,10 +95,10 @@ def evaluate(
     """Measure models on the same clips.
 
     Args:
-        contenders: In the order of the table; one of them has the role trained.
-        clips: What to measure on; one or more.
+        contenders: The models, in the order of the table; one of them has the role "trained".
+        clips: One or more clips.
         about: Description of the evaluation.
-        metrics: Of the errors, L1 first; None: all that are registered.
+        metrics: Metrics of the errors, L1 first; None: all registered metrics.
         probes: Options of the measurements beyond the errors.
         reporter: Shows the progress of each part of the work.
     """
@@ -108,21 +108,22 @@ def evaluate(
     width, starts = sums.actions.shape[-1], sums.starts
     is_moving = {name: bool(steps.any()) for name, steps in zip(sums.names, known.moving, strict=True)}
     moving = [start for start in starts if is_moving[start.episode_id, start.first_step]] or starts
-    mapped = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
+    mapped = [moving[index] for index in spread(len(moving), probes.landscape_clips)]
     models: dict[str, ModelResult] = {}
-    for one in contenders:
+    for contender in contenders:
+        model, name = contender.model, contender.name
         ranking, landscapes = None, None
-        with one.switched():
+        with contender.switched():
             if starts:
-                task = reporter.task(f"action ranking, {one.name}")
-                ranking = rank_actions(one.model, sums.moves, clips.space, probes, seed=about.seed, progress=task)
+                task = reporter.task(f"action ranking, {name}")
+                ranking = rank_actions(model, sums.moves, clips.space, probes, seed=about.seed, progress=task)
             if mapped and width >= 3:
-                task = reporter.task(f"energy landscapes, {one.name}")
-                landscapes = measure_landscapes(one.model, mapped, clips.space, probes, task)
-        distribution = distribution_of(sums.predicted[one.name], sums.true)
-        errors = joined(sums.errors[one.name])
-        models[one.name] = ModelResult(one.name, one.role, errors, landscapes, ranking, distribution)
-    errors = next(model.errors for model in models.values() if model.role == "trained")
+                task = reporter.task(f"energy landscapes, {name}")
+                landscapes = measure_landscapes(model, mapped, clips.space, probes, task)
+        distribution = distribution_of(sums.predicted[name], sums.true)
+        errors = joined(sums.errors[name])
+        models[name] = ModelResult(name, contender.role, errors, landscapes, ranking, distribution)
+    errors = next(result.errors for result in models.values() if result.role == "trained")
     note = f"No energy landscapes: an action has {width} numbers, and a landscape is over three."
     return Evaluation(
         about=about,
@@ -138,12 +139,12 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _Collected:
-    """What the clips of all processes gave: errors, actions, sums of latents, and one frame and the next of some."""
+    """Errors, actions, sums of latents, and starts for probing, collected over the clips of all processes."""
 
     errors: dict[str, list[PredictionErrors]]  # by model
     predicted: dict[str, LatentSums]  # rollouts with the true actions, by model
     true: LatentSums
-    copies: LatentSums  # of frame 0
+    copies: LatentSums  # copies of frame 0 (persistence)
     actions: Float[np.ndarray, "clips horizon action_dim"]
     names: list[ClipName]
     starts: list[RolloutStart]
@@ -166,7 +167,7 @@ def _collect(
     true, copies = LatentSums(origins[0]), LatentSums(origins[0])
     actions, names = list[np.ndarray](), list[ClipName]()
     starts, moves = list[RolloutStart](), list[RolloutStart]()
-    probed = {clips.names[place] for place in spread(len(clips.names), probes.ranking_clips)}
+    probed = {clips.names[index] for index in spread(len(clips.names), probes.ranking_clips)}
 
     def add(ids: Sequence[str], name: str, way: Way, mode: Mode, latents: torch.Tensor) -> None:
         if (way, mode) == ("true", "rollout"):
@@ -204,12 +205,12 @@ def _collect(
 def _examples(
     contenders: Sequence[Contender], clips: RepeatableClips, known: Clips, errors: PredictionErrors, count: int
 ) -> tuple[Example, ...]:
-    """Read the clips of the examples again: which ones these are is known only now."""
+    """Choose the example clips by their errors, and read them again with their frames."""
     chosen = chosen_clips(errors, known.action_size.sum(axis=1), count)
     if not chosen:
         return ()
     reasons = {(known.episode_ids[clip], known.starts[clip]): why for clip, why in chosen.items()}
-    found = {}
+    examples = {}
     for batch, frames_of_row in clips.read(list(reasons)):
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             true = batch.latents[row].float().cpu()
@@ -225,16 +226,17 @@ def _examples(
                 ).numpy()
                 for source, values in predicted.items()
             }
-            found[name] = Example(reasons[name], *name, frames_of_row(row), errors_of)
-    return tuple(found[name] for name in reasons if name in found)
+            examples[name] = Example(reasons[name], *name, frames_of_row(row), errors_of)
+    return tuple(examples[name] for name in reasons if name in examples)
 
 
 # ---- the clips ----
 
-SPEED_CM_S = 2.0  # of the flange; slower, and
-TURN_DEGREES_S = 10.0  # turning slower, and
-GRIP = 0.05  # closing or opening by less than this share in a model step: idle
-_IDLE_SHARE = 0.1  # of the 95th percentile of the norm, where actions are no poses
+# A step is idle if all three values are below these limits.
+SPEED_CM_S = 2.0  # speed of the flange
+TURN_DEGREES_S = 10.0  # angular speed of the flange
+GRIP = 0.05  # change of the gripper's closedness in a model step
+_IDLE_SHARE = 0.1  # for actions that are not poses: limit of the norm, as a share of its 95th percentile
 
 
 def clips_of(
@@ -244,13 +246,13 @@ def clips_of(
     space: ActionSpace,
     seconds_per_step: float,
 ) -> Clips:
-    """Return the clips with the size of their actions, and which of their steps move.
+    """Return the clips with the size of their actions, and which of their steps are moving.
 
     Args:
-        actions: Of the space.
-        names: Of each clip.
-        space: Of the actions.
-        seconds_per_step: Length of a model step.
+        actions: The actions of all clips.
+        names: Name of each clip.
+        space: Meaning of the actions.
+        seconds_per_step: Duration of a model step.
     """
     size, (episode_ids, starts) = space.shown_size(actions), zip(*names, strict=True)
     if space.position is None or space.rotation is None or space.gripper is None:
@@ -270,24 +272,26 @@ def clips_of(
 
 
 def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], count: int) -> dict[int, str]:
-    """Return which clips to show, and why: best, worst, median by L1 error over persistence, and most motion.
+    """Return the indices of the clips to show, with the reasons: most motion; best, worst and median relative error.
+
+    The relative error is the L1 error divided by that of persistence.
 
     Args:
-        errors: Of the model.
+        errors: Errors of the trained model.
         moved: Distance that the robot moves in each clip.
-        count: Number of clips, at most.
+        count: Largest number of clips.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        trained, nothing = (errors.of("rollout", L1, way).mean(axis=1) for way in ("true", "persistence"))
-        ratios = trained / nothing
+        trained, persistence = (errors.of("rollout", L1, way).mean(axis=1) for way in ("true", "persistence"))
+        ratios = trained / persistence
     order = np.argsort(np.nan_to_num(ratios, nan=np.inf, posinf=np.inf), kind="stable")
-    wanted = {
+    clips_by_reason = {
         "most motion": int(np.argmax(moved)),
         "best": int(order[0]),
         "worst": int(order[-1]),
         "median": int(order[len(order) // 2]),
     }
     chosen: dict[int, str] = {}
-    for why, clip in wanted.items():
+    for why, clip in clips_by_reason.items():
         chosen[clip] = f"{chosen[clip]}, {why}" if clip in chosen else why
     return dict(list(chosen.items())[:count])

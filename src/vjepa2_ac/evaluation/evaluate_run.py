@@ -1,4 +1,4 @@
-"""Evaluation of a run or a model on held-out episodes: load it and what it is compared with, measure on the clips."""
+"""Evaluation of a run or a model on held-out episodes: load the models, measure them on the same clips."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ _NO_BASE = "There is no base to compare with: it takes states or actions of othe
 
 @dataclass(frozen=True, eq=False)
 class Models:
-    """A run or a model, and what it is compared with."""
+    """A run or a model under evaluation, and the models that it is compared with."""
 
     subject: Subject
-    contenders: tuple[Contender, ...]  # the base first and the subject last
-    notes: tuple[str, ...]  # on them
+    contenders: tuple[Contender, ...]  # all models; the base model first and the subject last
+    notes: tuple[str, ...]  # notes on the models
 
     @property
     def world_model(self) -> WorldModel:
@@ -57,7 +57,7 @@ class Models:
         return self.subject.world_model
 
     def put_on(self, device: torch.device) -> None:
-        """Move all models to a device, ready to be measured; the encoder of the subject is enough for all."""
+        """Move all predictors and the subject's encoder, which all models share, to a device; set eval mode."""
         for each in self.contenders:
             if isinstance(each.model, WorldModel):
                 each.model.predictor.to(device).eval()
@@ -67,17 +67,17 @@ class Models:
 def load_models(
     name: str, config: Config, asked: EvaluationOptions, dataset: Dataset, decoder: TrainedDecoder | None = None
 ) -> Models:
-    """Load a run or a model, and what it is compared with, on the CPU. Cheap failures first.
+    """Load a run or a model, and the models to compare it with, on the CPU. Cheap checks come first.
 
     Args:
         name: The folder of a run; or a model, as in `model.base`.
-        config: As `settle` returned it.
-        asked: Which checkpoint, and what to compare with.
-        dataset: What it is measured on.
-        decoder: If its latents are to be decoded.
+        config: The config that `settle` returned.
+        asked: The options; `checkpoint` and `against` are used.
+        dataset: The data of the evaluation.
+        decoder: The decoder, if latents will be decoded.
 
     Raises:
-        InputError: One of the models cannot be loaded; it does not fit the data, the decoder, or the others.
+        InputError: A model cannot be loaded, or does not fit the data, the decoder, or the other models.
     """
     subject = load_subject(name, asked.checkpoint, config=config)
     world_model, is_of_run, is_base = subject.world_model, subject.checkpoint is not None, subject.is_base
@@ -86,33 +86,35 @@ def load_models(
     if decoder is not None:
         notes += decoder.require_fit(world_model, config.data, subject=name)
     against = asked.against if asked.against is not None else (BASE,) * is_of_run
-    against = tuple(other for other in against if other != BASE) if is_base else against  # it is measured once
-    found: list[Contender] = []
+    against = tuple(other for other in against if other != BASE) if is_base else against  # measure the base model once
+    contenders: list[Contender] = []
     if BASE in against and config.model.is_random:
         if asked.against is not None:
-            absent, needed = "a model without a base (model.base: random)", "a base to compare with"
-            raise InputError(where="--against base", found=absent, needed=needed, fix="Leave out --against base")
+            found, needed = "a model without a base (model.base: random)", "a base to compare with"
+            raise InputError(where="--against base", found=found, needed=needed, fix="Leave out --against base")
     elif BASE in against and not is_of_run:
-        found.append(Contender(BASE, "base", _like(name, world_model, config.model.base, config, dataset.widths)))
+        base_model = _load_like(name, world_model, config.model.base, config, dataset.widths)
+        contenders.append(Contender(BASE, "base", base_model))
     elif BASE in against and world_model.fresh_heads is not None:
         notes.append(_NO_BASE)
     elif BASE in against:
-        found.append(Contender(BASE, "base", world_model, partial(base_only, world_model)))
+        contenders.append(Contender(BASE, "base", world_model, partial(base_only, world_model)))
     is_adapter = world_model.adaptation is not None and world_model.adaptation.kind == "lora"
-    own = BASE if is_base else "adapter" if is_adapter else "model"
+    subject_label = BASE if is_base else "adapter" if is_adapter else "model"
     for other in against:
         if other != BASE:
-            taken = {each.name for each in found} | {own, BASE, PERSISTENCE, TRUE_FRAMES, *NEIGHBOURS}
-            called = Path(other).name if Path(other).name not in taken else other
-            found.append(Contender(called, "other", _like(name, world_model, other, config, dataset.widths)))
-    return Models(subject, (*found, Contender(own, "trained", world_model)), tuple(notes))
+            reserved = {each.name for each in contenders} | {subject_label, BASE, PERSISTENCE, TRUE_FRAMES, *NEIGHBOURS}
+            label = Path(other).name if Path(other).name not in reserved else other
+            other_model = _load_like(name, world_model, other, config, dataset.widths)
+            contenders.append(Contender(label, "other", other_model))
+    return Models(subject, (*contenders, Contender(subject_label, "trained", world_model)), tuple(notes))
 
 
-def _like(subject: str, world_model: WorldModel, other: str, config: Config, widths: Widths) -> WorldModel:
-    """Load another run or model that can be measured on the same latents, and states and actions of these widths.
+def _load_like(subject: str, world_model: WorldModel, other: str, config: Config, widths: Widths) -> WorldModel:
+    """Load another run or model, and check that it fits the same latents and states and actions of these widths.
 
     Raises:
-        InputError: It has another encoder, or takes other states or actions.
+        InputError: The model has another encoder, or its states or actions have other widths.
     """
     where = f"--against {other}"
     if not (other.startswith(BUILTIN) or Path(other).exists()):
@@ -129,7 +131,7 @@ def _like(subject: str, world_model: WorldModel, other: str, config: Config, wid
 
 
 def evaluate_subject(subject: str, asked: EvaluationOptions, *, reporter: Reporter = SILENT) -> Evaluation:
-    """Measure a run or a model on held-out episodes, in this process or shared by several. Cheap failures first.
+    """Measure a run or a model on held-out episodes, in one process or shared by several. Cheap checks come first.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
@@ -138,7 +140,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions, *, reporter: Report
 
     Raises:
         InputError: The subject, the data, the decoder, or a model to compare with cannot be used; the split is empty;
-            the folder of the output cannot be written.
+            or the output folder cannot be written.
     """
     config = settle(subject, asked)
     with joined(config) as accelerator:
@@ -166,20 +168,20 @@ def evaluate_subject(subject: str, asked: EvaluationOptions, *, reporter: Report
                     loaded.contenders, clips, decoder, evaluation.examples, encode=encode, reporter=reporter
                 )
     is_of_run = loaded.subject.checkpoint is not None
-    warned = [f"In training, {text}." for text in warnings_of(Path(subject) / METRICS)] if is_of_run else []
-    return replace(evaluation, decoded=decoded, notes=(*loaded.notes, *warned, *evaluation.notes))
+    warnings = [f"In training, {text}." for text in warnings_of(Path(subject) / METRICS)] if is_of_run else []
+    return replace(evaluation, decoded=decoded, notes=(*loaded.notes, *warnings, *evaluation.notes))
 
 
 def _encoded(
     world_model: WorldModel, images: Float[Tensor, "batch time 3 size size"]
 ) -> Float[Tensor, "batch time tokens dim"]:
-    """Return the latents of decoded images, rounded to 8 bits as camera images are."""
+    """Return the latents of decoded images, which are first rounded to 8 bits, as camera images are."""
     pixels = torch.from_numpy(as_pixels(images)).to(images.device)
     return world_model.encode(pixels_to_input(pixels, world_model.image_size))
 
 
 def _require_places(subject: str, asked: EvaluationOptions) -> None:
-    """Check that a run has the checkpoint, and that the folder of the output can be written."""
+    """Check that a run has the requested checkpoint, and that the output folder can be written."""
     folder = asked.out or Path(subject)
     if is_run(subject):
         select_checkpoint(Path(subject), asked.checkpoint)
@@ -195,22 +197,22 @@ def _clips(
     world_model: WorldModel,
     device: torch.device,
 ) -> RepeatableClips:
-    """Return the clips at these windows, with the frames as the encoder sees them; of cached latents, small ones."""
+    """Return the clips at these windows, with the frames that the encoder receives (small ones for cached latents)."""
     batch_size = config.validation.batch_size
     encode = partial(encode_batch, world_model, device=device)
-    own = own_part(len(windows), batch_size)
+    part = own_part(len(windows), batch_size)
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
-    some = partial(batches_of, dataset, may_be_none=True)
+    read_batches = partial(batches_of, dataset, may_be_none=True)
 
     def frames(batch: Batch, row: int) -> UInt8[np.ndarray, "time size size 3"]:
         return frames_as_seen(frames_of(dataset, batch, row), world_model.image_size)
 
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
-        wanted = windows[own.start : own.stop] if names is None else [by_name[name] for name in names]
-        for batch in some(wanted, batch_size=batch_size):
+        selected = windows[part.start : part.stop] if names is None else [by_name[name] for name in names]
+        for batch in read_batches(selected, batch_size=batch_size):
             yield encode(batch), partial(frames, batch)
 
-    before = actions_before(own, windows, partial(some, batch_size=1))
+    before = actions_before(part, windows, partial(read_batches, batch_size=1))
     return RepeatableClips(tuple(by_name), read, dataset.spaces.action, not dataset.config.is_cache, before, device)
 
 

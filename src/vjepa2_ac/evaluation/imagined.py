@@ -1,4 +1,4 @@
-"""The predicted frames of a held-out clip, of an image and a state, or of a plan: load, choose, roll out, decode."""
+"""Decoded rollouts from a held-out clip, from an image with a state, or of a plan."""
 
 from __future__ import annotations
 
@@ -31,47 +31,49 @@ from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.spaces import StateSpace
 
-_RATE_HZ = 15.0  # of a robot, where nobody says: DROID's
-_SEARCHED = 64  # clips, among which the one with the most motion is shown
+_RATE_HZ = 15.0  # control rate that is assumed for an image without data: DROID's
+_SEARCHED = 64  # number of clips from which the clip with the most motion is selected
 _MOST_PLAN_STEPS = 8
 Image = UInt8[np.ndarray, "height width 3"]
 Frames = UInt8[np.ndarray, "time h w 3"]
 Outcome = Callable[[Float[np.ndarray, "steps 7"]], tuple[Frames, Bool[np.ndarray, "time h w"]]]
-"""Actions -> the camera's frames from the start on, and which pixels show the arm."""
+"""Actions -> the simulated camera frames (start included), and a mask of the pixels that show the arm."""
 Simulate = Callable[[Dataset, int, int], Outcome | None]
-"""Data set, episode, control step -> what really happens from there; None: the data were not simulated."""
-TRUE = "true"  # the word for the recorded actions
+"""Data set, episode, control step -> a simulation from this step; None: the data were not recorded in a simulator."""
+TRUE = "true"  # name of the recorded actions
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a camera sees, and the robot's state then."""
+    """A camera image, and the state of the robot at the same time."""
 
     image: UInt8[np.ndarray, "height width 3"]
     state: Float[np.ndarray, " state_dim"]
-    extrinsics: Float[np.ndarray, " 6"] | None = None  # where the model uses it
+    extrinsics: Float[np.ndarray, " 6"] | None = None  # pose of the camera, if the model uses it
 
 
 @dataclass(frozen=True)
 class ImagineOptions:
-    """What is to be imagined."""
+    """Options of a decoded rollout."""
 
     decoder: str
     actions: tuple[str, ...] = (TRUE, "none", "up", "left", "close")  # names, `true`, or files
     steps: int = 7  # model steps
-    size_m: float = STEP_M  # of a named action, in each step, if the limits allow it
+    size_m: float = STEP_M  # length of a named action in each step, clipped to the limits
     episode: str | None = None  # None: the held-out clip with the most motion
-    start: int | None = None  # first control step; None: likewise
+    start: int | None = None  # first control step; None: 0, or that of the clip with the most motion
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, split
 
 
 def imagine_image(session: Subject, asked: ImagineOptions, seen: Seen) -> Imagination:
-    """Imagine what follows from an image under actions by name, or from files; `planning.views` as a planner sees them.
+    """Predict and decode the frames after an image, for actions by name or from files.
+
+    With `planning.views` above 1 the image contains the views of several cameras, as for a planner.
 
     Args:
-        session: The model, and the config whose crop and limits count.
-        asked: Decoder, actions (names of directions, or files), steps and size.
-        seen: The start.
+        session: The model, and the config with the crop and the limits.
+        asked: Decoder, actions (names of directions, or files), number of steps, and their size.
+        seen: The image and the state before the first action.
 
     Raises:
         InputError: Decoder, state or actions cannot be used.
@@ -89,14 +91,14 @@ def imagine_image(session: Subject, asked: ImagineOptions, seen: Seen) -> Imagin
     views = config.planning.views
     latents = encode_frames(model, seen.image[None], config.data.crop, views=views)
     state = np.asarray(seen.state, dtype=np.float64)
-    starts = [Start(one, state, space, camera) for one in latents[0].chunk(views)]
+    starts = [Start(view_latents, state, space, camera) for view_latents in latents[0].chunk(views)]
     cut = view(split_views(seen.image[None], views), config.data.crop)
     first = np.concatenate(frames_as_seen(cut, model.image_size), axis=1)
     decoded_first = shown(decoder.decoder, latents, views)[0]
 
-    def imagined(taken: Float[np.ndarray, "steps 7"]) -> Frames:
-        rolled = torch.cat([rolled_out(model.rollout, start, taken) for start in starts], dim=1)
-        return shown(decoder.decoder, rolled, views)
+    def predicted_frames(actions: Float[np.ndarray, "steps 7"]) -> Frames:
+        rollout = torch.cat([rolled_out(model.rollout, start, actions) for start in starts], dim=1)
+        return shown(decoder.decoder, rollout, views)
 
     return Imagination(
         subject=session.name,
@@ -105,7 +107,7 @@ def imagine_image(session: Subject, asked: ImagineOptions, seen: Seen) -> Imagin
         seconds_per_step=(config.data.model_stride if config.data.stride != "auto" else 1) / _RATE_HZ,
         first=first,
         decoded_first=decoded_first,
-        rollouts=tuple(Imagined("model", word, taken, imagined(taken)) for word, taken in chosen.items()),
+        rollouts=tuple(Imagined("model", name, actions, predicted_frames(actions)) for name, actions in chosen.items()),
         notes=(
             f"Times in the film suppose {_RATE_HZ:g} control steps in a second.",
             *warnings,
@@ -115,7 +117,7 @@ def imagine_image(session: Subject, asked: ImagineOptions, seen: Seen) -> Imagin
 
 
 def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None:
-    """Refuse states in which actions by name mean nothing: no poses, or poses in the camera's frame."""
+    """Refuse states for which named actions are undefined: vectors, and poses in the camera's frame."""
     if not space.is_base_pose:
         found, needed = "states that are no poses in the robot base frame", "poses: names are directions in that frame"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
@@ -130,12 +132,12 @@ def _actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig)
 def imagine_clip(
     subject: str, asked: ImagineOptions, *, simulate: Simulate | None = None, reporter: Reporter = SILENT
 ) -> Imagination:
-    """Imagine a held-out clip of a run or a model: under the recorded actions, by base and adapter, and under others.
+    """Predict and decode a held-out clip with each model, for the recorded actions and for counterfactual actions.
 
     Args:
         subject: The folder of a run; or a model, with data in `evaluation`.
-        asked: What is to be imagined.
-        simulate: Simulates the data; if this fails, a note says why.
+        asked: The options.
+        simulate: Simulates the outcome of other actions; if this fails, a note gives the reason.
         reporter: Shows the progress.
 
     Raises:
@@ -156,7 +158,7 @@ def imagine_clip(
     (batch,) = batches_of(dataset, [window], batch_size=1)
     size = models.world_model.image_size
     chosen = _actions_of(asked, batch, dataset, limits=config.planning.limits)
-    assert batch.frames is not None  # noqa: S101  # refused above: a cache
+    assert batch.frames is not None  # noqa: S101  # `require_frames` refuses cached latents
     frames = frames_as_seen(batch.frames[0].numpy(), size)
     truths: dict[str, tuple[Frames, np.ndarray | None]] = {AS_RECORDED: (frames[1:], None)}
     notes: tuple[str, ...] = ()
@@ -171,11 +173,11 @@ def imagine_clip(
         latents = encode_batch(models.world_model, batch, device=accelerator.device)
         start, states = Start.of(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
         for name, actions in chosen.items():
-            for one in models.contenders:
-                with one.switched():
-                    rolled = rolled_out(one.model.rollout, start, actions, states if name == AS_RECORDED else None)
+            for model in models.contenders:
+                with model.switched():
+                    rollout = rolled_out(model.model.rollout, start, actions, states if name == AS_RECORDED else None)
                 truth = truths.get(name, (None, None))
-                rollouts.append(Imagined(one.name, name, actions, shown(decoder.decoder, rolled), *truth))
+                rollouts.append(Imagined(model.name, name, actions, shown(decoder.decoder, rollout), *truth))
         decoded = shown(decoder.decoder, latents.latents[0])
     return Imagination(
         subject=subject,
@@ -199,13 +201,13 @@ def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: L
             chosen[AS_RECORDED] = recorded
             continue
         _require_directions(dataset.spaces.state, where=f"--actions {word}", fix="Give --actions true")
-        name = word if word in ACTION_NAMES else Path(word).name  # with its ending: never one of the other names
+        name = word if word in ACTION_NAMES else Path(word).name  # with its suffix, so that it equals no action name
         chosen[word if name in chosen else name] = _actions_by_name(word, len(recorded), asked.size_m, limits)
     return chosen
 
 
 def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
-    """Return episode and first control step of the clip."""
+    """Return the episode and the first control step of the clip to show."""
     lengths, clip, split = dataset.table.num_steps, dataset.config.clip_steps, asked.evaluation.split
     if asked.episode is None:
         members = dataset.members(split)[dataset.episodes]
@@ -226,7 +228,7 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
 
 
 def _motion(dataset: Dataset, episode: int, start: int) -> float:
-    """Return how far the robot moves in a clip, added up over its model steps."""
+    """Return the length of the robot's path in a clip, added up over its model steps."""
     steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
     states = dataset.source.read(episode, None, dataset.needed_steps(episode)).states[list(steps)]
     return dataset.spaces.state.path_length(states)
@@ -235,10 +237,10 @@ def _motion(dataset: Dataset, episode: int, start: int) -> float:
 def _as_seen(
     frames: Frames, arm: Bool[np.ndarray, "time h w"], *, config: Config, size: int
 ) -> tuple[Frames, Bool[np.ndarray, "time size size"]]:
-    """Return frames after the first one, and silhouettes of all, cut and resized as the encoder's input."""
+    """Return the frames after the first one, and the arm's silhouettes in all frames, cropped and resized as inputs."""
     silhouettes = np.repeat(np.uint8(255) * arm[..., None], 3, axis=-1)
-    seen, outlines = (frames_as_seen(view(one, config.data.crop), size) for one in (frames, silhouettes))
-    return seen[1:], outlines[..., 0] > 127
+    inputs, outlines = (frames_as_seen(view(images, config.data.crop), size) for images in (frames, silhouettes))
+    return inputs[1:], outlines[..., 0] > 127
 
 
 # ---- of a plan ----
@@ -246,38 +248,38 @@ def _as_seen(
 
 @dataclass(frozen=True, eq=False)
 class ImaginedPlan:
-    """Images of a plan, all as the encoder sees them."""
+    """Images of a plan, all with the crop and size of the encoder's input."""
 
-    start: Image  # decoded
-    steps: dict[int, Image]  # imagined after so many model steps; empty without a plan
-    goal: Image  # the one that applies at the end
+    start: Image  # decoded current frame
+    steps: dict[int, Image]  # number of model steps -> predicted frame, decoded; empty without a plan
+    goal: Image  # the goal that applies at the end of the plan
     decoded_goal: Image
 
 
 def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
-    """Decode the rollout of a plan, of some steps if there are many, and what it started from and aimed at.
+    """Decode the start, the goal and the predicted frames of a plan; at most eight frames, equally spaced.
 
     Args:
         answer: The decision.
-        decoder: Of the model's encoder; it is moved to the model's device.
+        decoder: A decoder for the model's encoder; it is moved to the model's device.
     """
     controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]].image
     decoder.to(controller.device)
-    given = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
-    start, decoded_goal = shown(decoder.decoder, given, controller.config.views)
+    latents = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
+    start, decoded_goal = shown(decoder.decoder, latents, controller.config.views)
     frames = _rollout(answer.decision, decoder)
-    places = spread_with_ends(len(frames), _MOST_PLAN_STEPS)
+    shown_steps = spread_with_ends(len(frames), _MOST_PLAN_STEPS)
     views = view(split_views(goal[None], controller.config.views), controller.crop)
-    seen = np.concatenate(frames_as_seen(views, decoder.card.shape.image_size), axis=1)
-    return ImaginedPlan(start, {place + 1: frames[place] for place in places}, seen, decoded_goal)
+    goal_input = np.concatenate(frames_as_seen(views, decoder.card.shape.image_size), axis=1)
+    return ImaginedPlan(start, {step + 1: frames[step] for step in shown_steps}, goal_input, decoded_goal)
 
 
 @torch.no_grad()
 def _rollout(decision: Decision, decoder: TrainedDecoder) -> Frames:
-    """Return the images after each step of a plan; none without a plan, or if the predictions are not finite."""
+    """Return the decoded frames after each step of a plan; empty without a plan or finite predictions."""
     side = decoder.card.shape.image_size
-    none = np.zeros((0, side, side, 3), np.uint8)
+    no_frames = np.zeros((0, side, side, 3), np.uint8)
     if decision.plan is None or decision.cost is None:
-        return none
+        return no_frames
     latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.imagine(decision.plan.actions[None])[0][0]
-    return shown(decoder.decoder, latents, decision.cost.views) if bool(torch.isfinite(latents).all()) else none
+    return shown(decoder.decoder, latents, decision.cost.views) if bool(torch.isfinite(latents).all()) else no_frames

@@ -1,7 +1,7 @@
-"""Measurement of predictions: errors between predicted and true latents, and those of persistence.
+"""Measurement of predictions: errors between predicted and true latents, and the errors of persistence.
 
-All errors compare layer-normalised latents, per clip and model step. *Persistence* is the error of copying a frame that
-was seen. A ratio of 1 means: as good as persistence; 0: perfect.
+All errors compare layer-normalised latents, per clip and model step. *Persistence* copies the last given frame. A
+relative error of 1 is as good as persistence; 0 is perfect.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import L1, MODES, Metric, Mode, PredictionErrors, Way
 
 _Window = TypeVar("_Window")
-VALIDATED: tuple[tuple[Way, Mode], ...] = (  # rollouts, which take longest, with the true actions only
+VALIDATED: tuple[tuple[Way, Mode], ...] = (  # rollouts take longest, so they are made with the true actions only
     *(("true", mode) for mode in MODES),
     *(("persistence", mode) for mode in MODES),
     ("zero", "teacher_forced"),
     ("shuffled", "teacher_forced"),
 )
-_MOST_FRAMES = 8  # of a sample: as the released weights were trained, and short enough for the widest stride
+_MOST_FRAMES = 8  # frames of a clip: as in the training of the released weights, and short enough for large strides
 ONE_STEP: tuple[tuple[Way, Mode], ...] = (("true", "teacher_forced"), ("persistence", "teacher_forced"))
 
 
@@ -41,27 +41,27 @@ class Predictor(Protocol):
     def predict(
         self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None
     ) -> Float[Tensor, "batch time tokens dim"]:
-        """Return the prediction of each next frame from the true frames before it."""
+        """Return the prediction of each frame from the true frames before it (teacher forcing)."""
         ...
 
     def rollout(
         self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None
     ) -> Float[Tensor, "batch horizon tokens dim"]:
-        """Return the frames after the context, each prediction fed back."""
+        """Return the predicted frames after the context; each prediction is the input of the next one."""
         ...
 
 
 @dataclass(frozen=True)
 class ClipSample:
-    """Held-out clips to measure, and how many of them are computed together."""
+    """Options of a sample of held-out clips."""
 
     split: Split = "validation"
-    clips: int = 64  # at most
+    clips: int = 64  # largest number of clips
     batch_size: int = 8
-    strides: tuple[int, ...] = ()  # of a calibration; empty: `windows.candidate_strides`
+    strides: tuple[int, ...] = ()  # strides of a calibration; empty: `windows.candidate_strides`
 
     def frames_of(self, config: DataConfig) -> int:
-        """Return the frames of a clip of these data: 8 at most."""
+        """Return the number of frames of a clip: that of the data, but at most 8."""
         return min(config.frames, _MOST_FRAMES)
 
 
@@ -69,7 +69,7 @@ class ClipSample:
 def measured(
     model: Predictor,
     batch: LatentBatch,
-    wanted: Sequence[tuple[Way, Mode]],
+    predictions: Sequence[tuple[Way, Mode]],
     metrics: Sequence[Metric],
     others: Float[Tensor, "batch time action_dim"] | None = None,
     watch: Callable[[Way, Mode, Float[Tensor, "batch horizon tokens dim"]], None] | None = None,
@@ -79,27 +79,27 @@ def measured(
     Args:
         model: The predictor.
         batch: The clips.
-        wanted: The predictions to make.
-        metrics: By what they are measured.
-        others: The actions of other clips, if predictions with shuffled actions are wanted.
-        watch: Receives each prediction, which is not stored.
+        predictions: The predictions to make.
+        metrics: The metrics of the errors.
+        others: The actions of other clips, required for predictions with shuffled actions.
+        watch: Called with each prediction, since predictions are not stored.
     """
     arrays: dict[tuple[Way, Mode, str], Float[np.ndarray, "clips horizon"]] = {}
-    for way, mode in wanted:
+    for way, mode in predictions:
         predicted = prediction(model, batch, way, mode, others)
         if watch is not None:
             watch(way, mode, predicted)
         for metric in metrics:
-            found = metric.of(predicted, batch.latents[:, 1:])
-            arrays[way, mode, metric.name] = np.asarray(found.cpu().numpy(), dtype=np.float64)
+            errors = metric.of(predicted, batch.latents[:, 1:])
+            arrays[way, mode, metric.name] = np.asarray(errors.cpu().numpy(), dtype=np.float64)
     return PredictionErrors(batch.episode_ids, arrays)
 
 
 def joined(parts: Sequence[PredictionErrors]) -> PredictionErrors:
-    """Return the errors of all clips of some batches.
+    """Concatenate the errors of several batches.
 
     Raises:
-        InputError: There are none.
+        InputError: There are no batches.
     """
     if not parts:
         raise no_clips()
@@ -108,7 +108,7 @@ def joined(parts: Sequence[PredictionErrors]) -> PredictionErrors:
 
 
 def no_clips() -> InputError:
-    """Return the error of clips of which no process can read one."""
+    """Return the error that none of the clips can be read."""
     fix = "Repair or fetch these episodes again, or add them to data.exclude"
     return InputError(where="data.path", found="none of the clips can be read: their episodes are broken", fix=fix)
 
@@ -119,9 +119,9 @@ def prediction_errors(
     metrics: Sequence[Metric] = (L1,),
     before: Float[Tensor, "1 time action_dim"] | None = None,
 ) -> PredictionErrors:
-    """Measure a model as a validation does, batch after batch, so that no latents are stored.
+    """Measure a model with the predictions of a validation, batch by batch, so that no latents are stored.
 
-    Processes that share the work each have some batches, and `before` as of `with_other_actions`.
+    If several processes share the work, each passes its batches, and `before` as for `with_other_actions`.
     """
     pairs = with_other_actions(batches, before)
     return joined(gathered([measured(model, batch, VALIDATED, metrics, others) for batch, others in pairs]))
@@ -130,29 +130,32 @@ def prediction_errors(
 def actions_before(
     own: range, windows: Sequence[_Window], read: Callable[[list[_Window]], Iterator[Batch]]
 ) -> Float[Tensor, "1 time action_dim"] | None:
-    """Return the actions that the first clip of a process's part is given as another's; None: there is none before it.
+    """Return the actions of the clip before this process's first clip, which are the first clip's shuffled actions.
+
+    None: this process has the first clip of all, or no clips.
 
     Args:
-        own: The part.
-        windows: Of all clips.
-        read: Reads some; those that are broken are left out.
+        own: The indices of this process's clips.
+        windows: The windows of all clips.
+        read: Reads the clips of windows; broken clips are left out.
     """
     if len(own) in (0, len(windows)):
         return None
     before = (batch.actions for window in reversed(windows[: own.start]) for batch in read([window]))
     if (nearest := next(before, None)) is not None:
         return nearest
-    first = (batch.actions for window in windows for batch in read([window]))  # the second, as of one process
-    return next(islice(first, 1, None), None)
+    # No clip before this part can be read: use the second readable clip, as a single process does for its first clip.
+    readable = (batch.actions for window in windows for batch in read([window]))
+    return next(islice(readable, 1, None), None)
 
 
 def with_other_actions(
     batches: Iterable[LatentBatch], before: Float[Tensor, "1 time action_dim"] | None = None
 ) -> Iterator[tuple[LatentBatch, Float[Tensor, "batch time action_dim"]]]:
-    """Yield each batch with other actions for its clips: those of the clip before, whatever the batch size.
+    """Yield each batch with the shuffled actions of its clips: those of the previous clip, for any batch size.
 
-    The first clip gets `before`, where another process has the clips before it; else those of the second; if it is
-    alone, its own reversed.
+    The first clip gets `before` if another process has the clips before it, otherwise the actions of the second clip;
+    a single clip gets its own actions in reverse order.
     """
     rest = iter(batches)
     head = list(islice(rest, 1))
@@ -169,9 +172,10 @@ def with_other_actions(
 def prediction(
     model: Predictor, batch: LatentBatch, way: Way = "true", mode: Mode = "rollout", others: Tensor | None = None
 ) -> Float[Tensor, "batch horizon tokens dim"]:
-    """Return the frames after the first as predicted.
+    """Return the predictions of all frames after the first.
 
-    States are the true ones, whatever the actions, and may reveal the motion: what wrong actions cost is a lower bound.
+    The states are the true ones for all actions, and can reveal the motion. The increase of the error with zero or
+    shuffled actions is therefore a lower bound.
     """
     seen = batch.latents[:, :1] if mode == "rollout" else batch.latents[:, :-1]
     if way == "persistence":

@@ -1,4 +1,4 @@
-"""Options of an evaluation, and the config that follows from them. PyTorch is not imported."""
+"""Options of an evaluation, and the config for them. PyTorch is not imported."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from vjepa2_ac.runs.folder import is_of_moved, is_run, read_run_config
 
 @dataclass(frozen=True)
 class ProbeOptions:
-    """Options of the measurements beyond the errors; 0 clips: none."""
+    """Options of action ranking, energy landscapes and examples; with 0 clips a measurement is skipped."""
 
     ranking_clips: int = 32
-    samples: int = 64  # alternative actions per move, drawn in each of two ways
+    samples: int = 64  # alternative actions per move, of each of two types (box and shell)
     landscape_clips: int = 8
-    nodes: int = 9  # along each axis of a landscape
-    reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
+    nodes: int = 9  # grid points along each axis of a landscape
+    reach_cm: float = 7.5  # half-width of landscapes and of the box along each axis, as in upstream's notebook
     examples: int = 4
     at_once: int = 64  # samples per batch
 
@@ -35,25 +35,25 @@ class EvaluationOptions:
     """The options of an evaluation."""
 
     split: Split = "test"
-    clips: int = 256  # at most, spread over the episodes
-    checkpoint: str = SELECTED  # of a run: selected, newest, best, or a number of optimizer steps
-    data: Config | None = None  # data other than the run's own; a model has none of its own
-    against: Sequence[str] | None = None  # base, runs, models; None: the base of a run, nothing for a model
-    out: Path | None = None  # output folder; None: the run's
+    clips: int = 256  # largest number of clips, spread over the episodes
+    checkpoint: str = SELECTED  # for a run: selected, newest, best, or a number of optimizer steps
+    data: Config | None = None  # config of the data; None: the data of the run. Required for a model
+    against: Sequence[str] | None = None  # "base", runs, models; None: the base model of a run, nothing for a model
+    out: Path | None = None  # output folder; None: the folder of the run
     probes: ProbeOptions = field(default_factory=ProbeOptions)
-    decoder: str | None = None  # folder of a decoder, or builtin:sim-tiny: rollouts are decoded and measured as images
-    overrides: Sequence[str] = ()  # of the config: planning.…, or for a run whose base was moved model.base=PATH
+    decoder: str | None = None  # folder of a decoder, or builtin:sim-tiny; with it, decoded rollouts are measured
+    overrides: Sequence[str] = ()  # of the config: planning.…, and model.base=PATH for a run whose base model was moved
 
 
 def settle(subject: str, asked: EvaluationOptions) -> Config:
-    """Return the config to measure with; its `planning` says how one step is planned.
+    """Return the config for an evaluation, with the overrides applied.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
         asked: The options.
 
     Raises:
-        InputError: The subject is no run and no data are named, a setting is wrong, or a folder is missing.
+        InputError: The subject is not a run and there are no data, a setting is invalid, or a folder is missing.
     """
     config = _config_of(subject, asked)
     for override in asked.overrides:
@@ -65,10 +65,10 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
 
 
 def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
-    """Refuse several processes: each would do everything, and all would write the same files.
+    """Refuse several processes, each of which would do all of the work and write the same files.
 
     Raises:
-        InputError: torchrun or `accelerate launch` started several.
+        InputError: torchrun or `accelerate launch` started several processes.
     """
     if (processes := environment.get("WORLD_SIZE", "1")) != "1":
         needed = "one: only train, encode and evaluate share their work among processes"
@@ -77,19 +77,19 @@ def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
 
 
 def _config_of(subject: str, asked: EvaluationOptions) -> Config:
-    """Return the config of a run, on other data if some are named, or of the data."""
-    own = read_run_config(Path(subject)) if is_run(subject) else None
+    """Return the config of a run (with other data, if given), or the config of the data for a model."""
+    run_config = read_run_config(Path(subject)) if is_run(subject) else None
     if asked.data is None:
-        if own is None:
+        if run_config is None:
             raise InputError(
                 where=subject,
                 found="no config.yaml: not the folder of a run" if Path(subject).exists() else "no such folder",
                 needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
                 fix="To measure a model, name the data with --data CONFIG and a folder with --out",
             )
-        return own
+        return run_config
     if asked.out is None:
         found, needed = "metrics.json of a run's own folder is for its own data", "a folder for what is found on these"
         raise InputError(where="--data without --out", found=found, needed=needed, fix="Add --out FOLDER")
     require_stride(asked.data.data, to="evaluate")
-    return asked.data if own is None else own.model_copy(update={"data": asked.data.data})
+    return asked.data if run_config is None else run_config.model_copy(update={"data": asked.data.data})

@@ -1,8 +1,8 @@
-"""Evaluation results: records of arrays by clip, and estimates from them with intervals. PyTorch is not imported.
+"""Evaluation results: arrays by clip, and estimates with intervals computed from them. PyTorch is not imported.
 
 Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). All errors compare
-layer-normalised latents, by all metrics that are registered. Estimates that compare two models are paired by clip. The
-rows are made by `evaluation.rows`, the summary by `evaluation.summary`.
+layer-normalised latents, with all registered metrics. Estimates that compare two models are paired by clip.
+`evaluation.rows` makes the rows of the tables, `evaluation.summary` the summary.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from vjepa2_ac.registry import METRICS
 if TYPE_CHECKING:
     from torch import Tensor
 
-SAME_ENERGY = 1e-6  # relative difference below which energies are equal: rounding decides no rank
-PERSISTENCE = "persistence"  # in the column of models: a copy of frame 0
+SAME_ENERGY = 1e-6  # energies with a smaller relative difference count as equal, so that rounding decides no rank
+PERSISTENCE = "persistence"  # name in the column of models: a copy of frame 0
 
 
 @dataclass(frozen=True)
 class Metric:
-    """A measure of predictions, of positive numbers: they are shown as ratios to those of persistence."""
+    """A metric of predictions with positive values, which are shown relative to persistence."""
 
     name: str  # in metrics.json
     label: str  # in tables and sentences
@@ -50,13 +50,13 @@ L2 = Metric("l2", "L2", "mean squared difference", _l2)
 
 
 def registered_metrics() -> tuple[Metric, ...]:
-    """Return all metrics, other people's among them; L1, which models are trained on, comes first."""
+    """Return all metrics, third-party metrics included; L1, the training loss, comes first."""
     return tuple(METRICS.find(name) for name in METRICS.names())
 
 
 Mode = Literal["teacher_forced", "rollout"]
 Actions = Literal["true", "zero", "shuffled"]
-Way = Literal["true", "zero", "shuffled", "persistence"]  # of predicting: with which actions, or by copying a frame
+Way = Literal["true", "zero", "shuffled", "persistence"]  # actions of a prediction, or a copy of the given frame
 Role = Literal["base", "trained", "other"]
 
 MODES: tuple[Mode, ...] = ("teacher_forced", "rollout")
@@ -67,9 +67,9 @@ ACTIONS: tuple[Actions, ...] = ("true", "zero", "shuffled")
 class About:
     """The description of an evaluation: model, data and settings."""
 
-    subject: str  # the run or model, as given
-    checkpoint: str  # which one, as text; "" for a model
-    checkpoint_path: str  # likewise
+    subject: str  # the run or model, as given by the user
+    checkpoint: str  # description of the checkpoint; "" for a model
+    checkpoint_path: str  # "" for a model
     source: str  # data.source
     data: str  # data.path
     cameras: tuple[str, ...]
@@ -88,9 +88,9 @@ class Clips:
     """The clips, and the size of their actions."""
 
     episode_ids: tuple[str, ...]
-    starts: tuple[int, ...]  # first control step of each
-    action_size: Float[np.ndarray, "clips horizon"]  # |dx, dy, dz| in cm; of vectors: the norm of the action
-    moving: Bool[np.ndarray, "clips horizon"]  # of each step, by the rule in `moving_means`
+    starts: tuple[int, ...]  # first control step of each clip
+    action_size: Float[np.ndarray, "clips horizon"]  # |dx, dy, dz| in cm; for vectors: the norm of the action
+    moving: Bool[np.ndarray, "clips horizon"]  # whether the robot moves in each step, by the rule in `moving_means`
     moving_means: str  # the rule, as text
 
     def __len__(self) -> int:
@@ -98,23 +98,24 @@ class Clips:
 
     @property
     def episodes(self) -> int:
-        """The number of episodes of the clips."""
+        """Number of different episodes."""
         return len(set(self.episode_ids))
 
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """The errors of one model and of persistence on some clips; row i of every array is clip i.
+    """The errors of one model and of persistence on the same clips; row i of every array is clip i.
 
-    Teacher-forced: frame h from the true frames before it. Rollout: from frame 0 alone, predictions fed back. Of
-    persistence: copying frame h - 1, and frame 0. Horizon 1 is the same in both.
+    Teacher forcing: frame h is predicted from the true frames before it. Rollout: all frames are predicted from frame 0
+    alone. Persistence copies frame h - 1 with teacher forcing, and frame 0 in a rollout. At horizon 1 both modes are
+    equal.
     """
 
     episode_ids: tuple[str, ...]
-    arrays: Mapping[tuple[Way, Mode, str], Float[np.ndarray, "clips horizon"]]  # by way, mode and name of the metric
+    arrays: Mapping[tuple[Way, Mode, str], Float[np.ndarray, "clips horizon"]]  # key: way, mode, name of the metric
 
     def of(self, mode: Mode, metric: Metric = L1, way: Way = "true") -> Float[np.ndarray, "clips horizon"]:
-        """Return the errors of one kind of prediction."""
+        """Return the errors for a mode, a metric, and the actions of the prediction."""
         return self.arrays[way, mode, metric.name]
 
 
@@ -122,35 +123,35 @@ class PredictionErrors:
 class ActionRanking:
     """The action-ranking error: the fraction of alternative actions with a lower energy than the true action.
 
-    It is measured on moves (`action_use.moves_of`) that are as large as planned ones, forwards and backwards in time.
-    Chance: 0.5; a perfect model: 0. The errors of two models on the same moves may be compared pair by pair.
+    It is measured on moves (`action_use.moves_of`) as large as planned actions, forwards and backwards in time. Chance
+    is 0.5; a perfect model has 0. The errors of two models on the same moves can be compared in pairs.
     """
 
-    samples: int  # alternatives per move, in the box and on the shell
+    samples: int  # alternatives per move in the box, and the same number on the shell
     reach: float  # half the width of the box along each of x, y, z, in metres
-    episode_ids: tuple[str, ...]  # of each move
+    episode_ids: tuple[str, ...]  # episode of each move
     ranks: Float[np.ndarray, " moves"]  # error of each move: mean of box and shell
-    rank: Estimate  # their mean
-    box: Estimate  # among actions that are uniform in the box
-    shell: Estimate  # among actions as long as the true one, in any direction: tells direction from "nothing moves"
-    spread: Estimate  # standard deviation of the energy over the box, over the error of persistence; 0: flat
-    change: Estimate  # change of the prediction with actions of the box, over the same; 0: the action is ignored
+    rank: Estimate  # mean of `ranks`
+    box: Estimate  # error among actions that are uniform in the box
+    shell: Estimate  # error among actions as long as the true action in random directions: sensitivity to direction
+    spread: Estimate  # standard deviation of the energy in the box, relative to persistence's error; 0: flat
+    change: Estimate  # change of the prediction with actions in the box, likewise relative; 0: actions are ignored
 
 
 @dataclass(frozen=True)
 class Validation:
-    """What a validation of a run measures."""
+    """The measurements of a validation during training."""
 
     errors: PredictionErrors
-    ranking: ActionRanking | None  # None: not asked for
+    ranking: ActionRanking | None  # None: not measured
 
 
 @dataclass(frozen=True)
 class Landscape:
-    """The L1 energy of one clip's first step over a grid of (dx, dy, dz); the rest of the action is the true one.
+    """The L1 energy of one step of a clip over a grid of (dx, dy, dz); the rest of the action is the true one.
 
-    The grid spans about the same on both sides of *zero* and has a node exactly at the true action, so a minimum at the
-    true action is no artefact of the grid's centre.
+    The grid is approximately centred at *zero* and has a node exactly at the true action, so that a minimum at the true
+    action is not an artefact of the grid's centre.
     """
 
     episode_id: str
@@ -158,16 +159,16 @@ class Landscape:
     axes: Float[np.ndarray, "3 grid"]  # the evaluated actions along each axis, ascending; cm, or plain numbers
     energy: Float[np.ndarray, "grid grid grid"]  # indices: first, second, third axis
     true: Float[np.ndarray, " 3"]
-    minimum: Float[np.ndarray, " 3"]  # where the energy is lowest (the mean if there are several)
+    minimum: Float[np.ndarray, " 3"]  # node with the lowest energy; the mean of several such nodes
 
     @property
     def distance(self) -> float:
-        """The distance of the minimum to the true action, in the units of the axes."""
+        """Distance between the minimum and the true action, in the unit of the axes."""
         return float(np.linalg.norm(self.minimum - self.true))
 
     @property
     def rank(self) -> float:
-        """The fraction of the other nodes whose energy is below that of the true action; equal energies count half."""
+        """Fraction of the other nodes whose energy is below that of the true action; equal energies count half."""
         node = tuple(np.abs(self.axes - self.true[:, None]).argmin(axis=1))
         difference = self.energy - self.energy[node]
         is_equal = np.abs(difference) <= SAME_ENERGY * abs(self.energy[node])
@@ -176,7 +177,7 @@ class Landscape:
 
     @property
     def sharpness(self) -> float:
-        """The range of the energy over its mean; 0: flat."""
+        """Sharpness: (highest - lowest) / mean energy; 0: flat."""
         return float(np.ptp(self.energy) / self.energy.mean())
 
 
@@ -185,17 +186,17 @@ LandscapeMeasure = Literal["distance", "rank", "sharpness"]
 
 @dataclass(frozen=True)
 class Landscapes:
-    """Landscapes of some clips of one model."""
+    """Energy landscapes of several clips for one model."""
 
-    axis_names: tuple[str, ...]  # three
-    unit: str  # cm, or "" where the states are no poses
+    axis_names: tuple[str, ...]  # three names
+    unit: str  # cm; "" if the states are not poses
     maps: tuple[Landscape, ...]
-    chance_distance: float  # mean distance of a node drawn at random to the true action
+    chance_distance: float  # mean distance between a random node and the true action
 
     @property
     def episode_ids(self) -> tuple[str, ...]:
         """The episode of each clip."""
-        return tuple(one.episode_id for one in self.maps)
+        return tuple(landscape.episode_id for landscape in self.maps)
 
     def mean(self, measure: LandscapeMeasure) -> Estimate:
         """Return the mean of a measure over the clips."""
@@ -206,21 +207,21 @@ class Landscapes:
         return mean_of(self._values(measure) - other._values(measure), self.episode_ids)
 
     def _values(self, measure: LandscapeMeasure) -> Float[np.ndarray, " clips"]:
-        return np.array([getattr(one, measure) for one in self.maps])
+        return np.array([getattr(landscape, measure) for landscape in self.maps])
 
 
 @dataclass(frozen=True)
 class LatentDistribution:
-    """How the latents of one kind of prediction are distributed, compared with the true ones of the same clips.
+    """Comparison of the distributions of predicted and true latents over clips (see `evaluation.distribution`).
 
-    By horizon (index h - 1), but for `fvd`, which has one feature vector for each clip: see `evaluation.distribution`.
+    All values are by horizon (index h - 1), except `fvd`, which uses one feature vector for each clip.
     """
 
-    spread: tuple[Estimate, ...]  # 1: as varied as the truth
+    spread: tuple[Estimate, ...]  # 1: as varied as the true latents
     mmd: tuple[Estimate, ...]  # squared, times 100; unbiased; no interval from one episode
-    fvd: float  # Fréchet distance; biased upwards, the more the fewer clips
-    variance: tuple[float, ...]  # trace of the covariance over clips, of these latents
-    true_variance: tuple[float, ...]  # the same of the true latents: `spread` is the ratio
+    fvd: float  # Fréchet distance; biased upwards, more so with fewer clips
+    variance: tuple[float, ...]  # trace of the covariance of the predicted latents over clips
+    true_variance: tuple[float, ...]  # trace of the covariance of the true latents; `spread` is the ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,23 +231,24 @@ class DecodedStrip:
     why: str
     episode_id: str
     start: int
-    rows: Mapping[str, UInt8[np.ndarray, "time size size 3"]]  # truth, decoded_truth, base, adapter; the first is given
+    # truth, decoded_truth, base, adapter -> images; the first image of a row is frame 0, which is not predicted
+    rows: Mapping[str, UInt8[np.ndarray, "time size size 3"]]
 
 
 @dataclass(frozen=True)
 class DecodedRollouts:
-    """What was measured of decoded rollouts. Frame 0 is given: horizons begin at 1.
+    """Metrics of decoded rollouts. Frame 0 is given, so horizons begin at 1.
 
-    A *source* is a model's rollout under the true actions, or one of its neighbours: decoded truth (the ceiling of the
-    decoder), decoded persistence (the floor), and raw persistence, a copy of the pixels of frame 0, which beats any
-    decoder in PSNR where little moves.
+    A *source* is a model's rollout with the true actions, or one of three baselines: decoded truth (the upper bound of
+    the decoder), decoded persistence, and raw persistence. The latter copies the pixels of frame 0 and has a better
+    PSNR than any decoder if little moves.
     """
 
-    decoder: Mapping[str, Any]  # what is known of it: folder, size, encoder, data, frames, steps, held_out
-    sources: tuple[str, ...]  # the neighbours, then the models
-    curves: Mapping[tuple[str, str], tuple[Estimate, ...]]  # by source and metric, such as psnr_db.moving.truth
+    decoder: Mapping[str, Any]  # description of the decoder: folder, size, encoder, data, frames, steps, held_out
+    sources: tuple[str, ...]  # the baselines, then the models
+    curves: Mapping[tuple[str, str], tuple[Estimate, ...]]  # key: source, metric such as psnr_db.moving.truth
     strips: tuple[DecodedStrip, ...] = ()
-    notes: tuple[str, ...] = ()  # what is absent, and why; how many clips were left out
+    notes: tuple[str, ...] = ()  # missing measurements with reasons; numbers of clips that were left out
     # By source: Fréchet distance of the re-encoded images to the true latents; empty: the encoder was not loaded.
     fvd: Mapping[str, float] = field(default_factory=dict)
 
@@ -257,61 +259,61 @@ class ModelResult:
 
     name: str  # base, adapter, model, or the name of another run
     role: Role
-    errors: PredictionErrors  # those of persistence are the same for all models, which share the encoder
+    errors: PredictionErrors  # persistence's errors are equal for all models, since they share the encoder
     landscapes: Landscapes | None = None
     ranking: ActionRanking | None = None
-    distribution: LatentDistribution | None = None  # of the rollout with the true actions
+    distribution: LatentDistribution | None = None  # for rollouts with the true actions
 
 
 @dataclass(frozen=True)
 class Example:
-    """One clip with its frames, and each model's prediction of it in a rollout from its first frame."""
+    """One clip with its frames, and the errors of each model in a rollout from the first frame."""
 
     why: str  # reason of the choice: best, worst, median, most motion
     episode_id: str
     start: int
-    frames: UInt8[np.ndarray, "time height width 3"] | None  # as the encoder sees them; None: no frames (a cache)
+    frames: UInt8[np.ndarray, "time height width 3"] | None  # the encoder's input; None for cached latents
     errors: Mapping[str, Float[np.ndarray, "horizon grid grid"]]  # model or persistence -> L1 error of each patch
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All results; models are in the order of the table: base, others, and the trained one last."""
+    """All results of an evaluation; models are in the order of the table: base, others, the trained model last."""
 
     about: About
     clips: Clips
     models: Mapping[str, ModelResult]
     examples: tuple[Example, ...] = ()
-    notes: tuple[str, ...] = ()  # for the reader: why there is no base, no landscape ...
-    metrics: tuple[Metric, ...] = (L1, L2)  # of the errors
-    copies: LatentDistribution | None = None  # of frame 0
-    fvd_of_halves: float = math.nan  # between two halves of the true clips: what chance makes of equal distributions
-    decoded: DecodedRollouts | None = None  # None: no decoder was given
+    notes: tuple[str, ...] = ()  # notes for the user, such as why there is no base model or no landscape
+    metrics: tuple[Metric, ...] = (L1, L2)  # metrics of the errors
+    copies: LatentDistribution | None = None  # distribution for copies of frame 0 (persistence)
+    fvd_of_halves: float = math.nan  # Fréchet distance between two halves of the true clips: the value by chance
+    decoded: DecodedRollouts | None = None  # None: no decoder was used
 
     @property
     def title(self) -> str:
-        """What was evaluated, for people: the name of a run with its step, or of a model."""
+        """Title of the evaluation: the name of a run with its step, or of a model."""
         step = self.about.checkpoint_path.rpartition("-")[2]
         base = " (the base model)" if self.about.is_base else ""
         return f"{self.about.subject}, step {int(step)}{base}" if step.isdecimal() else self.about.subject
 
     @property
     def trained(self) -> str:
-        """The name of the evaluated model: adapter, or model."""
+        """Name of the evaluated model in `models`, such as adapter."""
         return next(name for name, model in self.models.items() if model.role == "trained")
 
     @property
     def base(self) -> str | None:
-        """The name of the base in `models`; None: there is none."""
+        """Name of the base model in `models`; None: there is none."""
         return next((name for name, model in self.models.items() if model.role == "base"), None)
 
     @property
     def ranked(self) -> str | None:
-        """How actions were ranked, as text: two evaluations with the same text compare; None: they were not ranked."""
+        """Description of the action ranking; equal for comparable evaluations. None: actions were not ranked."""
         ranking = self.models[self.trained].ranking
         if ranking is None:
             return None
-        # Without the seed: other draws of the alternatives are within the interval.
+        # The seed is left out: the interval includes the variation between draws of the alternatives.
         return f"{len(ranking.ranks)} moves, 2 x {ranking.samples} alternatives within {100 * ranking.reach:g} cm"
 
     @property
@@ -321,58 +323,58 @@ class Evaluation:
 
     @property
     def horizon(self) -> int:
-        """The number of model steps of the longest horizon."""
+        """Longest horizon, in model steps."""
         return self.about.frames - 1
 
     @property
     def seconds_ahead(self) -> float:
-        """The same in seconds."""
+        """Longest horizon, in seconds."""
         return self.horizon * self.about.seconds_per_step
 
 
 # ---- estimates ----
 
 Curve = tuple[Estimate, ...]  # at horizon 1, 2, ...; index h - 1
-Steps = Bool[np.ndarray, "clips horizon"]  # which steps count
+Steps = Bool[np.ndarray, "clips horizon"]  # True for steps to include
 
 
 def over_persistence(errors: PredictionErrors, mode: Mode, metric: Metric = L1, way: Way = "true") -> Curve:
-    """Return mean error over mean persistence error by horizon: 1 as good as persistence; of L1, 0 is perfect."""
+    """Return the mean error relative to persistence's at each horizon: 1 is as good as persistence; 0 is perfect."""
     return ratios(errors.of(mode, metric, way), errors.of(mode, metric, "persistence"), errors.episode_ids)
 
 
 def one_step_over_persistence(
     errors: PredictionErrors, actions: Actions = "true", steps: Steps | None = None
 ) -> Estimate:
-    """Return teacher-forced error over persistence, over all steps of the clips or the chosen ones; NaN of none."""
+    """Return the teacher-forced error relative to persistence, over all or the selected steps; NaN without steps."""
     return ratio(_one_step(errors, actions, steps), _one_step(errors, "persistence", steps), errors.episode_ids)
 
 
 def gain_over(errors: PredictionErrors, others: PredictionErrors, mode: Mode = "rollout", metric: Metric = L1) -> Curve:
-    """Return the share by which a model is better than another, by horizon, paired by clip: 0.18 is 18 % better."""
+    """Return the relative gain over another model at each horizon, paired by clip: 0.18 is 18 % better."""
     pair = [each.of(mode, metric) for each in (errors, others)]
     better = 1 if metric.smaller_is_better else -1
     return bootstrapped(lambda sums: better * (1 - sums[0] / sums[1]), np.stack(pair), errors.episode_ids)
 
 
 def cost_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
-    """Return the share by which the teacher-forced error grows with zero or shuffled actions, paired; 0: unused."""
+    """Return the relative increase of the teacher-forced error with zero or shuffled actions, paired by clip."""
     grown = ratio(_one_step(errors, actions), _one_step(errors, "true"), errors.episode_ids)
     return Estimate(grown.value - 1, grown.low - 1, grown.high - 1)
 
 
 def gap_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
-    """Return how much higher the teacher-forced error over persistence is with zero or shuffled actions, paired."""
-    given, true = (errors.of("teacher_forced", L1, each) for each in (actions, "true"))
-    return ratio((given - true).mean(axis=1), _one_step(errors, "persistence"), errors.episode_ids)
+    """Return the increase of the teacher-forced error with zero or shuffled actions, relative to persistence."""
+    changed, true = (errors.of("teacher_forced", L1, each) for each in (actions, "true"))
+    return ratio((changed - true).mean(axis=1), _one_step(errors, "persistence"), errors.episode_ids)
 
 
 def rank_difference(one: ActionRanking, other: ActionRanking) -> Estimate:
-    """Return the mean rank of one model minus that of another on the same moves, paired: below 0 is better."""
+    """Return the action-ranking error minus that of another model on the same moves, paired: below 0 is better."""
     return mean_of(one.ranks - other.ranks, one.episode_ids)
 
 
 def _one_step(errors: PredictionErrors, way: Way, steps: Steps | None = None) -> np.ndarray:
-    """Return the mean teacher-forced L1 error of each clip, or the sum over the chosen steps."""
-    found = errors.of("teacher_forced", L1, way)
-    return np.asarray(found.mean(axis=1) if steps is None else (found * steps).sum(axis=1))
+    """Return the mean teacher-forced L1 error of each clip, or the sum over the selected steps."""
+    values = errors.of("teacher_forced", L1, way)
+    return np.asarray(values.mean(axis=1) if steps is None else (values * steps).sum(axis=1))

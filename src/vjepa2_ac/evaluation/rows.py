@@ -1,4 +1,4 @@
-"""The rows of an evaluation: every number with its interval, once, for console, page, metrics.json and comparison.
+"""The rows of an evaluation: all numbers with their intervals, for console, page, metrics.json and comparison.
 
 PyTorch is not imported.
 """
@@ -33,7 +33,7 @@ from vjepa2_ac.evaluation.result import (
 from vjepa2_ac.intervals import Estimate
 
 _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]  # null in JSON: NaN
-_MOST_HORIZONS = 8  # on a screen
+_MOST_HORIZONS = 8  # number of horizons in the console's tables
 _SIMILARITIES = {"psnr_db": ("PSNR (dB)", ".1f"), "ssim": ("SSIM", ".3f")}
 _REGIONS = {"whole": "whole image", "moving": "where something moves"}
 _GAIN: dict[str, Any] = {"form": ".1%", "better": "higher", "chance": 0.0}
@@ -41,20 +41,20 @@ _GAIN: dict[str, Any] = {"form": ".1%", "better": "higher", "chance": 0.0}
 
 @dataclass(frozen=True)
 class Row:
-    """One number of an evaluation: console, report page, metrics.json and comparison show the same ones."""
+    """One number of an evaluation, in one cell of a table."""
 
-    group: str  # the title of its table
-    name: str  # its line
-    key: str  # both, for programs, such as rollout.l1.over_persistence.3
-    model: str  # its column: a model, or persistence
-    value: _Number  # NaN: there is none
+    group: str  # title of the table
+    name: str  # label of the line
+    key: str  # identifies table and line in metrics.json, such as rollout.l1.over_persistence.3
+    model: str  # column: a model, or persistence
+    value: _Number  # NaN: not measured
     low: _Number = math.nan  # 95 % interval over episodes; NaN: there is none
     high: _Number = math.nan
     form: str = ".3f"
     better: Literal["lower", "higher", ""] = "lower"
     chance: float | None = None  # value of persistence, or of a model that ignores its actions
-    unit: str = ""  # of the value, if it has one and `name` does not give it: cm
-    detail: bool = False  # not for a screen
+    unit: str = ""  # unit of the value, such as cm
+    detail: bool = False  # left out on the console
 
     @property
     def estimate(self) -> Estimate:
@@ -71,11 +71,11 @@ class RowTable:
 
     title: str
     columns: tuple[str, ...]
-    lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, by chance or persistence, a cell for each column
+    lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, value by chance or of persistence, cells by column
 
 
 def sections(rows: Sequence[Row]) -> list[RowTable]:
-    """Return rows as tables: those of one key are a line, each in the column of its model."""
+    """Arrange rows as tables: rows with the same key form a line, with a column for each model."""
     by_key: dict[str, dict[str, Row]] = {}
     for row in rows:
         by_key.setdefault(row.key, {})[row.model] = row
@@ -113,7 +113,7 @@ def rows_of(evaluation: Evaluation) -> list[Row]:
 
 
 class _Rows(list[Row]):
-    """The rows so far."""
+    """A list of rows, with methods that add the rows of each measurement."""
 
     def __init__(self, evaluation: Evaluation) -> None:
         super().__init__()
@@ -124,94 +124,101 @@ class _Rows(list[Row]):
     def line(self, group: str, name: str, key: str, values: Mapping[str, Estimate], **style: Any) -> None:
         """Add a row for each model."""
         self.extend(
-            Row(group, name, key, model, one.value, one.low, one.high, **style) for model, one in values.items()
+            Row(group, name, key, model, estimate.value, estimate.low, estimate.high, **style)
+            for model, estimate in values.items()
         )
 
     def curves(
         self, group: str, key: str, curves: Mapping[str, Curve], shown: Collection[int] = (), **style: Any
     ) -> None:
-        """Add the rows of curves by horizon, of which some are shown on a screen."""
+        """Add the rows of curves by horizon; those not in `shown` are details."""
         for h in range(1, self.evaluation.horizon + 1):
             values = {model: curve[h - 1] for model, curve in curves.items()}
             name = f"{h * self.evaluation.about.seconds_per_step:.2f} s ahead"
             self.line(group, name, f"{key}.{h}", values, detail=h not in shown, **style)
 
     def add_errors(self) -> None:
-        """Add the errors of rollouts over persistence, and the gains over the base, paired by clip."""
+        """Add the rollout errors relative to persistence, and the gains over the base model, paired by clip."""
         last = self.evaluation.horizon
         every = -(-last // _MOST_HORIZONS)
         for metric in self.evaluation.metrics:
             shown = {1, *range(every, last + 1, every), last} if metric is L1 else {last}
-            curves = {name: over_persistence(one, "rollout", metric) for name, one in self.errors.items()}
+            curves = {name: over_persistence(errors, "rollout", metric) for name, errors in self.errors.items()}
             group, key = f"{metric.label} error / persistence, open loop", f"rollout.{metric.name}.over_persistence"
             better = "lower" if metric.smaller_is_better else "higher"
             self.curves(group, key, curves, shown, better=better, chance=1.0)
         if self.base is None:
             return
-        base, others = self.base.errors, {name: one for name, one in self.errors.items() if name != self.base.name}
+        base = self.base.errors
+        compared = {name: errors for name, errors in self.errors.items() if name != self.base.name}
         for metric in self.evaluation.metrics:
-            gains = {name: gain_over(one, base, "rollout", metric) for name, one in others.items()}
+            gains = {name: gain_over(errors, base, "rollout", metric) for name, errors in compared.items()}
             group, key = f"Gain over the base by {metric.label}, open loop", f"rollout.{metric.name}.gain_over_base"
             self.curves(group, key, gains, **_GAIN)
 
     def add_distributions(self) -> None:
         """Add spread, MMD and Fréchet distance of the latents."""
-        one = self.evaluation
-        models = {name: model.distribution for name, model in one.models.items() if model.distribution is not None}
-        if one.copies is None or not models:
+        evaluation, clips = self.evaluation, self.evaluation.clips
+        models = {
+            name: model.distribution for name, model in evaluation.models.items() if model.distribution is not None
+        }
+        if evaluation.copies is None or not models:
             return
-        known = {PERSISTENCE: one.copies, **models}
-        spreads = {name: distribution.spread for name, distribution in known.items()}
-        self.curves("Spread / that of the truth, open loop (1: as varied)", "spread", spreads, {one.horizon}, better="")
-        sample = f"{counted(len(one.clips), 'clip')} of {counted(one.clips.episodes, 'episode')}"
+        distributions = {PERSISTENCE: evaluation.copies, **models}
+        spreads, last = {name: each.spread for name, each in distributions.items()}, {evaluation.horizon}
+        self.curves("Spread / that of the truth, open loop (1: as varied)", "spread", spreads, last, better="")
+        sample = f"{counted(len(clips), 'clip')} of {counted(clips.episodes, 'episode')}"
         group = f"Squared MMD of latents to the truth, x 100, open loop ({sample}; unbiased)"
-        self.curves(group, "latent_mmd", {name: distribution.mmd for name, distribution in known.items()})
-        halves = f"; two halves of the true clips: {one.fvd_of_halves:.3g}" if math.isfinite(one.fvd_of_halves) else ""
+        self.curves(group, "latent_mmd", {name: each.mmd for name, each in distributions.items()})
+        of_halves = evaluation.fvd_of_halves
+        halves = f"; two halves of the true clips: {of_halves:.3g}" if math.isfinite(of_halves) else ""
         group = f"Fréchet distance of latents to the truth (FVD; {sample}; biased upwards{halves})"
         style: dict[str, Any] = {"form": ".3g", "detail": True}
-        distances = {name: distribution.fvd for name, distribution in known.items()}
+        distances = {name: each.fvd for name, each in distributions.items()}
         self.line(group, "predicted frames", "fvd.predicted", _without_intervals(distances), **style)
-        if one.decoded is not None and one.decoded.fvd:
-            self.line(group, "decoded frames", "fvd.decoded", _without_intervals(one.decoded.fvd), **style)
+        if evaluation.decoded is not None and evaluation.decoded.fvd:
+            self.line(group, "decoded frames", "fvd.decoded", _without_intervals(evaluation.decoded.fvd), **style)
 
     def add_one_steps(self) -> None:
-        """Add teacher-forced errors of one step: with other actions, and of moving and idle steps."""
+        """Add teacher-forced errors of one step: with zero and shuffled actions, and for moving and idle steps."""
         group, moving = "One step, teacher-forced: L1 error / persistence", self.evaluation.clips.moving
         for actions in ACTIONS:
-            ratios = {name: one_step_over_persistence(one, actions) for name, one in self.errors.items()}
+            ratios = {name: one_step_over_persistence(errors, actions) for name, errors in self.errors.items()}
             self.line(group, f"{actions} actions", f"one_step.{actions}", ratios, chance=1.0)
         for name, steps in (("moving", moving), ("idle", ~moving)):
             if steps.any():
-                ratios = {model: one_step_over_persistence(one, "true", steps) for model, one in self.errors.items()}
+                ratios = {
+                    model: one_step_over_persistence(errors, "true", steps) for model, errors in self.errors.items()
+                }
                 label = f"{name} ({counted(int(steps.sum()), 'step')})"
                 self.line(group, label, f"one_step.{name}", ratios, chance=1.0)
         grown, gap = "Growth of the one-step error without the true actions", "The same, over the error of persistence"
         for actions in ACTIONS[1:]:
             name = f"{actions} actions"
-            costs = {model: cost_of_actions(one, actions) for model, one in self.errors.items()}
+            costs = {model: cost_of_actions(errors, actions) for model, errors in self.errors.items()}
             self.line(grown, name, f"cost_of_actions.{actions}", costs, detail=True, **_GAIN)
-            gaps = {model: gap_of_actions(one, actions) for model, one in self.errors.items()}
+            gaps = {model: gap_of_actions(errors, actions) for model, errors in self.errors.items()}
             self.line(gap, name, f"gap_of_actions.{actions}", gaps, detail=True, **(_GAIN | {"form": ".3f"}))
 
     def add_ranking(self, model: str, ranking: ActionRanking) -> None:
-        """Add the action-ranking error, and how much prediction and energy change with the action."""
+        """Add the action-ranking error, and the changes of prediction and energy with the action."""
         group = "Action-ranking error: alternative actions with a lower energy than the true one"
         share: dict[str, Any] = {"form": ".1%", "chance": 0.5}
         self.line(group, "of all alternatives", "ranking.rank", {model: ranking.rank}, **share)
         self.line(group, "of those in the box", "ranking.box", {model: ranking.box}, **share)
         self.line(group, "of those of the same length", "ranking.shell", {model: ranking.shell}, **share)
-        for key, label, one in (
+        for key, label, estimate in (
             ("change", "change of the prediction with the action / persistence", ranking.change),
             ("spread", "spread of the energy / persistence", ranking.spread),
         ):
-            self.line(group, label, f"ranking.{key}", {model: one}, better="higher", chance=0.0)
+            self.line(group, label, f"ranking.{key}", {model: estimate}, better="higher", chance=0.0)
         base = None if self.base is None else self.base.ranking
         if base is not None and base is not ranking:
             label, difference = "of all alternatives, minus the base model's", {model: rank_difference(ranking, base)}
             self.line(group, label, "ranking.difference_to_base", difference, form="+.1%", chance=0.0, detail=True)
 
     def add_landscapes(self, model: str, landscapes: Landscapes) -> None:
-        """Add the offset of the energy minimum, the rank of the true action, the sharpness, and their differences."""
+        """Add distance of the energy minimum, rank, sharpness, and their differences from the base model's."""
         group, unit = f"Energy landscapes of {counted(len(landscapes.maps), 'clip')}", landscapes.unit
         labels: dict[LandscapeMeasure, tuple[str, dict[str, Any]]] = {
             "distance": (
@@ -236,12 +243,12 @@ class _Rows(list[Row]):
         """Add the metrics of decoded rollouts."""
         if (decoded := self.evaluation.decoded) is None:
             return
-        references, known = ("truth", "decoded_truth"), {metric for _, metric in decoded.curves}
-        main = next(one for one in references if f"psnr_db.whole.{one}" in known)
+        references, measured = ("truth", "decoded_truth"), {metric for _, metric in decoded.curves}
+        main = next(reference for reference in references if f"psnr_db.whole.{reference}" in measured)
         every = product(references, _SIMILARITIES.items(), _REGIONS.items())
         for reference, (name, (label, form)), (region, where) in every:
             metric = f"{name}.{region}.{reference}"
-            if metric in known:
+            if metric in measured:
                 group = f"Decoded images against the {reference.replace('_', ' ')}: {label}, {where}"
                 curves = {source.replace("_", " "): decoded.curves[source, metric] for source in decoded.sources}
                 shown = {self.evaluation.horizon} if reference == main else ()

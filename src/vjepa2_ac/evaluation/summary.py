@@ -25,10 +25,10 @@ from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
 Conclusion = Literal["yes", "no", "inconclusive", "not measured"]
 
 SAME_ERROR = 0.01  # relative; errors this close count as equal, whatever their interval
-SAME_RANK = 0.005  # absolute; likewise for action-ranking errors
-SAME_SUCCESS = 0.1  # absolute; a success rate that is surely less than this above a competitor's is not better
+SAME_RANK = 0.005  # absolute; action-ranking errors this close count as equal, whatever their interval
+SAME_SUCCESS = 0.1  # absolute; a success rate is not better if its upper bound is less than this above a competitor's
 CHANCE = 0.5  # action-ranking error of a model that ignores its actions
-_BASE, _PERSISTENCE, _CHANCE = "with the base model", "with persistence", "chance"  # what a verdict compares with
+_BASE, _PERSISTENCE, _CHANCE = "with the base model", "with persistence", "chance"  # values of `compared_with`
 _TOO_FEW = "too few for a conclusion"
 _COLUMNS, _NO_BREAK = 80, "\N{NO-BREAK SPACE}"
 _wrap = partial(wrap, break_on_hyphens=False)  # commands and paths have hyphens
@@ -40,19 +40,19 @@ class Verdict:
 
     name: str
     conclusion: Conclusion
-    statement: str  # what was measured, with one number; a word gives its sign: "lower"
+    statement: str  # the measurement with one number; a word such as "lower" gives the sign
     value: float | None = None  # this number with its sign; None: not measured
     low: float | None = None  # 95 % interval over episodes; None: there is none
     high: float | None = None
-    unit: Literal["%", "cm", ""] = "%"  # of the number: % shows a fraction
+    unit: Literal["%", "cm", ""] = "%"  # unit of the number; with % the value is a fraction
     reference: str = ""  # numbers to compare with
-    needs: str = ""  # a sentence: why there is no conclusion, and what it needs
-    baseline: float = 0.0  # value of a model that has learned nothing, or of the best competitor
-    compared_with: str = ""  # what decided the conclusion, as in "not better than with the base model"
+    needs: str = ""  # a sentence: why there is no conclusion, and what is needed for one
+    baseline: float = 0.0  # value of an untrained model, or of the best competitor
+    compared_with: str = ""  # the reference that decided the conclusion, as in "not better than with the base model"
 
     @property
     def interval(self) -> str:
-        """The interval as text, with digits and direction of the statement's number; empty without an interval."""
+        """The interval as text, with the digits and the sign of the statement's number; empty without an interval."""
         if self.value is None or self.low is None or self.high is None:
             return ""
         if self.unit == "%":
@@ -74,13 +74,13 @@ class Summary:
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
-        """The lines of the summary: the third one is action ranking until a closed loop has measured planning."""
+        """The lines of the summary. The third is planning if a closed loop measured it, otherwise action ranking."""
         third = self.ranks_actions if self.plans is None else self.plans
         return self.predicts, self.uses_actions, third, *(() if self.landscape is None else (self.landscape,))
 
     @property
     def sentence(self) -> str:
-        """The verdicts in words, at most 40 of them."""
+        """The conclusion from all verdicts in one or two sentences, at most 40 words."""
         third = "planning" if self.plans else "action ranking"
         claims = {"prediction": self.predicts, "the use of the actions": self.uses_actions, third: self.verdicts[2]}
         if needs := next((verdict.needs for verdict in claims.values() if verdict.needs), ""):
@@ -107,11 +107,11 @@ class Summary:
 
     @property
     def _unusable(self) -> str:
-        """What follows for planning, unless planning itself was measured."""
+        """The consequence for planning as a clause; empty if planning was measured."""
         return ", so the model cannot be used for planning" if self.plans is None else ""
 
     def _denial(self, claim: str, verdict: Verdict) -> str:
-        """Return the sentence on the first claim that was measured to be false."""
+        """Return the sentence about a claim whose verdict is no."""
         if verdict.name != "uses actions":
             check = " Check data, axes and stride first." * (verdict.name == "predicts")
             return f"{claim.capitalize()} is not better than {verdict.compared_with}.{check}"
@@ -139,7 +139,7 @@ class Summary:
 
 
 def _with_fixed_units(text: str) -> str:
-    """Return a text in which no line break separates a number from its unit."""
+    """Replace the space between a number and its unit by a no-break space."""
     return re.sub(r"(?<=\d) (?=%|cm\b|s\b)", _NO_BREAK, text)
 
 
@@ -149,7 +149,7 @@ def summarize(evaluation: Evaluation, rows: Sequence[Row]) -> Summary:
     trained_rows = {row.key: row for row in rows if row.model == evaluation.trained}
     base_rows = {row.key: row for row in rows if row.model == evaluation.base}
     ranked = () if model.ranking is None else model.ranking.episode_ids
-    mapped = () if model.landscapes is None else [one.episode_id for one in model.landscapes.maps]
+    mapped = () if model.landscapes is None else model.landscapes.episode_ids
     landscape = _landscape(trained_rows, base_rows)
     ranks_actions = _of_enough(_ranks_actions(trained_rows, base_rows), ranked)
     summary = Summary(
@@ -164,7 +164,7 @@ def summarize(evaluation: Evaluation, rows: Sequence[Row]) -> Summary:
 
 
 def _too_few(summary: Summary, episodes: int) -> Summary:
-    """Return a summary without conclusions, which states what the numbers alone show."""
+    """Return a summary without conclusions: it states that there are too few episodes, and the numbers so far."""
     needs = (
         f"{_are_too_few(episodes, 'held-out episode')}; at least {ENOUGH_EPISODES} are needed."
         f" So far: {summary.predicts.statement}; {summary.uses_actions.statement}."
@@ -179,7 +179,7 @@ def _too_few(summary: Summary, episodes: int) -> Summary:
 
 
 def _of_enough(verdict: Verdict, episode_ids: Sequence[str]) -> Verdict:
-    """Return a verdict on clips of these episodes: without conclusion if there are too few."""
+    """Return a verdict on clips of these episodes, without a conclusion if there are too few episodes."""
     episodes = len(set(episode_ids))
     if not 0 < episodes < ENOUGH_EPISODES:
         return verdict
@@ -197,35 +197,35 @@ def _are_too_few(number: int, what: str) -> str:
 
 
 def not_measured(name: str, how: str) -> Verdict:
-    """Return the verdict on what was not measured, with what measures it."""
+    """Return a verdict "not measured", with the command that measures it."""
     return Verdict(name, "not measured", f"measured by {how}")
 
 
 def with_closed_loop(summary: Summary, run: Path, checkpoint: str) -> Summary:
-    """Return a summary whose planning verdict is that of the run's newest closed loop of this checkpoint, if any."""
+    """Add the planning verdict of the run's newest closed-loop benchmark of this checkpoint, if there is one."""
     files = sorted(run.glob(f"closed_loop/*/{CLOSED_LOOP_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in files:
         written = json.loads(file.read_bytes())
-        measured = written["about"]["checkpoint"] or ""  # its name, and how it was selected
+        measured = written["about"]["checkpoint"] or ""  # name of the checkpoint, and how it was selected
         if measured.partition(" ")[0] == checkpoint.partition(" ")[0] and "verdict" in written:
             return replace(summary, plans=Verdict(**written["verdict"]))
     return summary
 
 
 def percent(share: float) -> str:
-    """Return a share in percent, with a digit more below 10."""
+    """Return a share in percent, with one decimal below 10 %."""
     return f"{100 * share:z.0f}" if abs(share) >= 0.0995 else f"{100 * share:z.1f}"
 
 
 def interval_of(share: Estimate) -> str:
-    """Return the interval of a share's size, whose sign a word gives, in percent; empty without an interval."""
+    """Return the interval of a share in percent, without the share's sign; empty without an interval."""
     form = "z.0f" if abs(share.value) >= 0.0995 else "z.1f"
     low, high = (share.low, share.high) if share.value >= 0 else (-share.high, -share.low)
     return f"[{100 * low:{form}}, {100 * high:{form}}]" if share.has_interval else ""
 
 
 def conclusion_of(gain: Estimate, same: float) -> Conclusion:
-    """Return yes or no if the interval of a gain lies on one side of 0 or within `same` of 0, else inconclusive."""
+    """Return yes or no if the interval of a gain is on one side of 0 or within `same` of 0, else inconclusive."""
     if max(abs(gain.low), abs(gain.high)) < same:
         return "no"
     conclusions: dict[int, Conclusion] = {-1: "no", 0: "inconclusive", 1: "yes"}
@@ -240,10 +240,10 @@ def _verdict(name: str, conclusion: Conclusion, statement: str, estimate: Estima
 
 
 def _predicts(evaluation: Evaluation, rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict:
-    """Conclude from the L1 error of the longest rollout: yes needs less than the base model's and than persistence's.
+    """Conclude from the L1 error of the longest rollout: yes if it is below the base model's and below persistence's.
 
-    The reference names a falling spread (smoother predictions also have a lower error), and other metrics that
-    disagree.
+    The verdict's reference mentions a lower spread (smoother predictions also have a lower error), and other metrics
+    that disagree.
     """
     horizon, ahead = evaluation.horizon, f"{evaluation.seconds_ahead:.1f} s ahead"
     error = rows[f"rollout.{L1.name}.over_persistence.{horizon}"].estimate
@@ -267,7 +267,7 @@ def _predicts(evaluation: Evaluation, rows: Mapping[str, Row], base_rows: Mappin
 
 
 def _blur(rows: Mapping[str, Row], base_rows: Mapping[str, Row], horizon: int) -> str:
-    """Return a remark if the predictions vary less than the base model's, or without one less than the truth."""
+    """Return a remark if the predictions vary less than the base model's, or less than the true latents if no base."""
     key = f"spread.{horizon}"
     if key not in rows or math.isnan(rows[key].value):
         return ""
@@ -284,12 +284,12 @@ def _verdict_on_gain(gain: Estimate, compared_with: str, ahead: str) -> Verdict:
 
 
 def _amount(change: Estimate, positive: str, negative: str) -> str:
-    """Return a relative change without its sign, which one of two words gives."""
+    """Return a relative change in percent, with one of two words for its sign."""
     return f"{percent(abs(change.value))} % {positive if change.value >= 0 else negative}"
 
 
 def _uses_actions(rows: Mapping[str, Row], ranks_actions: Verdict) -> Verdict:
-    """Conclude from the one-step error with shuffled actions; yes also needs an action-ranking error below chance."""
+    """Conclude from the one-step error with shuffled actions; yes also requires action ranking better than chance."""
     cost, gap = (rows[f"{name}.shuffled"].estimate for name in ("cost_of_actions", "gap_of_actions"))
     conclusion, reference, compared_with = conclusion_of(gap, SAME_ERROR), "", "with shuffled actions"
     low, high = ranks_actions.low, ranks_actions.high
@@ -301,7 +301,7 @@ def _uses_actions(rows: Mapping[str, Row], ranks_actions: Verdict) -> Verdict:
 
 
 def _ranks_actions(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict:
-    """Conclude from the action-ranking error: yes needs less than the base model's and less than chance."""
+    """Conclude from the action-ranking error: yes if it is below the base model's and below chance."""
     key = "ranking.rank"
     if key not in rows:
         return not_measured("ranks actions", "`vjepa2-ac evaluate --ranking-clips 32`")
@@ -317,9 +317,9 @@ def _ranks_actions(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Ver
 
 
 def _landscape(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict | None:
-    """Conclude from the distance of the energy minimum to the true action: yes needs less than the base model's.
+    """Conclude from the distance between energy minimum and true action; None: no landscapes were measured.
 
-    It also needs less than that of a random grid point. None: no landscapes were measured.
+    Yes requires a smaller distance than the base model's and than that of a random grid point.
     """
     key, sharpness = "landscapes.distance", "landscapes.sharpness"
     if key not in rows:
@@ -344,18 +344,20 @@ def _with_unit(number: float, unit: str) -> str:
 def closed_loop(
     shares: Mapping[str, Estimate], model: str, oracle: str, problems: int, task: str, conditions: str = ""
 ) -> Verdict:
-    """Conclude from the share of problems solved in closed loop: yes needs more than every other policy but the oracle.
+    """Conclude from the success rates in closed loop: yes if the model's exceeds those of all policies but the oracle.
 
     Args:
-        shares: Share of solved problems by policy: the model's, the oracle's, and those of its competitors.
-        model: Name of its policy.
-        oracle: That of the oracle. If it fails, or with fewer than five problems, there is no conclusion.
-        problems: Their number.
+        shares: Success rate by policy: of the model, the oracle, and the competitors.
+        model: Name of the model's policy.
+        oracle: Name of the oracle. If it solves less than half, or with fewer than five problems, there is no
+            conclusion.
+        problems: Number of problems.
         task: Name of the task.
-        conditions: Where, and with which help the model acts, as text.
+        conditions: Conditions of the measurement as text, for example the domain.
     """
     share, reference = shares[model], shares[oracle]
-    best = max((one for name, one in shares.items() if name not in {model, oracle}), key=lambda one: one.value)
+    competing = (rate for name, rate in shares.items() if name not in {model, oracle})
+    best = max(competing, key=lambda rate: rate.value)
     is_not_better = share.value <= best.value and share.high < best.value + SAME_SUCCESS
     conclusion: Conclusion = "yes" if share.low > best.high else "no" if is_not_better else "inconclusive"
     needs = ""
@@ -364,7 +366,7 @@ def closed_loop(
         needs = f"{solved}, so they cannot be used for comparison; raise --steps."
     elif problems < ENOUGH_EPISODES:
         needs = f"{_are_too_few(problems, 'problem')}; use --episodes 50."
-    others = ", ".join(f"{name} {percent(one.value)} %" for name, one in shares.items() if name != model)
+    others = ", ".join(f"{name} {percent(rate.value)} %" for name, rate in shares.items() if name != model)
     statement = f"solves {percent(share.value)} % of {counted(problems, f'{task} problem')} {conditions}".rstrip()
     competitors = "the zero action and random actions"
     verdict = _verdict("plans", "inconclusive" if needs else conclusion, statement, share, competitors)
