@@ -1,6 +1,6 @@
-"""Key frames of a demonstration: which of its frames are worth being goals, and how long each may take. Pure functions.
+"""Key frames of a demonstration: selection of the frames that become goals, and durations for them. Pure functions.
 
-A frame is a recorded moment: a control step of an episode, a frame of a film, or a model step.
+A frame is a control step of an episode, a frame of a video, or a model step.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from vjepa2_ac.spaces import actions_from_states
 
 States = Float[np.ndarray, "frames 7"]
 
-GRIPS = 0.15  # of closedness: less is no change of the gripper
-_MOVES = 0.02  # of closedness, from one frame to the next: less is no motion of the fingers
-_PAUSE = 2  # frames that the fingers may rest within one change
-_STILL_M, _STILL_RAD = 0.002, 0.02  # from one frame to the next: less is a resting arm
-_LEFT_M = 0.01  # farther from where it gripped, an arm has left
-_SAME_M, _SAME_RAD = 0.005, 0.05  # less apart in all are two images of the same state
+GRIPS = 0.15  # smallest difference of closedness that counts as a change of the gripper
+_MOVES = 0.02  # smallest change of closedness between two frames that counts as motion of the fingers
+_PAUSE = 2  # frames for which the fingers may rest within one change
+_STILL_M, _STILL_RAD = 0.002, 0.02  # the arm rests if it moves less than this between two frames
+_LEFT_M = 0.01  # the arm has left the position of a grip if it is farther away than this
+_SAME_M, _SAME_RAD = 0.005, 0.05  # two states count as equal if they differ by less than this
 
 
 @dataclass(frozen=True)
@@ -32,80 +32,81 @@ class KeyFrame:
     """A frame that becomes a goal."""
 
     frame: int
-    name: str  # why it was taken, in a few words
+    name: str  # reason of the choice, such as "closed" or "stop"
 
 
 @dataclass(frozen=True)
 class StillRule:
-    """What is a stop of the arm, and how near one another goals may be; in frames."""
+    """Rule for stops of the arm; all values are in frames."""
 
-    lasts: int = 4  # a shorter rest is no stop
-    apart: int = 4  # a stop nearer than this to another key frame is left out
+    lasts: int = 4  # shortest rest that counts as a stop
+    apart: int = 4  # a stop closer than this to another key frame is left out
 
 
 OF_MODEL_STEPS = StillRule(lasts=1, apart=1)
-"""Where a frame is a model step."""
+"""The rule if a frame is a model step."""
 
 
 def gripper_key_frames(states: States, rule: StillRule | None = None) -> tuple[KeyFrame, ...]:
-    """Return where the gripper begins to change and where it has changed, where the arm stops, and the end.
+    """Return the frames at which the gripper begins and ends to change, the stops of the arm, and the last frame.
 
-    Where the arm leaves before the fingers have come to rest, the gripper has changed at the last frame before that, if
-    half of the change is done by then. The start is no key frame. Where the arm rests at the end, the end is the frame
-    at which it came to rest.
+    If the arm leaves before the fingers rest, the change ends at the last frame before the arm leaves, provided that
+    half of the change is done by then. The first frame is never a key frame. If the arm rests at the end, the frame at
+    which it came to rest replaces the last frame.
 
     Args:
-        states: Measured, with closedness last (legend: `vjepa2_ac.episode`).
-        rule: What counts as a stop.
+        states: Measured states, with closedness last (conventions: `vjepa2_ac.episode`).
+        rule: The rule for stops.
 
     Raises:
         ValueError: Fewer than two frames.
 
-    Source of the idea: peract @ 02fb876, helpers/demo_loading_utils.py, keypoint_discovery. Theirs takes the frame
-    after a binary gripper has changed, and stops by joint velocities; here a change has a beginning and an end.
+    Source of the idea: peract @ 02fb876, helpers/demo_loading_utils.py, keypoint_discovery. That function takes the
+    frame after a binary gripper has changed, and finds stops by joint velocities; here a change has a beginning and an
+    end.
     """
     rule, last = rule or StillRule(), len(states) - 1
-    found: dict[int, str] = {}
+    names: dict[int, str] = {}  # by frame
     changes = _gripper_changes(states[:, GRIPPER])
     for begin, end in changes:
         closes = states[end, GRIPPER] > states[begin, GRIPPER]
         if begin >= rule.apart:
-            found.setdefault(begin, "before closing" if closes else "before opening")
-        found[_before_leaving(states, begin, end)] = "closed" if closes else "opened"
+            names.setdefault(begin, "before closing" if closes else "before opening")
+        names[_before_leaving(states, begin, end)] = "closed" if closes else "opened"
     for begin in _stops(states, rule.lasts):
-        near = [abs(begin - frame) < rule.apart for frame in (0, last, *found)]
-        if not any(near) and not any(first <= begin <= end for first, end in changes):
-            found[begin] = "stop"
-    if not found or not _is_same(states[max(found)], states[last]):
-        found[last] = "end"
-    elif found[max(found)] == "stop":
-        found[max(found)] = "end"
-    return tuple(KeyFrame(frame, found[frame]) for frame in sorted(found))
+        is_near = [abs(begin - frame) < rule.apart for frame in (0, last, *names)]
+        if not any(is_near) and not any(first <= begin <= end for first, end in changes):
+            names[begin] = "stop"
+    if not names or not _is_same(states[max(names)], states[last]):
+        names[last] = "end"
+    elif names[max(names)] == "stop":
+        names[max(names)] = "end"
+    return tuple(KeyFrame(frame, names[frame]) for frame in sorted(names))
 
 
 def _gripper_changes(closedness: Float[np.ndarray, " frames"]) -> list[tuple[int, int]]:
-    """Return first and last frame of each change of the gripper in one direction."""
-    found: list[tuple[int, int, float]] = []
-    for frame, way in enumerate(np.diff(closedness)):
-        if abs(way) < _MOVES:
+    """Return the first and the last frame of each change of the gripper in one direction."""
+    changes: list[tuple[int, int, float]] = []  # first frame, last frame, direction
+    for frame, difference in enumerate(np.diff(closedness)):
+        if abs(difference) < _MOVES:
             continue
-        if found and found[-1][2] == np.sign(way) and frame - found[-1][1] <= _PAUSE:
-            found[-1] = (found[-1][0], frame + 1, found[-1][2])
+        if changes and changes[-1][2] == np.sign(difference) and frame - changes[-1][1] <= _PAUSE:
+            changes[-1] = (changes[-1][0], frame + 1, changes[-1][2])
         else:
-            found.append((frame, frame + 1, float(np.sign(way))))
-    return [(begin, end) for begin, end, _ in found if abs(closedness[end] - closedness[begin]) >= GRIPS]
+            changes.append((frame, frame + 1, float(np.sign(difference))))
+    return [(begin, end) for begin, end, _ in changes if abs(closedness[end] - closedness[begin]) >= GRIPS]
 
 
 def _before_leaving(states: States, begin: int, end: int) -> int:
-    """Return the last frame of a change of the gripper at which the arm is where it began, or the end of the change."""
+    """Return the last frame of a gripper change before the arm leaves its position, or the end of the change."""
     changed = np.abs(states[begin : end + 1, GRIPPER] - states[begin, GRIPPER])
     moved = np.linalg.norm(states[begin : end + 1, :3] - states[begin, :3], axis=1)
-    there = np.flatnonzero((moved < _LEFT_M) & (changed >= max(GRIPS, changed[-1] / 2)))
-    return begin + int(there[-1]) if len(there) else end
+    candidates = np.flatnonzero((moved < _LEFT_M) & (changed >= max(GRIPS, changed[-1] / 2)))
+    return begin + int(candidates[-1]) if len(candidates) else end
 
 
 def _stops(states: States, lasts: int) -> list[int]:
-    """Return where the arm comes to rest for at least so many frames; at the start it has not come to rest."""
+    """Return the frames at which the arm comes to rest for at least `lasts` frames; a rest at the start is left out."""
     still = _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MOVES)
     begins = [frame for frame in range(1, len(still)) if still[frame] and not still[frame - 1]]
     return [begin for begin in begins if still[begin : begin + lasts].all() and begin + lasts <= len(still)]
@@ -123,56 +124,58 @@ def _are_below(
 
 
 def with_frames_between(keys: Sequence[KeyFrame], step: int, name: str = "on the way") -> tuple[KeyFrame, ...]:
-    """Return key frames, and on the way to each of them every `step`-th frame from the one before, or from the start.
+    """Return key frames, and every `step`-th frame between two of them, counted from the earlier one or the start.
 
-    A planner that sees one step ahead goes straight for a distant goal, with every axis at its limit. Near goals show
-    it the way. A frame less than half a step before a key frame is left out.
+    A planner with a horizon of one step moves straight towards a distant goal, with all axes at their limits. Closer
+    goals keep it on the demonstrated path. A frame less than half a step before a key frame is left out.
 
     Args:
         keys: In order.
-        step: Frames from one goal to the next.
-        name: Of the further ones, `{}` in it their number.
+        step: Number of frames from one goal to the next.
+        name: Name of the additional key frames; `{}` is replaced by the frame's number.
     """
-    found: list[KeyFrame] = []
+    with_between: list[KeyFrame] = []
     for before, key in itertools.pairwise((KeyFrame(0, "start"), *keys)):
-        ways = [one for one in range(before.frame + step, key.frame, step) if 2 * (key.frame - one) >= step]
-        found += [*(KeyFrame(one, name.format(one)) for one in ways), key]
-    return tuple(found)
+        between = [frame for frame in range(before.frame + step, key.frame, step) if 2 * (key.frame - frame) >= step]
+        with_between += [*(KeyFrame(frame, name.format(frame)) for frame in between), key]
+    return tuple(with_between)
 
 
 def every_key_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:
-    """Return every `step`-th frame but the first, and the last; one less than half a step before the last is left out.
+    """Return every `step`-th frame except the first, and the last frame.
+
+    A frame less than half a step before the last frame is left out.
 
     Args:
-        frames: Of the demonstration, two or more.
-        step: From one key frame to the next, one or more.
+        frames: Number of frames of the demonstration, two or more.
+        step: Number of frames from one key frame to the next, one or more.
     """
     return with_frames_between([KeyFrame(frames - 1, "end")], step, "frame {}")
 
 
 @dataclass(frozen=True)
 class Timing:
-    """How long goals of a demonstration apply."""
+    """Rules for the durations of goals from a demonstration."""
 
-    stride: int = 1  # frames of a model step
-    slack: int = 3  # model steps that a goal may take fewer or more than the demonstration
-    share: float | None = None  # of each goal but the last
-    stop_share: float | None = None  # of the last one
+    stride: int = 1  # frames per model step
+    slack: int = 3  # a goal may take this number of model steps fewer or more than the demonstration
+    share: float | None = None  # `SubGoal.share` of each goal but the last
+    stop_share: float | None = None  # `SubGoal.share` of the last goal
 
 
 def sub_goals_of(
     images: Sequence[np.ndarray], keys: Sequence[KeyFrame], timing: Timing, states: States | None = None
 ) -> tuple[SubGoal, ...]:
-    """Return key frames as goals, with the demonstration's durations and, if states are known, gripper modes.
+    """Return key frames as goals, with the demonstration's durations and, if states are given, gripper modes.
 
-    On the way to a frame at which the gripper is more closed than at the one before, it closes; likewise it opens; else
-    it is held.
+    The gripper closes on the way to a key frame at which it is more closed than at the previous one, opens if it is
+    more open, and is otherwise held.
 
     Args:
-        images: Of the key frames.
-        keys: Which they are.
-        timing: How long they may take.
-        states: Of all frames of the demonstration; None: the gripper does what planning.limits say.
+        images: Images of the key frames.
+        keys: The key frames.
+        timing: Rules for the durations.
+        states: States of all frames of the demonstration; None: the gripper mode is that of planning.limits.
     """
     goals, before = [], 0
     for image, key in zip(images, keys, strict=True):

@@ -32,36 +32,36 @@ from vjepa2_ac.storage.structured import utc_now
 
 @dataclass(frozen=True)
 class KeyFrameOptions(Timing):
-    """Which frames become goals, and how long each may take. A frame is a control step of an episode."""
+    """Options for selecting key frames, and rules for their durations. A frame is a control step of an episode."""
 
-    every: int | None = None  # frames; None: where the gripper changes or the arm stops
-    apart: int = StillRule.apart  # least frames between a stop and another goal
-    stride: int = 4  # frames of a model step
-    views: int = 1  # cameras that are seen side by side, from the first on
+    every: int | None = None  # distance in frames; None: frames at which the gripper changes or the arm stops
+    apart: int = StillRule.apart  # smallest number of frames between a stop and another goal
+    stride: int = 4  # frames per model step
+    views: int = 1  # number of cameras whose images are side by side, beginning with the first
 
     @property
     def by(self) -> str:
-        """How frames are chosen: by the gripper, or every n-th."""
+        """The selection rule: "gripper", or "every" n-th frame."""
         return "gripper" if self.every is None else "every"
 
 
 @dataclass(frozen=True, eq=False)
 class MadeGoals:
-    """The goals of a demonstration, and what is known about them."""
+    """The goals of a demonstration, and a description of their source."""
 
     options: KeyFrameOptions
     keys: tuple[KeyFrame, ...]
     goals: tuple[SubGoal, ...]
     first: UInt8[np.ndarray, "height width 3"]  # the first frame of the demonstration
-    frames: int  # of the demonstration
-    states: Float[np.ndarray, "frames 7"] | None  # None: they are no poses
-    origin: Mapping[str, Any]  # where it comes from, as plain values
+    frames: int  # number of frames of the demonstration
+    states: Float[np.ndarray, "frames 7"] | None  # None: the states are not poses
+    origin: Mapping[str, Any]  # source of the demonstration, as plain values
 
     def write(self, folder: Path) -> Path:
         """Write the folder of goals, and return the path of its goals.json.
 
         Raises:
-            InputError: It cannot be written.
+            InputError: The folder cannot be written.
         """
         about = {"by": self.options.by, "every": self.options.every, "stride": self.options.stride}
         made = {"frames": self.frames, "version": __version__, "time": utc_now()}
@@ -75,14 +75,14 @@ def make_goals(
     """Return the key frames of an episode of a data set as goals.
 
     Args:
-        config: The data set, and which camera, or cameras.
+        config: The data set and its camera or cameras.
         wanted: The episode: its name in the data, its number from 0, or a part of its name.
-        options: Which frames become goals.
+        options: Options for selecting key frames.
         progress: Called with (done, total) while the data set is indexed for the first time.
 
     Raises:
-        InputError: There is no such episode, it cannot be read, has one frame, or no poses and the options need them;
-            or the data are latents without frames, or there are not as many cameras.
+        InputError: There is no such episode, it cannot be read, has only one frame, or has no poses although the
+            options need them; or the data are latents without frames, or have too few cameras.
     """
     require_views(config, options.views)
     dataset = open_dataset(config, progress=progress)
@@ -104,10 +104,10 @@ def make_goals(
 
 
 def frame_of_episode(config: DataConfig, place: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Return the image at EPISODE:STEP of a data set, or the last one of EPISODE.
+    """Return the image at EPISODE:STEP of a data set, or the last image of EPISODE.
 
     Raises:
-        InputError: There is no such episode or step, or it cannot be read.
+        InputError: There is no such episode or step, or the episode cannot be read.
     """
     name, _, step = place.rpartition(":") if re.fullmatch(r".+:\d+", place) else (place, "", "")
     require_frames(config, to="take a goal from")

@@ -1,8 +1,9 @@
-"""Goal-conditioned inverse dynamics: from latents now, latents of the goal and steps left to the next action.
+"""Action prior: predicts the next action from the current latents, the goal's latents and the remaining steps.
 
-Source of the idea: arXiv 2605.08732 (GC-IDM): hindsight goals from demonstrations, adaptive layer norms on the steps
-that remain. Where things are in an image is read as spatial softmax does (arXiv 1509.06113). A prior is trained on the
-latents of demonstrations, in minutes on a CPU where they are cached.
+Source of the idea: arXiv 2605.08732 (GC-IDM, goal-conditioned inverse dynamics): hindsight goals from demonstrations,
+and adaptive layer norms conditioned on the remaining steps. Positions in an image are computed by a spatial softmax
+(arXiv 1509.06113). A prior is trained on the latents of demonstrations; with cached latents this takes minutes on a
+CPU.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from vjepa2_ac.storage.structured import read_json_object, record_of, utc_now
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 
 CARD, WEIGHTS = "prior.json", "prior.safetensors"
-POINTS, VALUES, WIDTH, BLOCKS = 16, 16, 256, 2  # points of an image, numbers of each; the network's width and depth
+POINTS, VALUES, WIDTH, BLOCKS = 16, 16, 256, 2  # points per image, features per point, width and depth of the network
 
 _NEEDED = "the folder of a prior, as `vjepa2-ac prior` writes it"
 _FIX = "Train it again: `vjepa2-ac prior RUN`"
@@ -56,18 +57,18 @@ Size = Annotated[int, Field(ge=1, le=65_536)]
 
 @dataclass(frozen=True)
 class PriorSizes:
-    """What goes in and comes out."""
+    """Sizes of the inputs and outputs of a prior."""
 
     grid: Size  # patches along one side
-    dim: Size  # of a token
+    dim: Size  # dimension of a token
     state: Size
     action: Size
-    ahead: Size  # most steps to a goal
+    ahead: Size  # largest number of model steps to a goal
 
 
 @dataclass(frozen=True)
 class PriorCard:
-    """What is known of a prior."""
+    """Description of a trained prior: its sizes, and how it was trained."""
 
     format: Literal["vjepa2-ac prior 1"]
     sizes: PriorSizes
@@ -81,7 +82,7 @@ class PriorCard:
 
 
 class ActionPrior(nn.Module):
-    """The network, and how a search starts from it."""
+    """The network of a prior, and the start of a search from its predictions."""
 
     grid: Tensor
     scale: Tensor
@@ -89,10 +90,10 @@ class ActionPrior(nn.Module):
     def __init__(self, sizes: PriorSizes) -> None:
         super().__init__()
         self.sizes = sizes
-        described = POINTS * (2 + VALUES)
+        num_features = POINTS * (2 + VALUES)
         self.features = nn.Linear(sizes.dim, 4 * POINTS)
         self.places, self.values = nn.Linear(4 * POINTS, POINTS), nn.Linear(4 * POINTS, VALUES)
-        self.inner = nn.Linear(3 * described + sizes.state, WIDTH)
+        self.inner = nn.Linear(3 * num_features + sizes.state, WIDTH)
         self.blocks = nn.ModuleList(nn.Linear(WIDTH, WIDTH) for _ in range(BLOCKS))
         self.norm = nn.LayerNorm(WIDTH, elementwise_affine=False)
         self.remaining = nn.Embedding(sizes.ahead + 1, BLOCKS * 2 * WIDTH)
@@ -100,7 +101,7 @@ class ActionPrior(nn.Module):
         nn.init.zeros_(self.remaining.weight)
         line = torch.linspace(-1.0, 1.0, sizes.grid)
         self.register_buffer("grid", torch.cartesian_prod(line, line))
-        self.register_buffer("scale", torch.ones(sizes.action))  # of an action: standard deviation in the data
+        self.register_buffer("scale", torch.ones(sizes.action))  # standard deviation of the actions in the data
 
     def forward(
         self,
@@ -119,7 +120,7 @@ class ActionPrior(nn.Module):
         return mean, log_deviation.clamp(-5.0, 3.0).exp()
 
     def _described(self, latents: Float[Tensor, "batch tokens dim"]) -> Float[Tensor, "batch numbers"]:
-        """Return where some things are in an image, and what is there."""
+        """Return the positions of `POINTS` points in an image (spatial softmax), and features at these points."""
         features = gelu(self.features(latents))
         shares = self.places(features).softmax(dim=1)
         points = torch.einsum("bnk,nc->bkc", shares, self.grid)
@@ -138,12 +139,12 @@ class ActionPrior(nn.Module):
 
         Args:
             frame: Latents of the current frame.
-            state: Measured.
+            state: The measured state.
             goal: Latents of the goal.
             remaining: Estimated number of model steps to the goal.
         """
-        left = torch.tensor([max(1, remaining)], device=frame.device)
-        mean, deviation = self(frame[None], goal[None], left, state[None])
+        steps_left = torch.tensor([max(1, remaining)], device=frame.device)
+        mean, deviation = self(frame[None], goal[None], steps_left, state[None])
         std = math.sqrt(2) * deviation  # of a Laplace distribution
         return (mean * self.scale)[0].float().cpu(), (std * self.scale)[0].float().cpu()
 
@@ -151,12 +152,14 @@ class ActionPrior(nn.Module):
     def start(
         self, cost: WorldModelCost, wanted: Float[Tensor, "tokens dim"], remaining: int, space: SearchSpace
     ) -> PlanStart:
-        """Return where a search starts: the next action, and what follows from what the model predicts after it.
+        """Return the start of a search: the prior's actions along its own rollout in the world model.
+
+        The first action is predicted from the current frame, each further action from the predicted frame before it.
 
         Args:
-            cost: Of the present scene; it predicts what is seen after an action.
+            cost: The cost of the current scene, whose model predicts the frames.
             wanted: Latents of the goal.
-            remaining: Model steps to it, at a guess.
+            remaining: Estimated number of model steps to the goal.
             space: The allowed actions.
         """
         seen, state = cost.now
@@ -171,7 +174,7 @@ class ActionPrior(nn.Module):
 
 
 def save_prior(folder: Path, card: PriorCard, prior: ActionPrior) -> None:
-    """Write a prior into a folder, whole or not at all.
+    """Write a prior into a folder, completely or not at all.
 
     Raises:
         InputError: The folder cannot be written.
@@ -185,7 +188,7 @@ def load_prior(folder: str | Path, *, where: str) -> tuple[PriorCard, ActionPrio
     """Read a prior and its card, on the CPU.
 
     Raises:
-        InputError: There is none, or it is incomplete or damaged.
+        InputError: There is no prior, or it is incomplete or damaged.
     """
     path = Path(folder)
     values = read_json_object(path / CARD, needed=_NEEDED, fix=_FIX)
@@ -196,7 +199,7 @@ def load_prior(folder: str | Path, *, where: str) -> tuple[PriorCard, ActionPrio
 
 
 def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> PriorStart:
-    """Return the start of searches from the prior of `planning.prior`, on the device of the model.
+    """Load `planning.prior` on the device of the model, and return its function for the start of a search.
 
     Raises:
         InputError: As `load_prior`; or the prior was trained with another encoder or crop.
@@ -209,45 +212,45 @@ def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> Prior
     return prior.to(cameras.model.device).start
 
 
-_FIRST = 8  # batches whose actions tell how large actions are
+_FIRST = 8  # number of batches from which the scale of the actions is computed
 _WARM_UP, _CLIP, _HELD_OUT = 50, 1.0, 256
 
 
 @dataclass(frozen=True)
 class PriorOptions:
-    """How a prior is trained."""
+    """Options for the training of a prior."""
 
     steps: int = 2000
-    ahead: int | None = None  # most model steps from a frame to its goal; None: as many as the run's clips have
+    ahead: int | None = None  # largest number of model steps from a frame to its goal; None: that of the run's clips
     batch_size: int = 32
     learning_rate: float = 1e-3
 
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Frames with a later one of the same clip as the goal."""
+    """Frames, each with a later frame of the same clip as its goal."""
 
     seen: Float[Tensor, "batch tokens dim"]
     wanted: Float[Tensor, "batch tokens dim"]
     remaining: Int[Tensor, " batch"]
     states: Float[Tensor, "batch state_dim"]
-    changes: Float[Tensor, "batch action_dim"]  # of the next model step
+    changes: Float[Tensor, "batch action_dim"]  # change of the state in the next model step
 
 
 def train_prior(
     config: Config, folder: Path, options: PriorOptions | None = None, reporter: Reporter = SILENT
 ) -> PriorCard:
-    """Train the prior of a config's encoder and demonstrations, and write it into a folder.
+    """Train a prior for the encoder and the demonstrations of a config, and write it into a folder.
 
     Args:
-        config: Data, model and seed. Cached latents are used where they are; else every clip is encoded as it comes.
-        folder: Where it goes.
-        options: How it is trained.
+        config: Data, model and seed. Cached latents are used if they exist; otherwise each clip is encoded when read.
+        folder: The output folder.
+        options: Options of the training.
         reporter: Shows the progress.
 
     Returns:
-        What is known of it: of held-out clips the error of its mean, over that of the zero action, for true goals and
-        for goals of other clips. A prior whose two numbers are the same does not look at the goal.
+        The card of the prior. On held-out clips it has the error of the predicted mean relative to the zero action's,
+        for true goals and for goals of other clips. If both errors are equal, the prior ignores the goal.
 
     Raises:
         InputError: The data or the model cannot be used, or the loss is not finite.
@@ -257,7 +260,7 @@ def train_prior(
     device = computing_device(config.training)
     data, frames = config.data, open_dataset(config.data, progress=reporter.task(INDEXING))
     reporter.task(LOADING)
-    model, spaces = load_base(config.model, seed=config.seed).to(device), frames.spaces  # its encoder alone counts
+    model, spaces = load_base(config.model, seed=config.seed).to(device), frames.spaces  # only the encoder is used
     if spaces.action.follows == "unknown":
         found = "commands of which nobody knows what they do to the state"
         raise InputError(where="data.actions: recorded", found=found, needed="actions that a planner can search among")
@@ -285,22 +288,22 @@ def _trained(
     drawn, spaces = torch.Generator().manual_seed(config.seed), dataset.spaces
     progress, steps = reporter.task("training the prior", "steps"), options.steps
     with closing(training_loader(dataset, seed=config.seed, batch_size=options.batch_size)) as batches:
-        first = [_pairs(one, spaces, drawn) for one in itertools.islice(_encoded(batches, model), _FIRST)]
+        first = [_pairs(clips, spaces, drawn) for clips in itertools.islice(_encoded(batches, model), _FIRST)]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             grid, widths = model.image_size // model.sizes.patch_size, dataset.spaces.widths
             ahead = dataset.config.frames - 1
             sizes = PriorSizes(grid, model.latent_dim, widths.state, widths.action, ahead)
             prior = ActionPrior(sizes).to(model.device)
-        prior.scale.copy_(torch.cat([one.changes for one in first]).std(dim=0).clamp(min=1e-6))
+        prior.scale.copy_(torch.cat([batch.changes for batch in first]).std(dim=0).clamp(min=1e-6))
         optimizer = torch.optim.AdamW(prior.parameters(), lr=options.learning_rate, weight_decay=0.01)
-        pairs = (_pairs(one, spaces, drawn) for one in _encoded(batches, model))
-        for step, some in enumerate(itertools.islice(itertools.chain(first, pairs), steps), start=1):
+        pairs = (_pairs(clips, spaces, drawn) for clips in _encoded(batches, model))
+        for step, batch in enumerate(itertools.islice(itertools.chain(first, pairs), steps), start=1):
             for group in optimizer.param_groups:
                 share = min(1.0, step / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * (step - 1) / steps))
                 group["lr"] = share * options.learning_rate
-            mean, deviation = prior(some.seen, some.wanted, some.remaining, some.states)
-            loss = prior_loss(mean, deviation, some.changes / prior.scale)
+            mean, deviation = prior(batch.seen, batch.wanted, batch.remaining, batch.states)
+            loss = prior_loss(mean, deviation, batch.changes / prior.scale)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]  # torch
             norm = torch.nn.utils.clip_grad_norm_(prior.parameters(), _CLIP)
@@ -329,7 +332,7 @@ def _encoded(batches: Iterator[Batch], model: WorldModel) -> Iterator[LatentBatc
 
 
 def _pairs(clips: LatentBatch, spaces: Spaces, drawn: torch.Generator) -> _Pairs:
-    """Draw a frame of each clip, and as its goal a later one."""
+    """Draw a frame of each clip, and a later frame as its goal."""
     count, steps = clips.actions.shape[:2]
     rows, at = torch.arange(count), torch.randint(steps, (count,), generator=drawn)
     gap = 1 + (torch.rand(count, generator=drawn) * (steps - at)).long()
@@ -342,22 +345,25 @@ def _pairs(clips: LatentBatch, spaces: Spaces, drawn: torch.Generator) -> _Pairs
 
 @torch.no_grad()
 def _measured(dataset: Dataset, model: WorldModel, prior: ActionPrior, spaces: Spaces) -> dict[str, Any]:
-    """Return the error of the mean over that of the zero action on held-out clips: with true and with others' goals."""
+    """Measure the error of the predicted mean on held-out clips, relative to the zero action's.
+
+    It is measured with true goals and with goals of other clips. Empty: there are no held-out clips.
+    """
     drawn, size = torch.Generator().manual_seed(0), spaces.action.sized
     errors: dict[str, list[Tensor]] = {"true_goals": [], "goals_of_others": [], "nothing": []}
     ids: list[str] = []
     if dataset.members("test").any():
         for clips in _encoded(validation_batches(dataset, "test", clips=_HELD_OUT, batch_size=32), model):
-            one = _pairs(clips, spaces, drawn)
-            for name, wanted in (("true_goals", one.wanted), ("goals_of_others", one.wanted.roll(1, dims=0))):
-                mean, _ = prior(one.seen, wanted, one.remaining, one.states)
-                errors[name].append((mean * prior.scale - one.changes)[:, size].norm(dim=1))
-            errors["nothing"].append(one.changes[:, size].norm(dim=1))
+            pairs = _pairs(clips, spaces, drawn)
+            for name, goals in (("true_goals", pairs.wanted), ("goals_of_others", pairs.wanted.roll(1, dims=0))):
+                mean, _ = prior(pairs.seen, goals, pairs.remaining, pairs.states)
+                errors[name].append((mean * prior.scale - pairs.changes)[:, size].norm(dim=1))
+            errors["nothing"].append(pairs.changes[:, size].norm(dim=1))
             ids += clips.episode_ids
     if not ids:
         return {}
     joined = {name: torch.cat(parts).double().cpu().numpy() for name, parts in errors.items()}
-    over: dict[str, Estimate] = {
+    ratios: dict[str, Estimate] = {
         name: ratio(joined[name], joined["nothing"], ids) for name in ("true_goals", "goals_of_others")
     }
-    return {"clips": len(ids), **{name: one.as_dict() for name, one in over.items()}}
+    return {"clips": len(ids), **{name: estimate.as_dict() for name, estimate in ratios.items()}}

@@ -1,4 +1,4 @@
-"""The anomaly monitor: errors of predictions by patch, and the threshold that undisturbed held-out episodes give."""
+"""The anomaly monitor: prediction errors by patch, and a threshold calibrated on undisturbed held-out episodes."""
 
 from __future__ import annotations
 
@@ -28,60 +28,60 @@ from vjepa2_ac.storage.structured import read_json_object, record_of
 MONITOR = "monitor.json"
 _FIX = "Make it with `vjepa2-ac monitor RUN`"
 Number = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-MOST_EPISODES = 200  # that a threshold is of
+MOST_EPISODES = 200  # largest number of episodes for a calibration
 _AT_ONCE = 16
 
 
 def surprise_of(
     errors: Float[Tensor, "*batch tokens"], expected: Float[Tensor, "*batch tokens"] | Float[Tensor, " tokens"]
 ) -> Float[Tensor, "*batch"]:
-    """Return the score of each step: by how much patches are farther off than is usual there, their mean."""
+    """Return the surprise of each step: the mean over patches of the error's excess over the patch's usual error."""
     return (errors - expected).clamp(min=0.0).mean(dim=-1)
 
 
 @dataclass(frozen=True)
 class Monitor:
-    """A threshold that held-out episodes gave."""
+    """The threshold of an anomaly monitor, and the held-out episodes that it was calibrated on."""
 
     format: Literal["vjepa2-ac monitor 1"]
     threshold: Number
-    false_alarms: Number  # promised share of undisturbed episodes with an alarm, as long as those
-    steps: int  # model steps of the longest of them
-    scores: tuple[Number, ...]  # highest of each episode
-    expected: tuple[Number, ...]  # error of each patch, mean of all steps: the camera does not move
+    false_alarms: Number  # guaranteed upper bound on the share of undisturbed episodes of the same length with an alarm
+    steps: int  # model steps of the longest calibration episode
+    scores: tuple[Number, ...]  # highest surprise of each calibration episode
+    expected: tuple[Number, ...]  # usual error of each patch (mean over all steps); valid for a fixed camera
     encoder: str
     predictor: str
 
     def compare(self, predicted: Float[Tensor, "tokens dim"], seen: Float[Tensor, "tokens dim"]) -> Surprise:
-        """Return the difference between a predicted frame and the frame."""
+        """Return the surprise of a frame, given its prediction."""
         errors = mean_difference(predicted, seen).float().cpu()
         score = float(surprise_of(errors, torch.tensor(self.expected)))
         return Surprise(score, errors, not score <= self.threshold)  # NaN is an alarm, too
 
     @classmethod
     def read(cls, path: str | Path, known: Fingerprints, *, tokens: int, where: str) -> Monitor:
-        """Read a monitor.json, or that of a folder.
+        """Read a monitor.json, and check that it was calibrated for a model.
 
         Args:
-            path: Of either.
-            known: Of the model that is to be watched.
-            tokens: Of a frame, to it.
-            where: What names the file, for messages.
+            path: The file, or its folder.
+            known: Fingerprints of the model.
+            tokens: Number of tokens of a frame.
+            where: The config key or option that names the path, for messages.
 
         Raises:
-            InputError: There is none, or it is another model's.
+            InputError: There is no such file, or it was calibrated for another model.
         """
         file = Path(path) / MONITOR if Path(path).is_dir() else Path(path)
         values = read_json_object(file, needed="a monitor.json", fix=_FIX)
-        found = record_of(cls, values, where=f"{where}: {file}", needed="a monitor.json", fix=_FIX)
-        is_its = (found.encoder, found.predictor) == (known.encoder, known.predictor)
-        if not is_its or len(found.expected) != tokens:
+        monitor = record_of(cls, values, where=f"{where}: {file}", needed="a monitor.json", fix=_FIX)
+        is_same_model = (monitor.encoder, monitor.predictor) == (known.encoder, known.predictor)
+        if not is_same_model or len(monitor.expected) != tokens:
             raise InputError(where=f"{where}: {file}", found="the threshold of another model", fix=_FIX)
-        return found
+        return monitor
 
 
 def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> Compare:
-    """Return the comparison of the monitor of `planning.monitor`.
+    """Read `planning.monitor`, and return its function that compares a frame with its prediction.
 
     Raises:
         InputError: As `Monitor.read`.
@@ -90,38 +90,38 @@ def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> Compa
 
 
 def conformal_threshold(scores: Float[Tensor, " episodes"], false_alarms: float) -> float:
-    """Return the score that a further undisturbed episode exceeds with at most this probability.
+    """Return the score that a new undisturbed episode exceeds with a probability of at most `false_alarms`.
 
-    Split conformal prediction: the k-th smallest of n scores, k = ceil((n + 1) (1 - false_alarms)), if episodes are
-    exchangeable. Source: Angelopoulos and Bates, arXiv 2107.07511, section 1.
+    Split conformal prediction: the k-th smallest of n scores with k = ceil((n + 1) (1 - false_alarms)). It assumes that
+    the episodes are exchangeable. Source: Angelopoulos and Bates, arXiv 2107.07511, section 1.
 
     Raises:
-        InputError: There are too few episodes for this.
+        InputError: There are too few episodes for this probability.
     """
     count = len(scores)
-    place = -int(-(count + 1) * (1.0 - false_alarms) // 1)
-    if not 1 <= place <= count:
+    rank = -int(-(count + 1) * (1.0 - false_alarms) // 1)
+    if not 1 <= rank <= count:
         needed = f"{int(-(-1 // false_alarms)) - 1} at least" if false_alarms > 0 else "a share above 0"
         found = f"{counted(count, 'held-out episode')} for false alarms in {false_alarms:.1%}"
         fix = "Record more, raise data.test_share, or --false-alarms"
         raise InputError(where="--false-alarms", found=found, needed=needed, fix=fix)
-    return float(torch.sort(scores).values[place - 1])
+    return float(torch.sort(scores).values[rank - 1])
 
 
 @dataclass(frozen=True, eq=False)
 class WatchedEpisode:
-    """The surprise of each model step of an episode."""
+    """The prediction errors of each model step of an episode."""
 
     name: str
-    steps: Int[np.ndarray, " time"]  # control step of the frame that was predicted
+    steps: Int[np.ndarray, " time"]  # control step of each predicted frame
     errors: Float[np.ndarray, "time tokens"]
 
     def scores(self, expected: Sequence[float] | np.ndarray) -> Float[np.ndarray, " time"]:
-        """Return the surprise of each step, by what is usual of each patch."""
+        """Return the surprise of each step, given the usual error of each patch."""
         return surprise_of(torch.from_numpy(self.errors), torch.tensor(np.asarray(expected))).numpy()
 
     def first_alarm(self, by: Monitor) -> int | None:
-        """Return the first step of which the surprise is above the threshold; None: there is none."""
+        """Return the index of the first step whose surprise is above the threshold; None: there is none."""
         above = np.flatnonzero(~(self.scores(by.expected) <= by.threshold))
         return int(above[0]) if len(above) else None
 
@@ -130,12 +130,12 @@ class WatchedEpisode:
 def watch_episodes(
     model: WorldModel, dataset: Dataset, episodes: Iterable[int], progress: Progress = no_progress
 ) -> Iterator[WatchedEpisode]:
-    """Yield the surprise of episodes: each frame is predicted from the one before it, as a planner does.
+    """Yield the prediction errors of episodes: each frame is predicted from the previous frame, as in planning.
 
     Args:
-        model: Merged, in eval mode.
-        dataset: Has the episodes, with their frames.
-        episodes: Their indices; those of one frame are left out.
+        model: The model, merged and in eval mode.
+        dataset: The data set with the episodes and their frames.
+        episodes: Indices of the episodes; episodes with a single frame are left out.
         progress: Called with (done, total) in episodes.
 
     Raises:
@@ -154,24 +154,24 @@ def watch_episodes(
             predicted = model.predict(seen.latents[:, :1], seen.actions, seen.states[:, :1], camera)
             errors.append(mean_difference(predicted[:, 0].float(), seen.latents[:, 1]).cpu())
         if errors:
-            found = torch.cat(errors)
-            yield WatchedEpisode(dataset.table.identity(index), np.array(starts) + stride, found.double().numpy())
+            all_errors = torch.cat(errors).double().numpy()
+            yield WatchedEpisode(dataset.table.identity(index), np.array(starts) + stride, all_errors)
         progress(done, len(chosen))
 
 
 def calibrate_monitor(
     model: WorldModel, dataset: Dataset, false_alarms: float, progress: Progress = no_progress
 ) -> Monitor:
-    """Return the threshold that at most a share of undisturbed episodes exceeds, from those that no training saw.
+    """Calibrate a monitor on held-out episodes for a largest share of false alarms.
 
     Args:
-        model: Merged, in eval mode.
-        dataset: Whose validation and test episodes count, 200 at most.
-        false_alarms: The share.
+        model: The model, merged and in eval mode.
+        dataset: The data set, of which up to 200 validation and test episodes are used.
+        false_alarms: Largest share of undisturbed episodes with an alarm.
         progress: Called with (done, total) in episodes.
 
     Raises:
-        InputError: There are too few, or one cannot be read.
+        InputError: There are too few episodes, or an episode cannot be read.
     """
     require_frames(dataset.config, to="watch")
     require_stride(dataset.config, to="know how long a model step is")
@@ -183,10 +183,12 @@ def calibrate_monitor(
     watched = list(watch_episodes(model, dataset, chosen.tolist(), progress))
     if len(watched) < 2:
         raise InputError(where=f"data.path: {dataset.config.path}", found="one held-out episode", needed="two or more")
-    sums, steps = np.stack([one.errors.sum(axis=0) for one in watched]), np.array([len(one.errors) for one in watched])
-    highest = [  # what is usual, by the other episodes: else an episode would seem calmer than a new one
-        one.scores((sums.sum(axis=0) - sums[place]) / (steps.sum() - steps[place])).max()
-        for place, one in enumerate(watched)
+    sums = np.stack([episode.errors.sum(axis=0) for episode in watched])
+    steps = np.array([len(episode.errors) for episode in watched])
+    # Leave-one-out mean as the usual error, so that an episode does not lower its own scores.
+    highest = [
+        episode.scores((sums.sum(axis=0) - sums[index]) / (steps.sum() - steps[index])).max()
+        for index, episode in enumerate(watched)
     ]
     known = model.fingerprints()
     return Monitor(

@@ -1,7 +1,7 @@
-"""Which policy is better, without a robot: the energy of what each would do at frames of held-out episodes.
+"""Offline comparison of policies: the energy of their action chunks at frames of held-out episodes.
 
-The goal of a chunk is what the demonstration saw as many model steps later. So a policy that does what was shown is
-good, and one that finds a better way is not seen to be.
+The goal of a chunk is the demonstration's frame the same number of model steps later. A policy that imitates the
+demonstration therefore scores well; the score does not show if a policy finds a better solution.
 """
 
 from __future__ import annotations
@@ -28,61 +28,61 @@ from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.spaces import POSE, StateSpace, apply_actions, states_along
 from vjepa2_ac.storage.structured import plain
 
-CHANCE = 0.5  # share of other actions with a lower energy than the true ones, for a model that ignores actions
-_OTHERS = 16  # actions of other places, in addition to the true ones
+CHANCE = 0.5  # share of other actions with a lower energy than the true ones, if a model ignores the actions
+_OTHERS = 16  # number of actions from other evaluation points that the true actions are compared with
 _NEEDED = "arrays `episodes` (names), `frames` (control steps) and `chunks` (places x chunks x control steps x numbers)"
 
 ChunkForm = Literal["targets", "deltas", "offsets"]
-"""targets: states to be reached, one after another. deltas: the change from each target to the next. offsets: of all
-targets from the present state."""
+"""targets: absolute target states, one after another. deltas: the change from each target to the next. offsets: the
+difference of each target from the current state."""
 
 
 @dataclass(frozen=True, eq=False)
 class PolicyChunks:
-    """What a policy would do at some frames of episodes."""
+    """The action chunks that a policy proposes at frames of episodes."""
 
     name: str
-    places: tuple[tuple[str, int], ...]  # name of the episode, and the control step
+    places: tuple[tuple[str, int], ...]  # evaluation points: name of the episode, control step
     chunks: Float[np.ndarray, "places chunks steps dim"]
 
 
 @dataclass(frozen=True)
 class PolicyScore:
-    """How a policy fares: mean energy over that of the zero action, below 1 is better."""
+    """The score of a policy: its mean energy relative to the zero action's; lower is better."""
 
     name: str
-    mean: Estimate  # of all its chunks
-    best: Estimate  # of its chunk of lowest energy, as the model would choose
-    behind: Estimate | None  # `mean` minus that of the policy before it in the order; None: it is the first
+    mean: Estimate  # over all chunks at an evaluation point
+    best: Estimate  # of the chunk with the lowest energy at each evaluation point, which the model would select
+    behind: Estimate | None  # `mean` minus that of the next better policy; None: this policy is the best
 
 
 @dataclass(frozen=True)
 class PolicyScores:
-    """Policies, the best first, and whether the model can tell."""
+    """The scores of policies, best first, and whether the model can rank actions."""
 
     policies: tuple[PolicyScore, ...]
-    demonstrated: Estimate  # what was done, over the zero action: no policy is expected to be better
-    others_below_true: Estimate  # share of the actions of other places with a lower energy than the true ones
-    places: int
+    demonstrated: Estimate  # score of the demonstrated actions; no policy is expected to be better
+    others_below_true: Estimate  # share of actions from other evaluation points with a lower energy than the true ones
+    places: int  # number of evaluation points
     episodes: int
-    left_out: int  # places whose goal would be after the episode's end
+    left_out: int  # number of points whose goal would be after the end of the episode
 
     @property
     def is_blind(self) -> bool:
-        """Whether the model ranks the true actions no better than chance, so that its order means nothing."""
+        """Whether the model ranks the true actions no better than chance, so that the order is meaningless."""
         return is_blind(self.others_below_true)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
-        found: dict[str, Any] = plain(asdict(self) | {"is_blind": self.is_blind})
-        return found
+        values: dict[str, Any] = plain(asdict(self) | {"is_blind": self.is_blind})
+        return values
 
 
 def read_policy_chunks(path: Path) -> PolicyChunks:
-    """Read what a policy would do from an .npz file; nothing in it is executed.
+    """Read the action chunks of a policy from an .npz file; no code from the file is executed.
 
     Raises:
-        InputError: It cannot be read, or an array is missing or has another shape.
+        InputError: The file cannot be read, or an array is missing or has another shape.
     """
     try:
         with np.load(path, allow_pickle=False) as arrays:
@@ -91,7 +91,7 @@ def read_policy_chunks(path: Path) -> PolicyChunks:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED) from None
     fits = episodes.shape == frames.shape == chunks.shape[:1] and chunks.ndim == 4 and len(episodes) > 0
     if not fits or frames.dtype.kind not in "iu" or chunks.dtype.kind != "f":
-        shapes = ", ".join(f"{one.dtype} {one.shape}" for one in (episodes, frames, chunks))
+        shapes = ", ".join(f"{array.dtype} {array.shape}" for array in (episodes, frames, chunks))
         raise InputError(where=str(path), found=f"arrays {shapes}", needed=_NEEDED)
     places = tuple(zip(map(str, episodes.tolist()), map(int, frames.tolist()), strict=True))
     return PolicyChunks(path.stem, places, chunks.astype(np.float64))
@@ -105,47 +105,47 @@ def changes_of_chunks(
     control_steps: int,
     space: StateSpace = POSE,
 ) -> Float[np.ndarray, "chunks model_steps dim"]:
-    """Return the change of each model step, as the planner's actions are.
+    """Convert action chunks to changes of the state in each model step, the actions of the planner.
 
-    Rotations act on the left (R' = R_delta @ R), as in `vjepa2_ac.episode`. Control steps at the end that fill no model
-    step are left out.
+    Rotations act on the left (R' = R_delta @ R), as in `vjepa2_ac.episode`. Control steps at the end that do not fill a
+    model step are left out.
 
     Args:
-        chunks: What the policy would do, chunks x control steps x dim: poses in metres, radians and closedness, or
+        chunks: Actions of the policy, chunks x control steps x dim: poses in metres, radians and closedness, or
             vectors.
-        state: Where the robot is.
-        form: What the numbers mean.
-        control_steps: Of a model step, in steps of the chunk: `data.stride` where both have one rate.
-        space: What a state is.
+        state: The current state of the robot.
+        form: Meaning of the numbers.
+        control_steps: Chunk steps per model step: `data.stride` if policy and data have the same rate.
+        space: Meaning of a state.
 
     Raises:
-        InputError: A chunk has other numbers than a state, one that no robot has, or is shorter than a model step; or
-            the state is none.
+        InputError: A chunk has another width than a state, implausible values, or is shorter than a model step; or the
+            state is invalid.
     """
     state = np.array(state, dtype=np.float64)
     space.require_state(state, "state")
-    found = np.array(chunks, dtype=np.float64)
-    if found.ndim != 3 or not len(found) or found.shape[2] != len(space) or not np.isfinite(found).all():
+    values = np.array(chunks, dtype=np.float64)
+    if values.ndim != 3 or not len(values) or values.shape[2] != len(space) or not np.isfinite(values).all():
         needed = f"finite numbers, chunks x control steps x {len(space)}: {', '.join(space.names)}"
-        raise InputError(where="chunks", found=f"an array of the shape {found.shape}", needed=needed)
-    if found.shape[1] < control_steps:
+        raise InputError(where="chunks", found=f"an array of the shape {values.shape}", needed=needed)
+    if values.shape[1] < control_steps:
         needed = f"{control_steps} at least, which are one model step"
-        raise InputError(where="chunks", found=counted(found.shape[1], "control step"), needed=needed)
-    now, given = torch.from_numpy(state), torch.from_numpy(found)
+        raise InputError(where="chunks", found=counted(values.shape[1], "control step"), needed=needed)
+    current, changes = torch.from_numpy(state), torch.from_numpy(values)
     if form == "deltas":
-        targets = states_along(now, given, space)[:, 1:].numpy()
+        targets = states_along(current, changes, space)[:, 1:].numpy()
     else:
-        targets = found if form == "targets" else apply_actions(now.expand_as(given), given, space).numpy()
+        targets = values if form == "targets" else apply_actions(current.expand_as(changes), changes, space).numpy()
     space.require_plausible(targets.reshape(-1, len(space)), "chunks")
     ends = targets[:, control_steps - 1 :: control_steps]
-    return np.stack([space.differences(np.concatenate([state[None], one])) for one in ends])
+    return np.stack([space.differences(np.concatenate([state[None], chunk_ends])) for chunk_ends in ends])
 
 
 def is_blind(error: Estimate | None) -> bool:
-    """Return whether a model ranks true actions no better than chance, so that its energies order nothing.
+    """Return whether a model ranks true actions no better than chance, so that its energies cannot rank actions.
 
     Args:
-        error: Share of other actions with a lower energy than the true ones. None, not measured: False is returned.
+        error: Share of other actions with a lower energy than the true ones. None (not measured) returns False.
     """
     return error is not None and not (error.high if error.has_interval else error.value) < CHANCE
 
@@ -154,14 +154,14 @@ def ranking_of_run(subject: str, checkpoint: str) -> Estimate | None:
     """Return the action-ranking error in the validation of a run's checkpoint; None: not measured.
 
     Args:
-        subject: The folder of a run, or a model, of which nothing is known.
-        checkpoint: Which one, as text with its step.
+        subject: The folder of a run; for a model the result is None.
+        checkpoint: Name of the checkpoint, which contains its step.
     """
     if not is_run(subject):
         return None
     step = step_of(checkpoint.split(maxsplit=1)[0]) or 0
     log = [row for row in read_metrics_log(Path(subject) / METRICS) if row["step"] <= step]
-    keys = ("action_ranking_error", "action_rank")  # the second one in runs before 2026-11-29
+    keys = ("action_ranking_error", "action_rank")  # the second key was used before 2026-11-29
     key, rows = max(((key, [row for row in log if key in row]) for key in keys), key=lambda one: len(one[1]))
     if not rows:
         return None
@@ -178,19 +178,19 @@ def score_policies(
     control_steps: int | None = None,
     progress: Progress = no_progress,
 ) -> PolicyScores:
-    """Score policies at the places that all of them have.
+    """Score policies at the evaluation points (episode and control step) that all of them have.
 
     Args:
-        controller: Plans with the model; it is reset.
-        dataset: Has the episodes.
+        controller: The controller of the model that scores; its goals are replaced.
+        dataset: The data set with the episodes.
         policies: One or more.
-        form: What the numbers of their chunks mean.
-        control_steps: Of a model step, in steps of the chunks; None: as in the data.
-        progress: Called with (done, total) in places.
+        form: Meaning of the numbers of the chunks.
+        control_steps: Chunk steps per model step; None: the stride of the data.
+        progress: Called with (done, total) in evaluation points.
 
     Raises:
-        InputError: There is no common place, an episode or a frame is not there, the data have fewer cameras than the
-            controller has views, or chunks cannot be used.
+        InputError: There is no common evaluation point, an episode or a frame does not exist, the data have fewer
+            cameras than the controller has views, or chunks are invalid.
     """
     views, stride, space = controller.config.views, dataset.config.model_stride, controller.spaces.state
     require_views(dataset.config, views, to="score policies at")
@@ -246,16 +246,20 @@ def score_policies(
 
 
 class _Place(NamedTuple):
-    """A frame of an episode, what was done there, and where it led."""
+    """An evaluation point: a frame of an episode, its state, and the demonstrated changes after it."""
 
-    place: tuple[str, int]
+    place: tuple[str, int]  # name of the episode, control step
     episode: int  # index in the data set
     state: Float[np.ndarray, " dim"]
     changes: Float[np.ndarray, "steps dim"]
 
 
 def _place_of(dataset: Dataset, place: tuple[str, int], ahead: int, space: StateSpace) -> _Place | None:
-    """Return a place whose goal is so many control steps later; None: the episode ends before that."""
+    """Read an evaluation point with a goal `ahead` control steps later; None: the episode ends before the goal.
+
+    Raises:
+        InputError: There is no such episode, or it cannot be read.
+    """
     name, step = place
     index = dataset.table.find(name)
     if index is None:
@@ -263,12 +267,18 @@ def _place_of(dataset: Dataset, place: tuple[str, int], ahead: int, space: State
     states = dataset.source.read(index).states
     if not 0 <= step < len(states) - ahead:
         return None
-    way = states[step : step + ahead + 1 : dataset.config.model_stride]
-    return _Place(place, index, states[step], space.differences(way))
+    path = states[step : step + ahead + 1 : dataset.config.model_stride]
+    return _Place(place, index, states[step], space.differences(path))
 
 
 def _drawn(rng: np.random.Generator, number: int, episodes: Sequence[str]) -> Int[np.ndarray, " others"]:
-    """Draw places of other episodes than that of one; of all others where there is one episode only."""
+    """Draw evaluation points from other episodes; from the same episode if there is only one.
+
+    Args:
+        rng: Random generator.
+        number: Index of the evaluation point.
+        episodes: Episode of each evaluation point.
+    """
     apart = [other for other, name in enumerate(episodes) if name != episodes[number]]
     choices = apart or [other for other in range(len(episodes)) if other != number] or [number]
     return rng.choice(np.array(choices), size=_OTHERS)
