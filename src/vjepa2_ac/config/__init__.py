@@ -1,4 +1,4 @@
-"""Config knobs: each is defined once, with type, range, default and meaning. `config.loading` reads them."""
+"""Config sections: each key is defined once, with type, range, default and meaning. `config.loading` reads configs."""
 
 from vjepa2_ac.config.data import DataConfig, DiskCacheConfig, IdleConfig
 from vjepa2_ac.config.model import (

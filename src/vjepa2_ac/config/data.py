@@ -1,4 +1,4 @@
-"""Data knobs: the form of the data set, and the clips that are made of it."""
+"""Config keys of the data: format of the data set, splits, clips and caches."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from vjepa2_ac.config.section import (
 )
 from vjepa2_ac.registry import SOURCES, TRANSFORMS
 
-# A serial number is a name, also where YAML takes it for a number.
+# YAML parses the serial number of a camera as an integer.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
 Split = Literal["train", "validation", "test"]
@@ -33,7 +33,10 @@ _JOINED = "to sum (deltas), mean (velocities) or last (absolute targets)"
 
 
 def _split_by(text: str) -> str:
-    """Accept the name of a field, or a pattern with one group; the fields depend on the data set."""
+    """Validate `data.split_by`: the name of a field, or a regular expression with one group.
+
+    The names of fields depend on the data set and are checked later.
+    """
     if re.fullmatch(r"[A-Za-z_]+", text):
         return text
     try:
@@ -46,27 +49,29 @@ def _split_by(text: str) -> str:
 
 
 class IdleConfig(Section):
-    """Which control steps are excluded because the robot stands still."""
+    """Which control steps are excluded because the robot does not move."""
 
     rule: Literal["none", "published", "commands", "motion"] = "none"
-    """none: keep all. published: ranges from a file. commands: openpi's rule on commanded joint velocities. motion: the
-    same runs, found in the measured poses, for data sets without joint velocities."""
+    """none: keep all steps. published: ranges from a file. commands: openpi's rule on commanded joint velocities.
+    motion: the same rule on the measured poses, for data sets without joint velocities."""
     ranges: Place | None = None
-    """For published: a JSON file or URL of {"recording_folderpath--file_path": [[start, end), ...]}; others: idle."""
+    """For rule published: path or URL of a JSON file with the ranges to keep, {"recording_folderpath--file_path":
+    [[start, end), ...]}; all other steps are idle."""
     velocity_change_rad_s: Positive = 1e-3
-    """For commands: a step is idle if no commanded joint velocity changes by this much."""
+    """For rule commands: a step is idle if no commanded joint velocity changes by this many radians per second."""
     translation_m: Positive = 1e-3
-    """For motion: a step is idle if translation, rotation and gripper change less than these three."""
+    """For rule motion: a step is idle if its translation in metres is below this, its rotation below rotation_rad and
+    its gripper change below gripper."""
     rotation_rad: Positive = 5e-3
-    """See translation_m."""
+    """For rule motion: the limit of the rotation in radians."""
     gripper: Positive = 1e-2
-    """See translation_m."""
+    """For rule motion: the limit of the gripper's change of closedness (0 to 1)."""
     shortest_idle_steps: PositiveInt = 7
-    """Shorter idle runs stay."""
+    """Shorter idle ranges are kept."""
     shortest_kept_steps: PositiveInt = 16
-    """Ranges between idle runs are removed, too, if they are shorter."""
+    """Shorter ranges between idle ranges are removed, too."""
     cut_last_steps: Count = 10
-    """Steps cut from the end of each remaining range."""
+    """Number of steps cut from the end of each remaining range."""
 
     @model_validator(mode="after")
     def _published_ranges_are_named(self) -> IdleConfig:
@@ -75,20 +80,21 @@ class IdleConfig(Section):
 
 
 class DiskCacheConfig(Section):
-    """The cache on this machine: remote data, and indexes of data sets."""
+    """The cache on this machine for remote data and for the indexes of data sets."""
 
     dir: Local | None = None
-    """Folder; null: $VJEPA2_AC_CACHE, or vjepa2-ac in the user's cache folder."""
+    """Folder of the cache; null: $VJEPA2_AC_CACHE, or vjepa2-ac in the user's cache folder."""
     limit_gb: NonNegative = 50.0
-    """Most that fetched data take, in GB, of all processes together; the least recently used are removed first. 0: none
-    are cached, and none are removed. Indexes do not count."""
+    """Size limit of the downloaded data in GB, over all processes; the least recently used data are removed first. 0:
+    nothing is cached and nothing is removed. Indexes do not count."""
 
 
 class PoseFields(Section):
-    """How the numbers of a data set form a pose: which of them, in which units, and with which rotation."""
+    """How the numbers of a data set form a pose: selection, units and rotation format."""
 
     select: tuple[Count, ...] | None = None
-    """Which numbers of `state`, in this order, are x, y, z, rotation (3 or 4), gripper; or the vector; null: all."""
+    """Indices of the numbers of `state` to use, in this order: x, y, z, rotation (3 or 4 numbers), gripper; for vectors
+    any numbers. null: all."""
     rotation: RotationFormat = "euler_xyz"
     """Rotation format: extrinsic xyz Euler angles in radians or degrees; a rotation vector (axis times angle in
     radians); or a unit quaternion with w first or last."""
@@ -106,112 +112,115 @@ class PoseFields(Section):
 
     @property
     def pose_keys(self) -> list[str]:
-        """The keys that have a meaning for poses only and differ from their defaults."""
+        """The keys that only apply to poses and differ from their defaults."""
         keys = ("rotation", "position_unit", "gripper_open", "gripper_closed")
         return [key for key in keys if getattr(self, key) != type(self).model_fields[key].default]
 
 
 def source_of(values: Any) -> str:
-    """Return the form of the data of a config, or of the values of one: RLDS unless it says another."""
-    found = values.get("source", "rlds") if isinstance(values, dict) else getattr(values, "source", "")
-    return str(found)
+    """Return the `source` of a data section, given as config or as plain values; rlds by default."""
+    source = values.get("source", "rlds") if isinstance(values, dict) else getattr(values, "source", "")
+    return str(source)
 
 
 class DataConfig(Section):
-    """The data set, and the clips made of it: one subclass for each form of data, told apart by `source`.
+    """The data set and the clips made from it. There is one subclass per data format, selected by `source`.
 
-    A subclass has the default of its `source`, a section for its own knobs where it has some, and its abilities.
+    A subclass defines the default of `source`, a section for options of its format if there are any, and the class
+    variables below.
     """
 
     affects: ClassVar[Affects] = Affects.CLIPS
-    kinds: ClassVar[dict[str, type[DataConfig]]] = {}  # of the forms that there are, by the name of their source
+    kinds: ClassVar[dict[str, type[DataConfig]]] = {}  # all known data formats: source -> subclass
     reader: ClassVar[str]  # the class that reads the episodes, as module:class; imported when the data are opened
-    is_cache: ClassVar[bool] = False  # of latents, by a LatentSource; no frames, one stride
+    is_cache: ClassVar[bool] = False  # whether it is a latent cache read by LatentSource: no frames, one stride
     has_camera_poses: ClassVar[bool] = True
-    has_vectors: ClassVar[bool] = True  # states may be other numbers than a pose
-    same_identity_fix: ClassVar[str] = ""  # the way out where two episodes are named alike
-    constants: ClassVar[dict[str, dict[str, Any]]] = {}  # options of its sections in 0.1: part of keys of caches
+    has_vectors: ClassVar[bool] = True  # whether `states: vector` is possible
+    same_identity_fix: ClassVar[str] = ""  # the fix in the error about two episodes of one identity
+    constants: ClassVar[dict[str, dict[str, Any]]] = {}  # options of 0.1 that are part of the keys of caches
 
     source: str
-    """Form of the data set."""
+    """Format of the data set."""
     path: Annotated[Place, Affects.NOTHING]
-    """Folder of the data set: on this machine, or a URL such as gs://bucket/folder or hf://datasets/owner/name. A run
-    goes on with a folder that was moved, for it is known by what it holds."""
+    """Folder of the data set: a local path, or a URL such as gs://bucket/folder or hf://datasets/owner/name. A run can
+    resume after the folder was moved, because its content is compared, not its path."""
     camera: _CameraName | tuple[_CameraName, ...] | None = None
-    """Which camera the model sees; of several, one is drawn for each clip. null: the source's first, for DROID the left
-    exterior camera, which the released weights saw. rlds, lerobot: a name in `cameras`. droid_raw: left, right, wrist,
-    ext1, ext2 or a serial number. npz: the name of an array of frames."""
+    """Camera whose frames the model receives; with a list of cameras, one is drawn for each clip. null: the source's
+    first camera, for DROID the left exterior camera, with which the released weights were trained. rlds, lerobot: a
+    name in `cameras`. droid_raw: left, right, wrist, ext1, ext2 or a serial number. npz: an array with frames."""
     states: Literal["pose", "vector"] = "pose"
-    """Kind of state. pose: 7 numbers, position, rotation and gripper, which the released weights know. vector: the
-    source's own numbers, unchanged, of any width, for other robots: two arms, joints, a mobile base."""
+    """Kind of state. pose: 7 numbers (position, rotation, gripper), as in the released weights. vector: the source's
+    numbers, unchanged and of any width, for other robots: two arms, joints, a mobile base."""
     actions: Literal["difference", "recorded"] = "difference"
     """difference: the change from a state to the next. recorded: the source's commands, of any width; for vectors."""
     join_actions: Annotated[Literal["sum", "mean", "last"] | None, Affects.MEASURED | Affects.RUN] = None
-    """How the recorded commands of a model step's control steps become one action. sum: deltas. mean: velocities. last:
-    absolute targets. Must be given unless `stride` is 1."""
+    """How the recorded commands of the control steps in a model step are combined into one action. sum: for deltas.
+    mean: for velocities. last: for absolute targets. Required unless `stride` is 1."""
     frames: Annotated[int, Field(ge=2, le=256)] = 16
-    """Frames of a clip, one per model step."""
+    """Number of frames per clip, one per model step."""
     stride: Annotated[PositiveInt | Literal["auto"], Affects.CLIPS | Affects.PLAN] = 4
-    """Control steps per model step. Unsettled for the released weights: 4, 8 and 15 are candidates. auto: before the
-    first step the model chooses among 4, 8 and 15 at 15 control steps per
-    second, scaled to other rates, by its prediction error over persistence."""
+    """Control steps per model step. The stride of the released weights is not known for certain: 4, 8 and 15 are
+    candidates. auto: before the first step, the one with the model's lowest error relative to persistence is chosen
+    from 4, 8 and 15 at 15 control steps per second, scaled to other rates."""
     start_every: PositiveInt = 1
     """Clips start at multiples of this many control steps, counted from the first step of their episode that
-    `data.idle` keeps. With the stride's own number, only every stride-th frame is ever needed: a small latent cache."""
+    `data.idle` keeps. If it equals `stride`, only every stride-th frame is needed, and a latent cache is smaller."""
     validation_share: Annotated[Share, Affects.RUN] = 0.05
-    """Share of the episodes held out for validation, by a hash of their identity; at least one of three, unless 0."""
+    """Share of the episodes held out for validation, by a hash of their identity; with three episodes or more at least
+    one, unless the share is 0."""
     test_share: Annotated[Share, Affects.RUN] = 0.05
-    """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
+    """Share of the episodes held out for `evaluate`, drawn as for validation; not used in training or validation."""
     splits: Annotated[Literal["dataset", "hash"], Affects.RUN] = "dataset"
-    """How the data set's own splits are used, if it has several (RLDS, LeRobot). dataset: train, val (or valid,
-    validation) and test are used as such; a missing one is drawn from train by its share, and other names count as
-    train. hash: all episodes are pooled, and the splits are drawn from them by the shares."""
+    """How the splits defined by the data set are used, if there are several (RLDS, LeRobot). dataset: train, val (or
+    valid, validation) and test are used as such; a missing one is drawn from train by its share, and splits of other
+    names belong to train. hash: all episodes are pooled, and the splits are drawn from them by the shares."""
     split_by: Annotated[Annotated[str, Field(max_length=500), AfterValidator(_split_by)] | None, Affects.RUN] = None
-    """What keeps related episodes in one split, so that training reveals nothing about held-out ones: a field (lab, day
-    or folder, as the identity says; task, scene, building, operator or day where the data set does), or a regular
-    expression with one group, which is searched in the identity. null: each episode is drawn independently."""
+    """Keeps related episodes in one split, to avoid leakage between splits: a field (lab, day or folder from the
+    identity; task, scene, building, operator or day from the data set), or a regular expression with one group, which
+    is searched in the identity. null: each episode is drawn independently."""
     outcome: Annotated[Literal["all", "success", "failure"], Affects.RUN] = "all"
     """Which demonstrations are used, if the data set records success and failure."""
     idle: IdleConfig = IdleConfig()
-    """Which steps are excluded because the robot stands still."""
+    """Which steps are excluded because the robot does not move."""
     broken_episodes: Annotated[Literal["error", "skip"], Affects.NOTHING] = "error"
-    """What to do with an episode that cannot be read. error: stop and name it. skip: leave its clips out, name and
-    count it. The run stops where more are broken than 3 episodes or 1 %, whichever is larger; or, of fewer than 6
-    episodes, more than half."""
+    """What to do with an episode that cannot be read. error: stop and name it. skip: skip its clips, and report and
+    count the episode. The run stops if more than 3 episodes or 1 % are broken, whichever is larger; with fewer than 6
+    episodes, if more than half are broken."""
     exclude: Annotated[tuple[str, ...], Affects.NOTHING] = ()
-    """Identities of episodes to leave out, as errors name them."""
+    """Identities of episodes to exclude, as printed in error messages."""
     pose_frame: Literal["base", "camera"] = "base"
-    """Frame of the poses: the robot's base (the released recipe), or the camera, where its extrinsics are known."""
+    """Frame of the poses: the robot's base (the released recipe), or the camera, if its extrinsics are known."""
     crop: Annotated[Literal["released", "square", "letterbox"], Affects.CLIPS | Affects.PLAN] = "released"
-    """How a frame that is not square is cropped. released: its centre, 1.35 times as wide as high at most, squashed.
-    square: its central square (upstream's evaluation). letterbox: all of it, with black bars."""
+    """How a frame that is not square is made square. released: crop the centre to an aspect ratio of at most 1.35, then
+    resize to a square. square: crop the central square (upstream's evaluation). letterbox: add black bars."""
     transforms: Annotated[tuple[Annotated[Component, ComponentOf(TRANSFORMS)], ...], Affects.RUN] = ()
-    """Changes of training clips by code of your own, in this order (docs/extending.md). Each is given a random
-    generator that depends on the seed and the position of the clip in the run."""
+    """Your transforms of training clips, applied in this order (docs/extending.md). Each receives a random generator
+    that depends on the seed and the position of the clip in the run."""
     cache: Annotated[Literal["off", "auto", "require"], OFF, Affects.RUN] = "off"
-    """Whether the frozen encoder's latents are cached on disk, so that each frame is encoded once. off: no. auto: those
-    that are not there yet are encoded before the first step. require: refuse to start where they are not there."""
+    """Whether the frozen encoder's latents are cached on disk, so that each frame is encoded once. off: no cache. auto:
+    missing latents are encoded before the first step. require: refuse to start if latents are missing."""
     cache_dtype: Literal["bf16", "fp32", "int8"] = "bf16"
-    """Storage type of latents: bf16; fp32, which takes twice as much room; int8 with a scale per token, half."""
+    """Storage type of cached latents. bf16: 2 bytes per number. fp32: twice the size of bf16. int8: about half the size
+    of bf16, with a scale per token."""
     cache_dir: Annotated[Place | None, Affects.NOTHING] = None
-    """Folder for latent caches, on this machine or a URL such as gs://bucket/folder, one folder in it for each; null:
-    `latents` in the folder of `disk_cache`."""
+    """Folder that contains the latent caches: a local path, or a URL such as gs://bucket/folder. null: `latents` in the
+    folder of `disk_cache`."""
     disk_cache: Annotated[DiskCacheConfig, Affects.NOTHING] = DiskCacheConfig()
-    """The cache on this machine."""
+    """The cache on this machine for remote data and for the indexes of data sets."""
     workers: Annotated[int, Field(ge=0, le=256), Affects.NOTHING] = 4
-    """Loader processes; 0 loads in the training process. The data does not depend on it."""
+    """Number of loader processes; 0 loads in the training process. The clips do not depend on it."""
 
     def __new__(cls, **values: Any) -> DataConfig:
-        """Make the config of the form of data that `source` names; of RLDS where it is not given."""
+        """Create the subclass that `source` selects, RLDS by default."""
         return super().__new__(cls.kinds.get(source_of(values), cls) if cls is DataConfig else cls)
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        """Take part in the union.
+        """Register the subclass as a data format.
 
         Raises:
             InputError: Another class has this source.
-            TypeError: A section has the name of something else that all forms of data have.
+            TypeError: A section has the name of a key or attribute of all data formats.
         """
         for name, field in cls.model_fields.items():
             section, common = field.annotation, DataConfig.model_fields.get(name)
@@ -225,7 +234,7 @@ class DataConfig(Section):
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Be the union of all forms of data where any is allowed."""
+        """Return the union of all data formats for `DataConfig`, and the ordinary schema for a subclass."""
         if Section not in cls.__bases__ or not cls.kinds:
             return handler(source)
         kinds = {name: handler.generate_schema(kind) for name, kind in cls.kinds.items()}
@@ -270,9 +279,9 @@ class DataConfig(Section):
 
     @classmethod
     def look(cls, path: str) -> dict[str, Any] | None:  # noqa: ARG003 - of a form that is looked for
-        """Return what `vjepa2-ac init` writes for a folder of this form, beside source and path; None: it is none.
+        """Return the values that `vjepa2-ac init` writes for a folder of this data format; None for other folders.
 
-        The values of this section; `control_rate_hz`, beside them, is the number of control steps per second.
+        They are the keys of this section except source and path, and `control_rate_hz`, the control steps per second.
         """
         return None
 
@@ -283,52 +292,52 @@ class DataConfig(Section):
 
     @property
     def offered_cameras(self) -> tuple[str, ...]:
-        """The cameras that a person may choose from, as far as they are known."""
+        """The known cameras from which a user can choose."""
         return self.known_cameras or self.cameras
 
     @property
     def first_camera(self) -> str:
-        """The camera that the model sees unless `camera` names others; of the form of data, where none are known."""
+        """The camera that is used if `camera` is null."""
         return self.offered_cameras[0]
 
     @property
     def pose_fields(self) -> tuple[str, PoseFields | None]:
-        """The name and the values of the section that says where a pose is stored; None for a form without one."""
+        """The name and the values of the section that describes how poses are stored; ("", None) if there is none."""
         sections = ((name, getattr(self, name)) for name in self.own_sections())
         return next(((name, fields) for name, fields in sections if isinstance(fields, PoseFields)), ("", None))
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The cameras that clips are drawn from, one or more."""
+        """The cameras from which clips are drawn, one or more."""
         if self.camera is None:
             return (self.first_camera,)
         return (self.camera,) if isinstance(self.camera, str) else self.camera
 
     def as_kind(self, source: str, **changes: Any) -> DataConfig:
-        """Return the config of another form of data with these knobs, as far as it has them, and changes; unchecked."""
+        """Return a config of another data format with the common keys of this one and `changes`, without validation."""
         same = {name: getattr(self, name) for name in DataConfig.model_fields}
         return self.kinds[source].model_construct(**{**same, "source": source, **changes})
 
     @classmethod
     def own_sections(cls) -> dict[str, type[Section]]:
-        """Return the sections that this form of data has and others have not."""
+        """Return the sections that only this data format has."""
         own = [(name, one.annotation) for name, one in cls.model_fields.items() if name not in DataConfig.model_fields]
         return {name: kind for name, kind in own if isinstance(kind, type) and issubclass(kind, Section)}
 
     @property
     def own_values(self) -> dict[str, dict[str, Any]]:
-        """The values of its own sections, as the keys of indexes and caches have them."""
+        """The values of the sections that only this data format has, as in the keys of indexes and caches."""
         values = self.model_dump(mode="json", include=set(self.own_sections()))
         return {name: values.get(name, {}) | self.constants.get(name, {}) for name in {**values, **self.constants}}
 
     @property
     def takes_latents(self) -> bool:
-        """Whether clips come from a latent cache, so that the encoder is not needed beside the predictor."""
+        """Whether clips come from a latent cache, so that training does not need the encoder."""
         return self.is_cache or self.cache != "off"
 
     @property
     def clip_steps(self) -> int:
-        """Control steps that a clip spans, first and last frame included.
+        """The number of control steps in a clip, from the first to the last frame inclusive.
 
         Raises:
             ValueError: The stride is not yet calibrated.
@@ -340,7 +349,7 @@ class DataConfig(Section):
         """The stride as a number.
 
         Raises:
-            ValueError: It is not yet calibrated.
+            ValueError: The stride is not yet calibrated.
         """
         if self.stride == "auto":
             raise ValueError("data.stride is auto: calibrate first")

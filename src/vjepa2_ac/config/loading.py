@@ -1,4 +1,4 @@
-"""Config loading: strict YAML with dotted overrides; all errors are reported at once, with their paths."""
+"""Config loading: strict YAML with dotted overrides; all errors are reported at once, with their keys."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import yaml  # to write: `storage.structured` reads
+import yaml  # for writing; `storage.structured` parses
 from pydantic import ValidationError
 
 from vjepa2_ac.config import Config, DataConfig
@@ -28,24 +28,24 @@ from vjepa2_ac.storage import read_bounded
 from vjepa2_ac.storage.places import BUILTIN, NO_DATA
 from vjepa2_ac.storage.structured import message_of, parse_yaml
 
-_MOST_BYTES = 1_000_000  # no config needs more, and PyYAML reads 20 MB in a minute
-# A command reads the config of its run several times, and PyYAML needs 20 ms. `parse_config` copies the values.
+_MOST_BYTES = 1_000_000  # size limit of a config file: PyYAML needs a minute for 20 MB
+# Cached because a command reads the config of its run several times, 20 ms each. `parse_config` copies the values.
 _parse_document = lru_cache(maxsize=8)(parse_yaml)
-_OF_A_RUN = ("run_id", "environment.json", "metrics.jsonl")  # next to the config of a run
+_OF_A_RUN = ("run_id", "environment.json", "metrics.jsonl")  # files of which a run folder has at least one
 _PACKAGED = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "configs"
 
 
 def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str] = ()) -> Config:
-    """Read a config, from a file or from plain values, and apply `key.sub=value` overrides.
+    """Load a config from a file or from plain values, and apply `key.sub=value` overrides.
 
-    Plug-ins may be in the working directory, unless the file is in the folder of a run (`load_config_of_run`).
+    Plug-ins may be in the working directory, unless the file is in a run folder (`load_config_of_run`).
 
     Args:
-        config: A file, `builtin:NAME` of the package, or plain values.
-        overrides: Such as training.steps=100.
+        config: A file, `builtin:NAME` for a config of the package, or plain values.
+        overrides: For example training.steps=100.
 
     Raises:
-        InputError: The file cannot be read or is not a valid config; names every key that is wrong.
+        InputError: The file cannot be read or is not a valid config; names every wrong key.
 
     Example:
         >>> config = load_config("builtin:demo", ["training.steps=100"])  # or a file, such as configs/demo.yaml
@@ -59,34 +59,34 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
 
 
 def config_of_model(base: str, overrides: Iterable[str] = (), *, where: str = "overrides", **model: Any) -> Config:
-    """Return the config of a model without a config file: the defaults, without data.
+    """Return a config with default values for using a model without a config file; its data set is a placeholder.
 
     Args:
         base: The model, as in `model.base`.
-        overrides: Such as planning.horizon=2.
-        where: What the values come from, for messages.
-        model: Further values of `model:`, such as dtype.
+        overrides: For example planning.horizon=2.
+        where: The origin of the values, for messages.
+        model: Further values of the section `model`, such as dtype.
 
     Raises:
-        InputError: As `parse_config`.
+        InputError: A value is wrong; names every wrong key.
     """
     values = {"run_dir": "none", "data": {"path": NO_DATA}, "model": {"base": base, **model}}
     return parse_config(values, overrides, where=where)
 
 
 def load_config_of_run(path: str | Path, overrides: Iterable[str] = ()) -> Config:
-    """Read the config of a run, which may be a stranger's: its plug-ins are not looked for in the working directory."""
+    """Load the config of a run. It may be untrusted, so its plug-ins are not imported from the working directory."""
     return parse_config(_read_yaml(config_path(path)), overrides, where=str(path), here=False)
 
 
 def packaged_configs() -> dict[str, str]:
-    """Return the first sentence of each config that comes with the package, by name."""
+    """Return the configs of the package: name -> first sentence of its comment."""
     heads = {path.stem: path.read_text(encoding="utf-8").split("\n\n")[0] for path in _PACKAGED.glob("*.yaml")}
     return {name: re.sub(r"\n?# ?", " ", head).split(". ")[0].strip(" .:\n") for name, head in sorted(heads.items())}
 
 
 def config_path(name: str | Path) -> Path:
-    """Return the file of a config: of `builtin:NAME` that of the package, else the path itself.
+    """Return the file of a config: for `builtin:NAME` the file in the package, otherwise the path itself.
 
     Raises:
         InputError: The package has no config of that name.
@@ -100,34 +100,35 @@ def config_path(name: str | Path) -> Path:
 
 
 def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str, here: bool = True) -> Config:
-    """Validate plain values, as YAML or JSON gives them, with `key.sub=value` overrides.
+    """Validate plain values, as from YAML or JSON, with `key.sub=value` overrides.
 
     Args:
-        values: The values; a Path is text.
-        overrides: Such as training.steps=100.
-        where: Their file, for messages.
-        here: Whether plug-ins may lie in the working directory: not those of a run, which may be a stranger's.
+        values: The values; a Path is converted to text.
+        overrides: For example training.steps=100.
+        where: The file of the values, for messages.
+        here: Whether plug-ins may be imported from the working directory; False for the config of a run, which may be
+            untrusted.
 
     Raises:
-        InputError: Names every key that is wrong, all at once.
+        InputError: A value is wrong; names every wrong key.
     """
-    given = json.loads(_as_json(values, where))
-    _keep_drawn_splits(given)
+    plain = json.loads(_as_json(values, where))
+    _keep_drawn_splits(plain)
     if not here:
-        drop_removed_keys(given, where)
-        move_norm_limit(given, where)
-        move_component_options(given, where)
+        drop_removed_keys(plain, where)
+        move_norm_limit(plain, where)
+        move_component_options(plain, where)
     for override in overrides:
         key, separator, text = override.partition("=")
         if not separator or not key:
             raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
-        _set(given, key.split("."), parse_yaml(text, where=f"override {key}"), override)
-    _replace_older_keys(given)
-    if isinstance(given.get("model"), dict):
-        _replace_keys_of_model(given["model"])
+        _set(plain, key.split("."), parse_yaml(text, where=f"override {key}"), override)
+    _replace_older_keys(plain)
+    if isinstance(plain.get("model"), dict):
+        _replace_keys_of_model(plain["model"])
     try:
-        given = with_plugins(given, where=where, here=here)
-        return Config.model_validate_json(_as_json(with_complete_replay(given), where))
+        plain = with_plugins(plain, where=where, here=here)
+        return Config.model_validate_json(_as_json(with_complete_replay(plain), where))
     except ValidationError as error:
         lines = _wrong_values(error)
     found = "\n  ".join([f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong", *lines]) + "\n"
@@ -140,25 +141,25 @@ def config_as_dict(config: Config) -> dict[str, Any]:
 
 
 def config_as_flat_dict(config: Config) -> dict[str, Any]:
-    """Return the resolved config by dotted keys, which is what trackers take."""
+    """Return the resolved config by dotted keys, the format that trackers accept."""
     return flat(config_as_dict(config))
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested values by their dotted keys."""
-    found: dict[str, Any] = {}
+    by_key: dict[str, Any] = {}
     for key, value in values.items():
-        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return found
+        by_key |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return by_key
 
 
 def config_as_yaml(config: Config) -> str:
-    """Return the resolved config as YAML that `load_config` reads back to an equal config."""
+    """Return the resolved config as YAML, from which `load_config` reads an equal config."""
     return str(yaml.dump(config_as_dict(config), Dumper=_Dumper, sort_keys=False, width=_NO_BREAKS))
 
 
 def yaml_line(key: str, value: Any) -> str:
-    """Return a key and its value as one line of YAML, which reads back as they are."""
+    """Return a key and its value as one line of YAML, which is parsed to the same key and value."""
     text = yaml.dump([{key: value}], Dumper=_Dumper, sort_keys=False, default_flow_style=True, width=_NO_BREAKS)
     return str(text).removeprefix("[{").removesuffix("}]\n")
 
@@ -170,16 +171,16 @@ def config_schema() -> dict[str, Any]:
 
 
 def changed_keys(old: Config, new: Config) -> list[str]:
-    """Return the dotted keys in which two configs differ."""
+    """Return the dotted keys whose values differ between two configs."""
     flat_old, flat_new = config_as_flat_dict(old), config_as_flat_dict(new)
     return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
 
 
-_NO_BREAKS = 10**6  # characters of a line
+_NO_BREAKS = 10**6  # characters per line, so that YAML breaks none
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes text that would be read as another type, and escapes what is not printable."""
+    """A YAML dumper that quotes text of which YAML would make another type, and escapes unprintable characters."""
 
 
 _Dumper.add_representer(
@@ -206,13 +207,13 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
     values = _parse_document(text, where=str(path))
     if not isinstance(values, dict):
-        found = "nothing" if values is None else f"a {type(values).__name__}"
-        raise InputError(where=str(path), found=found, needed="a mapping of keys to values")
+        description = "nothing" if values is None else f"a {type(values).__name__}"
+        raise InputError(where=str(path), found=description, needed="a mapping of keys to values")
     return values
 
 
 def _as_json(values: Mapping[str, Any], where: str) -> str:
-    """Return values as a file would hold them: a Path is text."""
+    """Return values as JSON; a Path becomes text."""
     try:
         return json.dumps(dict(values), default=os.fspath)
     except (TypeError, ValueError) as error:
@@ -223,9 +224,9 @@ _KEYS_OF_A_RUN = {"check_crc", "connections", "prefetch", "short_episodes"}
 
 
 def _keep_drawn_splits(values: Mapping[str, Any]) -> None:
-    """Set `data.splits` to hash in the config of a run that is older than this key, when all splits were drawn.
+    """Set `data.splits` to hash in the config of an older run without this key, because all its splits were drawn.
 
-    The config of a run is recognised by keys that are seldom written by hand: it has every key of its version.
+    The config of a run contains all keys of its version. It is recognised by keys that users seldom write.
     """
     replay = values.get("replay")
     for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
@@ -238,7 +239,7 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
         if values.get(key) is None:
             values[key] = {}
         if isinstance(values[key], str) and keys[depth + 1] == "options":
-            values[key] = {"name": values[key]}  # of a component
+            values[key] = {"name": values[key]}  # a component given by its name
         inner = values[key]
         if not isinstance(inner, dict):
             found = f"{'.'.join(keys[: depth + 1])} is a value"
@@ -247,7 +248,7 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
     if keys[-2:] == ["data", "source"] and value != values.get("source", "rlds"):
         others = [kind for name, kind in DataConfig.kinds.items() if name != value]
         for section in {section for kind in others for section in kind.own_sections()}:
-            values.pop(section, None)  # of the form of data that it replaces
+            values.pop(section, None)  # options of the former data format
     values[keys[-1]] = value
 
 
@@ -255,13 +256,13 @@ _OLDER_GRIPPERS = {"closedness": {}, "openness": {"gripper_open": 1.0, "gripper_
 
 
 def _replace_keys_of_model(model: dict[str, Any]) -> None:
-    """Replace the key `random` of 0.1, the sizes of a fresh predictor, by `base: random` and `sizes`."""
+    """Replace the key `model.random` of 0.1 (the sizes of a new predictor) by `base: random` and `sizes`."""
     if (sizes := model.pop("random", None)) is not None:
         model.update(base=RANDOM, sizes=sizes)
 
 
 def _replace_older_keys(values: dict[str, Any]) -> None:
-    """Replace, in configs of older runs, the key gripper of `data.fields` and two schedules by what means the same."""
+    """Replace keys of older runs, `data.fields.gripper` and two schedules, by the equivalent keys of today."""
     for section, inner in values.items():
         if section == "training" and isinstance(inner, dict) and inner.get("schedule") in ("constant", "linear"):
             decay_steps = _steps_after_warmup(inner) if inner["schedule"] == "linear" else 0
@@ -275,7 +276,7 @@ def _replace_older_keys(values: dict[str, Any]) -> None:
 
 
 def _steps_after_warmup(training: Mapping[str, Any]) -> int:
-    """Return the steps after the warm-up; 0 for values of another type, which the check of the config refuses."""
+    """Return the number of steps after the warm-up; 0 if a value has a wrong type, which validation reports later."""
     steps = training.get("steps", TrainingConfig.model_fields["steps"].default)
     warmup_steps = training.get("warmup_steps")
     if not isinstance(steps, int) or not isinstance(warmup_steps, int | None):
@@ -283,37 +284,39 @@ def _steps_after_warmup(training: Mapping[str, Any]) -> int:
     return max(0, steps - (usual_warmup({"steps": steps}) if warmup_steps is None else warmup_steps))
 
 
-# ---- plug-ins: modules that are imported before a config is checked; what they register may be named in it ----
+# ---- plug-ins: modules that are imported before a config is validated, because it may use their components ----
 
-_named: list[str] = []  # by `--plugin`
+_named: list[str] = []  # modules of `--plugin`
 
 
 def name_plugins(modules: list[str]) -> None:
-    """Import the modules of `--plugin`; every config that is read from now on names them, too.
+    """Import the modules of `--plugin`, and add them to the plug-ins of every config that is read later.
 
     Raises:
-        InputError: One is not there.
+        InputError: A module does not exist.
     """
     import_plugins(modules, where="--plugin")
     _named.extend(modules)
 
 
 def with_plugins(values: Mapping[str, Any], *, where: str, here: bool) -> dict[str, Any]:
-    """Import the plug-ins of a config, and the installed form of data that it names; return it with all plug-ins.
+    """Import the plug-ins of a config and its data format; return the values with all plug-ins, those of --plugin too.
 
     Args:
-        values: The plain values, which may be wrong.
-        where: Its file.
-        here: As for `registry.import_plugins`.
+        values: The plain values, not validated yet.
+        where: The file of the config.
+        here: See `registry.import_plugins`.
 
     Raises:
-        InputError: One is not there.
+        InputError: A plug-in does not exist.
     """
-    given = values.get("plugins")
-    if given is not None and not (isinstance(given, list) and all(isinstance(one, str) for one in given)):
-        return dict(values)  # an error, which the check names
-    plugins = list(dict.fromkeys([*(given or ()), *_named]))
-    import_plugins([one for one in plugins if one not in _named], where=f"{where}: plugins", here=here)
+    configured = values.get("plugins")
+    if configured is not None and not (
+        isinstance(configured, list) and all(isinstance(module, str) for module in configured)
+    ):
+        return dict(values)  # an error that validation reports
+    plugins = list(dict.fromkeys([*(configured or ()), *_named]))
+    import_plugins([module for module in plugins if module not in _named], where=f"{where}: plugins", here=here)
     replay = values.get("replay")
     for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
         if (source := source_of(data)) in SOURCES.names():
@@ -323,10 +326,10 @@ def with_plugins(values: Mapping[str, Any], *, where: str, here: bool) -> dict[s
 
 
 def admit_forms_of_data(*, all_installed: bool = False) -> None:
-    """Let configs hold the forms of data that were defined since the last time.
+    """Rebuild the config classes, so that they accept data formats that were registered since the last call.
 
     Args:
-        all_installed: Import those of all installed packages first.
+        all_installed: Import the data formats of all installed packages first.
     """
     for name in SOURCES.names() if all_installed else ():
         SOURCES.find(name)
@@ -340,33 +343,39 @@ def admit_forms_of_data(*, all_installed: bool = False) -> None:
 _admitted = dict(DataConfig.kinds)
 
 
-# ---- what is wrong ----
+# ---- error messages ----
 
-_TYPE_OF_A_UNION = re.compile(r"int|float|str|bool|.*[\[(-].*")  # as pydantic names it in the location of an error
+_TYPE_OF_A_UNION = re.compile(r"int|float|str|bool|.*[\[(-].*")  # pydantic's names of types in error locations
 
 
 def _wrong_values(error: ValidationError) -> list[str]:
-    """Return a line for every wrong value; a knob that may be of several types gets one line, not one per type."""
-    found: dict[str, list[str]] = {}
+    """Return a line for every wrong value; a key that allows several types gets one line, not one per type."""
+    lines_by_key: dict[str, list[str]] = {}
     for detail in error.errors(include_url=False):
-        if detail["type"] != "default_factory_not_called":  # a default that follows from another value, which is wrong
+        if detail["type"] != "default_factory_not_called":  # its cause, another wrong value, has its own line
             key = _key_of(detail["loc"]) + ".source" * (detail["type"] == "union_tag_invalid")
-            *others, last = dict.fromkeys([*found.get(key, ()), _explain(key, detail)])
-            found[key] = [*(line.split(" (found ")[0] for line in others), last]  # all of the same value
+            *earlier, last = dict.fromkeys([*lines_by_key.get(key, ()), _explain(key, detail)])
+            lines_by_key[key] = [*(line.split(" (found ")[0] for line in earlier), last]  # print the value only once
     inherited = {
-        key for key, lines in found.items() if key_of_data(key) != key and found.get(key_of_data(key)) == lines
+        key
+        for key, lines in lines_by_key.items()
+        if key_of_data(key) != key and lines_by_key.get(key_of_data(key)) == lines
     }
-    return [f"{key}: {', or '.join(lines)}".removeprefix(": ") for key, lines in found.items() if key not in inherited]
+    return [
+        f"{key}: {', or '.join(lines)}".removeprefix(": ")
+        for key, lines in lines_by_key.items()
+        if key not in inherited
+    ]
 
 
 def all_keys() -> list[str]:
-    """Return the dotted keys of all sections and knobs."""
+    """Return the dotted names of all sections and keys."""
     paths = [key.split(".") for key in marks_of(Config)]
     return list(dict.fromkeys(".".join(path[:depth]) for path in paths for depth in range(1, len(path) + 1)))
 
 
 def _key_of(location: Sequence[Any]) -> str:
-    """Return the dotted key of pydantic's location, without its names for forms of data and types of a union."""
+    """Return the dotted key for an error location of pydantic, without its names for data formats and union types."""
     parts: list[str] = []
     for before, part in zip(["", *location], map(str, location), strict=False):
         is_form = before == "data" and part in DataConfig.kinds

@@ -10,17 +10,17 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from vjepa2_ac.config.section import Affects, PositiveInt, Section, Share
 from vjepa2_ac.storage import places
 
-# Far beyond every such model (released: width 1408, depth 40, 1.3 billion weights): a file may claim any size.
+# Limits far above the released model (width 1408, depth 40, 1.3 billion weights), because a file may claim any size.
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Depth = Annotated[int, Field(ge=1, le=512)]
 Heads = Annotated[int, Field(ge=1, le=1_024)]
 Ratio = Annotated[float, Field(gt=0.0, le=64.0)]
 VectorWidth = Annotated[int, Field(ge=1, le=4_096)]
-_MOST_TOKENS = 65_536  # of a frame
+_MOST_TOKENS = 65_536  # per frame
 _MOST_WEIGHTS = 10**10  # 40 GB in float32
 _MOST_TARGETS = 4_096
-_STATE_DIM = 7  # of a pose and a gripper
-_USUAL_ALPHA = 32.0  # of every config here, at any rank
+_STATE_DIM = 7  # position, rotation, gripper
+_USUAL_ALPHA = 32.0  # in all configs of the package, at any rank
 
 
 Family = Literal["v2", "v2.1"]
@@ -28,34 +28,34 @@ FramePath = Literal["tubelet", "image"]
 EncoderKey = Literal["ema_encoder", "target_encoder", "encoder"]
 
 RANDOM = "random"
-"""The value of `model.base` for a fresh predictor; write a folder of this name as `./random`."""
+"""The value of `model.base` for a new predictor; write a folder of this name as `./random`."""
 
 
 class _EncoderShape(Section):
-    """The sizes of an encoder that a config chooses and a model file holds; the defaults are ViT-g/16's."""
+    """Sizes of an encoder, in configs and in model files; the defaults are those of ViT-g/16."""
 
     width: Width = 1408
-    """Width of a latent."""
+    """Embedding width, the number of values per latent."""
     depth: Depth = 40
-    """Transformer blocks."""
+    """Number of transformer blocks."""
     heads: Heads = 22
-    """Attention heads; width / heads is the size of a head."""
+    """Number of attention heads; width / heads is the size of a head."""
 
 
 class _PredictorShape(Section):
-    """The sizes and inputs of a predictor that a config chooses and a model file holds; the defaults are released."""
+    """Sizes and inputs of a predictor, in configs and in model files; the defaults are those of the released model."""
 
     width: Width = 1024
-    """Width of a token."""
+    """Embedding width, the number of values per token."""
     depth: Depth = 24
-    """Transformer blocks."""
+    """Number of transformer blocks."""
     heads: Heads = 16
-    """Attention heads."""
+    """Number of attention heads."""
     use_extrinsics: bool = False
-    """Whether the camera pose is one more input token per time step."""
+    """Whether each time step has the camera pose as an additional input token."""
     use_states: bool = True
-    """Whether the state is an input token of each time step. false: the states are no input, for a robot whose states
-    are not calibrated. The states of the data may then have any width."""
+    """Whether each time step has the state as an input token. false: for a robot whose states are not calibrated; the
+    states of the data may then have any width."""
 
 
 class EncoderSizes(_EncoderShape):
@@ -64,10 +64,10 @@ class EncoderSizes(_EncoderShape):
     mlp_ratio: Ratio = 48 / 11
     """Hidden width of the MLP over the width."""
     family: Family = "v2"
-    """V-JEPA 2, or 2.1: other rotary positions, and a learned vector for the kind of input."""
+    """V-JEPA 2, or 2.1, which has other rotary positions and a learned vector for the kind of input."""
     frame: FramePath = "tubelet"
-    """How a frame enters. tubelet: twice, as a video of two equal frames, as all published predictors had it. image
-    (with family v2.1): as one image, through patches of its own."""
+    """How a frame is encoded. tubelet: as a video of two equal frames, as for all published predictors. image (only
+    family v2.1): as one image, with the patch embedding for images."""
 
 
 class PredictorSizes(_PredictorShape):
@@ -76,9 +76,9 @@ class PredictorSizes(_PredictorShape):
     mlp_ratio: Ratio = 4.0
     """Hidden width of the MLP over the width."""
     action_dim: VectorWidth = 7
-    """Width of an action. Where the data's are others, its encoder is replaced by a fresh one."""
+    """Width of an action. If the data have another width, the action encoder is replaced by a new one."""
     state_dim: VectorWidth = _STATE_DIM
-    """Width of a state, likewise."""
+    """Width of a state. If the data have another width, the state encoder is replaced by a new one."""
 
     @model_validator(mode="after")
     def _widths_are_used(self) -> PredictorSizes:
@@ -89,7 +89,7 @@ class PredictorSizes(_PredictorShape):
 
 
 class ModelSizes(Section):
-    """Sizes of a world model, as its file has them. The defaults are V-JEPA 2-AC ViT-g/16 at 256 px."""
+    """Sizes of a world model, as in its file. The defaults are those of V-JEPA 2-AC ViT-g/16 at 256 px."""
 
     image_size: Annotated[int, Field(ge=1, le=8_192)] = 256
     """Height and width of a frame in pixels; a multiple of patch_size."""
@@ -102,12 +102,12 @@ class ModelSizes(Section):
 
     @property
     def tokens_per_frame(self) -> int:
-        """Patches of one frame."""
+        """The number of patches per frame."""
         return (self.image_size // self.patch_size) ** 2
 
     @property
     def too_narrow_to_copy(self) -> str | None:
-        """What a run from scratch is warned of: a predictor that cannot start near copying; None: it can."""
+        """The warning for training from scratch if the predictor cannot start near persistence, otherwise None."""
         if self.predictor.width >= self.encoder.width:
             return None
         return (
@@ -137,10 +137,10 @@ class ModelSizes(Section):
         return self
 
     @model_validator(mode="after")
-    def _sizes_are_of_this_world(self) -> ModelSizes:
+    def _sizes_are_limited(self) -> ModelSizes:
         parts, tokens = (self.encoder, self.predictor), self.tokens_per_frame
         weights = sum(part.depth * part.width**2 * (4 + 2 * part.mlp_ratio) for part in parts)
-        weights += 6 * self.patch_size**2 * self.encoder.width  # of patches: 3 colours, 2 frames
+        weights += 6 * self.patch_size**2 * self.encoder.width  # patch embedding of 3 colours and 2 frames
         return self.refused(
             (tokens > _MOST_TOKENS, f"image_size: {tokens:,} tokens a frame, more than {_MOST_TOKENS:,}"),
             (
@@ -151,18 +151,18 @@ class ModelSizes(Section):
 
 
 class EncoderSizesConfig(_EncoderShape):
-    """Sizes of a random encoder; of an official `.pt` its heads."""
+    """Sizes of a random encoder. For an official `.pt` only `heads` is used."""
 
 
 class PredictorSizesConfig(_PredictorShape):
-    """Sizes of a fresh predictor; of an official `.pt` its heads, and whether the camera pose is an input."""
+    """Sizes of a new predictor. For an official `.pt` only `heads` and `use_extrinsics` are used."""
 
 
 class SizesConfig(Section):
-    """Sizes of a world model that a config chooses. The defaults are V-JEPA 2-AC ViT-g/16 at 256 px."""
+    """Sizes of a new world model. The defaults are those of V-JEPA 2-AC ViT-g/16 at 256 px."""
 
     image_size: Annotated[int, Field(ge=1, le=8_192)] = 256
-    """Height and width of a frame in pixels; a multiple of 16, the size of a patch."""
+    """Height and width of a frame in pixels; a multiple of 16, the patch size."""
     encoder: EncoderSizesConfig = EncoderSizesConfig()
     """The frozen encoder."""
     predictor: PredictorSizesConfig = PredictorSizesConfig()
@@ -170,7 +170,7 @@ class SizesConfig(Section):
 
     @property
     def whole(self) -> ModelSizes:
-        """All sizes: MLPs as wide as in the published models; states and actions of a pose until the data say more."""
+        """All sizes: MLP widths as in the published models, and the widths of poses until the data are known."""
         released = EncoderSizes()
         ratio = released.mlp_ratio if self.encoder.width == released.width else 4.0
         encoder = EncoderSizes(mlp_ratio=ratio, **self.encoder.model_dump())
@@ -187,53 +187,56 @@ class SizesConfig(Section):
 
 
 class EncoderConfig(Section):
-    """An encoder of its own, under a predictor that does not bring one."""
+    """A pre-trained encoder, for a base model without an encoder."""
 
     path: Annotated[str, AfterValidator(places.of_an_encoder), Affects.PLAN]
-    """Meta's `.pt` of V-JEPA 2 or 2.1 (`vjepa2-ac download --list`), a transformers folder, the same from the Hub as
-    `hf://owner/name` or `hf://owner/name@revision`, or the folder of a model of this project. A run resumes with a path
-    to which it was moved: the fingerprint of the weights decides."""
+    """Meta's `.pt` of V-JEPA 2 or 2.1 (`vjepa2-ac download --list`), a transformers folder, `hf://owner/name` or
+    `hf://owner/name@revision` for such a folder on the Hub, or the folder of a model of this project. A run can resume
+    after the path was changed, because the fingerprint of the weights is compared."""
     key: EncoderKey | None = None
-    """Which encoder of a `.pt`; null: the first of these that it has. A predictor knows the one it was trained on."""
+    """Which encoder of a `.pt` is loaded; null: the first of these that it contains. The file of a trained predictor
+    records the key of its encoder."""
     frame: FramePath = "tubelet"
-    """How a frame enters. tubelet: twice, as a video of two equal frames, as all published predictors had it. image
-    (V-JEPA 2.1 only): as one image, through patches of its own."""
+    """How a frame is encoded. tubelet: as a video of two equal frames, as for all published predictors. image (only
+    V-JEPA 2.1): as one image, with the patch embedding for images."""
     heads: Heads | None = None
-    """Attention heads of an encoder of a width that nobody has published; null: those of the published width."""
+    """Number of attention heads, for an encoder whose width is not that of a published model; null: as in the published
+    model of the same width."""
     layer: Depth | None = None
-    """Its block after which features are taken; null: the last. Earlier ones (two thirds deep) were seen to tell more
-    of motion (docs/encoders.md). They are normalised without the last norm's weights, and cost less."""
+    """The block whose output is used as features; null: the last. Features of earlier blocks (at two thirds of the
+    depth) contained more information about motion (docs/encoders.md) and cost less. They are normalised without the
+    weights of the last norm."""
 
 
 class ModelConfig(Section):
     """Which world model to start from."""
 
     base: Annotated[str, AfterValidator(places.of_a_model), Affects.PLAN]
-    """The model to adapt: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny
-    model of the demo, which comes with the package). A run resumes with a path to which its base was moved: the
-    fingerprint of the weights decides. random: a fresh predictor of these `sizes`, close to copying the last frame, on
-    `encoder` or else a random encoder; with `adapter.kind: none` that is training from scratch."""
+    """The base model: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny model
+    of the demo, which is part of the package). A run can resume after the path was changed, because the fingerprint of
+    the weights is compared. random: a new predictor with `sizes`, initialised close to persistence, with `encoder` or
+    else a random encoder; with `adapter.kind: none` this is training from scratch."""
     encoder: Annotated[EncoderConfig | None, Affects.RUN] = None
-    """A pretrained encoder, for `base: random` or a base that holds a predictor alone; null: the base's own. Family,
-    width, depth and MLP are the file's."""
+    """A pre-trained encoder, for `base: random` or a base model without an encoder; null: the encoder of the base
+    model. Family, width, depth and MLP are read from the file."""
     sizes: Annotated[SizesConfig, Affects.RUN | Affects.PLAN] = SizesConfig()
-    """The sizes for `base: random`; of an official `.pt` what the file does not contain: the image size, the heads, and
-    whether the camera pose is an input. All other sizes are read from the file."""
+    """The sizes for `base: random`. For an official `.pt` only those that the file does not contain are used: the image
+    size, the heads, and whether the camera pose is an input."""
     dtype: Annotated[Literal["float32", "bfloat16"], Affects.LATENTS | Affects.RUN | Affects.PLAN] = "bfloat16"
-    """Type of the frozen weights; trained weights are always float32. Planning computes in it."""
+    """Data type of the frozen weights, and of planning; trained weights are always float32."""
 
     @property
     def is_random(self) -> bool:
-        """Whether the predictor is a fresh one."""
+        """Whether the predictor is new, not pre-trained."""
         return self.base == RANDOM
 
     def with_base(self, name: str) -> ModelConfig:
-        """Return the config of another model that is there, with the other settings of this one."""
+        """Return this config with another, existing base model."""
         sizes = SizesConfig() if self.is_random else self.sizes
         return self.model_copy(update={"base": name, "encoder": None, "sizes": sizes})
 
 
-PEFT_NAMES = {  # of the knobs below
+PEFT_NAMES = {  # PEFT's name -> config key
     "r": "rank",
     "lora_alpha": "alpha",
     "lora_dropout": "dropout",
@@ -248,27 +251,27 @@ class AdapterConfig(Section):
     """What is trained: a LoRA adapter on the predictor, or the whole predictor."""
 
     kind: Literal["lora", "none"] = "lora"
-    """lora: low-rank adapter (PEFT). none: every weight of the predictor is trained."""
+    """lora: low-rank adapter (PEFT). none: all weights of the predictor are trained."""
     rank: Annotated[int, Field(ge=1, le=1024)] = 16
-    """Rank of the update of each target."""
+    """Rank of the update of each target layer."""
     alpha: Annotated[float, Field(gt=0.0, le=1e6)] = 32.0
-    """Scale of the update: alpha / sqrt(rank) with rsLoRA, alpha / rank without. With rsLoRA keep it at any rank: as
-    twice the rank it makes the update grow with the rank."""
+    """Scale of the update: alpha / sqrt(rank) with rsLoRA, alpha / rank without. With rsLoRA use the same alpha at any
+    rank; with alpha = 2 x rank the update would grow with the rank."""
     rslora: bool = True
-    """Rank-stabilised scale (arXiv 2312.03732)."""
+    """Whether the scale is rank-stabilised (rsLoRA, arXiv 2312.03732)."""
     dropout: Share = 0.0
-    """Dropout before the adapter's first matrix, in training only. The released recipe and our measurements use none;
-    it costs an eighth of a step on a GPU (predicted) and keeps a mask and a copy of each layer's input."""
+    """Dropout before the adapter's first matrix, in training only. The released recipe and our measurements use none.
+    Dropout takes an eighth of a step on a GPU (predicted), and memory for a mask and a copy of each layer's input."""
     targets: Annotated[tuple[str, ...], Field(max_length=_MOST_TARGETS)] = ("q", "k", "v", "o", "fc1", "fc2")
-    """Linear layers of the predictor that get an adapter, by the last part of their name; besides the defaults:
-    predictor_embed, predictor_proj, action_encoder, state_encoder. Or sets: attention (q, k, v, o), mlp (fc1, fc2),
-    all (every linear layer). Or single layers by their whole name, such as blocks.0.attn.q."""
+    """Linear layers of the predictor with an adapter, by the last part of their name: the defaults, predictor_embed,
+    predictor_proj, action_encoder and state_encoder. Or sets: attention (q, k, v, o), mlp (fc1, fc2), all (every linear
+    layer). Or single layers by their full name, such as blocks.0.attn.q."""
     modules_to_save: tuple[Literal["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"], ...] = ()
     """Layers before and after the blocks that are trained directly, without an adapter."""
     dora: bool = False
     """Train the norm of each row of a weight separately from its direction (DoRA, arXiv 2402.09353)."""
     peft: dict[str, Any] = {}
-    """Further options of PEFT's LoraConfig, by its names: {rank_pattern: {fc1: 32}, init_lora_weights: gaussian}."""
+    """Further options of PEFT's LoraConfig, for example {rank_pattern: {fc1: 32}, init_lora_weights: gaussian}."""
 
     @model_validator(mode="after")
     def _is_an_adapter_of_this_base(self) -> AdapterConfig:
@@ -280,7 +283,7 @@ class AdapterConfig(Section):
 
     @property
     def out_of_line(self) -> str | None:
-        """What a run is warned of: with rsLoRA an alpha that is raised with the rank; None: nothing."""
+        """The warning if alpha seems to be raised with the rank although rsLoRA is on, otherwise None."""
         if self.kind != "lora" or not self.rslora or self.alpha < 2 * _USUAL_ALPHA:
             return None
         scale, usual = (alpha / math.sqrt(self.rank) for alpha in (self.alpha, _USUAL_ALPHA))

@@ -21,21 +21,21 @@ from vjepa2_ac.config.section import (
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.registry import ENERGIES, PLANNERS
 
-Place = Annotated[float, Field(ge=-5.0, le=5.0)]  # along an axis of the base frame, in metres; no arm reaches farther
+Place = Annotated[float, Field(ge=-5.0, le=5.0)]  # coordinate in the base frame in metres; no arm reaches farther
 Corner = tuple[Place, Place, Place]
-ELITES = 10  # of the planners cem and icem, unless their option says another number
-Metre = ZeroToOne  # no arm moves farther in a model step: more would be millimetres
+ELITES = 10  # default of the option `elites` of the planners cem and icem
+Metre = ZeroToOne  # no arm moves farther in a model step, so that larger values are probably millimetres
 
 
 class LimitsConfig(Section):
-    """Limits of every action, independent of the model. All per model step; `action_repeat` repeats it."""
+    """Limits of every action, independent of the model. All limits apply to one model step."""
 
     xyz: Literal["data"] | tuple[Metre, Metre, Metre] = (0.05, 0.05, 0.05)
-    """Largest dx, dy, dz in metres, 1 at most; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075. data: the 99th
+    """Largest dx, dy, dz in metres, 1 at most; 0 fixes an axis. Upstream's notebooks use 0.05 to 0.075. data: the 99th
     percentile of the motions in the training data, along each axis."""
     l1: Positive | None = None
-    """Largest sum of the absolute dx, dy and dz in metres; longer motions are scaled down. The paper's planner has
-    0.075. null: no such limit."""
+    """Largest sum of the absolute dx, dy and dz in metres; longer motions are scaled down. The planner in the paper
+    uses 0.075. null: no such limit."""
     workspace: tuple[Corner, Corner] | None = None
     """Corners (lowest and highest x, y, z, in metres) of a box for the flange; null: none. Actions are shortened so
     that every target is inside. A robot that is outside by more than one step does not move. Only for poses in the base
@@ -48,15 +48,15 @@ class LimitsConfig(Section):
     gripper: ZeroToOne = 0.75
     """Largest change of the gripper's closedness."""
     gripper_mode: Literal["rounded", "free", "held", "open", "close"] = "rounded"
-    """rounded: changes below 0.25 of a finished plan become zero, as upstream. free: left as they are. held: no change.
-    open, close: a change of -1 or 1 in every model step, whatever `gripper` says; rounded before."""
+    """rounded: changes below 0.25 in the final plan are set to zero, as upstream. free: changes are not modified. held:
+    no change. open, close: a change of -1 or 1 in every model step, independent of `gripper`."""
 
     @property
     def xyz_m(self) -> tuple[float, float, float]:
         """The largest dx, dy, dz in metres.
 
         Raises:
-            InputError: They are those of the data, and no run has recorded them.
+            InputError: `xyz` is data, and no run has recorded the motions of its training data.
         """
         if isinstance(self.xyz, tuple):
             return self.xyz
@@ -79,32 +79,32 @@ class LimitsConfig(Section):
 
 
 class EnergyConfig(Section):
-    """Distance of a prediction from the goal."""
+    """Energy of a plan: the distance between prediction and goal."""
 
     distance: Annotated[Component, ComponentOf(ENERGIES, "l1")] = Component("l1")
-    """Distance of predicted and goal latents. l1: mean absolute difference (upstream). l2: mean squared difference.
-    cosine: 1 - cosine similarity of each token. Or an energy of your own (docs/extending.md)."""
+    """Distance between predicted and goal latents. l1: mean absolute difference (upstream). l2: mean squared
+    difference. cosine: 1 - cosine similarity of each token. Or the name of your energy (docs/extending.md)."""
     steps: Literal["last", "sum"] = "last"
     """last: the distance after the last step of the plan (upstream). sum: the sum over all steps."""
     samples_at_once: PositiveInt = 64
-    """Action sequences that go through the predictor at once: bounds its memory."""
+    """Number of action sequences per forward pass of the predictor; limits the memory."""
 
 
 class PlanningConfig(Section):
-    """One decision: from the current frame to an action."""
+    """How an action is planned from the current frame."""
 
     planner: Annotated[Component, ComponentOf(PLANNERS, "cem")] = Component("cem")
-    """How actions are searched: cem, icem, mppi, gradient, or a planner of your own (docs/extending.md). prior: no
-    search, the plan is the mean of `prior`."""
+    """The optimiser of the actions: cem, icem, mppi, gradient, or the name of your planner (docs/extending.md). prior:
+    no search, the plan is the mean of `prior`."""
     horizon: PositiveInt = 1
-    """Model steps that a plan spans."""
+    """Number of model steps in a plan."""
     action_repeat: PositiveInt = 1
-    """Model steps for which a plan repeats an action; the horizon is a multiple of it. Every model step makes a new
-    plan."""
+    """Number of model steps for which a plan repeats each action; the horizon must be a multiple of it. A new plan is
+    made at every model step."""
     samples: Annotated[int, Field(ge=2)] = 800
-    """Action sequences per iteration; the planner gradient has the option `starts` instead."""
+    """Number of action sequences per iteration; the planner gradient has the option `starts` instead."""
     iterations: PositiveInt = 10
-    """Iterations of sampling and fitting."""
+    """Number of iterations of sampling and fitting."""
     budget_s: Positive | None = None
     """Time limit of a search in seconds: an iteration that would end later is not started, and the best plan so far is
     used. The first iteration always runs. Encoding the frame does not count. null: all iterations run."""
@@ -114,22 +114,22 @@ class PlanningConfig(Section):
     monitor: Local | None = None
     """A monitor.json (`vjepa2-ac monitor`): each frame is compared with the prediction of the last decision."""
     warm_start: bool = False
-    """Whether a search starts from the last plan, shifted by the executed steps. Not recommended at horizon 1, where
-    the plan is the last action only: the arm overshoots (docs/decisions.md)."""
+    """Whether a search starts from the previous plan, shifted by the executed steps. Not recommended with horizon 1,
+    where the previous plan is only the previous action: the arm overshoots (docs/decisions.md)."""
     views: Annotated[int, Field(ge=1, le=4)] = 1
     """Number of cameras whose images are side by side in every frame, all of one width. The model predicts each view
-    separately, and the energy is the mean over them. A single view hardly shows depth. The model must be trained on
-    all views (`data.camera` with several names)."""
+    separately, and the energy is the mean over the views. A single view contains little information about depth. The
+    model must be trained on all views (`data.camera` with several names)."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
-    """blocks: torch.compile for the predictor's blocks; needs a C compiler, and the first decision takes a minute
-    longer. Energies are equal up to rounding."""
+    """blocks: torch.compile for the predictor's blocks. Needs a C compiler; the first decision takes a minute longer.
+    Energies are equal up to rounding."""
     axes: Local | None = None
     """Calibrated axes of the model: the axes.json of `data calibrate --axes`. Actions and poses are rotated by the
     calibrated angle before the model receives them. Only for poses in the base frame."""
     limits: LimitsConfig = LimitsConfig()
     """Limits of every action."""
     energy: EnergyConfig = EnergyConfig()
-    """Distance of a prediction from the goal."""
+    """Energy of a plan: the distance between prediction and goal."""
 
     @model_validator(mode="after")
     def _numbers_fit(self) -> PlanningConfig:

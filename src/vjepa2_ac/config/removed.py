@@ -1,4 +1,7 @@
-"""Config keys that 0.1 had: configs of older runs still load, and a config of a user gets one plain error."""
+"""Config keys of version 0.1 that were removed or moved.
+
+Configs of older runs still load; in other configs such a key is an error with an explanation.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +89,7 @@ MOVED = {
     "training.loss_options": "training.loss: {name: NAME, options: {...}}",
     "training.smooth_l1_beta": "training.loss: {name: smooth_l1, options: {beta: 1.0}}",
 }
-"""Keys and sections whose values are at another key today; of most, options of a component."""
+"""Removed keys and sections -> where their values are today; most are options of a component."""
 
 
 def why_removed(key: str) -> str | None:
@@ -106,7 +109,7 @@ def _warn(text: str, *values: object) -> None:
 def drop_removed_keys(values: dict[str, Any], where: str) -> None:
     """Delete removed keys from the config of an older run, in place.
 
-    A value whose meaning is not today's is reported as a warning.
+    A value that differs from today's fixed behaviour is reported as a warning.
 
     Args:
         values: The plain values of the config.
@@ -168,10 +171,10 @@ def move_component_options(values: dict[str, Any], where: str) -> None:
         component = section.get(key, usual) if isinstance(section, dict) else None
         component = {"name": component} if isinstance(component, str) else component
         if not isinstance(component, dict):
-            continue  # an error, which the check of the config names
+            continue  # an error that validation reports
         name = component.get("name", usual)
         if not isinstance(name, str):
-            continue  # likewise
+            continue  # an error that validation reports
         older = {one: section.pop(one, None) for one in _OLDER_OPTIONS[key]}
         if name == "smooth_l1" and "smooth_l1_beta" in older:
             older[name] = {"beta": older["smooth_l1_beta"]}

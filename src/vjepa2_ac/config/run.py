@@ -1,4 +1,4 @@
-"""Run config: the sections that make up a complete run."""
+"""The complete config of a run, and the replay section."""
 
 from __future__ import annotations
 
@@ -26,20 +26,21 @@ def _run_folder(path: str) -> str:
 
 
 class ReplayConfig(Section):
-    """Clips of a second data set, mixed into training against forgetting: those of the base, or of varied motion.
+    """A second data set whose clips are mixed into training to reduce forgetting.
 
-    Validation, evaluation and planning know the first data set only.
+    It is for example the training data of the base model, or data with diverse motion. Validation, evaluation and
+    planning use the first data set only.
     """
 
     share: Annotated[float, Field(gt=0.0, lt=1.0), Affects.RUN] = 0.25
-    """Share of the training clips that come from it, evenly spread over the run."""
+    """Share of the training clips that come from the replay data set, evenly spread over the run."""
     data: Annotated[DataConfig, Affects.RUN]
-    """The second data set: its `path`, and the keys of `data` that differ; the others are those of `data`, except
-    `exclude`, and `camera` if the source differs. As many frames, the same kind of states and actions, and latents of a
-    cache if the first one's clips are. Only its training split is used, and its `workers` are not."""
+    """The replay data set: `path`, and the keys that differ from `data`. All other keys are inherited from `data`,
+    except `exclude`, and `camera` if the source differs. Frames per clip, kind of states and actions, and use of a
+    latent cache must be the same as in `data`. Only the training split is used; `workers` is ignored."""
 
     def misfits(self, first: DataConfig) -> list[str]:
-        """Return why clips of both cannot be in one micro-batch, as far as their configs say."""
+        """Return why clips of both data sets cannot be in one micro-batch, as far as their configs show."""
         same = ("frames", "states", "actions", "join_actions", "pose_frame")
         pairs = [(name, getattr(self.data, name), getattr(first, name)) for name in same]
         lines = [f"replay.data.{name} {one} is not data.{name} {other}" for name, one, other in pairs if one != other]
@@ -54,30 +55,30 @@ class Config(Section):
     """A complete run."""
 
     run_dir: Annotated[str, AfterValidator(_run_folder), Affects.NOTHING]
-    """Folder of the run, on this machine: resolved config, checkpoints, metrics. `checkpoint.remote` keeps a copy."""
+    """Local folder of the run: resolved config, checkpoints, metrics. `checkpoint.remote` keeps a copy."""
     seed: Annotated[int, Field(ge=0, lt=2**31), Affects.RUN | Affects.PLAN] = 0
-    """Decides the order of clips, fresh weights and dropout."""
+    """Seed of the order of clips, new weights, dropout and the planner's samples."""
     plugins: Annotated[tuple[str, ...], Affects.NOTHING] = ()
-    """Modules of your own, imported before this config is checked: they register forms of data, transforms, losses,
-    planners, metrics, energies and trackers (docs/extending.md). Installed packages need not be named."""
+    """Your modules, imported before the config is validated: they register data formats, transforms, losses, planners,
+    metrics, energies and trackers (docs/extending.md). Plug-ins of installed packages need not be listed."""
     data: DataConfig
-    """The data set, and the clips made of it."""
+    """The data set and the clips made from it."""
     replay: ReplayConfig | None = None
-    """A second data set that a share of the training clips comes from; null: none."""
+    """A second data set for a share of the training clips; null: none."""
     model: ModelConfig
     """Which world model to start from."""
     adapter: Annotated[AdapterConfig, Affects.RUN] = AdapterConfig()
     """What is trained."""
     training: Annotated[TrainingConfig, Affects.RUN] = TrainingConfig()
-    """How the weights change."""
+    """Optimization, losses and computation."""
     validation: Annotated[ValidationConfig, Affects.RUN] = ValidationConfig()
     """Validation before the first step and during training."""
     checkpoint: Annotated[CheckpointConfig, Affects.NOTHING] = CheckpointConfig()
-    """Checkpoints, here and elsewhere."""
+    """Checkpoints, and their copies on remote storage."""
     tracking: Annotated[TrackingConfig, Affects.NOTHING] = TrackingConfig()
-    """Where metrics go."""
+    """Experiment trackers that receive the metrics."""
     planning: Annotated[PlanningConfig, Affects.PLAN] = PlanningConfig()
-    """How a robot is controlled afterwards; training does not use it."""
+    """How actions are planned with the trained model; training does not use it."""
     decoder: Annotated[DecoderConfig, Affects.NOTHING] = DecoderConfig()
     """The decoder of `vjepa2-ac decoder`; training does not use it."""
 
@@ -98,7 +99,7 @@ class Config(Section):
         training, adapter, model, best = self.training, self.adapter, self.model, self.checkpoint.keep_best
         predictor, steps, lora = model.sizes.predictor, training.rollout_steps, adapter.kind == "lora"
         graph, fp32, compiled = training.cuda_graph, training.precision == "fp32", training.compile != "off" and lora
-        draws_or_scales = training.precision == "fp16" or adapter.dropout > 0  # which a graph would repeat
+        draws_or_scales = training.precision == "fp16" or adapter.dropout > 0  # a graph would repeat masks and scale
         patient, ranked = training.patience is not None, self.validation.ranking_clips > 0
         stray = [name for name in ("targets", "modules_to_save") if "state_encoder" in getattr(adapter, name)]
         stray = stray if lora and not predictor.use_states else []
@@ -119,18 +120,18 @@ class Config(Section):
 
     @property
     def data_sets(self) -> tuple[DataConfig, ...]:
-        """The data set, and that of `replay` where there is one."""
+        """The data set and, if configured, the replay data set."""
         return (self.data,) if self.replay is None else (self.data, self.replay.data)
 
     def with_stride(self, stride: int) -> Config:
-        """Return the config with a stride that was found out."""
+        """Return the config with a calibrated stride."""
         return self.model_copy(update={"data": self.data.with_stride(stride)})
 
     def for_replay(self) -> Config:
         """Return the config of a run on the data set of `replay` alone.
 
         Raises:
-            ValueError: There is none.
+            ValueError: There is no replay data set.
         """
         if self.replay is None:
             raise ValueError("a config without replay")
@@ -138,7 +139,7 @@ class Config(Section):
 
 
 def with_complete_replay(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the plain values of a config in which `replay.data` has the keys of `data` that it does not give."""
+    """Return the plain values of a config, with `replay.data` completed by the keys that it inherits from `data`."""
     data, replay = values.get("data"), values.get("replay")
     if not (isinstance(data, dict) and isinstance(replay, dict) and isinstance(second := replay.get("data"), dict)):
         return values
@@ -146,7 +147,7 @@ def with_complete_replay(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _inherited(data: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of `data` that a second data set takes where it gives none."""
+    """Return the values of `data` that the replay data set inherits."""
     dropped = {"path", "exclude"}
     source = second.get("source", source_of(data))
     if source != source_of(data):
@@ -156,13 +157,13 @@ def _inherited(data: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, 
 
 
 def _merged(base: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of both, those of the second where both have some; sections are merged key by key."""
+    """Return the values of both mappings; `other` overrides `base`, and sections are merged key by key."""
     sections = {key for key in base.keys() & other if isinstance(base[key], dict) and isinstance(other[key], dict)}
     return {**base, **other, **{key: {**base[key], **other[key]} for key in sections}}
 
 
 def _differences(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values that `_merged` needs to make them of a base; of sections likewise."""
+    """Return the values that differ from `base`, also within sections: the inverse of `_merged`."""
     differing = {}
     for key, value in values.items():
         before = base.get(key)

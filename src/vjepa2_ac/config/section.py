@@ -1,9 +1,9 @@
-"""Base class of config sections: frozen, strict, every key documented; what each key affects; and components.
+"""Base class of config sections, annotations that say what each key affects, and components with options.
 
-A section has one mark: `Section.affects`, or `Annotated[…, Affects.RUN]` where the section is used. A key that differs
-has a mark of its own.
+A section is annotated as a whole: by `Section.affects`, or by `Annotated[…, Affects.RUN]` where the section is used. A
+key that differs from its section has an annotation in addition.
 
-A component is given by its name, with options of its own: `planner: icem`, or
+A component is configured by its name and, if needed, its options: `planner: icem`, or
 `planner: {name: icem, options: {elites: 20}}`.
 """
 
@@ -22,46 +22,46 @@ from pydantic_core import core_schema
 from vjepa2_ac.registry import Registry
 from vjepa2_ac.storage import places
 
-PositiveInt = Annotated[int, Field(ge=1, le=1_000_000_000)]  # no machine has memory for more of anything
+PositiveInt = Annotated[int, Field(ge=1, le=1_000_000_000)]  # larger values would exceed any memory
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 ZeroToOne = Annotated[float, Field(ge=0.0, le=1.0)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 OFF = BeforeValidator(lambda value: "off" if value is False else value)  # YAML reads off as a boolean
-Place = Annotated[str, AfterValidator(places.anywhere)]  # on this machine, where ~ is the user's home, or a URL
-Local = Annotated[str, AfterValidator(places.on_this_machine)]  # likewise, but no URL
-LocalOrBuiltin = Annotated[str, AfterValidator(places.of_a_model)]  # likewise, or a part of the package
+Place = Annotated[str, AfterValidator(places.anywhere)]  # a local path (~ is the user's home) or a URL
+Local = Annotated[str, AfterValidator(places.on_this_machine)]  # a local path
+LocalOrBuiltin = Annotated[str, AfterValidator(places.of_a_model)]  # a local path, or builtin:NAME
 
 
 class Affects(Flag):
-    """What changes when a config key has another value."""
+    """What a config key affects."""
 
-    NOTHING = 0  # only speed, paths and outputs
-    LATENTS = auto()  # a latent cache
-    MEASURED = auto()  # what a validation measures; the clips are compared separately
+    NOTHING = 0  # nothing but speed, paths and outputs
+    LATENTS = auto()  # the content of a latent cache
+    MEASURED = auto()  # the metrics of a validation; its clips are compared separately
     RUN = auto()  # the result of training: a run cannot resume with another value
-    PLAN = auto()  # a decision of the planner
+    PLAN = auto()  # the decisions of the planner
     CLIPS = LATENTS | MEASURED | RUN
 
 
 class Section(BaseModel):
     """A group of config keys: frozen, and unknown keys are errors."""
 
-    affects: ClassVar[Affects | None] = None  # the mark of keys without a mark; None: that of the outer section
+    affects: ClassVar[Affects | None] = None  # for keys without an annotation; None: as the outer section
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
     def refused(self, *rules: tuple[object, str]) -> Self:
-        """Return the section if no rule is broken; called by validators.
+        """Return the section, or raise an error if a rule is broken; called by validators.
 
         Args:
             rules: Pairs (is_broken, message).
 
         Raises:
-            ValueError: With the message of the first broken rule.
+            ValueError: A rule is broken; has the message of the first one.
         """
         for is_broken, why in rules:
             if is_broken:
@@ -69,25 +69,25 @@ class Section(BaseModel):
         return self
 
 
-OVERLAY = "replay.data"  # the keys of `data` that differ in a second data set
+OVERLAY = "replay.data"  # contains the keys of `data` that differ in the replay data set
 
 
 @cache
 def marks_of(section: type[BaseModel]) -> Mapping[str, Affects]:
-    """Return the mark of each key of a section and of the sections in it, by its dotted key.
+    """Return what each key of a section and of its inner sections affects, by dotted key.
 
     Raises:
-        TypeError: A key has no mark.
+        TypeError: A key has no annotation.
     """
     return dict(_marks(section, getattr(section, "affects", None), ""))
 
 
 @cache
 def mark_of(key: str, section: type[BaseModel]) -> Affects:
-    """Return the mark of a key, or of the key that has a value such as data.fields.cameras.left.
+    """Return what a key affects; for a part of a value, such as data.fields.cameras.left, what the whole key affects.
 
-    The mark of a section combines those of its keys. The keys of `replay.data` are those of `data`; a second data set
-    affects the run only.
+    For a section the annotations of its keys are combined. The keys of `replay.data` are those of `data`, but affect
+    the run only.
 
     Raises:
         KeyError: There is no such key.
@@ -107,10 +107,10 @@ def key_of_data(key: str) -> str:
 
 
 def values_that_affect(what: Affects, section: BaseModel) -> dict[str, Any]:
-    """Return the values of the keys of a section that affect any of these, as nested plain values.
+    """Return the values of the keys of a section that affect any of `what`, as nested plain values.
 
     Raises:
-        TypeError: As `marks_of`.
+        TypeError: A key has no annotation.
     """
     plain: dict[str, Any] = section.model_dump(mode="json")
     chosen: dict[str, Any] = {}
@@ -141,7 +141,7 @@ def _marks(section: type[BaseModel], outer: Affects | None, prefix: str) -> Iter
 
 
 def sections_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the sections that a key of this type may hold."""
+    """Return the sections that occur in a type annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [section for one in get_args(annotation) for section in sections_in(one)]
@@ -160,15 +160,15 @@ class Component:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def plain(self) -> str | dict[str, Any]:
-        """Return the component as a config file holds it."""
+        """Return the component as plain values, as in a config file."""
         return {"name": self.name, "options": dict(self.options)} if self.options else self.name
 
 
 @dataclass(frozen=True)
 class ComponentOf:
-    """Marks a config key that holds a component, as in `Annotated[Component, ComponentOf(PLANNERS, "cem")]`.
+    """The annotation of a config key that is a component, as in `Annotated[Component, ComponentOf(PLANNERS, "cem")]`.
 
-    The options are checked by the `Config` class of the component when the config is read.
+    Reading a config checks the options with the `Config` class of the component.
 
     Args:
         registry: The registry of the components.
@@ -179,7 +179,7 @@ class ComponentOf:
     usual: str | None = None
 
     def read(self, value: object) -> Component:
-        """Return the component that a config value means.
+        """Parse a config value.
 
         Raises:
             ValueError: The value has another form, or the registry has no component of this name with these options.
@@ -194,12 +194,12 @@ class ComponentOf:
         return Component(name, self.registry.changed_options(self.registry.known(name), options))
 
     def __get_pydantic_core_schema__(self, _source: Any, _handler: Any) -> core_schema.CoreSchema:
-        """Return the schema by which pydantic reads and writes the key."""
+        """Return the schema with which pydantic reads and writes the key."""
         plain = core_schema.plain_serializer_function_ser_schema(Component.plain)
         return core_schema.no_info_plain_validator_function(self.read, serialization=plain)
 
     def __get_pydantic_json_schema__(self, _schema: Any, _handler: Any) -> dict[str, Any]:
-        """Return the JSON schema: the names, and the options of each component that has some."""
+        """Return the JSON schema: the names of the components, and their options."""
         names = self.registry.names()
         with_options = [
             {

@@ -1,4 +1,4 @@
-"""Source options: the forms of data, where each stores what the model needs, and what each can."""
+"""Config keys of the data formats: RLDS, LeRobot, raw DROID, npz and latent caches."""
 
 from __future__ import annotations
 
@@ -9,31 +9,34 @@ from pydantic import Field
 from vjepa2_ac.config.data import DataConfig, PoseFields
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
-RAW_RATE_HZ = 15.0  # control steps of raw DROID; an MP4 holds one frame for each, whatever its header says
-JOINT_VELOCITY = "action.joint_velocity"  # LeRobot's column of commanded joint velocities, which the idle filter reads
+RAW_RATE_HZ = (
+    15.0  # control steps per second of raw DROID; its MP4s have one frame per step, whatever their header says
+)
+JOINT_VELOCITY = "action.joint_velocity"  # LeRobot's column of commanded joint velocities, read by the idle filter
 
-RECORD: Literal["record"] = "record"  # as an identity
+RECORD: Literal["record"] = "record"  # a value of `identity`
 
 _Names = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
 class RldsFields(PoseFields):
-    """Where an RLDS data set stores what the model needs; the defaults are DROID's."""
+    """Features of an RLDS data set; the defaults are DROID's."""
 
     state: _Names = (
         "steps/observation/cartesian_position",
         "steps/observation/gripper_position",
     )
-    """Features whose numbers, concatenated, hold position, rotation and gripper of the *measured* state; for
+    """Features whose concatenated numbers are position, rotation and gripper of the *measured* state; with
     `states: vector` any numbers."""
     action: _Names = ("steps/action",)
-    """For `actions: recorded`: features that form, concatenated, the *commanded* action of each control step."""
+    """For `actions: recorded`: features whose concatenated numbers are the *commanded* action of each control step."""
     identity: _Names | Literal["record"] = (
         "episode_metadata/recording_folderpath",
         "episode_metadata/file_path",
     )
-    """Features that name an episode; the split into train, validation and test is a hash of them. record: split, file
-    and number of the record, for sets without such features; the split then changes if the set is written again."""
+    """Features that identify an episode; the split into train, validation and test is a hash of them. record: split,
+    file and index of the record, for data sets without such features; the split then changes if the data set is written
+    again."""
     cameras: Annotated[dict[str, str], Field(min_length=1)] = {
         "exterior_1_left": "steps/observation/exterior_image_1_left",
         "exterior_2_left": "steps/observation/exterior_image_2_left",
@@ -41,28 +44,28 @@ class RldsFields(PoseFields):
     }
     """Camera name -> feature with its frames."""
     language: str | None = "steps/language_instruction"
-    """Feature stored in the episode's metadata; the model does not use it."""
+    """Feature with the language instruction, kept in the episode's metadata; the model does not use it."""
     joint_velocity: str | None = "steps/action_dict/joint_velocity"
-    """Feature with the *commanded* joint velocities, read by the idle filter; null: there is none."""
+    """Feature with the *commanded* joint velocities, read by the idle filter; null: there is no such feature."""
     control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 15.0
-    """Control steps per second (RLDS does not say)."""
+    """Control steps per second, which RLDS files do not contain."""
 
     @property
     def identity_features(self) -> tuple[str, ...]:
-        """The features that name an episode; none if the record does."""
+        """The features that identify an episode; empty with `identity: record`."""
         return () if self.identity == RECORD else self.identity
 
 
 class LeRobotFields(PoseFields):
-    """Where a LeRobot data set stores what the model needs; the defaults are those of DROID's ports."""
+    """Columns of a LeRobot data set; the defaults are those of DROID's ports."""
 
     state: _Names = (
         "observation.state.cartesian_position",
         "observation.state.gripper_position",
     )
-    """Columns that hold position, rotation and gripper of the *measured* state; for `states: vector` any numbers."""
+    """Columns with position, rotation and gripper of the *measured* state; with `states: vector` any numbers."""
     action: _Names = ("action",)
-    """For `actions: recorded`: columns that form, concatenated, the *commanded* action of each control step."""
+    """For `actions: recorded`: columns whose concatenated numbers are the *commanded* action of each control step."""
     cameras: Annotated[dict[str, str], Field(min_length=1)] = {
         "exterior_1_left": "observation.images.exterior_1_left",
         "exterior_2_left": "observation.images.exterior_2_left",
@@ -70,7 +73,7 @@ class LeRobotFields(PoseFields):
     }
     """Camera name -> video feature."""
     success: str | None = "is_episode_successful"
-    """Column with the episode's success, used if there is one."""
+    """Column with the success of the episode; ignored if the data set has no such column."""
 
 
 class RldsData(DataConfig):
@@ -89,7 +92,7 @@ class RldsData(DataConfig):
 
 
 class RawDroidData(DataConfig):
-    """DROID's own folders."""
+    """DROID's raw recordings."""
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.droid_raw:RawDroidSource"
     has_vectors: ClassVar[bool] = False
@@ -103,7 +106,7 @@ class RawDroidData(DataConfig):
 
     @property
     def offered_cameras(self) -> tuple[str, ...]:
-        """By their place on the robot, the left exterior one first; or by a serial number."""
+        """The camera names by mounting position, the left exterior camera first. Serial numbers are allowed, too."""
         return RAW_CAMERAS
 
 
@@ -130,23 +133,23 @@ class NpzData(DataConfig):
 
     @property
     def first_camera(self) -> str:
-        """The array of that name."""
+        """The array `frames`."""
         return "frames"
 
 
 class LatentsData(DataConfig):
-    """A latent cache alone."""
+    """A latent cache without the data set it was made from."""
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.latents:LatentSource"
     is_cache: ClassVar[bool] = True
 
     source: Literal["latents"] = "latents"
-    """latents: a latent cache alone, without the data set that it was made from."""
+    """latents: a latent cache, without the data set it was made from."""
 
     @property
     def first_camera(self) -> str:
-        """All that were encoded."""
+        """All encoded cameras."""
         return "all"
 
 
-DataConfig.model_rebuild(force=True)  # the union of these
+DataConfig.model_rebuild(force=True)  # builds the union of these classes

@@ -27,60 +27,63 @@ DecoderSize = Literal["tiny", "small", "medium"]
 
 
 def usual_warmup(values: dict[str, Any]) -> int:
-    """Return the default of `training.warmup_steps` for these values of `training`."""
+    """Return the default of `training.warmup_steps` for the values of the section `training`."""
     return min(1_000, int(values.get("steps", 0)) // 10)
 
 
 class TrainingConfig(Section):
-    """How the weights change."""
+    """Optimization, losses and computation."""
 
     steps: PositiveInt = 100_000
-    """Optimizer steps."""
+    """Number of optimizer steps."""
     batch_size: PositiveInt = 2
-    """Clips per process and micro-batch."""
+    """Number of clips per process and micro-batch."""
     accumulation: PositiveInt = 16
-    """Micro-batches of each process per optimizer step. A run resumed with another number of processes keeps the
-    clips of a step: accumulation then follows from that."""
+    """Number of micro-batches per process and optimizer step. A run that resumes with another number of processes keeps
+    the number of clips per step, and accumulation changes accordingly."""
     rollout_steps: Annotated[int, Field(ge=1, le=64)] = 2
-    """Predictions of the rollout loss; the first is teacher-forced, each further one uses the previous prediction."""
+    """Number of predictions in the rollout loss; the first is teacher-forced, each further one uses the previous
+    prediction."""
     loss: Annotated[Component, ComponentOf(LOSSES, "l1")] = Component("l1")
-    """Distance of predicted and true latents. l1: absolute (released). l2: squared. smooth_l1: squared only below its
-    option beta. Or a loss of your own (docs/extending.md)."""
+    """Difference between predicted and true latents. l1: absolute (released). l2: squared. smooth_l1: squared below its
+    option beta, absolute above. Or the name of your loss (docs/extending.md)."""
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-4
     """Peak learning rate."""
     schedule: Literal["cosine", "warmup_stable_decay"] = "cosine"
-    """Both begin with a linear warm-up from 0. cosine: then half a cosine to 0. warmup_stable_decay: then constant, and
-    a linear decay to 0 in the last decay_steps."""
+    """Both start with a linear warm-up from 0. cosine: then half a cosine down to 0. warmup_stable_decay: then
+    constant, with a linear decay to 0 in the last decay_steps."""
     warmup_steps: Count = Field(default_factory=usual_warmup)
-    """Optimizer steps of the linear warm-up; unless given 1,000, or a tenth of the steps where that is less."""
+    """Number of optimizer steps of the linear warm-up. Default: the smaller of 1,000 and a tenth of the steps."""
     decay_steps: Count = 0
-    """Optimizer steps of the final decay, warmup_stable_decay only; 0: the rate stays constant to the end."""
+    """Number of optimizer steps of the final decay, for warmup_stable_decay only; 0: the rate stays constant."""
     optimizer: Literal["adamw", "adamw_8bit"] = "adamw"
-    """adamw_8bit stores the moments of matrices of 4,096 elements and more in 8 bits: bitsandbytes, extra 8bit."""
+    """adamw_8bit stores the moments of matrices with at least 4,096 elements in 8 bits. Needs bitsandbytes (extra
+    8bit)."""
     weight_decay: ZeroToOne = 0.04
-    """AdamW's decay; biases and norms are exempt."""
+    """Weight decay of AdamW; biases and norms are excluded."""
     max_grad_norm: Positive | None = 1.0
-    """Gradients are clipped to this norm; null: never (the released recipe)."""
+    """Gradients are clipped to this norm; null: no clipping (the released recipe)."""
     precision: Annotated[Literal["bf16", "fp16", "fp32"], Affects.LATENTS | Affects.RUN] = "bf16"
-    """Arithmetic of the networks (autocast). bf16 needs compute capability 8.0 on CUDA; fp16 needs CUDA, too."""
+    """Precision of the computation (autocast). On CUDA bf16 needs compute capability 8.0; fp16 needs CUDA."""
     gradient_checkpointing: bool = False
-    """Compute each predictor block again in the backward pass instead of keeping its activations."""
+    """Recompute each predictor block in the backward pass instead of storing its activations."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
-    """blocks: torch.compile for the predictor's blocks, in training steps only; needs a C compiler, and a minute before
-    the first step. The same losses and gradients to rounding; dropout draws other masks."""
+    """blocks: torch.compile for the predictor's blocks, in training steps only. Needs a C compiler, and a minute before
+    the first step. Losses and gradients are equal up to rounding; dropout draws other masks."""
     cuda_graph: bool = False
-    """Launch a micro-batch as one CUDA graph: faster where Python is slower than the GPU. Dropout must be 0."""
+    """Launch a micro-batch as one CUDA graph: faster if Python is slower than the GPU. Dropout must be 0."""
     attention: Literal["auto", "per_step"] = "auto"
-    """auto: FlexAttention in training steps on CUDA, which is compiled for each size of a batch. per_step: one plain
-    attention for each model step, which compiles nothing. The same losses and gradients to rounding."""
+    """auto: FlexAttention in training steps on CUDA, compiled for each batch size. per_step: plain attention for each
+    model step, without compilation. Losses and gradients are equal up to rounding."""
     device: Annotated[Literal["auto", "cpu", "cuda"], Affects.RUN | Affects.PLAN] = "auto"
-    """auto: CUDA where there is one."""
+    """auto: CUDA if available, otherwise the CPU."""
     allow_weak_base: Annotated[bool, Affects.NOTHING] = False
-    """Train even if the base is no better than persistence (copy the last frame) on the validation clips."""
+    """Train even if the base model is not better than persistence (copying the last frame) on the validation clips."""
     patience: Annotated[PositiveInt | None, Affects.NOTHING] = None
-    """Validations without a better one (`checkpoint.keep_best`) after which training ends; null: all steps are done."""
+    """Number of consecutive validations without improvement (`checkpoint.keep_best`) after which training ends; null:
+    training ends after all steps."""
     log_every: Annotated[PositiveInt, Affects.NOTHING] = 10
-    """Optimizer steps between lines in metrics.jsonl."""
+    """Number of optimizer steps between two lines in metrics.jsonl."""
 
     @model_validator(mode="after")
     def _parts_fit(self) -> TrainingConfig:
@@ -95,54 +98,57 @@ class ValidationConfig(Section):
     """Validation before the first step and during training."""
 
     every: PositiveInt = 1_000
-    """Optimizer steps between validations."""
+    """Number of optimizer steps between validations."""
     clips: PositiveInt = 64
-    """Clips of held-out episodes, always the same ones."""
+    """Number of clips of held-out episodes; the same clips in every validation."""
     batch_size: Annotated[int, Field(ge=2)] = 4
-    """Clips that are evaluated at once."""
+    """Number of clips per batch."""
     ranking_clips: Annotated[int, Field(ge=0), Affects.MEASURED] = 32
-    """Of these clips, how many have the true action of a move ranked among others: what planning needs (docs/
-    evaluation.md). Two moves each, as large as planned ones, forwards and backwards. 0: none."""
+    """Number of these clips on which the action-ranking error is measured, which shows whether a model can plan (docs/
+    evaluation.md). Two motions of each clip are used, as large as planned ones, forwards and backwards. 0: none."""
     ranking_samples: Annotated[PositiveInt, Affects.MEASURED] = 32
-    """Other actions per move, drawn in each of two ways: in a box of 7.5 cm to each side, and of the same length in any
-    direction."""
+    """Number of alternative actions per motion, drawn twice: from a box of 7.5 cm to each side, and with the length of
+    the true action in random directions."""
     decoder: Annotated[LocalOrBuiltin | None, Affects.NOTHING] = None
-    """Folder of a decoder (docs/decoding.md), or builtin:sim-tiny: with it each validation draws what base and model
-    imagine of one validation clip, the one with the most motion: in RUN/imagined and in the trackers. null: none."""
+    """Folder of a decoder (docs/decoding.md), or builtin:sim-tiny: each validation then draws the frames that base
+    model and trained model predict for the validation clip with the most motion, in RUN/imagined and in the trackers.
+    null: no images."""
 
 
 class CheckpointConfig(Section):
-    """Checkpoints, here and elsewhere."""
+    """Checkpoints, and their copies on remote storage."""
 
     every: PositiveInt = 1_000
-    """Optimizer steps between checkpoints; one is also written when the last one is 15 minutes old."""
+    """Number of optimizer steps between checkpoints; one is also saved when the last one is 15 minutes old."""
     keep: PositiveInt = 5
     """Number of newest checkpoints that are kept."""
     keep_best: Annotated[Literal["ranking", "error", "off"], OFF, Affects.MEASURED] = "ranking"
-    """By what the best checkpoint is selected; it is written and kept, and evaluated, exported and planned with unless
-    another is asked for. ranking: the lowest action-ranking error (`validation.ranking_clips`); among those within half
-    a percentage point, the lowest error; the base is a candidate, because a lower error may go with worse plans. error:
-    the rollout error over persistence at the last horizon. off: the newest counts."""
+    """The criterion for the best checkpoint. The best checkpoint is saved and kept, and is the default for evaluation,
+    export and planning. ranking: the lowest action-ranking error (`validation.ranking_clips`), and among those within
+    half a percentage point of it the lowest rollout error; the untrained state is a candidate, because a lower error
+    may come with worse plans. error: the rollout error relative to persistence at the last horizon. off: no best
+    checkpoint, the default is the newest."""
     remote: Place | None = None
-    """Where the run is copied to during training: gs://bucket/folder, another URL of fsspec that can be written, or a
-    folder. A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as here."""
+    """Where the run is copied during training: gs://bucket/folder, another writable fsspec URL, or a folder. A start
+    with an empty run_dir resumes from the copy. The copy has the same checkpoints. null: no copy."""
     remote_every_minutes: NonNegative = 30.0
     """Minutes between uploads to remote; there is also one at the end and on preemption."""
     remote_wait_seconds: NonNegative = 120.0
-    """How long a preempted run waits for that; shorter than the notice period of the machine."""
+    """How long a preempted run waits for the upload, in seconds; shorter than the notice period of the machine."""
 
 
 class TrackingConfig(Section):
-    """Where metrics go, besides metrics.jsonl in the run folder."""
+    """Experiment trackers that receive the metrics in addition to metrics.jsonl in the run folder."""
 
     tensorboard: bool = True
-    """Event files in RUN/tensorboard, extra tensorboard. Without the extra a run prints how to install it."""
+    """TensorBoard event files in RUN/tensorboard (extra tensorboard). Without the extra a run prints how to install
+    it."""
     wandb: Literal["disabled", "online", "offline"] = "disabled"
-    """Weights & Biases, extra wandb. offline: files in RUN/wandb, which `wandb sync` sends later."""
+    """Weights & Biases (extra wandb). offline: files in RUN/wandb, which `wandb sync` uploads later."""
     trackio: bool = False
-    """trackio, extra trackio: stored where trackio stores its runs (TRACKIO_DIR), shown by `trackio show`."""
+    """trackio (extra trackio): stored in trackio's folder (TRACKIO_DIR), shown by `trackio show`."""
     others: Annotated[dict[str, dict[str, Any]], TRACKERS.things_in_schema] = {}
-    """Trackers of your own (docs/extending.md), by name, each with its options: {} where it has none."""
+    """Your trackers (docs/extending.md): name -> options, {} for none."""
 
     @model_validator(mode="after")
     def _others_are_known(self) -> TrackingConfig:
@@ -152,18 +158,20 @@ class TrackingConfig(Section):
 
 
 class DecoderConfig(Section):
-    """The decoder that `vjepa2-ac decoder` trains: it shows what the encoder's latents hold."""
+    """The decoder that `vjepa2-ac decoder` trains, to display latents as frames."""
 
     folder: Annotated[Local | None, Affects.NOTHING] = None
-    """Folder of the decoder; null: `decoder`, beside run_dir. It is made for an encoder and a camera, not for a run."""
+    """Folder of the decoder; null: the folder `decoder` next to run_dir. A decoder belongs to an encoder and a camera,
+    not to a run."""
     size: DecoderSize = "small"
-    """Parameters at the released sizes: tiny 2 M, for small encoders; small 27 M; medium 96 M."""
+    """Size of the decoder; with the released encoder tiny (for small encoders) has 2 M parameters, small 27 M, medium
+    96 M."""
     frames: PositiveInt = 40_000
-    """Frames to learn from, at most, spread over the training episodes; each is encoded once. They take 0.9 MB of disk
-    each at the released sizes with data.cache_dtype bf16, 0.6 MB with int8, until training ends."""
+    """Maximum number of training frames, spread over the training episodes; each is encoded once. With the released
+    encoder each takes 0.9 MB of disk with data.cache_dtype bf16, 0.6 MB with int8, until training ends."""
     steps: PositiveInt = 20_000
-    """Optimizer steps."""
+    """Number of optimizer steps."""
     batch_size: PositiveInt = 64
-    """Frames of a step."""
+    """Number of frames per step."""
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 5e-4
-    """Peak learning rate; it falls to none by half a cosine."""
+    """Peak learning rate, followed by half a cosine down to 0."""
