@@ -256,13 +256,13 @@ _OLDER_GRIPPERS = {"closedness": {}, "openness": {"gripper_open": 1.0, "gripper_
 
 
 def _replace_keys_of_model(model: dict[str, Any]) -> None:
-    """Replace the key `model.random` of 0.1 (the sizes of a new predictor) by `base: random` and `sizes`."""
+    """Replace the key `random` of 0.1 (the sizes of a new predictor) by `base: random` and `sizes`."""
     if (sizes := model.pop("random", None)) is not None:
         model.update(base=RANDOM, sizes=sizes)
 
 
 def _replace_older_keys(values: dict[str, Any]) -> None:
-    """Replace keys of older runs, `data.fields.gripper` and two schedules, by the equivalent keys of today."""
+    """Replace keys of older runs (`gripper` in `data.fields`, and two schedules) by the equivalent keys of today."""
     for section, inner in values.items():
         if section == "training" and isinstance(inner, dict) and inner.get("schedule") in ("constant", "linear"):
             decay_steps = _steps_after_warmup(inner) if inner["schedule"] == "linear" else 0

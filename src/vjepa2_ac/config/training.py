@@ -130,7 +130,8 @@ class CheckpointConfig(Section):
     checkpoint, the default is the newest."""
     remote: Place | None = None
     """Where the run is copied during training: gs://bucket/folder, another writable fsspec URL, or a folder. A start
-    with an empty run_dir resumes from the copy. The copy has the same checkpoints. null: no copy."""
+    with an empty run_dir resumes from the copy. `keep` and the best checkpoint apply to the copy, too. null: no
+    copy."""
     remote_every_minutes: NonNegative = 30.0
     """Minutes between uploads to remote; there is also one at the end and on preemption."""
     remote_wait_seconds: NonNegative = 120.0
