@@ -1,1 +1,1 @@
-"""A run on disk: its folder, checkpoints, metrics log, lock, and its mirror elsewhere."""
+"""Runs on disk: run folder, checkpoints, metrics log, lock, and the mirror on remote storage."""

@@ -1,8 +1,8 @@
-"""Checkpoints for an exact resume of a run: adapter, optimizer and step; never the frozen base.
+"""Checkpoints from which a run resumes exactly: adapter, optimizer and step, without the frozen base model.
 
-A checkpoint is a folder `step-00001000` with `manifest.json`, which holds the SHA-256 of every other file. It is
-written under a temporary name and renamed, so a folder with the final name is complete or was damaged later; the
-manifest shows which. A folder with any other name, such as `step-00001000.bak`, is the user's own and is left alone.
+A checkpoint is a folder `step-00001000` with `manifest.json`, which contains the SHA-256 of every other file. It is
+written under a temporary name and then renamed. A folder with the final name is therefore complete, or was damaged
+later, which the manifest shows. Folders with other names, such as `step-00001000.bak`, are never changed.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from vjepa2_ac.storage.structured import MOST_BYTES, json_object, read_json_obje
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINTS = "checkpoints"  # of a run's folder
+CHECKPOINTS = "checkpoints"  # subfolder of a run folder
 STATE = "state.json"
 MANIFEST = "manifest.json"
-ADAPTER = "adapter"  # a folder: what `model.adapter_folder.save_trained` writes
+ADAPTER = "adapter"  # subfolder, written by `model.adapter_folder.save_trained`
 OPTIMIZER = "optimizer.pt"
-FETCHING = ".fetching-"  # a checkpoint being fetched, see `runs.mirror`
+FETCHING = ".fetching-"  # prefix of a checkpoint that is being downloaded, see `runs.mirror`
 
 _WRITING = ".writing-"
 SELECTED, NEWEST, BEST = "selected", "newest", "best"
@@ -44,49 +44,49 @@ _NEEDED = "where a run stood, as this program wrote it"
 _FIX = "Delete this checkpoint, to use an older one"
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
-SAME_RANK = 0.005  # mean ranks this close are equal: on other clips they differ by more
+SAME_RANK = 0.005  # smaller differences of the action-ranking error are ignored: other clips change it by more
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
 class DataState:
-    """What a run has seen of a data set."""
+    """A data set as used by a run so far."""
 
-    fingerprint: str  # of its episodes
-    windows: Count  # clips of an epoch: their order depends on the number
-    broken: Mapping[str, str]  # episodes whose clips could not be read, and why
+    fingerprint: str  # hash of the episodes
+    windows: Count  # number of clips per epoch, on which their order depends
+    broken: Mapping[str, str]  # episodes that could not be read -> reason
 
 
 @dataclass(frozen=True)
 class RunState:
     """Progress of a run. Data order, learning rate and random numbers are functions of the step."""
 
-    step: Count  # optimizer steps done
-    run_id: str = ""  # a random name that stays with the run wherever it is resumed
+    step: Count  # completed optimizer steps
+    run_id: str = ""  # random name of the run, the same on every machine
     clips_done: Count = 0  # position in the sequence of clips of the whole run
-    clips_per_step: PositiveInt | None = None  # of all processes
-    clips_asked: PositiveInt | None = None  # of one process, by the config: batch_size * accumulation
+    clips_per_step: PositiveInt | None = None  # summed over all processes
+    clips_asked: PositiveInt | None = None  # per process, from the config: batch_size * accumulation
     processes: PositiveInt = 1
-    best_step: Count | None = None  # the best validation by checkpoint.keep_best; 0: the base's
-    best_error: Finite | None = None  # its rollout error
-    best_rank: Finite | None = None  # its mean rank of the true action, if that selects
-    lowest_rank: Finite | None = None  # of all validations
-    base_rank: Finite | None = None  # mean rank of the true action before the first step, if that selects
-    measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.resume`
-    loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
-    data: tuple[DataState, ...] = ()  # of its data set, and of the replayed one
+    best_step: Count | None = None  # step of the best validation by checkpoint.keep_best; 0: before training
+    best_error: Finite | None = None  # rollout error of the best validation
+    best_rank: Finite | None = None  # action-ranking error of the best validation, with keep_best=ranking
+    lowest_rank: Finite | None = None  # lowest action-ranking error of all validations
+    base_rank: Finite | None = None  # action-ranking error before the first step, with keep_best=ranking
+    measured_on: Mapping[str, str] | None = None  # settings on which validation errors depend, see `training.resume`
+    loss_scale: Mapping[str, int | float] | None = None  # state of the gradient scaler, with fp16
+    data: tuple[DataState, ...] = ()  # the data set and, if configured, the replay data set
 
     @property
     def best_name(self) -> str | None:
-        """The name of the best checkpoint; None if there is none."""
+        """The folder name of the best checkpoint, or None."""
         return None if self.best_step is None else checkpoint_name(self.best_step)
 
     def measured(self, error: float, rank: float | None = None) -> RunState:
-        """Return the state after a validation at its step, which may be the best one.
+        """Return the state after a validation at the current step, which becomes the best one if it is better.
 
         Args:
-            error: What decides, if there is no rank; and between ranks that are as good as equal.
-            rank: Of the best, it is within `SAME_RANK` of the lowest of all.
+            error: The rollout error. It decides if `rank` is None, and among ranks within `SAME_RANK` of the lowest.
+            rank: The action-ranking error. The rank of the best validation is within `SAME_RANK` of the lowest.
         """
         if not math.isfinite(error) or (rank is not None and not math.isfinite(rank)):
             return self
@@ -102,18 +102,18 @@ class RunState:
 
 
 def checkpoint_name(step: int) -> str:
-    """Return the folder name of a step's checkpoint."""
+    """Return the folder name of the checkpoint of a step."""
     return f"step-{step:08d}"
 
 
 def step_of(name: str) -> int | None:
-    """Return the step of a checkpoint by the name of its folder; None if the name is no checkpoint's."""
-    found = _NAME.fullmatch(name)
-    return int(found[1]) if found and name == checkpoint_name(int(found[1])) else None
+    """Return the step of a checkpoint from its folder name; None for other names."""
+    match = _NAME.fullmatch(name)
+    return int(match[1]) if match and name == checkpoint_name(int(match[1])) else None
 
 
 def listed(folder: Path) -> list[Path]:
-    """Return the checkpoints in a folder, sorted by step, complete or damaged; none if there is no folder.
+    """Return all checkpoints in a folder, complete or damaged, sorted by step; empty if the folder does not exist.
 
     Raises:
         OSError: The folder cannot be listed.
@@ -126,7 +126,7 @@ def listed(folder: Path) -> list[Path]:
 
 
 def remove_leavings(folder: Path) -> None:
-    """Remove the incomplete files of killed starts of this run. No other process may write there."""
+    """Remove incomplete checkpoints left by killed processes. No other process may write into the folder."""
     for beginning in (_WRITING, FETCHING):
         for path in folder.glob(f"{beginning}*"):
             if step_of(path.name.removeprefix(beginning)) is not None:
@@ -137,15 +137,15 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
     """Write a checkpoint atomically, then remove all but the newest `keep` and the best.
 
     Args:
-        folder: The run's checkpoint folder.
-        state: Progress of the run.
-        write_files: Called with a folder, into which it writes weights and optimizer state.
-        keep: How many of the newest checkpoints stay; that of `state.best_step` stays, too.
+        folder: The checkpoint folder of the run.
+        state: The progress of the run.
+        write_files: Writes weights and optimizer state into the folder that it receives.
+        keep: Number of newest checkpoints to keep; the one of `state.best_step` is kept, too.
 
     Raises:
-        InputError: The folder cannot be written (full disk, no permission), or has a complete checkpoint of this or a
-            later step, which another process wrote. Older checkpoints are not changed.
-        UnreachableError: It has one of such a step that cannot be read.
+        InputError: The folder cannot be written (full disk, no permission), or another process has written a complete
+            checkpoint of this or a later step. Older checkpoints are not changed.
+        UnreachableError: A checkpoint of this or a later step exists and cannot be read.
     """
     final = folder / checkpoint_name(state.step)
     temporary = folder / f"{_WRITING}{final.name}"
@@ -154,7 +154,7 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
         found = "a complete checkpoint that another process wrote; it is left as it is"
         raise InputError(where=str(complete[0]), found=found, fix="Start again: the run resumes from this checkpoint")
     try:
-        remove_leavings(folder)  # they occupy space
+        remove_leavings(folder)  # frees disk space
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
         write_files(temporary)
@@ -176,30 +176,30 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """Return the newest complete checkpoint, None if there are none; damaged ones are named in a warning.
+    """Return the newest complete checkpoint, or None without checkpoints; log a warning for each damaged one.
 
     Raises:
-        InputError: There are checkpoints, and all are damaged.
-        UnreachableError: The newest one that is not known to be damaged cannot be read.
+        InputError: All checkpoints are damaged.
+        UnreachableError: A checkpoint cannot be read, which does not show whether it is damaged.
     """
-    found = listed(folder)
-    for path in reversed(found):
+    checkpoints = listed(folder)
+    for path in reversed(checkpoints):
         problem = find_damage(path)
         if problem is None:
             return path
         logger.warning("%s: %s; this checkpoint is skipped", path, problem)
-    if found:
-        damaged = f"all checkpoints are damaged ({counted(len(found), 'checkpoint')})"
+    if checkpoints:
+        damaged = f"all checkpoints are damaged ({counted(len(checkpoints), 'checkpoint')})"
         fix = "To start again from step 0, delete this folder"
         raise InputError(where=str(folder), found=damaged, fix=fix)
     return None
 
 
 def find_damage(checkpoint: Path) -> str | None:
-    """Return what is wrong with a checkpoint, or None if every file matches the manifest.
+    """Return a description of the damage of a checkpoint, or None if every file matches the manifest.
 
     Raises:
-        UnreachableError: A file cannot be read, which does not show that it is damaged.
+        UnreachableError: A file cannot be read, which does not show whether it is damaged.
     """
     name = MANIFEST
     try:
@@ -219,7 +219,7 @@ def find_damage(checkpoint: Path) -> str | None:
 
 
 def read_state(checkpoint: Path) -> RunState:
-    """Return the progress of the run at a checkpoint, without a best checkpoint that is missing."""
+    """Return the progress of the run at a checkpoint, without a best checkpoint if its folder is missing."""
     state = written_state(checkpoint)
     if state.best_name is None or (checkpoint.parent / state.best_name).is_dir():
         return state
@@ -227,7 +227,7 @@ def read_state(checkpoint: Path) -> RunState:
 
 
 def written_state(checkpoint: Path) -> RunState:
-    """Return the progress of the run as it was written.
+    """Return the progress of the run as it is in the file.
 
     Raises:
         InputError: The file is missing or damaged.
@@ -239,12 +239,12 @@ def written_state(checkpoint: Path) -> RunState:
 
 def _remove(checkpoint: Path) -> None:
     if checkpoint.is_symlink():
-        checkpoint.unlink()  # its target is not this run's
+        checkpoint.unlink()  # never delete the target of a link
     else:
         shutil.rmtree(checkpoint)
 
 
-# ---- its files: neither manifest nor tensors are trusted, for a checkpoint may come from elsewhere ----
+# ---- files of a checkpoint: manifest and tensors are not trusted, because a checkpoint may be downloaded ----
 
 
 def write_manifest(folder: Path) -> None:
@@ -267,10 +267,10 @@ def write_manifest(folder: Path) -> None:
 
 
 def named_files(manifest: bytes) -> dict[str, str]:
-    """Return the files that a manifest names, in its own folder, with the SHA-256 of each.
+    """Parse a manifest: relative path of each file -> SHA-256.
 
     Raises:
-        InputError: It is no manifest, or names a file elsewhere.
+        InputError: It is no manifest, or names a file outside its folder.
     """
     files = json_object(manifest, where=MANIFEST).get("files")
     if not isinstance(files, dict) or not all(isinstance(digest, str) for digest in files.values()):
@@ -286,9 +286,9 @@ def write_torch(value: object, file: BinaryIO) -> None:
     """Write tensors and plain values.
 
     Raises:
-        OSError: The disk is full, or another system error, which torch itself would hide.
+        OSError: The disk is full, or another system error, which torch would hide in a RuntimeError.
     """
-    import torch  # checkpoints are listed without it
+    import torch  # imported here, because listing checkpoints does not need it
 
     try:
         torch.save(value, file)
@@ -303,7 +303,7 @@ def read_torch(path: Path) -> Any:
 
     Raises:
         InputError: The file is missing, damaged, or contains more than tensors and plain values.
-        UnreachableError: It cannot be read.
+        UnreachableError: The file cannot be read.
     """
     import torch
 
@@ -312,7 +312,7 @@ def read_torch(path: Path) -> Any:
         try:
             _require_as_written(path)
             return torch.load(path, weights_only=True, map_location="cpu")
-        except Exception as error:  # of a damaged file torch raises anything
+        except Exception as error:  # torch raises errors of any type for a damaged file
             if is_refusal(error):
                 raise
             found = f"cannot be read ({error})"
@@ -322,7 +322,7 @@ def read_torch(path: Path) -> Any:
 
 
 def _require_as_written(path: Path) -> None:
-    """Refuse other formats that torch reads, too: a small file of these may take any memory.
+    """Refuse other formats than uncompressed zip archives, because loading a small file of these may need any memory.
 
     Raises:
         OSError: The file cannot be read.
@@ -341,25 +341,25 @@ class SelectedCheckpoint:
     """A complete checkpoint, and how it was selected."""
 
     path: Path
-    why: str  # how it was selected, in words
-    by: str  # how it was requested, as of `select_checkpoint`
+    why: str  # how it was selected, as text
+    by: str  # the argument `by` of `select_checkpoint`
     newest: RunState  # progress of the run at its newest checkpoint
 
     def __str__(self) -> str:
-        """Return its name, and how it was selected."""
+        """Return the folder name, and how the checkpoint was selected."""
         return f"{self.path.name} ({self.why})"
 
 
 def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
-    """Return a complete checkpoint of a run.
+    """Select a complete checkpoint of a run.
 
     Args:
-        run: The run's folder.
-        by: selected: the best where there is one, else the newest; newest; best (by validation, see
-            `checkpoint.keep_best`); or a number of optimizer steps.
+        run: The run folder.
+        by: selected (the best if there is one, otherwise the newest), newest, best (by validation, see
+            `checkpoint.keep_best`), or a number of optimizer steps.
 
     Raises:
-        InputError: There is no such checkpoint, or it is damaged; names the existing ones.
+        InputError: There is no such checkpoint, or it is damaged; lists the existing ones.
     """
     folder = run / CHECKPOINTS
     newest = newest_checkpoint(folder)

@@ -1,17 +1,18 @@
-"""The folder of a run: its files, and its owner.
+"""The run folder: its files, checks before it is used, and the lock against a second training process.
 
-RUN/config.yaml         the resolved config, defaults and a chosen stride included
-RUN/environment.json    versions, machine, command and folder of every start
-RUN/calibration.json    metrics of each stride, where data.stride was auto
-RUN/changes.json        how far states change in a model step (99th percentile): what `data` means in planning.limits
-RUN/run_id              a name that no other run has
-RUN/metrics.jsonl       metrics, a row per line
-RUN/metrics.json        what `evaluate` measured; report.html and evaluation.png show it
+RUN/config.yaml         the resolved config, including defaults and a calibrated stride
+RUN/environment.json    versions, machine, command and working directory of every start
+RUN/calibration.json    metrics of each stride, if data.stride was auto
+RUN/changes.json        99th percentile of the change of states per model step, for the value `data` in planning.limits
+RUN/run_id              the unique name of the run
+RUN/metrics.jsonl       metrics, one JSON object per line
+RUN/metrics.json        metrics from `evaluate`, displayed in report.html and evaluation.png
 RUN/checkpoints/        step-XXXXXXXX folders
-RUN/tensorboard/        event files; RUN/wandb/ likewise
-RUN/imagined/           what is imagined at each validation, where `validation.decoder` is set; and films of `imagine`
-RUN/.mirror/            links to what is being sent to checkpoint.remote, while it is
-RUN/.lock               a kernel lock, held by the process that is training: released however it ends
+RUN/tensorboard/        TensorBoard event files
+RUN/wandb/              files of Weights & Biases
+RUN/imagined/           predicted frames at each validation, if `validation.decoder` is set; and videos of `imagine`
+RUN/.mirror/            links to the files that are being uploaded to checkpoint.remote, during the upload
+RUN/.lock               a kernel lock, held by the training process and released when that ends in any way
 """
 
 from __future__ import annotations
@@ -48,31 +49,32 @@ LOCK = ".lock"
 CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
 RUN_ID = "run_id"
-CALIBRATION = "calibration.json"  # of an auto stride
-CHANGES = "changes.json"  # of states in a model step
+CALIBRATION = "calibration.json"
+CHANGES = "changes.json"
 HELD = ".mirror"
 METRICS = "metrics.jsonl"
 TENSORBOARD = "tensorboard"
-SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS)  # with which a run goes on elsewhere
+SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS)  # needed to resume on another machine
 _ID = re.compile(r"[\w.-]{0,128}")
 _MOST_BYTES_OF_ID = 1_000
-IMAGINED = "imagined"  # images of what the model imagines
+IMAGINED = "imagined"
 
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS})
 _OF_DATA = ("path", "idle.ranges", "cache_dir", "disk_cache.dir")
-MOVABLE = ("model.base", "model.encoder.path")  # the weights there are recognised by their fingerprint
+MOVABLE = ("model.base", "model.encoder.path")  # paths that may change: the weights are identified by a fingerprint
 _PATHS = (*(f"{data}.{key}" for data in ("data", "replay.data") for key in _OF_DATA), *MOVABLE)
 
 
 def check_run_folder(config: Config, *, allow_config_change: bool = False) -> None:
-    """Check that the run's folder is free, or belongs to this config, and can be written. Changes nothing.
+    """Check that the run folder is free or belongs to a run with this config, and is writable. Changes nothing.
 
     Args:
-        config: The run.
-        allow_config_change: A run of another config is to go on with this one.
+        config: The config of the run.
+        allow_config_change: Accept that the run in the folder has another config.
 
     Raises:
-        InputError: The folder is a file, somebody else's, of another config, or not writable.
+        InputError: The path is a file, the folder contains other files or a run with another config, or it is not
+            writable.
     """
     folder = Path(config.run_dir)
     if folder.exists() and not folder.is_dir():
@@ -93,35 +95,35 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
 
 
 def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool = False) -> Path:
-    """Create the run's folder, or resume in it, and record this start's versions.
+    """Create the run folder or prepare it for a resume, and record the config and the environment of this start.
 
     Args:
-        config: The run.
-        run_name: What `run_id` gave, or a checkpoint from elsewhere.
-        allow_config_change: Resume with this config where the folder has another one.
+        config: The config of the run.
+        run_name: The name from `run_id`, or from a downloaded checkpoint.
+        allow_config_change: Resume with this config if the run in the folder has another one.
 
     Raises:
-        InputError: As `check_run_folder`.
+        InputError: See `check_run_folder`.
     """
     check_run_folder(config, allow_config_change=allow_config_change)
     folder = Path(config.run_dir)
     start = {"seed": config.seed, "folder": str(Path.cwd()), **environment()}
-    if changes := write_config(config):  # the first of all files: it makes the folder a run's
+    if changes := write_config(config):  # the first file, because a folder with a config is recognised as a run
         start["config_changes"] = changes
     path = folder / ENVIRONMENT
     write_atomically(path, json.dumps([*_earlier_starts(path), start], indent=1).encode())
     write_atomically(folder / RUN_ID, run_name)
     (folder / CHECKPOINTS).mkdir(exist_ok=True)
     remove_leavings(folder / CHECKPOINTS)
-    shutil.rmtree(folder / HELD, ignore_errors=True)  # links keep the room of checkpoints that are gone
+    shutil.rmtree(folder / HELD, ignore_errors=True)  # links keep deleted checkpoints on the disk
     return folder
 
 
 def run_id(folder: Path) -> str:
-    """Return the name that a run got at its first start; a new one where there is none.
+    """Return the name of the run in a folder, or a new random name.
 
     Raises:
-        InputError: It cannot be a name: it becomes part of those that trackers give.
+        InputError: The file does not contain a valid name; trackers use it in paths.
     """
     path = folder / RUN_ID
     if not path.is_file():
@@ -133,9 +135,9 @@ def run_id(folder: Path) -> str:
 
 
 def write_config(config: Config) -> list[str]:
-    """Write the config of this start into the run's folder if it differs, and return what changed since the last one.
+    """Write the config into the run folder if it differs from the one there, and return the changes.
 
-    `train RUN --resume` reads it: a setting that was used for one start holds for the next.
+    `train RUN --resume` reads this file, so that a changed setting also applies to the next start.
     """
     path, changes = Path(config.run_dir, CONFIG), config_changes(config)
     if changes or not path.exists():
@@ -144,13 +146,13 @@ def write_config(config: Config) -> list[str]:
 
 
 def asks_nothing_new(config: Config) -> bool:
-    """Return whether a config leaves as they are what its run computes, what it measures, and where it reads."""
+    """Return whether a config changes neither the computation, the measurements nor the paths of its run."""
     changed = changed_keys(read_run_config(Path(config.run_dir)), config)
     return not any(key in _PATHS or (Affects.RUN | Affects.MEASURED) & mark_of(key, Config) for key in changed)
 
 
 def config_changes(config: Config) -> list[str]:
-    """Return a line per setting in which a config differs from that of the run in its folder: key, old, new value."""
+    """Return a line `key: old -> new` for each value that differs from the config in the run folder."""
     folder = Path(config.run_dir)
     if not (folder / CONFIG).is_file():
         return []
@@ -161,24 +163,26 @@ def config_changes(config: Config) -> list[str]:
 
 
 def is_of_moved(override: str) -> bool:
-    """Return whether a `key=value` gives the path of weights that may have been moved."""
+    """Return whether a `key=value` override sets a path in `MOVABLE`."""
     return override.partition("=")[0] in MOVABLE
 
 
 def is_run(subject: str) -> bool:
-    """Return whether this is the folder of a run; otherwise it names a model."""
+    """Return whether a path is a run folder; otherwise it is the name of a model."""
     return (Path(subject) / CONFIG).is_file()
 
 
 def read_run_config(folder: Path, overrides: Iterable[str] = ()) -> Config:
-    """Return the config of a run; relative paths that do not exist here as seen from where the run was started.
+    """Return the config of a run.
+
+    Relative paths that do not exist from the working directory are resolved from where the run was started.
 
     Args:
-        folder: The run's folder.
-        overrides: Such as checkpoint.keep=3.
+        folder: The run folder.
+        overrides: For example checkpoint.keep=3.
 
     Raises:
-        InputError: Not the folder of a run, or an override is wrong.
+        InputError: The folder is no run folder, or an override is wrong.
     """
     if not (folder / CONFIG).is_file():
         found = "no config.yaml" if folder.is_dir() else "no such folder"
@@ -191,10 +195,10 @@ def read_run_config(folder: Path, overrides: Iterable[str] = ()) -> Config:
 
 
 def _seen_from_start(config: Config, folder: Path) -> Iterator[tuple[str, str]]:
-    """Yield the keys of relative paths that exist from a folder in which the run was started, and not from here."""
+    """Yield key and new path for relative paths that exist only from a folder in which the run was started."""
     flat = config_as_flat_dict(config)
     data_sets = zip(("data", "replay.data"), config.data_sets, strict=False)
-    only_names = {f"{name}.idle.ranges" for name, data in data_sets if data.is_cache}  # a part of the cache's key
+    only_names = {f"{name}.idle.ranges" for name, data in data_sets if data.is_cache}  # not read, only part of a key
     starts = [str(start.get("folder")) for start in reversed(_earlier_starts(folder / ENVIRONMENT))]
     for key in _PATHS:
         path = flat.get(key)
@@ -202,23 +206,23 @@ def _seen_from_start(config: Config, folder: Path) -> Iterator[tuple[str, str]]:
             continue
         if Path(path).exists():
             continue
-        there = next((found for start in starts if (found := Path(start, path)).exists()), None)
-        if there is not None:
-            yield key, str(there)
+        existing_path = next((candidate for start in starts if (candidate := Path(start, path)).exists()), None)
+        if existing_path is not None:
+            yield key, str(existing_path)
 
 
 def places_elsewhere(config: Config) -> list[str]:
-    """Return a line for each place away from this machine that a config names: its knob, and its address.
+    """Return a line `key: URL` for each remote location in a config.
 
-    A run's config may be untrusted: the addresses in it are shown before they are used.
+    The config of a run may be untrusted, so that its URLs are displayed before they are used.
     """
-    knobs = config_as_flat_dict(config).items()
-    named = [f"{key}: {value}" for key, value in knobs if isinstance(value, str) and is_url(value)]
-    return [*named, "tracking.wandb: online"] if config.tracking.wandb == "online" else named
+    values = config_as_flat_dict(config).items()
+    urls = [f"{key}: {value}" for key, value in values if isinstance(value, str) and is_url(value)]
+    return [*urls, "tracking.wandb: online"] if config.tracking.wandb == "online" else urls
 
 
 def environment() -> dict[str, object]:
-    """Return what a figure should be read with: versions, machine, command, time."""
+    """Return the environment of a measurement or start: versions, machine, command and time."""
     packages = ("vjepa2-ac", "torch", "transformers", "peft", "accelerate", "numpy", "scipy", "simplejpeg")
     return {
         "time": utc_now(),
@@ -232,7 +236,7 @@ def environment() -> dict[str, object]:
 
 
 def _is_without_config(path: Path) -> bool:
-    """Return whether a file may be where no config is: after a start that was killed, or of a process not the first."""
+    """Return whether a file may exist in a new run folder without config: from a killed start or another process."""
     return path.name == LOCK or (path.name.startswith(f".{CONFIG}.") and path.name.endswith(".partial"))
 
 
@@ -240,16 +244,16 @@ def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
     try:
         with user_can_read(path):
             starts = json.loads(read_bounded(path, MOST_BYTES))
-    except (InputError, ValueError, RecursionError):  # there is none, or it is damaged
+    except (InputError, ValueError, RecursionError):  # the file is missing or damaged
         return []
     return [start for start in starts if isinstance(start, dict)] if isinstance(starts, list) else []
 
 
 def with_settled_values(config: Config) -> Config:
-    """Return the config with the values that the run in its folder has settled.
+    """Return the config with values that the run in its folder has fixed.
 
-    These are the stride, if the config says auto, and `data.splits`, if the config does not set it: an older run keeps
-    its drawn splits.
+    These are the calibrated stride, if the config has auto, and `data.splits`, if the config does not set it: an older
+    run keeps its drawn splits.
     """
     folder = Path(config.run_dir)
     if not (folder / CONFIG).is_file():
@@ -266,25 +270,25 @@ def with_settled_values(config: Config) -> Config:
 
 
 class RunLock:
-    """A lock for writing into a run's folder: two training processes would overwrite each other's checkpoints.
+    """A lock on a run folder, because two training processes would overwrite each other's checkpoints.
 
     It is held from `take` to the end of the `with` block.
 
     Args:
-        folder: The run's folder; `take` creates it if needed.
+        folder: The run folder; `take` creates it if needed.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._lock = folder, FileLock(folder / LOCK)
 
     def take(self) -> None:
-        """Take the lock; does nothing if it is held already.
+        """Acquire the lock; do nothing if it is held already.
 
-        On a file system without such locks the run continues without one, with a warning.
+        On a file system without locks the run continues without one, with a warning.
 
         Raises:
-            InputError: Another process holds it, which is named if it has begun to train; or the folder cannot be
-                written.
+            InputError: Another process holds the lock (named if it has started training), or the folder is not
+                writable.
         """
         if self._lock.is_locked:
             return
@@ -300,11 +304,11 @@ class RunLock:
             except OSError as error:
                 if error.errno not in _NO_LOCKS:
                     raise
-                what_to_do = "see that no other process trains in this folder"
-                logger.warning("%s: no locks here (%s): %s", self._folder, error.strerror, what_to_do)
+                advice = "see that no other process trains in this folder"
+                logger.warning("%s: no locks here (%s): %s", self._folder, error.strerror, advice)
 
     def __enter__(self) -> RunLock:
-        """Return the lock, not yet taken."""
+        """Return the lock, not yet acquired."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -313,7 +317,7 @@ class RunLock:
 
 
 def last_start(path: str | Path) -> str:
-    """Return by which process, where and when the last start in a list of them was made, here or elsewhere."""
+    """Describe the last start in an environment.json: process, host and time."""
     last: dict[str, Any] = (_earlier_starts(path) or [{}])[-1]
     if "host" not in last:
         return "another process"

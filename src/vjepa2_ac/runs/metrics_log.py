@@ -1,11 +1,11 @@
-"""The metrics log of a run: rows go to metrics.jsonl always, and to its trackers.
+"""The metrics log of a run: metrics.jsonl, and the trackers.
 
-`metrics.jsonl` is the run's own record. Where it cannot be written, on a full disk for example, rows wait, and are
-retried with each further row. They must be on the disk before the run relies on them: at the next checkpoint at the
-latest, which is then due at once. If they cannot be written even then, the run ends with an error that says why.
+Rows that cannot be written to metrics.jsonl, for example on a full disk, are kept in memory and retried with each
+further row. A checkpoint is then due immediately, and rows must be on the disk before it is complete. If they still
+cannot be written, the run ends with an error.
 
-Trackers are TensorBoard, Weights & Biases and trackio, by Accelerate's classes. These libraries write in threads or
-processes of their own. A tracker that cannot be opened or that fails is disabled with one warning. Only a library that
+Trackers are TensorBoard, Weights & Biases and trackio, through Accelerate's classes. These libraries write in separate
+threads or processes. A tracker that cannot be opened or that fails is disabled with one warning. Only a library that
 is not installed is an error, before the first step. A resumed run continues the same W&B or trackio run.
 """
 
@@ -36,7 +36,7 @@ from vjepa2_ac.storage.structured import finite_or_none, json_object
 
 logger = logging.getLogger(__name__)
 
-WARNING = "warning"  # kind of a row in metrics.jsonl, which has a `text`
+WARNING = "warning"  # kind of a row in metrics.jsonl with a `text` instead of metrics
 STALLED_S = 60.0
 
 _MOST_BYTES = 1 << 28
@@ -45,12 +45,12 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 
 class MetricsLog:
-    """Appends rows to `metrics.jsonl`, a JSON object per line, and sends them to trackers.
+    """A log that appends rows to `metrics.jsonl`, one JSON object per line, and sends them to trackers.
 
     Args:
-        run_dir: The run's folder.
-        first_step: Rows after this step belong to a part of the run that is being repeated; they are dropped.
-        trackers: Closed with the metrics log; None: there are none.
+        run_dir: The run folder.
+        first_step: Rows after this step are removed, because the run repeats these steps.
+        trackers: The trackers, which are closed with the log; None for no trackers.
 
     Raises:
         InputError: The file cannot be written.
@@ -66,28 +66,28 @@ class MetricsLog:
         self._trackers = trackers or Trackers({})
 
     def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
-        """Append one row: its kind (train, validation), its optimizer step, and metrics (numbers or lists of them)."""
-        plain = {key: finite_or_none(one) if isinstance(one, float) else one for key, one in metrics.items()}
+        """Append a row: its kind (train, validation), its optimizer step, and metrics (numbers or lists of numbers)."""
+        plain = {key: finite_or_none(value) if isinstance(value, float) else value for key, value in metrics.items()}
         row = {"kind": kind, "step": step, **plain}
         self._waiting += (json.dumps(row) + "\n").encode()
         self._write()
         self._trackers.log(kind, step, metrics)
 
     def show(self, kind: str, name: str, step: int, image: Image) -> None:
-        """Send an image to the trackers; it is no part of metrics.jsonl."""
+        """Send an image to the trackers; metrics.jsonl does not contain images."""
         self._trackers.log_image(kind, name, step, image)
 
     @property
     def is_behind(self) -> bool:
-        """Whether there are rows that could not be written yet."""
+        """Whether some rows could not be written yet."""
         return bool(self._waiting)
 
     @contextmanager
     def before_a_checkpoint(self) -> Iterator[None]:
-        """Sync the rows to the disk before the block writes a checkpoint, from which the run would resume without them.
+        """Sync the rows to the disk before the block saves a checkpoint, because the run resumes after these rows.
 
-        The block runs in any case: hours of work matter more than a row. An older checkpoint that it removes may free
-        the space that a row needs.
+        The block runs in any case, because losing a checkpoint is worse than losing a row. It may also free disk space,
+        by removing an older checkpoint.
 
         Raises:
             InputError: Rows can be written neither before nor after the block.
@@ -96,13 +96,13 @@ class MetricsLog:
         yield
         if error and self._waiting:
             error = self._write(sync=True)
-        if error:  # also of a flush, after which the system may have discarded the data
+        if error:  # after a failed fsync the system may have discarded the data
             found = f"the latest metrics cannot be written ({error.strerror or error}), and are lost"
             fix = "Make room on the disk of the run, then resume: the same command goes on"
             raise InputError(where=str(self.path), found=found, fix=f"The checkpoint of this step is written. {fix}")
 
     def _write(self, *, sync: bool = False) -> OSError | None:
-        """Write the rows that wait, and with `sync` wait until the disk has them; return what prevents it."""
+        """Write the waiting rows, and with `sync` flush them to the disk; return the error if this fails."""
         if not self._waiting and not sync:
             return None
         try:
@@ -120,7 +120,7 @@ class MetricsLog:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the file, and the trackers."""
+        """Close the file and the trackers."""
         self._write()
         os.close(self._handle)
         self._trackers.close()
@@ -130,7 +130,7 @@ def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the rows of a metrics.jsonl; an incomplete last line of a killed process is skipped.
 
     Raises:
-        InputError: The file is too large to be one.
+        InputError: The file is too large.
     """
     if not path.exists():
         return
@@ -153,9 +153,9 @@ def warnings_of(path: Path) -> list[str]:
 
 @contextmanager
 def warn_if_stalled(path: Path) -> Iterator[None]:
-    """Warn if the block, which writes a file, lasts longer than a minute.
+    """Warn if the block, which writes a file, takes longer than a minute.
 
-    A network disk may block for minutes, and training has to wait: without a message it would look like one that hangs.
+    A network disk may block for minutes. Without a warning, training would seem to hang.
     """
     text = "%s: the disk has not taken it for %g s; training waits for it"
     timer = threading.Timer(STALLED_S, logger.warning, (text, path, STALLED_S))
@@ -170,14 +170,14 @@ def warn_if_stalled(path: Path) -> Iterator[None]:
 # ---- trackers ----
 
 Opening = Callable[[], Any]
-"""Makes a tracker (accelerate.tracking.GeneralTracker), whose methods may raise anything."""
+"""Creates a tracker (accelerate.tracking.GeneralTracker); its methods may raise any error."""
 
 
 class Trackers:
     """The working trackers of a run.
 
     Args:
-        openings: Functions that make a tracker, by its display name.
+        openings: Display name -> function that creates the tracker.
     """
 
     def __init__(self, openings: Mapping[str, Opening]) -> None:
@@ -189,7 +189,7 @@ class Trackers:
                 self._open[name] = tracker
 
     def log(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
-        """Log the numbers of a row; lists, such as errors by horizon, number by number from 1."""
+        """Log the numbers of a row; each number of a list, such as errors by horizon, separately and counted from 1."""
         numbers = {f"{kind}/{key}": value for key, value in _numbers(metrics).items()}
         self._for_each(lambda tracker: tracker.log(numbers, step=step))
 
@@ -198,7 +198,7 @@ class Trackers:
         self._for_each(lambda tracker: tracker.log_images({f"{kind}/{name}": image[None]}, step=step))
 
     def close(self) -> None:
-        """Close all; a second call does nothing."""
+        """Close all trackers; a second call does nothing."""
         for name, tracker in self._open.items():
             with self._disable_on_error(name, "did not close", "its last metrics may be missing there"):
                 tracker.finish()
@@ -223,14 +223,14 @@ def require_installed(tracking: TrackingConfig) -> None:
     """Check that the libraries of the trackers are installed.
 
     Raises:
-        InputError: A requested one is not installed.
+        InputError: A requested library is not installed.
     """
-    asked = {
+    requested = {
         "wandb": (tracking.wandb != "disabled", pip_install("wandb"), "disabled"),
         "trackio": (tracking.trackio, pip_install("trackio"), "false"),
     }
-    for library, (is_asked, install, off) in asked.items():
-        if is_asked and importlib.util.find_spec(library) is None:
+    for library, (is_requested, install, off) in requested.items():
+        if is_requested and importlib.util.find_spec(library) is None:
             found, fix = f"asked for, but {library} is not installed", f"Run {install}, or set tracking.{library}={off}"
             raise InputError(where=f"tracking.{library}", found=found, fix=fix)
 
@@ -239,18 +239,18 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
     """Open the trackers of a config; one that cannot be opened is disabled with a warning.
 
     Args:
-        config: The run.
-        folder: Its folder, where TensorBoard and W&B write.
-        run_id: The run's permanent name, there, too.
-        first_step: Completed steps; TensorBoard drops rows after it, whose steps are repeated.
+        config: The config of the run.
+        folder: The run folder, where TensorBoard and W&B write.
+        run_id: The permanent name of the run, also in the trackers.
+        first_step: Number of completed steps; TensorBoard drops later rows, because the run repeats these steps.
     """
     tracking = config.tracking
     openings: dict[str, Opening] = {}
     if tracking.tensorboard and importlib.util.find_spec("tensorboard") is None:
-        missing = (
+        message = (
             "TensorBoard is not installed: no event files, but metrics.jsonl has every number. To install it, run %s"
         )
-        logger.warning(missing, pip_install("tensorboard"))
+        logger.warning(message, pip_install("tensorboard"))
     elif tracking.tensorboard:
         openings["TensorBoard"] = lambda: _tensorboard(folder, first_step)
     if tracking.wandb != "disabled":
@@ -263,7 +263,7 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
 
 
 def _project() -> str:
-    """Return the project of Weights & Biases and of trackio."""
+    """Return the project name for Weights & Biases and trackio."""
     return os.environ.get("WANDB_PROJECT", "vjepa2-ac")
 
 
@@ -276,11 +276,11 @@ def _tensorboard(folder: Path, first_step: int) -> Any:
 
 
 def _wandb(config: Config, folder: Path, run_id: str) -> Any:
-    """Return a tracker of W&B, which ignores rows of steps that it has already: a resumed run repeats the same."""
+    """Return a W&B tracker. W&B ignores rows of steps it already has; a resumed run repeats exactly these rows."""
     import wandb
     from accelerate.tracking import WandBTracker
 
-    # Output is not captured: it would contain the console's progress bar. Times are bounded.
+    # Console output is not captured, because it contains the progress bar. Timeouts limit the delay of training.
     return WandBTracker(
         _project(),
         id=run_id,
@@ -295,7 +295,7 @@ def _wandb(config: Config, folder: Path, run_id: str) -> Any:
 
 
 def _trackio(config: Config, run_id: str) -> Any:
-    """Return a tracker of trackio, which identifies a run by its name: that is therefore the run's id."""
+    """Return a trackio tracker. trackio identifies a run by its name, which is therefore the run's id."""
     import trackio
     from accelerate.tracking import TrackioTracker
 

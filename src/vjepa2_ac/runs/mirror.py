@@ -1,9 +1,9 @@
-"""The mirror of a run at another place, `checkpoint.remote`: a thread copies the run's folder there.
+"""The mirror of a run on remote storage (`checkpoint.remote`): a thread uploads the run folder.
 
-The place looks like a run's folder: `config.yaml`, `metrics.jsonl` and so on, and `checkpoints/step-XXXXXXXX/`. A
-checkpoint there is complete when its `manifest.json` exists, which is uploaded last and removed first. During an upload
-the manifest is there under another name, so that a resumed upload recognises the files of the same checkpoint and does
-not send them again. Nothing that happens at the place stops the run.
+The remote copy has the layout of a run folder: `config.yaml`, `metrics.jsonl` and so on, and
+`checkpoints/step-XXXXXXXX/`. A remote checkpoint is complete when its `manifest.json` exists, which is uploaded last
+and removed first. During an upload the manifest has another name, so that a resumed upload recognises the files of the
+same checkpoint and does not upload them again. No error on the remote storage stops the run.
 """
 
 from __future__ import annotations
@@ -37,45 +37,45 @@ from vjepa2_ac.storage.structured import MOST_BYTES, read_json_object
 
 logger = logging.getLogger(__name__)
 
-SENDING = ".sending.json"  # the name of the manifest of a checkpoint that is being uploaded
+SENDING = ".sending.json"  # name of the manifest during an upload
 REMOTE_KEY = "checkpoint.remote"
-LONGEST_WAIT_S = 3600.0  # for the mirror at the end of a run
-_LOOK_EVERY_S = 0.1  # whether the machine is about to stop
+LONGEST_WAIT_S = 3600.0  # for the uploads at the end of a run
+_LOOK_EVERY_S = 0.1  # interval of checks whether the machine is about to stop
 
 Listing = Mapping[str, Mapping[str, int]]
-"""Sizes of files by name, by name of the checkpoint."""
+"""Name of the checkpoint -> file name -> size in bytes."""
 
 
 class LostPlaceError(InputError):
-    """The place belongs to another run, or to a later start of the same run."""
+    """The remote folder belongs to another run, or to a later start of the same run."""
 
 
 class _CancelledError(Exception):
-    """The current pass is no longer needed."""
+    """The current upload pass is no longer needed."""
 
 
 def complete(listing: Listing) -> list[str]:
-    """Return the names of the complete checkpoints, the newest first."""
+    """Return the names of the complete checkpoints, newest first."""
     return sorted((name for name, files in listing.items() if MANIFEST in files), key=step_number, reverse=True)
 
 
 def step_number(name: str) -> int:
-    """Return the step of a checkpoint by its name; 0 for another name."""
+    """Return the step of a checkpoint from its name; 0 for other names."""
     return step_of(name) or 0
 
 
 @dataclass(frozen=True)
 class RemoteCheckpoints:
-    """The checkpoints at a place; every method raises UnreachableError if it cannot be reached.
+    """The checkpoints in a remote folder; every method raises UnreachableError if it cannot be reached.
 
     Attributes:
-        place: What `storage.absolute` returned.
+        place: The URL or path of the remote folder, from `storage.absolute`.
     """
 
     place: str
 
     def listing(self) -> Listing:
-        """Return the checkpoints there, complete or not, from one listing."""
+        """List all remote checkpoints, complete or not, with one request."""
         checkpoints: dict[str, dict[str, int]] = {}
         for path, size in storage.file_sizes(storage.join(self.place, CHECKPOINTS)).items():
             name, _, file = path.partition("/")
@@ -84,14 +84,14 @@ class RemoteCheckpoints:
         return checkpoints
 
     def owner(self, listing: Listing, run_id: str | None) -> str | None:
-        """Return the run of all checkpoints in a listing, also of incomplete ones; None if it is not known.
+        """Return the id of the run to which all checkpoints in a listing belong; None if it is not known.
 
         Args:
-            listing: The listing of this place.
-            run_id: The expected run; None: any.
+            listing: The result of `listing`; incomplete checkpoints count, too.
+            run_id: The expected run; None for any run.
 
         Raises:
-            LostPlaceError: A checkpoint is of another run.
+            LostPlaceError: A checkpoint belongs to another run.
         """
         for name in sorted(listing, reverse=True):
             try:
@@ -111,14 +111,14 @@ class RemoteCheckpoints:
         """Upload the missing files of a complete local checkpoint.
 
         Args:
-            checkpoint: Its folder; the name stays the same.
-            files: The files that are there already.
+            checkpoint: The local folder; the remote one gets the same name.
+            files: The remote files that exist already, with sizes.
             before_each: Called before each file; an exception ends the upload.
         """
         name, manifest = checkpoint.name, (checkpoint / MANIFEST).read_bytes()
         claim = next((claim for claim in (MANIFEST, SENDING) if claim in files), None)
         if files and (claim is None or storage.read_bounded(self._path(name, claim), MOST_BYTES) != manifest):
-            self.remove(name)  # another checkpoint of this name
+            self.remove(name)  # a different checkpoint with the same name
             files = {}
         sizes = {path: (checkpoint / path).stat().st_size for path in named_files(manifest)}
         missing = [path for path, size in sizes.items() if files.get(path) != size]
@@ -127,18 +127,21 @@ class RemoteCheckpoints:
         if missing and SENDING not in files:
             storage.upload(checkpoint / MANIFEST, self._path(name, SENDING))
         manifest_last = [MANIFEST] if missing or MANIFEST not in files else []
-        for path in [*sorted(missing, key=lambda path: path != STATE), *manifest_last]:  # first the owner
+        for path in [
+            *sorted(missing, key=lambda path: path != STATE),
+            *manifest_last,
+        ]:  # first the file with the run id
             before_each()
             storage.upload(checkpoint / path, self._path(name, path))
         if missing or SENDING in files:
             storage.remove(self._path(name, SENDING))
 
     def remove(self, name: str) -> None:
-        """Remove a checkpoint; its manifest goes first, so that it no longer counts."""
+        """Remove a checkpoint, its manifest first, so that the checkpoint is incomplete from then on."""
         storage.remove_folder(self._path(name), first=MANIFEST)
 
     def fetch(self, name: str, folder: Path) -> str | None:
-        """Download a checkpoint into a new folder; return its damage, if any."""
+        """Download a checkpoint into a new folder; return a description of its damage, or None."""
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         try:
@@ -158,16 +161,16 @@ class RemoteCheckpoints:
 
 
 class Mirror:
-    """Keeps another place in sync with a run's folder: in a thread, one pass at a time.
+    """A mirror that keeps a remote folder in sync with a run folder, in a thread, one upload pass at a time.
 
-    An outage is reported by one warning, however long it lasts. Files that are only on this machine at the end are
-    reported by another one. As a context it stops uploading at the end; if the run ends with an error, it uploads what
-    exists first.
+    An outage causes one warning, however long it lasts. Files that exist only on this machine at the end cause another
+    one. As a context manager it stops uploading at the end; if the run ends with an error, it uploads existing files
+    first.
 
     Args:
-        place: `checkpoint.remote`.
-        config: The run.
-        run_id: The run whose checkpoints may be there.
+        place: The value of `checkpoint.remote`.
+        config: The config of the run.
+        run_id: The id of the run. Checkpoints of other runs are an error.
     """
 
     def __init__(self, place: str, config: Config, run_id: str) -> None:
@@ -176,15 +179,15 @@ class Mirror:
         self._thread: threading.Thread | None = None
         self._begun_s = -float("inf")
         self._aim: str | None = None  # the newest local checkpoint when the thread started
-        self._sent: str | None = None  # the newest remote one
-        self._starts: bytes | None = None  # the list of starts as uploaded: a different one there is a later start's
+        self._sent: str | None = None  # the newest remote checkpoint
+        self._starts: bytes | None = None  # the uploaded list of starts; another remote list means a later start
         self._outage_reported = self._is_lost = self._is_ending = self._has_ended = False
         shutil.rmtree(self._folder / HELD, ignore_errors=True)  # links of a killed process
 
     def tick(self) -> None:
-        """Start a pass if it is due and there is a new checkpoint; returns at once.
+        """Start an upload pass if one is due and there is a new checkpoint, without waiting for it.
 
-        The first checkpoint of a start is sent without waiting.
+        The first checkpoint after a start is uploaded immediately.
         """
         is_due = time.monotonic() - self._begun_s >= 60.0 * self._config.remote_every_minutes
         if is_due and not self.is_sending and self._newest_here() != self._sent:
@@ -192,15 +195,15 @@ class Mirror:
 
     @property
     def is_sending(self) -> bool:
-        """Whether a pass is in progress."""
+        """Whether an upload pass is in progress."""
         return self._thread is not None and self._thread.is_alive()
 
     def finish(self, is_asked_to_stop: Callable[[], bool]) -> None:
-        """Upload the newest files and wait for them; warn if the place is not up to date then.
+        """Upload the newest files and wait for the upload; warn if the remote copy is not up to date afterwards.
 
         Args:
-            is_asked_to_stop: Whether the machine is about to stop: then the wait is `checkpoint.remote_wait_seconds`,
-                else an hour.
+            is_asked_to_stop: Returns whether the machine is about to stop. The wait is limited to
+                `checkpoint.remote_wait_seconds` in this case, otherwise to an hour.
         """
         if self._has_ended:
             return
@@ -256,20 +259,20 @@ class Mirror:
             shutil.rmtree(self._folder / HELD, ignore_errors=True)
 
     def _continue_pass(self) -> None:
-        """Cancel the pass if the mirror has ended, or is finishing and there is a newer checkpoint."""
+        """Cancel the upload pass if the mirror has ended, or is finishing and there is a newer checkpoint."""
         if self._has_ended or (self._is_ending and self._newest_here() != self._aim):
             raise _CancelledError
 
     def _bring_up_to_date(self) -> None:
-        """Upload what is missing: the run's small files, the newest complete checkpoint, and the best one.
+        """Upload missing files: the small files of the run, the newest complete checkpoint, and the best one.
 
-        Incomplete older checkpoints are removed before, so that a full place has room again; those that are no longer
-        kept are removed after.
+        Incomplete older checkpoints are removed before the upload, to free space. Complete ones beyond
+        `checkpoint.keep` are removed afterwards.
 
         Raises:
-            LostPlaceError: The place belongs to another run, or another machine has resumed this run and uses it.
-            UnreachableError: It cannot be reached.
-            OSError: The run's folder cannot be read, or written for the links.
+            LostPlaceError: The remote folder belongs to another run, or another machine has resumed this run.
+            UnreachableError: The remote folder cannot be reached.
+            OSError: The run folder cannot be read, or links cannot be written into it.
         """
         remote = self._remote
         listing = remote.listing()
@@ -299,7 +302,7 @@ class Mirror:
         self._sent = newest.name
 
     def _send_small_files(self) -> None:
-        """Upload the files of the run's folder in their current state: they may grow meanwhile."""
+        """Upload copies of the small files, because they may grow during the upload."""
         for name in SMALL_FILES:
             source, copy = self._folder / name, self._folder / HELD / name
             if source.is_file():
@@ -310,12 +313,12 @@ class Mirror:
                     self._starts = copy.read_bytes()
 
     def _hold(self, name: str) -> Path | None:
-        """Link a checkpoint's files into a folder of the mirror, so that training may remove them during the upload.
+        """Link the files of a checkpoint into a folder of the mirror, so that training may remove it during the upload.
 
-        None is returned for one that is incomplete, or just being removed.
+        Returns None if the checkpoint is incomplete or is being removed.
 
         Raises:
-            OSError: One that is complete cannot be read.
+            OSError: A complete checkpoint cannot be read.
         """
         source, held = self._folder / CHECKPOINTS / name, self._folder / HELD / name
         shutil.rmtree(held, ignore_errors=True)
@@ -335,7 +338,7 @@ class Mirror:
 
 
 def reason_of(error: Exception) -> str:
-    """Return why a place is not up to date; with a fix only if the reason is permanent."""
+    """Return the message of an upload error; with a fix only if the reason is permanent."""
     if isinstance(error, UnreachableError) and not isinstance(error, RefusedError):
         return f"{error.where}: {error.found}"
     return str(error).rstrip(".")

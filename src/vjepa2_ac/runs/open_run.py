@@ -1,4 +1,4 @@
-"""Open a run: check and lock its folder, and fetch a newer checkpoint from `checkpoint.remote`."""
+"""Open a run: check and lock its folder, and download a newer checkpoint from `checkpoint.remote`."""
 
 from __future__ import annotations
 
@@ -34,25 +34,24 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class OpenRun:
-    """A run that can begin or resume, in the process that writes its files."""
+    """A run that is ready to start or resume, in the process that writes its files."""
 
-    config: Config  # with the stride that the run has chosen; its run_dir has the checkpoints to resume from
+    config: Config  # with the calibrated stride; its run_dir contains the checkpoints to resume from
     lock: RunLock
     allow_config_change: bool
 
     def begin(self, config: Config, state: RunState) -> None:
-        """Lock the folder, and record this start in it; a new folder is only created now.
+        """Lock the run folder and record this start in it. A new folder is created here, not earlier.
 
         Args:
-            config: The run; its stride is a number.
-            state: The state that the run starts from.
+            config: The config of the run; its stride is a number.
+            state: The state from which the run starts.
 
         Raises:
-            InputError: Another process trains in the folder, or has done so since it was inspected; or as
+            InputError: Another process trains in the folder, or has written a later checkpoint; or see
                 `open_run_folder`.
         """
         self.lock.take()
-        # Checkpoints up to this step were inspected when the run was resumed.
         later = [path for path in listed(Path(config.run_dir, CHECKPOINTS)) if step_number(path.name) > state.step]
         if newest := next((path for path in reversed(later) if find_damage(path) is None), None):
             there = f"a checkpoint of step {step_number(newest.name)}"
@@ -61,7 +60,7 @@ class OpenRun:
         open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
 
     def mirror(self, run_id: str) -> Mirror | None:
-        """Return the mirror that keeps `checkpoint.remote` up to date; None: there is no remote."""
+        """Return the mirror that keeps `checkpoint.remote` up to date; None if that is not set."""
         place = self.config.checkpoint.remote
         return None if place is None else Mirror(place, self.config, run_id)
 
@@ -70,16 +69,16 @@ class OpenRun:
 def open_run(
     config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False
 ) -> Iterator[OpenRun]:
-    """Check the folder of a run, fetch what is newer in `checkpoint.remote`, and hold the lock to the end of the block.
+    """Check the run folder, download a newer checkpoint from `checkpoint.remote`, and hold the lock during the block.
 
     Args:
-        config: The run.
+        config: The config of the run.
         reporter: Receives messages.
         check_only: Lock nothing, and download into a temporary folder.
-        allow_config_change: The run in the folder may have another config.
+        allow_config_change: Accept that the run in the folder has another config.
 
     Raises:
-        InputError: The folder is not this run's, is in use or cannot be written; or as `open_remote`.
+        InputError: The folder belongs to another run, is in use or is not writable; or see `open_remote`.
     """
     config, trial = with_settled_values(config), None
     check_run_folder(config, allow_config_change=allow_config_change)
@@ -87,9 +86,9 @@ def open_run(
         lock = exit_stack.enter_context(RunLock(Path(config.run_dir)))
         if check_only:
             trial = Path(exit_stack.enter_context(tempfile.TemporaryDirectory()), "run")
-        elif Path(config.run_dir).is_dir():  # a new one is created, and locked, after all checks
+        elif Path(config.run_dir).is_dir():  # a new folder is created and locked after all checks
             lock.take()
-        # Locked before anything is downloaded into the run's folder: another process could still be writing there.
+        # The lock is acquired before a download into the run folder: another process could still be writing there.
         first = None if check_only else lock
         config = open_remote(config, reporter, lock=first, allow_config_change=allow_config_change, into=trial)
         yield OpenRun(with_settled_values(config), lock, allow_config_change)
@@ -103,27 +102,27 @@ def open_remote(
     allow_config_change: bool = False,
     into: Path | None = None,
 ) -> Config:
-    """Test `checkpoint.remote` if it is set, fetch a newer checkpoint from there, and return the config to use.
+    """Test access to `checkpoint.remote` if it is set, download a newer checkpoint, and return the config to use.
 
-    The test writes a small file there and removes it again. This fetches the newest checkpoint whose files all
-    match its manifest, the best checkpoint, and the run's small files. Damaged checkpoints are reported and
-    skipped, and removed there after a complete one was fetched. A place that cannot be reached is a warning, unless
-    this machine has no checkpoint and the place is known to have some, complete or not.
+    The test writes a small remote file and removes it again. Downloaded are the newest checkpoint whose files all match
+    its manifest, the best checkpoint, and the small files of the run. Damaged checkpoints are reported and skipped, and
+    removed after a complete one was downloaded. A remote folder that cannot be reached causes a warning; it is an error
+    if this machine has no checkpoint and the remote folder is known to contain some.
 
     Args:
-        config: The run.
+        config: The config of the run.
         reporter: Receives messages for the user.
-        lock: The lock to take before the first file is fetched.
-        allow_config_change: The config of the run there may differ.
-        into: The folder to fetch into, new or empty, if not the run's own: for a trial, which removes nothing there.
+        lock: The lock to acquire before the first download.
+        allow_config_change: Accept that the remote run has another config.
+        into: A new or empty folder for the download instead of the run folder; nothing is removed remotely then.
 
     Returns:
-        The config, whose run_dir has the run to resume.
+        The config, whose run_dir contains the run to resume.
 
     Raises:
-        InputError: This user may not write there; the checkpoints there are of another run, or have another config;
-            they are damaged and this machine has none to resume from; or another process has the lock.
-        UnreachableError: A checkpoint there cannot be fetched, and this machine has none to resume from.
+        InputError: The remote folder is not writable; its checkpoints belong to another run or config, or are damaged
+            while this machine has none; or another process holds the lock.
+        UnreachableError: A remote checkpoint cannot be downloaded, and this machine has none.
     """
     if config.checkpoint.remote is None:
         return config
@@ -133,7 +132,7 @@ def open_remote(
         fix = "Set checkpoint.remote to a folder on another disk, or a URL such as gs://bucket/run"
         raise InputError(where=REMOTE_KEY, found=found, needed=needed, fix=fix)
     state = None
-    with suppress(InputError):  # no local checkpoint is complete: a remote one may be
+    with suppress(InputError):  # all local checkpoints are damaged, but a remote one may be complete
         newest = newest_checkpoint(run_dir / CHECKPOINTS)
         state = None if newest is None else written_state(newest)
     remote, newer = RemoteCheckpoints(place), list[str]()
@@ -148,7 +147,7 @@ def open_remote(
         newer = [name for name in complete(listing) if state is None or step_number(name) > state.step]
         if not newer and (state is not None or owner is None):
             return config
-        # If an owner but no complete checkpoint is there, a machine was killed during its first upload.
+        # An owner without a complete checkpoint means that a machine was killed during its first upload.
         target = config if into is None else config.model_copy(update={"run_dir": str(into)})
         _require_this_config(target, place, allow_config_change=allow_config_change)
         if lock is not None:
@@ -158,7 +157,7 @@ def open_remote(
         fix = f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out"
         raise InputError(where=REMOTE_KEY, found=f"{error.where}: {error.found}", fix=fix) from error
     except UnreachableError as error:
-        if state is None and (newer or owner is not None):  # a run is there: a new one could not be mirrored there
+        if state is None and (newer or owner is not None):  # a new run could not use the remote folder of another one
             raise
         stand = f"after step {state.step}" if state else "without a checkpoint"
         there = f", though {newer[0]} is there" if newer else ""
@@ -173,7 +172,7 @@ def open_remote(
 
 
 def _require_this_config(config: Config, place: str, *, allow_config_change: bool) -> None:
-    """Refuse a run at the place whose config differs, as for a local folder."""
+    """Refuse a remote run whose config differs, as for a local run folder."""
     with tempfile.TemporaryDirectory() as folder:
         with suppress(FileNotFoundError):
             storage.download(storage.join(place, CONFIG), Path(folder, CONFIG))
@@ -188,11 +187,11 @@ def _require_this_config(config: Config, place: str, *, allow_config_change: boo
 def _fetch_newest(
     remote: RemoteCheckpoints, names: Sequence[str], folder: Path, reporter: Reporter, *, removes_damaged: bool
 ) -> bool:
-    """Download a run into its folder, with the first of these checkpoints (the newest first) that is complete.
+    """Download the small files of a run, and the first checkpoint in `names` that is complete.
 
-    The checkpoint comes last, so that an interrupted download starts again. Returns False if all are damaged.
+    The checkpoint is downloaded last, so that an interrupted download starts again. Returns False if all are damaged.
     """
-    for name in SMALL_FILES:  # config.yaml first: without it the folder would be no run's
+    for name in SMALL_FILES:  # config.yaml first, because it marks a run folder
         with suppress(FileNotFoundError):
             storage.download(storage.join(remote.place, name), folder / name)
     remove_leavings(folder / CHECKPOINTS)
@@ -207,7 +206,7 @@ def _fetch_newest(
 
 
 def _fetch(remote: RemoteCheckpoints, name: str, checkpoints: Path) -> bool:
-    """Download a checkpoint, after the best one that it names; return False, with a warning, if it is damaged."""
+    """Download a checkpoint and the best checkpoint that it names; return False, with a warning, if it is damaged."""
     fetched, final = checkpoints / f"{FETCHING}{name}", checkpoints / name
     if problem := remote.fetch(name, fetched):
         shutil.rmtree(fetched)
@@ -216,7 +215,7 @@ def _fetch(remote: RemoteCheckpoints, name: str, checkpoints: Path) -> bool:
     best = written_state(fetched).best_name
     if best is not None and best != name and not (checkpoints / best).is_dir():
         _fetch(remote, best, checkpoints)
-    shutil.rmtree(final, ignore_errors=True)  # a damaged local one
+    shutil.rmtree(final, ignore_errors=True)  # a damaged local checkpoint
     fetched.rename(final)
     storage.sync(checkpoints)
     return True

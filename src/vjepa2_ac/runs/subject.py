@@ -30,14 +30,14 @@ BASE_MODEL = "base model"
 class Subject:
     """An open run or model: its world model in eval mode, its config, and the source of its weights."""
 
-    name: str  # the folder of the run, or the model, as given
+    name: str  # the run folder, or the name of the model
     config: Config
     world_model: WorldModel  # `load_to_plan` moves it to its device and merges the adapter; `load_subject` does neither
-    checkpoint: Path | None = None  # the folder of the checkpoint; None: a model
-    chosen: str = ""  # the checkpoint as text; "" for a model
+    checkpoint: Path | None = None  # the checkpoint folder; None for a model
+    chosen: str = ""  # description of the checkpoint; "" for a model
     is_base: bool = False  # the checkpoint has the weights of the base model
-    note: str = ""  # a sentence about a checkpoint of step 0; "" for a trained one
-    warnings: tuple[str, ...] = ()  # the note, and for planning why plans may exceed the motions in the training data
+    note: str = ""  # a sentence about a checkpoint of step 0; "" for a trained checkpoint
+    warnings: tuple[str, ...] = ()  # the note; for planning also why plans may exceed the motions in the training data
 
     def as_dict(self) -> dict[str, Any]:
         """Return the identity of the model as plain values: its name, and hashes of the weights."""
@@ -62,21 +62,20 @@ class Subject:
 def load_subject(
     name: str | Path, checkpoint: str = SELECTED, overrides: Sequence[str] = (), *, config: Config | None = None
 ) -> Subject:
-    """Load a run or a model, on the CPU: for a run its base with the trained weights of a complete checkpoint.
+    """Load a run or a model on the CPU; for a run, the base model with the trained weights of a complete checkpoint.
 
-    A checkpoint that has the base's weights is logged as a warning.
+    A checkpoint whose weights are those of the base model is logged as a warning.
 
     Args:
-        name: The folder of a run; or a model, as in `model.base`.
-        checkpoint: Of a run: selected, newest, best, or a number of optimizer steps; see
+        name: A run folder, or a model as in `model.base`.
+        checkpoint: For a run: selected, newest, best, or a number of optimizer steps; see
             `runs.checkpoint.select_checkpoint`.
-        overrides: Where the base or the encoder of a run was moved: model.base=PATH, model.encoder.path=PATH. The
-            fingerprints of the weights must be those that the run was trained on.
-        config: The config to load with, for a run its own with changed settings. None: the run's own with the
-            overrides; for a model the defaults.
+        overrides: New paths of the base model or the encoder of a run: model.base=PATH, model.encoder.path=PATH. The
+            fingerprints of the weights must be those with which the run was trained.
+        config: The config to use. None: the config of the run with the overrides; for a model the defaults.
 
     Raises:
-        InputError: There is no such run, checkpoint or model, or the base of the run cannot be loaded.
+        InputError: There is no such run, checkpoint or model, or the base model of the run cannot be loaded.
     """
     name = str(name)
     if not is_run(name):
@@ -99,10 +98,10 @@ def load_subject(
 
 
 def untrained_model(config: Config, checkpoint: Path) -> str:
-    """Return what the model of a run is before its first step, as text: `BASE_MODEL`, or a model that differs from it.
+    """Describe the model of a run before its first step: `BASE_MODEL`, or how it differs from the base model.
 
     Args:
-        config: Of the run.
+        config: The config of the run.
         checkpoint: Any checkpoint of the run.
 
     Raises:
@@ -118,7 +117,7 @@ def untrained_model(config: Config, checkpoint: Path) -> str:
 
 
 def note_about(config: Config, chosen: SelectedCheckpoint) -> str:
-    """Return a sentence that says that a checkpoint is the untrained model, and why it was selected; "": it is not."""
+    """Return a sentence if a checkpoint is the untrained model, with why it was selected; otherwise ""."""
     if step_of(chosen.path.name):
         return ""
     untrained, state = untrained_model(config, chosen.path), chosen.newest
@@ -135,7 +134,7 @@ def describe_selection(folder: Path) -> str:
     """Return which checkpoint of a run is selected, by which rule, and its action-ranking error.
 
     Raises:
-        InputError: As `select_checkpoint`.
+        InputError: See `select_checkpoint`.
     """
     config, chosen = read_run_config(folder), select_checkpoint(folder)
     state, step = chosen.newest, step_of(chosen.path.name) or 0
@@ -149,14 +148,14 @@ def describe_selection(folder: Path) -> str:
 
 
 def run_config_of(folder: Path, overrides: Iterable[str]) -> Config:
-    """Return the config of a run whose base or encoder may have been moved.
+    """Return the config of a run, with new paths of the base model and the encoder.
 
     Args:
-        folder: The run.
+        folder: The run folder.
         overrides: The new paths: model.base=PATH, model.encoder.path=PATH.
 
     Raises:
-        InputError: Not the folder of a run, or another key is given.
+        InputError: The folder is no run folder, or an override sets another key.
     """
     for override in overrides:
         if not is_of_moved(override):
