@@ -1,4 +1,4 @@
-"""Clips from the steps and frames of an episode, batches from clips, and the data set of clips for any DataLoader."""
+"""Clips of episodes, batches of clips, and a `torch.utils.data.Dataset` of clips."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ClipRequest:
 
     episode: int  # index into the data set's table
     start: int  # first control step
-    camera: str | None = None  # whose frames; None: the config's (first) camera
+    camera: str | None = None  # camera of the frames; None: the first camera of the config
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ClipDataset(TorchDataset[Clip]):
 
     read: Callable[[int], Clip]
     count: int
-    connections: int  # clips that are read at once
+    connections: int  # number of clips that are read concurrently
 
     def __len__(self) -> int:
         return self.count
@@ -53,15 +53,15 @@ class ClipDataset(TorchDataset[Clip]):
         return self.read(range(self.count)[index])
 
     def __getitems__(self, indices: Sequence[SupportsIndex]) -> list[Clip]:
-        """Return several clips, as a DataLoader requests them; clips behind a URL are read concurrently."""
+        """Return several clips for a DataLoader; clips behind a URL are read concurrently."""
         return list(in_parallel(self.__getitem__, indices, self.connections))
 
 
 def clip_of(recording: Episode, request: ClipRequest, config: DataConfig) -> Clip:
-    """Return a clip of an episode; decodes its frames only.
+    """Return a clip of an episode, decoding only the frames of the clip.
 
     Raises:
-        InputError: One of the frames cannot be read, or the camera has no pose and needs one.
+        InputError: A frame cannot be read, or `data.pose_frame` is camera and the camera's pose is unknown.
     """
     steps = range(request.start, request.start + config.clip_steps, config.model_stride)
     frames = latents = None
@@ -98,13 +98,13 @@ def actions_of(
     """Return the actions between consecutive model steps of a clip.
 
     Args:
-        states: At these steps, in the config's coordinate frame.
-        commands: The recorded ones of all control steps of the episode; used for `data.actions: recorded` only.
+        states: States at the steps of the clip, in the config's coordinate frame.
+        commands: Recorded commands of all control steps of the episode; used only with `data.actions: recorded`.
         steps: Control steps of the clip, equally spaced.
         config: The definition of an action.
 
     Raises:
-        ValueError: Commands are required and there are none.
+        ValueError: Commands are required and the episode has none.
     """
     if config.actions == "difference":
         return measured_space(config, states.shape[1]).differences(states)
@@ -116,21 +116,21 @@ def actions_of(
 def joined(
     commands: Float[np.ndarray, "steps action_dim"], stride: int, how: str | None
 ) -> Float[np.ndarray, "model_steps action_dim"]:
-    """Return one action for each `stride` commands: their sum, their mean, or the last of them.
+    """Join the commands of each model step to one action: their sum, mean, or the last command.
 
-    The command of a control step is sent after that step is measured: the model step from control step t to t + stride
-    has the commands of t .. t + stride - 1.
+    The command of a control step is sent after the state of that step was measured, so the model step from control
+    step t to t + stride has the commands of t .. t + stride - 1.
     """
     groups = commands.reshape(-1, stride, commands.shape[1])
     if how == "sum":
         return np.asarray(groups.sum(axis=1))
     if how == "mean":
         return np.asarray(groups.mean(axis=1))
-    return groups[:, -1]  # the only one at stride 1
+    return groups[:, -1]  # also for stride 1, where a group has one command
 
 
 def collate(clips: Sequence[Clip]) -> Batch:
-    """Stack clips into a batch; it has camera poses if each of the clips has.
+    """Stack clips into a batch; the batch has camera poses only if all clips have them.
 
     Raises:
         InputError: The frames of two clips differ in size.
@@ -164,13 +164,13 @@ default_collate_fn_map[Clip] = _collate_by_default  # PyTorch documents this as 
 
 
 def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:
-    """Return latents joined by `torch.stack` or `torch.cat`, and their scales likewise."""
+    """Join latents and their scales with `torch.stack` or `torch.cat`."""
     scales = [one.scales for one in latents if one.scales is not None]
     return StoredLatents(join([one.values for one in latents]), join(scales) if scales else None)
 
 
 def no_clips(frames: int, widths: Widths) -> Batch:
-    """Return an empty micro-batch, of which no clip could be read."""
+    """Return an empty micro-batch, used if none of its clips could be read."""
     return Batch(
         frames=torch.zeros(0, frames, 1, 1, 3, dtype=torch.uint8),
         states=torch.zeros(0, frames, widths.state),

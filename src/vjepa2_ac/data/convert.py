@@ -1,8 +1,8 @@
-"""Write any data set that can be read as a LeRobot data set v3.0: the files, columns and keys that LeRobot writes.
+"""Convert any supported data set to a LeRobot data set v3.0.
 
-Frames become H.264 (yuv420p, constant rate factor 18, a key frame every 2 frames), which is lossy. There is an MP4 for
-each episode and camera, and one table with a row group for each episode. All numbers and texts are exact. Layout, names
-and types are those of a data set that LeRobot 0.4.4 wrote.
+Frames become H.264 (yuv420p, constant rate factor 18, a key frame every 2 frames), which is lossy; numbers and texts
+are exact. Each episode and camera has an MP4, and one table has a row group per episode. Layout, names and types are
+those of LeRobot 0.4.4.
 """
 
 from __future__ import annotations
@@ -30,29 +30,30 @@ from vjepa2_ac.reporter import INDEXING, Reporter
 
 STATE, ACTION, SUCCESS, CAMERA = "observation.state", "action", "is_episode_successful", "observation.images."
 
-_FRAMES_AT_ONCE = 32  # in memory
+_FRAMES_AT_ONCE = 32  # frames in memory
 Columns = Mapping[str, Shaped[np.ndarray, "steps numbers"]]
 Frames = Iterable[UInt8[np.ndarray, "height width 3"]]
 Statistics = dict[str, np.ndarray]
 """min, max, mean, std, count and quantiles of a feature, by LeRobot's names."""
 
 _FORM = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "lerobot" / "v30.json"
-_TASK = "__index_level_0__"  # the text of a task is the index of pandas' table: LeRobot looks tasks up by it
+_TASK = "__index_level_0__"  # the task texts are the index of a pandas table, by which LeRobot looks tasks up
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _CRF, _KEY_FRAME_EVERY = 18, 2
-_SAMPLED_FRAMES, _SAMPLED_SIDE = 32, 100  # of an episode, and pixels: enough for the statistics of a camera
-_EPISODES_AT_ONCE = 100  # rows of the table of episodes that are written together
+_SAMPLED_FRAMES, _SAMPLED_SIDE = 32, 100  # frames per episode, and pixels per side, for the statistics of a camera
+_EPISODES_AT_ONCE = 100  # rows per write of the table of episodes
 
 
 def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> tuple[int, int]:
-    """Write a data set as LeRobot v3.0, and return how many episodes and control steps were written.
+    """Write a data set as LeRobot v3.0 and return the numbers of written episodes and control steps.
 
-    The episodes that `data.exclude` and `data.outcome` leave are written whole, with idle steps, in the order of the
-    source: measured states, recorded commands if `data.actions` is recorded or else the change to the next control step
-    (0 at the last one), frames of all cameras of `data.camera`, task and success. The folder appears complete.
+    The episodes that `data.exclude` and `data.outcome` select are written completely, including idle steps, in the
+    order of the source. An episode has measured states, actions, the frames of all cameras of `data.camera`, task and
+    success. Its actions are the recorded commands if `data.actions` is recorded, otherwise the change to the next
+    control step (0 at the last step). The folder appears only when it is complete.
 
     Args:
-        config: Where the data are and how they are read.
+        config: The data set and how to read it.
         folder: A new or empty folder.
         reporter: Shows the progress.
 
@@ -111,35 +112,35 @@ def _frames(recording: Episode) -> Iterator[UInt8[np.ndarray, "height width 3"]]
 
 
 class LeRobotWriter:
-    """Writes episodes one after another into an empty folder; after `finish` the data set is complete.
+    """A writer of episodes into an empty folder; after `finish` the data set is complete.
 
     Args:
         folder: The folder.
         rate_hz: Control steps per second.
-        names: What the numbers of a column are called, by feature.
+        names: The names of a column's numbers, by feature.
     """
 
     def __init__(self, folder: Path, rate_hz: float, names: Mapping[str, Sequence[str]]) -> None:
         self._folder, self._names, self._form = folder, names, json.loads(_FORM.read_text())
         self._pa = parquet_library("data convert")
-        self._rate_hz = int(rate_hz) if float(rate_hz).is_integer() else rate_hz  # LeRobot's own sets have integers
+        self._rate_hz = int(rate_hz) if float(rate_hz).is_integer() else rate_hz  # LeRobot writes integers
         self._features: dict[str, Any] = {}
         self._statistics: dict[str, Statistics] = {}
         self._tasks: dict[str, int] = {}
-        self._rows: list[dict[str, Any]] = []  # of the table of episodes, not yet written
+        self._rows: list[dict[str, Any]] = []  # unwritten rows of the table of episodes
         self._tables: dict[str, Any] = {}  # open Parquet files
         self.num_episodes = self.num_steps = 0
 
     def add(self, columns: Columns, frames: Mapping[str, Frames], task: str) -> None:
-        """Write an episode; nothing of it remains if one of its frames cannot be used.
+        """Write an episode, or nothing if one of its frames cannot be used.
 
         Args:
-            columns: Its numbers, by feature.
-            frames: A frame for each step, by feature; an odd last row or column of pixels is dropped.
-            task: What the robot was to do; may be empty.
+            columns: The numbers of the episode, by feature.
+            frames: One frame per step, by feature; an odd last row or column of pixels is dropped.
+            task: The instruction; may be empty.
 
         Raises:
-            InputError: A frame has another size than those of the first episode; or is raised by `frames`.
+            InputError: A frame has another size than those of the first episode, or `frames` raised it.
             OSError: A file cannot be written.
         """
         number, start, steps = self.num_episodes, self.num_steps, len(next(iter(columns.values())))
@@ -181,7 +182,7 @@ class LeRobotWriter:
             self._write_rows()
 
     def finish(self) -> None:
-        """Write what describes the data set; meta/info.json comes last."""
+        """Write the metadata of the data set, meta/info.json last."""
         self._write_rows()
         pandas = {"pandas": json.dumps(self._form["pandas_of_tasks"])}
         self._append("meta/tasks.parquet", {"task_index": [*self._tasks.values()], _TASK: [*self._tasks]}, pandas)
@@ -198,7 +199,7 @@ class LeRobotWriter:
             table.close()
 
     def _write_video(self, path: Path, key: str, frames: Frames, steps: int) -> Statistics:
-        """Write the frames of a camera, and return statistics of a sample of their pixels, from 0 to 1."""
+        """Write the video of a camera; return statistics of a sample of its pixels, scaled to 0 .. 1."""
         sample: list[UInt8[np.ndarray, "height width 3"]] = []
 
         def sampled() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
@@ -233,7 +234,7 @@ class LeRobotWriter:
             rows.clear()
 
     def _append(self, name: str, columns: Mapping[str, Any], about: Mapping[str, str] | None = None) -> None:
-        """Write a row group to a Parquet file, which is created with its first one."""
+        """Append a row group to a Parquet file, creating the file if needed."""
         table = self._pa.table(dict(columns), metadata=about)
         if name not in self._tables:
             path = self._folder / name
@@ -251,7 +252,7 @@ def statistics_of(values: Shaped[np.ndarray, "steps numbers"]) -> Statistics:
 
 
 def joined(known: Statistics, new: Statistics) -> Statistics:
-    """Return the statistics of two sets of steps together; quantiles are averaged, as LeRobot does."""
+    """Combine the statistics of two sets of steps; quantiles are averaged with weights, as in LeRobot."""
     share = new["count"] / (known["count"] + new["count"])
     averages = {name: known[name] + (new[name] - known[name]) * share for name in ("mean", *_QUANTILES)}
     variances = [one["std"] ** 2 + (one["mean"] - averages["mean"]) ** 2 for one in (known, new)]

@@ -1,4 +1,4 @@
-"""The data set of a run: its episodes and steps, opened and filtered once, small enough to send to every worker."""
+"""The data set of a run: its selected episodes and steps, opened once and pickled to every loader worker."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ if TYPE_CHECKING:  # PyTorch is imported when clips are read
 
 logger = logging.getLogger(__name__)
 
-_MOST_EPISODES_READ = 8  # to find the widths, if some are broken
+_MOST_EPISODES_READ = 8  # episodes to try in order to determine the widths
 
 
 @dataclass(frozen=True)
 class Removed:
-    """What a filter removed, after the previous filters."""
+    """The episodes, steps and clips that a filter removed from the result of the previous filters."""
 
-    name: str  # of the filter: excluded, broken, outcome or idle
+    name: str  # name of the filter: excluded, broken, outcome or idle
     episodes: int  # number of episodes without remaining steps
-    steps: int  # of episodes that could be read
-    windows: int | None  # clips; None while data.stride is auto
+    steps: int  # number of steps in episodes that could be read
+    windows: int | None  # number of clips; None while data.stride is auto
 
     def __str__(self) -> str:
         clips = "" if self.windows is None else f", {counted(self.windows, 'clip')}"
@@ -57,14 +57,14 @@ class Removed:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """An open data set: its episodes, and the steps that the config selects. Can be pickled to a loader worker."""
+    """An open data set: its episodes, and the steps that the config selects. It can be pickled to a loader worker."""
 
     config: DataConfig
-    source: EpisodeSource  # a LatentSource, of a cache
+    source: EpisodeSource  # a LatentSource if the data are a latent cache
     table: EpisodeTable
     kept: StepSelection
-    broken: BrokenEpisodes  # grows in the process that opened the set
-    groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each one's group; None: `data.split_by` names none
+    broken: BrokenEpisodes  # grows in the process that opened the data set
+    groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each episode's group; None without `data.split_by`
 
     @cached_property
     def taking_part(self) -> Bool[np.ndarray, " episodes"]:
@@ -75,30 +75,30 @@ class Dataset:
 
     @property
     def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
-        """The hashes that determine the split of each episode."""
+        """The hash that determines the split of each episode."""
         return self.table.id_hash if self.groups is None else self.groups
 
     def members(self, split: Split) -> Bool[np.ndarray, " episodes"]:
-        """Return which episodes are used and belong to a split."""
+        """Return a mask of the episodes that are used and belong to a split."""
         among = of_outcome(self.table, self.config)
         return np.asarray(self.taking_part & members_of(self.table, self.split_hash, self.config, split, among))
 
     def clips(self, split: Split = "train") -> ClipDataset:
         """Return the clips of a split as a `torch.utils.data.Dataset`.
 
-        Clip i is always the same one: clips are sorted by the identity of their episode and then by their first control
-        step, whatever the seed; of several cameras one is drawn by a hash of the clip. Clips are as recorded:
-        `data.transforms` belongs to the order of a training run.
+        The order is fixed: clips are sorted by the identity of their episode and then by their first control step,
+        independent of the seed. With several cameras a hash of the clip selects one. Clips are as recorded, because
+        `data.transforms` depends on the position in a training run.
 
         Returns:
             `len(clips)` clips; `clips[i]` is an `episode.Clip` of `frames` (time x height x width x 3, uint8, RGB,
-            cropped; None of a latent cache, which has `latents`), `states` (time x 7: metres, radians, closedness) and
+            cropped; None for a latent cache, which has `latents`), `states` (time x 7: metres, radians, closedness) and
             `actions` (time-1 x 7), float32. A DataLoader collates clips to an `episode.Batch` of tensors. It may
-            shuffle and use any number of workers; for data behind a URL, workers that are not forked.
+            shuffle and use any number of workers; for data behind a URL the workers must not be forked.
 
         Raises:
-            InputError: No such split, no clips, or `data.stride` is auto. `clips[i]` raises it where the clip cannot be
-                read, whatever `data.broken_episodes` is; from a worker, DataLoader makes a RuntimeError of it.
+            InputError: No such split, no clips, or `data.stride` is auto. `clips[i]` raises it if the clip cannot be
+                read, independent of `data.broken_episodes`; DataLoader turns it into a RuntimeError in workers.
 
         Example:
             >>> loader = torch.utils.data.DataLoader(dataset.clips("train"), batch_size=8, shuffle=True, num_workers=4)
@@ -110,7 +110,7 @@ class Dataset:
         return ClipDataset(partial(_read_window, self, windows), len(windows), connections_to(self.config))
 
     def request(self, window: tuple[int, int]) -> ClipRequest:
-        """Return the request for the clip of a window: (episode, first control step); its camera is drawn by a hash."""
+        """Return the request for the clip of a window (episode, first control step); a hash selects its camera."""
         from vjepa2_ac.data.clips import ClipRequest
 
         episode, start = window
@@ -118,7 +118,7 @@ class Dataset:
         return ClipRequest(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
 
     def windows(self, split: Split) -> Windows:
-        """Return where the clips of a split begin, in the fixed order of `clips`.
+        """Return the windows of a split, one per clip, in the fixed order of `clips`.
 
         Raises:
             InputError: No such split, or no clips; see `windows_of`. Or `data.stride` is auto.
@@ -143,14 +143,14 @@ class Dataset:
         return InputError(where=f"data.path: {config.path}", found=found, fix=fix)
 
     def with_frames(self, frames: int) -> Dataset:
-        """Return the data set with clips of another length; of a latent cache, where they need the same frames."""
+        """Return the data set with clips of another length; clips of a latent cache must need the same frames."""
         return replace(self, config=self.config.model_copy(update={"frames": frames}))
 
     def with_stride(self, stride: int) -> Dataset:
         """Return the data set with another stride.
 
         Raises:
-            InputError: The data is a latent cache, which has the frames of one stride only.
+            InputError: The data are a latent cache, which has the frames of one stride only.
         """
         if self.config.is_cache and stride != self.config.stride:
             found = f"latents that were encoded for clips at stride {self.config.stride}, not {stride}"
@@ -160,7 +160,7 @@ class Dataset:
 
     @cached_property
     def removed(self) -> tuple[Removed, ...]:
-        """What each filter removed, in their order."""
+        """The parts that the filters removed, in the order of the filters."""
         included_ones = included(self.table, self.config)
         chosen = included_ones & of_outcome(self.table, self.config)
         masks = np.ones(len(self.table), bool), included_ones, chosen, self.taking_part
@@ -175,14 +175,14 @@ class Dataset:
         )
 
     def _count(self, kept: StepSelection) -> tuple[int, int, int]:
-        """Return the numbers of episodes, steps and, if the stride is known, windows."""
+        """Return the numbers of episodes, steps and windows (0 if the stride is unknown)."""
         is_known = self.config.stride != "auto"
         windows = len(clip_starts(self.table, kept, self.config)) if is_known else 0
         return len(np.unique(kept.episode)), kept.steps, windows
 
     @property
     def episodes(self) -> Int[np.ndarray, " episodes"]:
-        """The episodes that clips may come from."""
+        """The indices of the episodes that clips may come from."""
         return np.unique(self.kept.episode)
 
     @cached_property
@@ -196,18 +196,18 @@ class Dataset:
 
     @cached_property
     def control_rate_hz(self) -> float:
-        """Control steps per second: of the whole data set if the source knows it, else of its first episode."""
+        """Control steps per second of the data set, or of its first episode if the source does not provide it."""
         rate = self.table.texts.get("control_rate_hz")
         return float(rate) if rate is not None else self.source.read(int(self.episodes[0])).control_rate_hz
 
     @cached_property
     def spaces(self) -> Spaces:
-        """The spaces of its states and actions."""
+        """The spaces of states and actions."""
         return spaces_of(self.config, self.widths)
 
     @cached_property
     def widths(self) -> Widths:
-        """The widths of states and actions: 7 for poses, else those of the first readable episode.
+        """The widths of states and actions: 7 for poses, otherwise those of the first readable episode.
 
         Raises:
             InputError: The first episodes cannot be read.
@@ -222,10 +222,10 @@ class Dataset:
         return widths_of(self.source.read(int(self.episodes[0])))
 
     def leave_out(self, episode: int, error: InputError) -> None:
-        """Apply `data.broken_episodes` to an episode that cannot be read: record it, or stop.
+        """Apply `data.broken_episodes` to an episode that cannot be read: record the episode, or raise the error.
 
         Raises:
-            InputError: The error with a fix; or, too many are broken by now.
+            InputError: The policy is error, or too many episodes are broken.
         """
         name = self.table.identity(episode)
         if self.config.broken_episodes == "error":
@@ -233,10 +233,10 @@ class Dataset:
         self.broken.met(name, str(error))
 
     def read(self, episode: int, camera: str | None = None) -> Episode:
-        """Return an episode; no frame is read before `Episode.read_frames` requests it.
+        """Return an episode; frames are read only on `Episode.read_frames`.
 
         Raises:
-            InputError: The episode cannot be read, or its states or actions have other widths than those of the others.
+            InputError: The episode cannot be read, or the widths of its states or actions differ from the others.
         """
         recording = self.source.read(episode, camera, self.needed_steps(episode))
         require_widths(recording, self.widths)
@@ -251,12 +251,13 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     """Open a data set and select its episodes and steps.
 
     Args:
-        config: Where it is, and what is excluded.
+        config: The data set and its filters.
         progress: Called with (done, total) while the data set is indexed for the first time.
 
     Raises:
         InputError: There is no such data set; an episode is broken and `data.broken_episodes` does not skip it, or too
-            many are; two episodes have one identity; a filter or `data.split_by` cannot be applied; or nothing remains.
+            many are broken; two episodes have the same identity; a filter or `data.split_by` cannot be applied; or no
+            episode remains.
     """
     source: Any = open_source(config)
     table = EpisodeTable.of(source.infos(progress))
@@ -290,21 +291,22 @@ def through_latents(dataset: Dataset, folder: Path | str) -> Dataset:
     """
     config = dataset.config.as_kind("latents", path=str(folder), cache="off", camera=dataset.config.cameras)
     source = open_source(config)
-    table = replace(EpisodeTable.of(source.infos()), labels=dataset.table.labels)  # older caches lack those of splits
+    # The labels are copied, because caches of older versions lack the labels of splits.
+    table = replace(EpisodeTable.of(source.infos()), labels=dataset.table.labels)
     return _settled(replace(dataset, source=source, table=table, config=config))
 
 
 def _settled(dataset: Dataset) -> Dataset:
-    """Check that a latent cache has what the clips need, and set its cameras in the config."""
+    """Check that a latent cache has the files of all clips, and set its cameras in the config."""
     source: Any = dataset.source
     return replace(dataset, config=source.settle(dataset.starts.episode)) if dataset.config.is_cache else dataset
 
 
 def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
-    """Return a clip; decodes its frames only.
+    """Return a clip, decoding only the frames of the clip.
 
     Raises:
-        InputError: The episode or one of the frames cannot be read; does not say how to leave the episode out.
+        InputError: The episode or one of the frames cannot be read. The error has no fix that excludes the episode.
     """
     from vjepa2_ac.data.clips import clip_of
 
@@ -320,7 +322,7 @@ def _read_window(dataset: Dataset, windows: Windows, index: int) -> Clip:
 
 
 def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return the frames of a clip of a batch, cropped, for people to look at; small frames for cached latents.
+    """Return the cropped frames of a clip in a batch, for display; for cached latents the small frames of the cache.
 
     Raises:
         InputError: The frames of a cache cannot be read.
@@ -338,10 +340,10 @@ def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "ti
 
 
 def find_episode(dataset: Dataset, wanted: str) -> int:
-    """Return an episode by its name in the data, its number from 0, or a part that no other name has.
+    """Return the index of an episode by its identity, its number from 0, or a unique part of its identity.
 
     Raises:
-        InputError: There is no such episode, or there are several.
+        InputError: No episode matches, or several match.
     """
     table = dataset.table
     if (index := table.find(wanted)) is not None:
@@ -364,10 +366,10 @@ def widths_of(episode: Episode) -> Widths:
 
 
 def require_widths(episode: Episode, widths: Widths) -> None:
-    """Refuse an episode whose widths differ from those of the others.
+    """Refuse an episode whose widths differ from those of the data set.
 
     Raises:
-        InputError: Names both.
+        InputError: The widths differ.
     """
     found = widths_of(episode)
     if found != widths:

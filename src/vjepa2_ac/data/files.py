@@ -1,4 +1,4 @@
-"""The files of a data set: listed, read by several threads, and fetched once where they are behind a URL."""
+"""The files of a data set: list them, read them with several threads, and cache remote files on the local disk."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
 
-CONNECTIONS = 16  # concurrent reads of a process, for remote data
-DEEPEST = 8  # folders below the data set's
-_QUEUED = 4096  # results and tasks that wait at once: of a hundred thousand episodes not all
+CONNECTIONS = 16  # concurrent reads of remote data per process
+DEEPEST = 8  # levels of folders below the data set's folder
+_QUEUED = 4096  # submitted tasks at most, which limits the memory for data sets of 100,000 episodes
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-open_cache = functools.cache(DiskCache)  # one instance per process and folder: its warning is logged once
+open_cache = functools.cache(DiskCache)  # one instance per process and folder, so that a warning is logged once
 
 
 def fetched_data(config: DiskCacheConfig) -> DiskCache:
-    """Return the cache of fetched data: one for all sources and runs, with one limit."""
+    """Return the disk cache of fetched data, which all sources and runs share, with one size limit."""
     return open_cache(cache_folder(config) / "fetched", int(config.limit_gb * 1e9))
 
 
 class EpisodeFiles:
-    """Reads files; what comes from URLs or was parsed is cached on this machine, within `data.disk_cache.limit_gb`."""
+    """A reader of files that caches remote and parsed content on this machine, within `data.disk_cache.limit_gb`."""
 
     def __init__(self, config: DataConfig) -> None:
         self.cache = fetched_data(config.disk_cache)
 
     def open(self, path: str, *, version: str) -> str | BlockCachedFile:
-        """Return what to open for partial reads: a local path itself, or a file of cached blocks.
+        """Return a local path unchanged, or open a remote file for partial reads with a cache of its blocks.
 
         Args:
             path: Local path or URL.
@@ -58,7 +58,7 @@ class EpisodeFiles:
         """Return the content of a file.
 
         Raises:
-            InputError: There is no such file; an UnreachableError if it cannot be read.
+            InputError: There is no such file. An UnreachableError if the file cannot be read.
         """
         with storage.user_can_read(path, fix="Copy the episode again"):
             if storage.is_url(path):
@@ -66,7 +66,7 @@ class EpisodeFiles:
             return storage.read_bytes(path)
 
     def parsed(self, key: str, parse: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
-        """Return arrays of an episode that were parsed on this machine before, or now."""
+        """Return arrays from the disk cache, or parse them now and cache the result."""
         if (data := self.cache.read(key)) is not None:
             with suppress(NotATableError):
                 return unpack(data)[0]
@@ -76,12 +76,12 @@ class EpisodeFiles:
 
 
 def connections_to(config: DataConfig) -> int:
-    """Return how many files are read at once: behind a URL, where each is waited for, several."""
+    """Return the number of concurrent reads of a data set: several behind a URL, where latency dominates, else one."""
     return CONNECTIONS if storage.is_url(config.path) else 1
 
 
 def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> Iterator[Result]:
-    """Yield the result of a function for every item, in order, from several threads; or raise the first error."""
+    """Apply a function to all items with several threads; yield the results in order or raise the first error."""
     if connections == 1 or len(items) < 2:
         yield from map(function, items)
         return
@@ -94,9 +94,9 @@ def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], conne
 
 
 def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
-    """Yield all files, with their folder relative to `root`; names that begin with a dot are skipped.
+    """Yield (folder relative to `root`, file) of all files below `root`; names that begin with a dot are skipped.
 
-    A folder with several links to it is visited once: its files would be episodes under several names.
+    A folder that several links lead to is visited once, so that its files are not episodes under several names.
 
     Raises:
         OSError: A folder cannot be listed.
@@ -115,15 +115,15 @@ def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
 
 
 def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
-    """Return the files of a folder, and the names of its folders except hidden ones.
+    """Return the files in a folder, and the names of the folders in it except hidden ones.
 
     Raises:
-        OSError: It cannot be listed.
+        OSError: The folder cannot be listed.
         InputError: A name is not UTF-8.
     """
     place = storage.join(root, folder)
     listed = storage.list_folder(place)
-    for one in listed:  # the identity of an episode must be text that can be encoded
+    for one in listed:  # identities of episodes must be encodable as UTF-8
         if not one.name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in one.name):
             raise InputError(where=place, found=f"the name {one.name!r}", needed="names in UTF-8", fix="Rename it")
     folders = [one.name for one in listed if not one.is_file and not one.name.startswith(".")]

@@ -1,4 +1,4 @@
-"""Idle time: the ranges of steps in which the robot moves, by a rule or from a list, found once and cached on disk."""
+"""Idle time: the ranges of steps in which the robot moves, computed by a rule or read from a list, cached on disk."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from vjepa2_ac.storage.structured import read_json_object, shown
 
 logger = logging.getLogger(__name__)
 
-_MOST_BYTES = 1 << 28  # of a published list
-_ALL_BROKEN = 10  # so many broken episodes at the start, and no others, have one cause
+_MOST_BYTES = 1 << 28  # size limit of a published list
+_ALL_BROKEN = 10  # if the first ten episodes are all broken, a setting is wrong, and the first error is raised
 
 Found = list[tuple[int, int]] | EpisodeProblem
 
@@ -28,10 +28,10 @@ Found = list[tuple[int, int]] | EpisodeProblem
 def find_ranges(
     source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress | None
 ) -> StepSelection:
-    """Return the ranges that `data.idle.rule` keeps, of all episodes, used or not.
+    """Return the ranges that `data.idle.rule` keeps, for all episodes, whether they are used or not.
 
     Raises:
-        InputError: The list of ranges cannot be read or belongs to another data set; or the rule fits no episode.
+        InputError: The list of ranges cannot be read or belongs to another data set, or the rule fits no episode.
     """
     values = {"idle": config.idle.model_dump(mode="json"), **config.own_values}
     parts: dict[str, object] = {"found": "idle ranges", "table": fingerprint_of(table), "data": values}
@@ -63,10 +63,10 @@ def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, pr
 
 
 def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
-    """Return the ranges of a list that somebody published; see `data.idle.ranges`.
+    """Return the ranges in a published list; see `data.idle.ranges`.
 
     Raises:
-        InputError: It cannot be read, or has no episode of the table, or wrong ranges of one.
+        InputError: The list cannot be read, has no episode of the table, or has invalid ranges.
     """
     where = f"data.idle.ranges: {path}"
     needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
@@ -94,9 +94,9 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
 
 
 def _pairs(ranges: object, steps: int) -> list[tuple[int, int]] | None:
-    """Return the ranges of one episode in their order; None if they are no pairs of its steps, or overlap."""
+    """Return the sorted ranges of one episode; None if they are not pairs of its steps or overlap."""
     try:
-        pairs = sorted((start, end) for start, end in ranges)  # type: ignore[attr-defined] # that is what is tried
+        pairs = sorted((start, end) for start, end in ranges)  # type: ignore[attr-defined] # see the except clause
         edges = [edge for pair in pairs for edge in pair]
         are_steps = all(type(edge) is int and 0 <= edge <= steps for edge in edges)
     except (TypeError, ValueError):
@@ -108,7 +108,7 @@ def kept_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
     """Return the ranges [start, end) of steps that an episode keeps under the rule `commands` or `motion`.
 
     Raises:
-        InputError: The rule is `commands` and the episode has no joint velocities, or some that are not finite.
+        InputError: The rule is `commands` and the joint velocities are missing or not finite.
     """
     if config.rule == "motion":
         return moving_ranges(idle_by_motion(episode.states, config), config)
@@ -122,7 +122,7 @@ def kept_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
 
 
 def idle_by_commands(velocities: Float[np.ndarray, "steps joints"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
-    """Return the steps at which no commanded joint velocity differs from the step before; never the first.
+    """Return a mask of the steps at which no commanded joint velocity changes; False at the first step.
 
     Source: Physical-Intelligence/openpi @ 15a9616, examples/droid/compute_droid_nonidle_ranges.py.
     """
@@ -131,7 +131,7 @@ def idle_by_commands(velocities: Float[np.ndarray, "steps joints"], config: Idle
 
 
 def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
-    """Return the steps at which the measured pose hardly differs from the step before; never the first."""
+    """Return a mask of the steps at which the measured pose changes less than the thresholds; False at the first."""
     if len(states) < 2:
         return np.zeros(len(states), bool)
     motion = POSE.differences(states.astype(np.float64))
@@ -144,7 +144,7 @@ def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> 
 
 
 def long_idle_runs(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
-    """Return the steps in idle runs that are long enough to go."""
+    """Return a mask of the steps in idle runs of at least `data.idle.shortest_idle_steps` steps."""
     found = np.zeros(len(idle), bool)
     for start, end in runs_of(idle):
         found[start:end] = end - start >= config.shortest_idle_steps
@@ -152,7 +152,7 @@ def long_idle_runs(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> Bool
 
 
 def moving_ranges(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> list[tuple[int, int]]:
-    """Return the ranges that remain without long idle runs, short ranges between them, and the last steps of each.
+    """Return the ranges that remain after removing long idle runs, short ranges between them, and the end of each.
 
     Source: Physical-Intelligence/openpi @ 15a9616, examples/droid/compute_droid_nonidle_ranges.py.
     """
@@ -162,6 +162,6 @@ def moving_ranges(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> list[
 
 
 def runs_of(mask: Bool[np.ndarray, " steps"]) -> list[tuple[int, int]]:
-    """Return the ranges [start, end) of neighbouring steps at which a mask is true."""
+    """Return the ranges [start, end) of consecutive steps at which a mask is true."""
     edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))

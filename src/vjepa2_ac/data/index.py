@@ -1,6 +1,7 @@
-"""The index of a data set: facts about every episode, as columns, and their cache, so that a set is scanned once.
+"""The index of a data set: facts about every episode, stored as columns and cached, so that a set is scanned once.
 
-DROID has 95,658 episodes: a list of as many objects is slow to load and to send to workers. A table takes a few bytes.
+DROID has 95,658 episodes. A list of that many objects is slow to load and to send to workers; a table of columns is
+small and fast.
 """
 
 from __future__ import annotations
@@ -28,34 +29,34 @@ from vjepa2_ac.storage import places
 
 logger = logging.getLogger(__name__)
 
-UNKNOWN = 0  # hash of an episode whose states were not read, since no other is similar
+UNKNOWN = 0  # `state_hash` of an episode whose states were not read; `hash_of_states` never returns it
 
-_NOT_KNOWN = -1  # number of a label, or success
+_NOT_KNOWN = -1  # in the columns of labels and of success
 _COLUMNS = ("num_steps", "success", "ids", "id_hash", "id_rank")
 _HASH, _MOTION, _LOCATOR, _LABEL = "state_hash", "motion", "locator.", "label."
 _TEXT = "text"
 _NO_MOTION = (np.nan,) * 8
-MEANS, SPANS = slice(2, 5), slice(5, 8)  # of `StatesSummary.motion`
+MEANS, SPANS = slice(2, 5), slice(5, 8)  # parts of `StatesSummary.motion`
 _CACHE = "VJEPA2_AC_CACHE"
-_VERSION = 5  # of the cache: another number makes all of it be rebuilt
+_VERSION = 5  # of the cache; a new number invalidates all entries
 
 
 class NotATableError(ValueError):
-    """The bytes are not a table by `to_bytes`."""
+    """The bytes are not a table written by `to_bytes`."""
 
 
 def pack(arrays: Mapping[str, np.ndarray], text: object = None) -> bytes:
-    """Return arrays and a JSON value as the content of a file; equal ones give equal bytes."""
+    """Serialise arrays and a JSON value reproducibly to the bytes of a file."""
     file = io.BytesIO()
     np.savez(file, **{_TEXT: np.frombuffer(json.dumps(text).encode(), np.uint8)}, **arrays)  # type: ignore[arg-type] # none is called allow_pickle
     return file.getvalue()
 
 
 def unpack(data: bytes) -> tuple[dict[str, np.ndarray], Any]:
-    """Return what `pack` was given; nothing is unpickled, and nothing expands beyond the file's size.
+    """Return the arrays and the JSON value of `pack`; nothing is unpickled or expands beyond the file's size.
 
     Raises:
-        NotATableError: It is another kind of file, or damaged.
+        NotATableError: The bytes are another kind of file, or damaged.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -63,17 +64,17 @@ def unpack(data: bytes) -> tuple[dict[str, np.ndarray], Any]:
                 raise NotATableError("compressed or damaged arrays")  # noqa: TRY301
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = dict(file)
-        text = arrays.pop("problems" if "problems" in arrays else _TEXT)  # the former: older ranges of steps
+        text = arrays.pop("problems" if "problems" in arrays else _TEXT)  # "problems": ranges of older versions
         return arrays, json.loads(text.tobytes())
-    except Exception as error:  # zipfile and numpy raise whatever damage makes of a file
+    except Exception as error:  # zipfile and numpy raise many types of errors for damaged files
         raise NotATableError(str(error)[:200] or type(error).__name__) from None
 
 
 @dataclass(frozen=True)
 class EpisodeProblem:
-    """An unusable episode, and the reason."""
+    """An unusable episode and the reason."""
 
-    name: str  # its identity; if that cannot be read, its position
+    name: str  # the identity of the episode, or its position if the identity cannot be read
     where: str
     found: str
     needed: str = ""
@@ -98,13 +99,13 @@ class Labels:
     number: Int32[np.ndarray, " episodes"]  # into the names; -1: unknown
 
     def __post_init__(self) -> None:
-        """Refuse numbers without a name, which a damaged file may contain."""
+        """Refuse numbers outside the list of names, which a damaged file may contain."""
         if len(self.number) and not _NOT_KNOWN <= self.number.min() <= self.number.max() < len(self.names):
             raise ValueError(f"labels of {len(self.names)} names with numbers up to {self.number.max()}")
 
     @classmethod
     def of(cls, values: Sequence[str | None]) -> Labels:
-        """Make labels; None or an empty name: unknown."""
+        """Create labels; None or an empty name means unknown."""
         names = sorted({value for value in values if value})
         place = {name: number for number, name in enumerate(names)}
         return cls(tuple(names), np.array([place.get(value or "", _NOT_KNOWN) for value in values], np.int32))
@@ -119,8 +120,8 @@ class Labels:
 class EpisodeTable(Sequence[EpisodeInfo]):
     """The usable episodes of a data set, in the source's order, as columns.
 
-    `locators` are columns of the source (the position of an episode); `labels` are an episode's groups, such as its
-    scene; `texts` are small values of the whole data set.
+    `locators` are columns by which the source finds an episode; `labels` are groups of episodes, such as the scene;
+    `texts` are small values of the whole data set.
     """
 
     num_steps: Int32[np.ndarray, " episodes"]
@@ -137,7 +138,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
 
     @classmethod
     def of(cls, infos: Sequence[EpisodeInfo]) -> EpisodeTable:
-        """Make a table without the optional columns; a given table is returned unchanged.
+        """Create a table without the optional columns; an existing table is returned unchanged.
 
         Raises:
             InputError: An identity contains a NUL character, which arrays of type S lose at the end of a text.
@@ -174,7 +175,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         return bytes(self.ids[index]).decode(errors="replace")
 
     def label(self, name: str, index: int) -> str | None:
-        """Return a label of one episode, such as its task; None: it has none."""
+        """Return a label of one episode, such as its task, or None."""
         return self.labels[name].of_episode(index) if name in self.labels else None
 
     def find(self, identity: str) -> int | None:
@@ -185,7 +186,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         return None
 
     def to_bytes(self) -> bytes:
-        """Return the table as a file's content."""
+        """Serialise the table."""
         text = {
             "problems": [vars(problem) for problem in self.problems],
             "texts": dict(self.texts),
@@ -202,7 +203,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         """Read the result of `to_bytes`.
 
         Raises:
-            NotATableError: It is another kind of file, or damaged.
+            NotATableError: The bytes are another kind of file, or damaged.
         """
         arrays, text = unpack(data)
         try:
@@ -227,29 +228,29 @@ class EpisodeTable(Sequence[EpisodeInfo]):
 
 @dataclass(frozen=True, eq=False)
 class StepSelection:
-    """Ranges [start, end) of control steps that a clip must fit into; by episode, then ascending and disjoint."""
+    """Ranges [start, end) of control steps that a clip must fit into, by episode, then ascending and disjoint."""
 
     episode: Int32[np.ndarray, " ranges"]  # index into the table
     start: Int32[np.ndarray, " ranges"]
     end: Int32[np.ndarray, " ranges"]
-    problems: tuple[tuple[int, EpisodeProblem], ...] = ()  # the episodes that could not be read, by the same index
+    problems: tuple[tuple[int, EpisodeProblem], ...] = ()  # (index into the table, problem) of unreadable episodes
 
     @classmethod
     def whole(cls, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"]) -> StepSelection:
-        """Keep every step of the used episodes."""
+        """Return a selection of all steps of the used episodes."""
         episode = np.flatnonzero(taking_part).astype(np.int32)
         return cls(episode, np.zeros(len(episode), np.int32), table.num_steps[episode])
 
     @classmethod
     def of_each(cls, found: Sequence[list[tuple[int, int]] | EpisodeProblem]) -> StepSelection:
-        """Join the ranges of all episodes."""
+        """Create a selection from the ranges or the problem of each episode."""
         problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, EpisodeProblem))
         ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
         episode, start, end = np.ascontiguousarray(np.array(ranges, np.int32).reshape(-1, 3).T)
         return cls(episode, start, end, problems)
 
     def only(self, episodes: Bool[np.ndarray, " episodes"]) -> StepSelection:
-        """Return the selection with these episodes only."""
+        """Return the part of the selection that belongs to a mask of episodes."""
         stays = episodes[self.episode]
         return replace(self, episode=self.episode[stays], start=self.start[stays], end=self.end[stays])
 
@@ -260,11 +261,11 @@ class StepSelection:
 
     @property
     def steps(self) -> int:
-        """The total number of kept steps."""
+        """The total number of selected steps."""
         return int((self.end.astype(np.int64) - self.start).sum())
 
     def to_bytes(self) -> bytes:
-        """Return this as a file's content."""
+        """Serialise the selection."""
         problems = [(place, vars(problem)) for place, problem in self.problems]
         return pack({"episode": self.episode, "start": self.start, "end": self.end}, problems)
 
@@ -273,7 +274,7 @@ class StepSelection:
         """Read the result of `to_bytes`.
 
         Raises:
-            NotATableError: It is another kind of file, or damaged.
+            NotATableError: The bytes are another kind of file, or damaged.
         """
         arrays, problems = unpack(data)
         try:
@@ -286,12 +287,12 @@ T = TypeVar("T", EpisodeTable, StepSelection)
 
 
 def identity_hash(identity: str) -> int:
-    """Return 64 bits of the identity's SHA-256: as a share of 2**64 it determines the episode's split."""
+    """Return 64 bits of the identity's SHA-256; divided by 2**64 they determine the episode's split."""
     return int.from_bytes(hashlib.sha256(identity.encode()).digest()[:8], "big")
 
 
 def labels_of(values: Sequence[Mapping[str, str | None]]) -> dict[str, Labels]:
-    """Return the labels of episodes, each given as {label: name}; unused labels are dropped."""
+    """Return labels from one {label: name} mapping per episode; labels without any name are dropped."""
     every = {label for of_one in values for label in of_one}
     found = {label: Labels.of([of_one.get(label) for of_one in values]) for label in sorted(every)}
     return {label: labels for label, labels in found.items() if labels.names}
@@ -300,18 +301,19 @@ def labels_of(values: Sequence[Mapping[str, str | None]]) -> dict[str, Labels]:
 def hash_of_states(states: Float[np.ndarray, "steps state_dim"]) -> int:
     """Return 64 bits of the BLAKE2b of the states as float32, never `UNKNOWN`.
 
-    As float32, since the same recording is float64 in one file and float32 in another. Rounding further would not make
-    other roundings agree: a value at an edge of any grid may be rounded to either side.
+    The states are hashed as float32, because a recording may be float64 in one file and float32 in another. Coarser
+    rounding would not make other roundings agree: a value at the edge of a grid cell may be rounded to either side.
     """
     content = f"{states.shape} ".encode() + (states.astype("<f4") + np.float32(0)).tobytes()  # -0 is 0
     return int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "big") or 1
 
 
 class StatesSummary(NamedTuple):
-    """What the index keeps of the states of an episode.
+    """The summary of an episode's states in the index.
 
     `motion` has the longest distance (metres) and the largest rotation (radians) between consecutive poses, then the
-    mean and the standard deviation of x, y and z over the episode; of vectors two zeros, and the first three numbers.
+    mean and the standard deviation of x, y and z over the episode. For vectors the first two numbers are 0, and x, y
+    and z are the first three numbers of the states.
     """
 
     state_hash: int = UNKNOWN
@@ -322,7 +324,7 @@ UNREAD = StatesSummary()
 
 
 def summary_of(states: Float[np.ndarray, "steps state_dim"]) -> StatesSummary:
-    """Return the summary of an episode with one or more steps."""
+    """Summarise the states of an episode with one or more steps."""
     width = states.shape[1]
     fastest = step_sizes(states).max(axis=0, initial=0.0) if width == STATE_DIM else np.zeros(2)
     positions = states[:, np.arange(3) % width]
@@ -330,10 +332,10 @@ def summary_of(states: Float[np.ndarray, "steps state_dim"]) -> StatesSummary:
 
 
 def cache_folder(config: DiskCacheConfig) -> Path:
-    """Return the cache folder on this machine: the config's, $VJEPA2_AC_CACHE, or the user's.
+    """Return the local cache folder: `data.disk_cache.dir`, $VJEPA2_AC_CACHE, or the user's default cache folder.
 
     Raises:
-        InputError: The environment names none.
+        InputError: The environment variable is not a local path.
     """
     if config.dir is not None:
         return Path(config.dir)
@@ -346,35 +348,34 @@ def cache_folder(config: DiskCacheConfig) -> Path:
 
 
 def key_of(parts: Mapping[str, object]) -> str:
-    """Return a short key of everything that a cached result depends on."""
+    """Return a short hash of all values that a cached result depends on."""
     text = json.dumps({"version": _VERSION, **parts}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def index_key(parts: Mapping[str, object], place: str, *, named: str = "") -> str:
-    """Return the key of an index: what else is cached of these episodes depends on it.
+    """Return the key of an index, on which the keys of other cached data of its episodes depend.
 
-    A folder of this machine is known by what it holds, wherever it lies. At a URL the place counts, too, for servers
-    say little of versions.
+    A local folder is identified by its content, so that it may be moved. For a URL the path is part of the key, too,
+    because the versions of remote files are less reliable.
 
     Args:
         parts: The files of the data set, and how they are read.
-        place: Its folder.
-        named: An episode's identity, where that depends on the name of the folder.
+        place: The folder of the data set.
+        named: An episode's identity, if identities depend on the name of the folder.
     """
     return key_of({**parts, "path": place} if storage.is_url(place) else {**parts, "named": named})
 
 
 def fingerprint_of(table: EpisodeTable) -> str:
-    """Return everything that the episodes depend on, as one text: the key of their index, or a hash of the table."""
+    """Return a fingerprint of the episodes: the key of their index, or a hash of the table."""
     return table.texts.get("index") or hashlib.sha256(table.to_bytes()).hexdigest()
 
 
 def get_or_build(config: DiskCacheConfig, key: str, place: str, build: Callable[[], EpisodeTable]) -> EpisodeTable:
-    """Return the table cached under a key, which is among its `texts`; build and cache it if it is missing or damaged.
+    """Return the table cached under a key; build and cache it if it is missing or damaged. `texts` contains the key.
 
-    Problems name files where they lay when they were found: as far as that was in `place`, they name them where they
-    lie now.
+    If the data set was moved, paths in cached problems are rewritten from the old folder to `place`.
     """
     now = storage.absolute(place)
 
@@ -388,12 +389,12 @@ def get_or_build(config: DiskCacheConfig, key: str, place: str, build: Callable[
 
 
 def get_or_make(config: DiskCacheConfig, key: str, make: Callable[[], T], kind: type[T]) -> T:
-    """Return the table cached under a key; make and cache it if it is missing or damaged (a NotATableError).
+    """Return the table cached under a key; make and cache it if it is missing or damaged.
 
-    The file ends with its key, so that the file of another key is not used under this name.
+    The file ends with its key, so that a renamed file of another key is not used.
 
     Raises:
-        UnreachableError: It is there and cannot be read.
+        UnreachableError: The file exists and cannot be read.
     """
     path = cache_folder(config) / "index" / f"{key}.index"
     try:

@@ -1,8 +1,8 @@
 """The clip loader: batches in a deterministic order.
 
-The batch at a position of the run is a pure function of the seed and the position. Workers only affect the speed: they
-send batches through shared memory. A worker never makes its run wait for ever: one that dies, cannot send, or is waited
-for after a signal ends the run.
+The batch at a position of the run is a pure function of the seed and the position. Workers affect only the speed; they
+send batches through shared memory. A run never waits forever for a worker: it ends if a worker dies, cannot send a
+batch, or does not deliver one shortly after a stop signal.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from vjepa2_ac.episode import Batch, Clip, Skipped
 from vjepa2_ac.errors import InputError, UnreachableError, UserError, counted
 from vjepa2_ac.process import safe_imports, stop_request
 
-SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where PyTorch puts the batches of workers, on Linux
+SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - PyTorch stores the batches of workers here on Linux
 PREFETCH = 2  # batches that each worker prepares in advance
-_POLL_S = 1.0  # between two checks of workers and signals, while waiting for a batch
-_GRACE_S = 5.0  # a signal waits this long for a batch, for the step to be finished
+_POLL_S = 1.0  # interval of checks of workers and signals while waiting for a batch
+_GRACE_S = 5.0  # time limit for a batch after a stop signal, so that the step can be finished
 _NO_WORKERS = "data.workers=0"
 _ROOM = f"With Docker add --shm-size=8g or --ipc=host to `docker run`, set {_NO_WORKERS}"
 CLIPS_WORTH_WORKERS = 256  # starting workers takes longer than reading fewer validation clips
@@ -55,15 +55,15 @@ CLIPS_WORTH_WORKERS = 256  # starting workers takes longer than reading fewer va
 
 @dataclass(frozen=True)
 class ProcessShare:
-    """The index of a process among those that share some work."""
+    """The share of one process in work that is split between several processes."""
 
     rank: int = 0
     processes: int = 1
-    of_step: int | None = None  # micro-batches of an optimizer step, of all processes; None: one per process
+    of_step: int | None = None  # micro-batches per optimizer step of all processes together; None: one per process
 
     @property
     def own(self) -> range:
-        """The micro-batches of a step that this process computes: every n-th, for n processes."""
+        """The indices of the micro-batches of a step that this process computes: rank, rank + processes, ..."""
         return range(self.rank, self.processes if self.of_step is None else self.of_step, self.processes)
 
 
@@ -72,7 +72,7 @@ WHOLE = ProcessShare()
 
 @dataclass(frozen=True)
 class Mixed:
-    """A data set, and a second one that a share of the training clips comes from."""
+    """A data set, and optionally a second one that provides a share of the training clips (replay)."""
 
     dataset: Dataset
     replayed: Dataset | None = None
@@ -90,18 +90,19 @@ def training_loader(
 ) -> Batches:
     """Yield the micro-batches of one process, endlessly, from any position of the run.
 
-    The run is one sequence of clips. Micro-batch m of it holds the `batch_size` clips from position
-    start_position + m * batch_size; the process has its own of each step. If `data.broken_episodes` is skip, clips that
-    cannot be read are missing from their micro-batch, which may even be empty; no other clip replaces them.
+    The run is one sequence of clips. Micro-batch m holds the `batch_size` clips from position
+    start_position + m * batch_size, and the micro-batches of a step are split between the processes. If
+    `data.broken_episodes` is skip, clips that cannot be read are missing from their micro-batch, which may be empty;
+    no other clip replaces them.
 
-    Each of two data sets has a sequence of its own. Clip p of the run is clip floor(p * share) of the second data set
-    if floor((p + 1) * share) is larger than floor(p * share). So the share is exact in every part of the run, up to a
-    clip.
+    With a second data set, each data set has a separate sequence. Clip p of the run is clip floor(p * share) of the
+    second data set if floor((p + 1) * share) is larger than floor(p * share). So the share is exact in every part of
+    the run, up to one clip.
 
-    Pinned batches are in memory from which copies to a CUDA device do not block the host.
+    Pinned batches are in page-locked memory, from which copies to a CUDA device do not block the host.
 
     Raises:
-        InputError: There is nothing to train on, or a clip cannot be read, also in a worker.
+        InputError: There are no training clips, or a clip cannot be read, also in a worker.
     """
     both = dataset if isinstance(dataset, Mixed) else Mixed(dataset)
     dataset, replayed = both.dataset, both.replayed
@@ -126,7 +127,7 @@ def _training_clips(dataset: Dataset, seed: int) -> _MicroBatches:
 
 
 def _training_clip(config: DataConfig, order: ClipOrder, position: int) -> ClipRequest:
-    """Return the request for a clip of the endless sequence of a run: the camera is drawn per clip."""
+    """Return the request for the clip at a position of the endless sequence; the camera is drawn per clip."""
     camera = config.cameras[order.choice(position, len(config.cameras))]
     return ClipRequest(*order.window(position), camera)
 
@@ -134,8 +135,8 @@ def _training_clip(config: DataConfig, order: ClipOrder, position: int) -> ClipR
 def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size: int) -> Iterator[Batch]:
     """Yield a fixed set of at most `clips` clips of a split, evenly spread over its windows, in batches.
 
-    The set depends on the data only: neither the seed nor the number of shards changes it. Neighbours in it are from
-    distant parts of the data, so that their actions are unrelated. A large set is read by workers.
+    The set depends on the data only, not on the seed or the number of shards. Consecutive clips are from distant parts
+    of the data, so that their actions are unrelated. A large set is read by workers.
 
     Raises:
         InputError: The split is empty, or a clip cannot be read.
@@ -156,12 +157,12 @@ def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tu
 def batches_of(
     dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int, may_be_none: bool = False
 ) -> Iterator[Batch]:
-    """Yield the clips that start at these (episode, first control step), in this order, in batches.
+    """Yield batches of the clips at these windows (episode, first control step), in order.
 
-    If `data.broken_episodes` is skip, a batch may be smaller; none is empty. Many clips are read by workers.
+    If `data.broken_episodes` is skip, a batch may be smaller, but never empty. Many clips are read by workers.
 
     Raises:
-        InputError: A clip cannot be read; or, by policy, none of them, unless that may be.
+        InputError: A clip cannot be read; or all clips were skipped and `may_be_none` is False.
     """
     count, empty = len(windows), not may_be_none
     rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
@@ -183,18 +184,18 @@ def _chosen_clip(dataset: Dataset, windows: Sequence[tuple[int, int]], position:
 
 @dataclass(frozen=True)
 class _MicroBatches(TorchDataset[Batch]):
-    """Micro-batches of the clips at given positions."""
+    """Micro-batches of clips, indexed by lists of positions."""
 
     dataset: Dataset
     request_at: Callable[[int], ClipRequest]  # a pure function of the position, the same in every worker
-    changes: ClipChanges | None = None  # of training clips; likewise
-    replayed: _MicroBatches | None = None  # of the second data set
-    share: Fraction = Fraction(0)  # of these
+    changes: ClipChanges | None = None  # transforms of training clips; pure functions, too
+    replayed: _MicroBatches | None = None  # clips of the second data set
+    share: Fraction = Fraction(0)  # share of clips from the second data set
 
     def __getitems__(self, positions: list[int]) -> Batch | UserError:
-        """Return a micro-batch, or its error: DataLoader would change an error that is raised.
+        """Return a micro-batch, or its error, because DataLoader would change the type of a raised error.
 
-        A worker puts the batch into shared memory here: PyTorch would do so in a thread, whose error gets lost.
+        A worker moves the batch into shared memory here. PyTorch would do so in a thread, whose errors get lost.
         """
         before = storage.bytes_fetched()
         try:
@@ -230,12 +231,12 @@ class _MicroBatches(TorchDataset[Batch]):
 
 
 class Batches(Iterator[Batch]):
-    """The batches of a loader, in order; a batch's error and its skipped clips are reported when it is requested.
+    """The batches of a loader, in order; errors and skipped clips are reported when their batch is requested.
 
     Args:
-        rows: The workers' results: micro-batches, or errors instead.
+        rows: The results of the workers: micro-batches or errors.
         broken: Records clips that could not be read.
-        replayed: Records those of the second data set.
+        replayed: Records clips of the second data set that could not be read.
     """
 
     def __init__(
@@ -250,7 +251,7 @@ class Batches(Iterator[Batch]):
         """Return the next batch.
 
         Raises:
-            InputError: A clip cannot be read, also in a worker; or too many cannot.
+            InputError: A clip cannot be read, also in a worker; or too many episodes are broken.
         """
         row = next(self._rows)
         if isinstance(row, UserError):
@@ -272,18 +273,18 @@ class Batches(Iterator[Batch]):
 def results_of_workers(
     items: TorchDataset[Any], positions: Iterator[list[int]], workers: int, *, pinned: bool = False
 ) -> Generator[Any, None, None]:
-    """Yield `items.__getitems__` of each list of positions, in order, computed by worker processes.
+    """Yield `items.__getitems__(list)` for each list of positions, in order, computed by worker processes.
 
     Args:
         items: The data set.
-        positions: What each result is made of.
-        workers: Number of processes; 0: this one.
+        positions: The list of positions of each result.
+        workers: Number of worker processes; 0: compute in this process.
         pinned: Put tensors into pinned memory.
 
     Raises:
-        UnreachableError: A worker has ended; or a signal has come, and no result soon after.
+        UnreachableError: A worker has ended, or no result arrived shortly after a stop signal.
     """
-    # A fork server has no threads: a plain fork may hang in OpenMP or CUDA, and Python warns of it.
+    # A fork server has no threads, whereas a plain fork may hang in OpenMP or CUDA, as Python warns.
     context = multiprocessing.get_context("forkserver") if workers else None
     if context is not None:
         context.set_forkserver_preload(["vjepa2_ac.data.loader"])
@@ -292,7 +293,7 @@ def results_of_workers(
         items,
         batch_sampler=positions,
         collate_fn=_identity,
-        generator=torch.Generator(),  # otherwise the loader uses dropout's generator
+        generator=torch.Generator(),  # the default generator is the one of dropout
         num_workers=workers,
         multiprocessing_context=context,
         worker_init_fn=_prepare_worker if workers else None,
@@ -304,12 +305,12 @@ def results_of_workers(
     rows = iter(loader)
     ours = set(multiprocessing.active_children()) - others
     at_exit = partial(_end_workers, ours)
-    atexit.register(at_exit)  # multiprocessing sends SIGTERM, and waits for workers that ignore it
+    atexit.register(at_exit)  # multiprocessing would send SIGTERM and wait for workers that ignore it
     try:
         while (row := _next_row(rows, ours)) is not None:
             yield row
     finally:
-        del rows  # requests the workers to end, and waits for a while
+        del rows  # asks the workers to end, and waits for a while
         _end_workers(ours)
         atexit.unregister(at_exit)
 
@@ -319,7 +320,7 @@ def _identity(batch: Any) -> Any:
 
 
 def _next_row(rows: Iterator[Any], workers: Iterable[BaseProcess]) -> Any:
-    """Return the next result; None: there is none. Errors as of `results_of_workers`."""
+    """Return the next result, or None at the end; errors as for `results_of_workers`."""
     started = time.monotonic()
     while True:
         try:
@@ -338,20 +339,20 @@ def _next_row(rows: Iterator[Any], workers: Iterable[BaseProcess]) -> Any:
 
 
 def _end_workers(workers: Iterable[BaseProcess]) -> None:
-    """Kill workers that did not end on request: blocked by a clip, and ignoring SIGTERM."""
+    """Kill workers that did not end on request, because they are reading a clip and ignore SIGTERM."""
     for worker in workers:
         if worker.is_alive():
             worker.kill()
 
 
 def _start_servers() -> None:
-    """Start the fork server with safe imports, and with a run's stop signals blocked, which its workers inherit.
+    """Start the fork server with safe imports and with stop signals blocked; its workers inherit the signal mask.
 
-    A signal to the whole process group, as from a terminal, `timeout` or Slurm, is for the run: it needs its workers to
-    finish the step, and ends them.
+    A signal to the whole process group, as from a terminal, `timeout` or Slurm, must reach only the run, which needs
+    its workers to finish the step and then ends them.
     """
     stop = {signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP}
-    for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the first one clears the mask
+    for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the first call clears the mask
         before = signal.pthread_sigmask(signal.SIG_BLOCK, stop)
         try:
             with safe_imports():
@@ -364,16 +365,16 @@ def _start_servers() -> None:
 
 
 def _prepare_worker(_worker: int) -> None:
-    """End this worker when its reading process has ended for any reason, or when a batch cannot be sent.
+    """Make this worker exit when its run has ended for any reason, or when a batch cannot be sent.
 
-    PyTorch's own watchdog checks the fork server, which lives as long as its workers: both would stay for ever. The
-    thread that sends batches only prints its errors: the run would wait for the batch for ever.
+    PyTorch's watchdog checks the fork server, which lives as long as its workers, so both would stay forever. The
+    thread that sends batches only prints its errors, so the run would wait for the batch forever.
     """
     queues.Queue._on_queue_feeder_error = staticmethod(_end_without_sending)  # type: ignore[attr-defined]  # untyped
     run = multiprocessing.parent_process()
     if run is None:
         raise ValueError("not in a worker")
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which ends its workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run handles Ctrl-C and ends its workers
 
     def watch() -> None:
         run.join()
@@ -391,15 +392,15 @@ def _end_without_sending(error: BaseException, _batch: object) -> None:
 
 
 def require_shared_memory(data: DataConfig, batch_bytes: float, processes: int = 1) -> None:
-    """Check that shared memory has room for the batches that workers prefetch; a container has 64 MB by default.
+    """Check that shared memory has space for the prefetched batches of all workers; containers have 64 MB by default.
 
     Args:
         data: The config.
-        batch_bytes: Size of a batch.
+        batch_bytes: Size of a batch in bytes.
         processes: Number of processes of the run on this machine.
 
     Raises:
-        UnreachableError: There is less room.
+        UnreachableError: There is too little shared memory.
     """
     needed = processes * data.workers * PREFETCH * batch_bytes
     free = shutil.disk_usage(SHARED_MEMORY).free if SHARED_MEMORY.is_dir() else math.inf
@@ -410,10 +411,10 @@ def require_shared_memory(data: DataConfig, batch_bytes: float, processes: int =
 
 
 def _in_shared_memory(batch: Batch) -> Batch:
-    """Return a batch in shared memory. PyTorch would move it in the thread that sends it, whose errors get lost.
+    """Move a batch into shared memory. PyTorch would do so in the thread that sends the batch, whose errors get lost.
 
     Raises:
-        UnreachableError: There is no room.
+        UnreachableError: There is too little shared memory.
     """
     try:
         return batch.mapped(Tensor.share_memory_)

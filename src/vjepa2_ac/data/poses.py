@@ -1,9 +1,10 @@
-"""Poses as data sets write them, converted to the project's states (conventions: `vjepa2_ac.episode`).
+"""Convert poses from the formats of data sets to states, and detect a wrong rotation format.
 
-And the formats that three rotation numbers may have, compared: the hand turns smoothly only in the right one. An Euler
-angle jumps by 2 pi where it passes pi, and a rotation vector changes its sign, although the hand turns on evenly. Read
-in the right format, a jump of the numbers is an ordinary step; read in another format, the hand turns abruptly. The
-speed over all steps does not show the format: in a wrong format the hand may be faster or slower.
+The conventions of states are in `vjepa2_ac.episode`. A wrong format of three rotation numbers is detected at jumps: an
+Euler angle jumps by 2 pi where it passes pi, and a rotation vector changes its sign, although the hand turns smoothly.
+Read in the right format, the rotation at a jump of the numbers is as small as at other steps; read in another format,
+the hand turns abruptly. The mean speed does not show the format, because a wrong format may make the hand faster or
+slower.
 """
 
 from __future__ import annotations
@@ -24,22 +25,22 @@ _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _UNIT_TOLERANCE = 1e-2
 
 FORMATS: tuple[RotationFormat, ...] = ("euler_xyz", "rotation_vector", "euler_xyz_degrees")
-MIN_JUMPS = 3  # at which only the other format is smooth, before the configured one is doubted
+MIN_JUMPS = 3  # jumps at which only another format is smooth, required to reject the configured format
 
-_JUMP, _JUMP_RATIO = 1.5, 6.0  # a jump: a change of the numbers above this, and above this many median changes
-_STEPS_AROUND = 5  # on either side of a jump
-_MIN_ANGLE_RAD = 0.005  # a smaller step counts as this one: rounding of the numbers
-_SMOOTH, _ABRUPT = 3.0, 9.0  # a step's angle relative to the steps around it
-_CLEAR_MAJORITY = 5
+_JUMP, _JUMP_RATIO = 1.5, 6.0  # a jump exceeds this change of the numbers and this multiple of the median change
+_STEPS_AROUND = 5  # steps on either side of a jump
+_MIN_ANGLE_RAD = 0.005  # lower bound of a step's angle, because smaller angles are rounding errors
+_SMOOTH, _ABRUPT = 3.0, 9.0  # limits of a step's angle relative to the steps around it
+_CLEAR_MAJORITY = 5  # least ratio of jumps that favour another format to jumps that favour the configured one
 
 
 def num_rotation_numbers(written_as: RotationFormat) -> int:
-    """Return how many numbers a rotation has: 4 for a quaternion, 3 for the other formats."""
+    """Return the number of numbers of a rotation: 4 for quaternions, 3 for the other formats."""
     return 4 if written_as.startswith("quaternion") else 3
 
 
 def rotations_from(numbers: Float[np.ndarray, "steps _"], written_as: RotationFormat) -> Rotation:
-    """Return the rotations that these numbers describe.
+    """Convert rotation numbers of a format to SciPy rotations.
 
     Raises:
         ValueError: A quaternion is zero.
@@ -56,16 +57,16 @@ def rotations_from(numbers: Float[np.ndarray, "steps _"], written_as: RotationFo
 def poses_from(
     numbers: Float[np.ndarray, "steps _"], fields: PoseFields, where: str, *, section: str
 ) -> Float[np.ndarray, "steps 7"]:
-    """Return states from the numbers of an episode: position, rotation and gripper of each step.
+    """Convert the numbers of an episode (position, rotation and gripper of each step) to states.
 
     Args:
         numbers: The selected numbers, in the order position, rotation, gripper.
-        fields: Their format.
+        fields: The format of the numbers.
         where: File and episode, for messages.
         section: The config section of the fields, such as data.lerobot.
 
     Raises:
-        InputError: They are implausible under these settings: not a unit quaternion, out of reach.
+        InputError: The poses are implausible in this format: a quaternion is not of unit length, or out of reach.
     """
     fix = f"Check {section}: state, select, rotation, position_unit, gripper_open and gripper_closed"
     require_plausible = partial(POSE.require_plausible, where=where, fix=fix, conversions=_conversions(fields, section))
@@ -84,7 +85,7 @@ def poses_from(
 
 
 def _conversions(fields: PoseFields, section: str) -> dict[str, str]:
-    """Return, by the name of a unit that implausible numbers may look like, the config key to set."""
+    """Return the fix for numbers that seem to be in another unit, by the name of that unit."""
     conversions = {}
     if fields.position_unit == "m":
         conversions = {unit: f"set {section}.position_unit: {unit[0]}m" for unit in ("millimetres", "centimetres")}
@@ -96,7 +97,7 @@ def _conversions(fields: PoseFields, section: str) -> dict[str, str]:
 def require_selection(
     columns: Mapping[str, int], fields: PoseFields, section: str, *, is_pose: bool, episode: str = ""
 ) -> None:
-    """Refuse `select` beyond the numbers that there are, and numbers that do not form a pose.
+    """Refuse a `select` with indices out of range, and a number of columns that does not form a pose.
 
     Args:
         columns: The width of each column of `state`, by its description.
@@ -106,7 +107,7 @@ def require_selection(
         episode: File and episode, for messages; empty: all episodes have these columns.
 
     Raises:
-        InputError: Says what was found and which key to change.
+        InputError: Names the config key to change.
     """
     place = f"{episode}: {section}" if episode else section
     source, where = " + ".join(columns), f"{place}.state"
@@ -138,9 +139,9 @@ def _require_unit_quaternions(quaternions: Float[np.ndarray, "steps 4"], where: 
 
 @dataclass(frozen=True, eq=False)
 class RotationSpeeds:
-    """How fast a hand turns if the rotation numbers of some episodes have one format."""
+    """The rotation speed of the hand if the rotation numbers of some episodes are read in one format."""
 
-    median_rad_s: float  # over the steps at which the numbers change; 0 if they never do
+    median_rad_s: float  # over the steps at which the numbers change; 0 if they never change
     at_jumps: Float[np.ndarray, " jumps"]  # the speed at each jump of the numbers, relative to the steps around it
 
     @property
@@ -150,7 +151,7 @@ class RotationSpeeds:
 
     @property
     def num_smooth_jumps(self) -> int:
-        """The number of jumps at which the hand turns about as fast as around them, as in the right format."""
+        """The number of jumps at which the hand turns about as fast as at the steps around, as in the right format."""
         return int((self.at_jumps <= _SMOOTH).sum())
 
     def num_smoother_than(self, other: RotationSpeeds) -> int:
@@ -161,16 +162,16 @@ class RotationSpeeds:
 def rotation_speeds(
     episodes: Iterable[Float[np.ndarray, "steps 3"]], control_rate_hz: float
 ) -> dict[RotationFormat, RotationSpeeds]:
-    """Return how fast the hand turns in each format that the rotation numbers may have.
+    """Return the rotation speeds of the hand in each format that three rotation numbers may have.
 
-    Quaternions are not compared: with w first or last they give the same speeds.
+    The two orders of quaternions are not compared, because they give the same speeds.
 
     Args:
-        episodes: The three rotation numbers of each control step, as the data set has them.
+        episodes: The three rotation numbers of each control step, as stored in the data set.
         control_rate_hz: Control steps per second.
 
     Returns:
-        By format; those in radians only if no number is too large for radians.
+        Speeds by format. Formats in radians are absent if a number is too large for radians.
     """
     numbers = [_without_repetitions(one) for one in episodes]
     numbers = [one for one in numbers if len(one) > 1]
@@ -190,17 +191,17 @@ def rotation_speeds(
 def smoother_format(
     speeds: Mapping[RotationFormat, RotationSpeeds], written_as: RotationFormat, max_rad_s: float
 ) -> RotationFormat | None:
-    """Return the format in which the hand turns much more smoothly than in the configured one; None: there is none.
+    """Return the format in which the hand turns much more smoothly than in the configured one, or None.
 
-    tests/data/test_rotation_formats.py tries random smooth motions in all three formats. A hand that points down (roll
-    near pi) usually makes the numbers jump. If the hand is tilted by more than it moves, or is near its zero rotation,
-    the numbers never jump, and a wrong format is not found. Numbers in degrees are found if one of them is too large
+    tests/data/test_rotation_formats.py tests random smooth motions in all three formats. If the hand points down (roll
+    near pi), the numbers usually jump. If the hand is tilted by more than it moves, or is near its zero rotation, the
+    numbers never jump, and a wrong format is not detected. Numbers in degrees are detected if one of them is too large
     for radians.
 
     Args:
-        speeds: What `rotation_speeds` returns.
+        speeds: The result of `rotation_speeds`.
         written_as: The configured format.
-        max_rad_s: A median speed above this one is impossible: the numbers are degrees.
+        max_rad_s: The largest possible median speed; if it is exceeded, the numbers are degrees.
     """
     if num_rotation_numbers(written_as) == 4:
         return None
@@ -217,7 +218,7 @@ def smoother_format(
 
 
 def _without_repetitions(numbers: Float[np.ndarray, "steps 3"]) -> Float[np.ndarray, "changing 3"]:
-    """Return the steps without those that repeat the previous one, which hide the speed."""
+    """Remove steps whose numbers equal those of the next step, because repetitions distort the speed."""
     return numbers[np.append(np.diff(numbers, axis=0).any(axis=1), True)] if len(numbers) else numbers
 
 
@@ -234,7 +235,7 @@ def _step_angles(numbers: Float[np.ndarray, "steps 3"], written_as: RotationForm
 def _relative_to_neighbours(
     angles: Float[np.ndarray, " changes"], is_jump: Bool[np.ndarray, " changes"]
 ) -> Float[np.ndarray, " jumps"]:
-    """Return the angle at each jump, relative to the mean of the steps around it without jumps; NaN: there are none."""
+    """Return the angle at each jump relative to the mean angle of the steps around it without jumps, or NaN."""
     calm = np.stack([np.where(is_jump, 0.0, angles), ~is_jump])
     sums = np.cumsum(np.pad(calm, ((0, 0), (_STEPS_AROUND + 1, _STEPS_AROUND))), axis=1)
     total, count = (sums[:, 2 * _STEPS_AROUND + 1 :] - sums[:, : -2 * _STEPS_AROUND - 1])[:, is_jump]

@@ -1,4 +1,4 @@
-"""Which episodes a run uses, and for which split: exclusion, broken episodes, outcomes, and train, validation, test."""
+"""Selection of episodes: exclusion, broken episodes, outcomes, and the splits train, validation and test."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from vjepa2_ac.errors import InputError, counted
 
 logger = logging.getLogger(__name__)
 
-NAMED = 10  # episodes in one message, at most
-_ALLOWED_BROKEN = 3  # episodes, in all but the smallest data sets
-_ALLOWED_SHARE = 0.01  # of the episodes, in large data sets
+NAMED = 10  # most identities in one message
+_ALLOWED_BROKEN = 3  # broken episodes that are tolerated in all but the smallest data sets
+_ALLOWED_SHARE = 0.01  # share of broken episodes that is tolerated in large data sets
 SPLIT = "split"  # label of an episode: the name of its split in the data set
 
 _HELD_OUT: tuple[Split, ...] = ("validation", "test")
 _ROLES: dict[str, Split] = {"val": "validation", "valid": "validation", "validation": "validation", "test": "test"}
-_FEWEST_GROUPS = 3  # one for each split
+_FEWEST_GROUPS = 3  # one per split
 
 Members = Bool[np.ndarray, " episodes"]
 
-# For DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.
+# Patterns for DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.
 IN_IDENTITY = {
     "lab": r"([^/]+)/(?:success|failure)/",
     "day": r"/(?:success|failure)/([0-9]{4}-[0-9]{2}-[0-9]{2})(?:/|$)",
@@ -38,7 +38,7 @@ IN_IDENTITY = {
 
 
 def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
-    """Return which episodes are used: all except those in `data.exclude`.
+    """Return a mask of the episodes that are not in `data.exclude`.
 
     Raises:
         InputError: `data.exclude` contains an unknown identity.
@@ -58,10 +58,10 @@ def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " epis
 
 
 def of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
-    """Return which episodes have the outcome of `data.outcome`.
+    """Return a mask of the episodes that have the outcome of `data.outcome`.
 
     Raises:
-        InputError: No episode says whether it succeeded.
+        InputError: The outcome of all episodes is unknown.
     """
     if config.outcome == "all":
         return np.ones(len(table), bool)
@@ -72,10 +72,10 @@ def of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " ep
 
 
 def require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig) -> None:
-    """Refuse two episodes with one identity: they would share a split, and an error could not name one of them.
+    """Refuse two episodes with the same identity, because errors and `data.exclude` could not tell them apart.
 
     Raises:
-        InputError: There are two.
+        InputError: Two used episodes have the same identity.
     """
     members = np.flatnonzero(taking_part)
     hashes, counts = np.unique(table.id_hash[members], return_counts=True)
@@ -90,38 +90,38 @@ def require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episod
 
 
 def max_broken(episodes: int) -> int:
-    """Return how many broken episodes of a data set `data.broken_episodes: skip` leaves out before it stops.
+    """Return the number of broken episodes that `data.broken_episodes: skip` tolerates.
 
-    3 or 1 %, whichever is larger, but of fewer than 6 episodes at most half: where most episodes cannot be read, a
-    setting is wrong rather than the recordings.
+    The limit is 3 episodes or 1 %, whichever is larger, and at most half of fewer than 6 episodes. If most episodes
+    cannot be read, probably a setting is wrong rather than the recordings.
     """
     return max(min(_ALLOWED_BROKEN, episodes // 2), int(_ALLOWED_SHARE * episodes))
 
 
 class BrokenEpisodes:
-    """The broken episodes of an opened data set: those found while opening it, and those found by clips since.
+    """The broken episodes of an open data set, found while opening it or while reading clips.
 
-    It is in the process that opened the data set; loader workers report to it. `data.broken_episodes` is the policy:
-    stop at the first, or skip and count them, and stop where too many are broken.
+    The record is in the process that opened the data set; loader workers report to it. `data.broken_episodes` is the
+    policy: raise the first error, or skip and count broken episodes, and raise an error if too many are broken.
 
     Args:
         config: The data.
-        episodes: How many there are, broken ones included.
-        usable: The hashes of the identities of the episodes that clips may come from; None: not known.
+        episodes: Number of episodes, including broken ones.
+        usable: The identity hashes of the episodes that clips may come from; None: unknown.
     """
 
     def __init__(self, config: DataConfig, episodes: int, usable: UInt64[np.ndarray, " usable"] | None = None) -> None:
         self._config, self._episodes, self._usable = config, episodes, usable
-        self.reasons: dict[str, str] = {}  # of the broken episodes, in the order in which they were found
+        self.reasons: dict[str, str] = {}  # by identity, in the order of discovery
 
     def __len__(self) -> int:
         return len(self.reasons)
 
     def found(self, problems: Sequence[EpisodeProblem]) -> None:
-        """Record the problems found while the data set was opened or indexed.
+        """Record problems that were found while the data set was opened or indexed.
 
         Raises:
-            InputError: `data.broken_episodes` is error: the first of them; or too many are broken.
+            InputError: `data.broken_episodes` is error (raises the first problem), or too many episodes are broken.
         """
         if not problems:
             return
@@ -140,7 +140,7 @@ class BrokenEpisodes:
         """Record an episode of which a clip could not be read.
 
         Raises:
-            InputError: Now too many are broken.
+            InputError: Too many episodes are broken now.
         """
         if name not in self.reasons:
             count = len(self) + 1
@@ -148,32 +148,33 @@ class BrokenEpisodes:
             self._add({name: reason})
 
     def recall(self, reasons: Mapping[str, str]) -> None:
-        """Count also what the run has found before it was resumed, or in its other processes.
+        """Record broken episodes that the run found before it was resumed, or in other processes.
 
         Raises:
-            InputError: In total too many are broken.
+            InputError: Too many episodes are broken in total.
         """
         self._add({name: why for name, why in reasons.items() if name not in self._config.exclude})
 
     def refusal(self, error: InputError, names: Sequence[str]) -> InputError:
-        """Return an error of broken episodes, with the fixes that would leave them out: skip, exclusion, or none.
+        """Return an error about broken episodes whose fix names the config keys that would leave them out.
 
-        Skip is a fix if the episodes are few enough; exclusion is one if other episodes remain.
+        The fix names `data.broken_episodes: skip` if the episodes are few enough, and `data.exclude` if other episodes
+        remain.
 
         Args:
-            error: The error of one of them, or of all.
-            names: The identities of all that are known to be broken.
+            error: The error of one or all of these episodes.
+            names: The identities of all episodes that are known to be broken.
         """
         names = list(dict.fromkeys(names))
         hashes = np.array([identity_hash(name) for name in names], np.uint64)
-        if self._usable is not None and np.isin(self._usable, hashes).all():  # nothing would be left
+        if self._usable is not None and np.isin(self._usable, hashes).all():  # no episode would remain
             return error
         is_few = len(names) <= max_broken(self._episodes)
         return with_exclusion(error, names, is_skippable=is_few and self._config.broken_episodes == "error")
 
     def _add(self, reasons: Mapping[str, str]) -> None:
         new = {name: why for name, why in reasons.items() if name not in self.reasons}
-        self.reasons = {**self.reasons, **new}  # another dict: a checkpoint being written keeps the previous one
+        self.reasons = {**self.reasons, **new}  # a new dict, because a checkpoint may be writing the old one
         if len(self) <= (allowed := max_broken(self._episodes)):
             return
         name, reason = next(iter(self.reasons.items()))
@@ -184,11 +185,11 @@ class BrokenEpisodes:
 
 
 def with_exclusion(error: InputError, names: Sequence[str], *, is_skippable: bool = False) -> InputError:
-    """Return an error of one or more episodes whose fix says how to leave them out.
+    """Return an error about some episodes whose fix also shows how to exclude them.
 
     Args:
-        error: What is wrong with them.
-        names: Their identities, all different; the fix lists ten at most, and the number of all.
+        error: The error.
+        names: The identities of the episodes, all different; the fix lists at most ten, and the total number.
         is_skippable: Whether `data.broken_episodes: skip` would leave them out.
     """
     fix = f"{error.fix.rstrip('.')}. " if error.fix else ""
@@ -209,23 +210,23 @@ def named(ids: Sequence[str], count: int | None = None) -> str:
 
 
 def roles_of(names: Iterable[str]) -> dict[str, Split]:
-    """Return as which of our splits each split of a data set is used, by its name.
+    """Return the split (train, validation or test) as which each split of a data set is used, by its name.
 
-    An unknown name counts as train. The result is empty unless the data set has both a split to train on and a split
-    that is held out.
+    An unknown name counts as train. The result is empty unless the data set has both a training split and a held-out
+    split.
     """
     roles = {name: _ROLES.get(name.lower(), "train") for name in names}
     return roles if "train" in roles.values() and len(set(roles.values())) > 1 else {}
 
 
 def with_own_splits(table: EpisodeTable, names: Sequence[str | None]) -> EpisodeTable:
-    """Return the table with the name of each episode's split as a label, if the data set has several splits."""
+    """Add the name of each episode's split in the data set as a label, if the data set has several splits."""
     labels = Labels.of(names)
     return table if len(labels.names) < 2 else replace(table, labels={**table.labels, SPLIT: labels})
 
 
 def held_out_by(table: EpisodeTable, config: DataConfig) -> dict[Split, Members]:
-    """Return the episodes of validation and test where the data set has such splits and `data.splits` uses them."""
+    """Return the masks of the data set's own validation and test splits, if it has them and `data.splits` uses them."""
     labels = table.labels.get(SPLIT)
     if labels is None or config.splits == "hash":
         return {}
@@ -235,7 +236,7 @@ def held_out_by(table: EpisodeTable, config: DataConfig) -> dict[Split, Members]
 
 
 def describe_splits(table: EpisodeTable, config: DataConfig) -> str:
-    """Return how the data set's own splits are used, as text; empty if the data set has only one split."""
+    """Describe how the data set's own splits are used; empty if the data set has only one split."""
     labels = table.labels.get(SPLIT)
     if labels is None:
         return ""
@@ -253,13 +254,13 @@ def describe_splits(table: EpisodeTable, config: DataConfig) -> str:
 def members_of(
     table: EpisodeTable, split_hash: UInt64[np.ndarray, " episodes"], config: DataConfig, split: Split, among: Members
 ) -> Members:
-    """Return which episodes belong to a split: those of the data set's own, or drawn from the others by `in_split`.
+    """Return a mask of the episodes of a split: the data set's own split, or drawn from the others by `in_split`.
 
     Args:
         table: The episodes, with the names of the data set's own splits.
         split_hash: As for `in_split`.
         config: `data.splits` and the shares; the share of a split that the data set has is not used.
-        split: Which split.
+        split: The split.
         among: As for `in_split`.
     """
     held_out = held_out_by(table, config)
@@ -276,17 +277,17 @@ def in_split(
     split: Split,
     among: Bool[np.ndarray, " episodes"] | None = None,
 ) -> Bool[np.ndarray, " episodes"]:
-    """Return which episodes belong to a split.
+    """Return a mask of the episodes that belong to a split.
 
-    The hash, as a number in [0, 1), is compared with the shares. Where that leaves validation or test without any,
-    as may happen to few episodes, though its share is above 0, the one whose number comes next moves there.
+    The hash, as a number in [0, 1), is compared with the shares. If validation or test would be empty although its
+    share is above 0, which may happen with few episodes, the episode with the next larger hash is assigned to it.
 
     Args:
-        split_hash: Of each episode's identity; with `data.split_by`, of the name of its group.
+        split_hash: Hash of each episode's identity; with `data.split_by`, of the name of its group.
         config: The shares.
-        split: Which split.
-        among: Which of them are split, None: all. The split of one depends on the others where these are few: so they
-            are the same throughout a run, with those that are broken or left out by `data.exclude`.
+        split: The split.
+        among: Mask of the episodes to split; None: all. With few episodes the split of one depends on the others, so
+            the mask includes broken episodes and those in `data.exclude`, and stays the same throughout a run.
     """
     number = split_hash.astype(np.float64) / 2**64
     among = np.ones(len(number), bool) if among is None else among
@@ -296,7 +297,10 @@ def in_split(
 
 
 def _bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[float, float]:
-    """Return the numbers below which a group is of test, and of test or validation; `groups` has all, sorted."""
+    """Return the bounds (test, held out): groups below the first are test, groups between them are validation.
+
+    `groups` holds the numbers of all groups, sorted.
+    """
     test, held_out = config.test_share, config.test_share + config.validation_share
     if len(groups) < _FEWEST_GROUPS:
         return test, held_out
@@ -312,15 +316,15 @@ def _bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[f
 def groups_of(
     table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig
 ) -> UInt64[np.ndarray, " episodes"] | None:
-    """Return the hash of each episode's group (`data.split_by`), which determines its split; None: its identity does.
+    """Return the hash of each episode's group (`data.split_by`), which determines its split; None without groups.
 
     Args:
         table: The episodes.
-        taking_part: Which of them are used; the others need not belong to a group, and then get that of another one.
+        taking_part: Mask of the used episodes; other episodes without a group get the hash of an arbitrary group.
         config: `data.split_by`.
 
     Raises:
-        InputError: There is no such field, one of those has none, or a pattern does not match its identity.
+        InputError: There is no such field, a used episode has no value, or the pattern does not match its identity.
     """
     split_by = config.split_by
     if split_by is None:

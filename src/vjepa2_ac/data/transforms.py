@@ -1,10 +1,11 @@
-"""Camera frames to encoder input: crop, the user's transforms, scaling, normalisation.
+"""Convert camera frames to encoder input: crop, the user's transforms, scaling, normalisation.
 
-The crop is taken in the loader, on uint8, and the user's transforms are applied there; everything else runs on the
-device, on a whole batch.
+The crop and the user's transforms are applied in the loader, to uint8 frames; scaling and normalisation run on the
+device, on whole batches.
 
 Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/transforms.py and src/datasets/utils/video/transforms.py. The
-recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, is always taken: nothing is random.
+random crop of Meta's training recipe never fits a 16:9 frame, so its fallback, a central crop, is always used, and
+nothing is random.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from vjepa2_ac.registry import TRANSFORMS
 Crop = Literal["released", "square", "letterbox"]
 Transform = Callable[[Clip, np.random.Generator], Clip]
 
-NARROWEST, WIDEST = 0.75, 1.35  # width over height that the recipe leaves uncropped
+NARROWEST, WIDEST = 0.75, 1.35  # aspects (width over height) between these are not cropped in Meta's recipe
 
-_MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)  # of ImageNet, as the encoder was trained
+_MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)  # of ImageNet, with which the encoder was trained
 _STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
 _STREAM = 0x7F  # separates the random numbers of transforms from others of the same seed and position
 
@@ -46,9 +47,9 @@ class CropBox:
 
 
 def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
-    """Return the part of a frame that the model sees: all of it, or the centre cut to an aspect (width over height).
+    """Return the part of a frame that the model receives: a central crop limited to an aspect (width over height).
 
-    released: an aspect between 0.75 and 1.35. square: 1, as upstream evaluates. letterbox: all.
+    released: an aspect between 0.75 and 1.35. square: 1, as in Meta's evaluation. letterbox: the whole frame.
     """
     aspects = {"released": (NARROWEST, WIDEST), "square": (1.0, 1.0), "letterbox": (0.0, float("inf"))}
     narrowest, widest = aspects[kind]
@@ -63,12 +64,12 @@ def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
 def view(
     frames: UInt8[np.ndarray, "time height width 3"], kind: Crop = "released"
 ) -> UInt8[np.ndarray, "time seen_height seen_width 3"]:
-    """Return the part of the frames that the model sees, at their own resolution; see `DataConfig.crop`.
+    """Return the part of the frames that the model receives, at the original resolution; see `DataConfig.crop`.
 
-    A view of the same memory, except for letterbox, if bars must be added.
+    The result shares memory with the frames, unless letterbox adds bars.
 
     Raises:
-        InputError: With bars the frames are too large.
+        InputError: The frames are too large after adding bars.
     """
     if kind == "letterbox":
         return _with_bars(frames)
@@ -79,10 +80,10 @@ def view(
 def split_views(
     frames: UInt8[np.ndarray, "time height all 3"], views: int
 ) -> UInt8[np.ndarray, "frames height width 3"]:
-    """Return the views that stand side by side in frames, those of a frame one after another.
+    """Split frames with several views side by side into single views, in frame-major order.
 
     Raises:
-        InputError: The width is not that of so many views.
+        InputError: The width of the frames is not a multiple of the number of views.
     """
     time, height, width = frames.shape[:3]
     if width % views:
@@ -97,18 +98,18 @@ def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.nda
         return frames
     side = max(height, width)
     require_bounded(side, side, "data.crop: letterbox", count=len(frames))
-    rows, columns = side - height, side - width  # missing ones, in all
+    rows, columns = side - height, side - width  # numbers of rows and columns to add
     return np.pad(frames, ((0, 0), (rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0)))
 
 
 def pixels_to_input(
     frames: UInt8[Tensor, "batch time height width 3"], image_size: int
 ) -> Float[Tensor, "batch time 3 size size"]:
-    """Return cropped frames as encoder input: squashed to a square (bilinear), ImageNet mean 0 and std 1.
+    """Convert cropped frames to encoder input: resized to a square (bilinear) and normalised as for ImageNet.
 
     Args:
-        frames: Results of `view`, stacked, on any device.
-        image_size: Height and width of a result, in pixels.
+        frames: Stacked results of `view`, on any device.
+        image_size: Height and width of the result in pixels.
     """
     pixels = frames.flatten(0, 1).permute(0, 3, 1, 2).to(torch.float32)
     resized = torch.nn.functional.interpolate(
@@ -119,7 +120,7 @@ def pixels_to_input(
 
 
 def input_to_pixels(inputs: Float[Tensor, "*batch 3 size size"]) -> UInt8[Tensor, "*batch 3 size size"]:
-    """Return encoder input as the image that it is, rounded to 8 bits: the inverse of the normalisation."""
+    """Invert the normalisation of encoder input, and round to uint8 images."""
     pixels = inputs.float() * per_channel(_STD, inputs.device) + per_channel(_MEAN, inputs.device)
     return pixels.round().clamp(0, 255).to(torch.uint8)
 
@@ -127,7 +128,7 @@ def input_to_pixels(inputs: Float[Tensor, "*batch 3 size size"]) -> UInt8[Tensor
 def frames_as_seen(
     frames: UInt8[np.ndarray, "time height width 3"], size: int
 ) -> UInt8[np.ndarray, "time size size 3"]:
-    """Return cropped frames as the encoder sees them, for people to look at."""
+    """Return cropped frames at the resolution of the encoder input, as uint8 images for display."""
     inputs = pixels_to_input(torch.from_numpy(np.ascontiguousarray(frames))[None], size)[0]
     return np.ascontiguousarray(input_to_pixels(inputs).permute(0, 2, 3, 1).numpy())
 
@@ -136,20 +137,20 @@ def frames_as_seen(
 class ClipChanges:
     """The user's transforms of the training clips of a run."""
 
-    transforms: tuple[tuple[str, Transform], ...]  # by name, in the config's order
+    transforms: tuple[tuple[str, Transform], ...]  # (name, transform) in the config's order
     seed: int
 
     @classmethod
     def of(cls, data: DataConfig, seed: int) -> ClipChanges:
-        """Return the changes that a config describes; transforms are made once, in the process that starts workers."""
+        """Create the transforms of a config, once, in the process that starts the workers."""
         made = ((config.name, TRANSFORMS.make(config.name, config.options)) for config in data.transforms)
         return cls(tuple(made), seed)
 
     def apply(self, clip: Clip, position: int) -> Clip:
-        """Return the changed clip: a pure function of the clip, the seed and its position in the run.
+        """Apply all transforms to a clip: a pure function of the clip, the seed and the position in the run.
 
         Raises:
-            InputError: A transform returned something that training cannot use.
+            InputError: The result of a transform has other shapes or types.
         """
         for number, (name, transform) in enumerate(self.transforms):
             before, generator = clip, np.random.default_rng([_STREAM, number, self.seed, position])
@@ -159,7 +160,7 @@ class ClipChanges:
 
 
 def _require_same_form(result: object, before: Clip, name: str) -> None:
-    """Refuse the result of a transform unless shapes and types are as before; frames may have another size."""
+    """Refuse the result of a transform if shapes or types differ from its input; the size of frames may differ."""
     found, needed = ([_form(one, part) for part in ("frames", "states", "actions")] for one in (result, before))
     for one, other in zip(found, needed, strict=True):
         if one != other:
@@ -176,6 +177,6 @@ def _form(clip: object, part: str) -> str:
 
 @lru_cache(maxsize=32)
 def per_channel(values: tuple[float, float, float], device: torch.device) -> Float[Tensor, "3 1 1"]:
-    """Return numbers for red, green and blue on a device: copied there once, since the copy blocks the host."""
-    with torch.inference_mode(False):  # tensors of inference mode could not be trained with
+    """Return numbers for red, green and blue as a tensor on a device, cached because the copy blocks the host."""
+    with torch.inference_mode(False):  # inference tensors cannot be used in training
         return torch.tensor(values, device=device).view(3, 1, 1)

@@ -1,7 +1,7 @@
-"""Clip windows: which clips exist, and their order.
+"""Clip windows: the set of all clips, and their order.
 
-Everything here is a pure function of the episodes' identities and remaining steps, the seed and a position: nothing
-depends on the number of shards, workers or ranks, and resuming a run needs no saved state.
+All results are pure functions of the episodes' identities and remaining steps, the seed and a position. They do not
+depend on the number of shards, workers or ranks, so resuming a run needs no saved state.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from vjepa2_ac.errors import InputError, counted
 
 logger = logging.getLogger(__name__)
 
-_ROUNDS = 8  # of the permutation
-_HALF_BITS = 3  # minimum: narrower halves favour some orders of few windows
+_ROUNDS = 8  # rounds of the Feistel network
+_HALF_BITS = 3  # least width of its halves; smaller ones make some orders of few windows more likely
 _MASK64 = (1 << 64) - 1
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Clips in the order of their episodes' identities, then of their starts; as runs of neighbours.
+    """The windows of clips, sorted by the identity of the episode and then by the start, stored as runs.
 
-    A run has the clips that start at `first`, `first` + `every`, ..., `count` of them.
+    A run has `count` clips, which start at `first`, `first` + `every`, ...
     """
 
     episode: Int32[np.ndarray, " runs"]  # index into the source
-    first: Int32[np.ndarray, " runs"]  # control step
-    count: Int32[np.ndarray, " runs"]
-    every: int = 1  # control steps
-    short: tuple[int, ...] = ()  # episodes skipped because they are shorter than a clip
+    first: Int32[np.ndarray, " runs"]  # first control step of the first clip
+    count: Int32[np.ndarray, " runs"]  # number of clips
+    every: int = 1  # control steps between the starts of consecutive clips
+    short: tuple[int, ...] = ()  # episodes that are skipped because they are shorter than a clip
 
     def of(self, runs: np.ndarray) -> Windows:
-        """Return some of the runs, by a mask or by index."""
+        """Select runs by a mask or by indices."""
         return replace(self, episode=self.episode[runs], first=self.first[runs], count=self.count[runs])
 
     @cached_property
@@ -61,25 +61,25 @@ class Windows:
         return int(self.episode[run]), int(self.first[run]) + self.every * place
 
     def steps_of(self, run: int) -> Int[np.ndarray, " n"]:
-        """Return the starts of a run, by its index."""
+        """Return the first control steps of all clips of a run."""
         return int(self.first[run]) + self.every * np.arange(self.count[run])
 
     @property
     def episodes(self) -> Int32[np.ndarray, " episodes"]:
-        """The episodes that clips come from, each once, ascending."""
+        """The distinct episodes that clips come from, ascending."""
         return np.unique(self.episode)
 
 
 def clip_starts(table: EpisodeTable, kept: StepSelection, config: DataConfig) -> Windows:
-    """Return all clips within kept ranges.
+    """Return the windows of all clips that fit into the kept ranges.
 
-    With `data.start_every` their starts are multiples of it, counted from the first kept step of their episode.
+    With `data.start_every` = n, clips start at every n-th step, counted from the first kept step of their episode.
     """
     span = kept.end - kept.start - (config.clip_steps - 1)
     phase = np.zeros(len(table), np.int32)
-    phase[kept.episode[::-1]] = kept.start[::-1]  # the last write counts: an episode's first range
+    phase[kept.episode[::-1]] = kept.start[::-1]  # reversed, so that the first range of an episode is written last
     skipped = (phase[kept.episode] - kept.start) % config.start_every
-    count = -((skipped - span) // config.start_every)  # rounded up; 0 or less if none remains
+    count = -((skipped - span) // config.start_every)  # rounded up; 0 or less if no clip fits
     runs = Windows(kept.episode, kept.start + skipped, count, config.start_every).of(count > 0)
     return runs.of(np.lexsort((runs.first, table.id_rank[runs.episode])))
 
@@ -91,13 +91,13 @@ def windows_of(
 
     Args:
         table: The episodes.
-        members: Which of them are used, and belong to the split: at least one.
-        starts: The result of `clip_starts`, at least of these.
+        members: Mask of the episodes that are used and belong to the split; at least one.
+        starts: The result of `clip_starts`, which includes these episodes.
         config: The length of a clip.
         split: The name of the split.
 
     Raises:
-        InputError: The split has only short episodes, or none with a clip's length of kept steps.
+        InputError: All episodes of the split are shorter than a clip, or no range of kept steps is long enough.
     """
     where, count = f"data.path: {config.path}", int(members.sum())
     length = f"{counted(config.clip_steps, 'step')} for a clip of {config.frames} frames at stride {config.stride}"
@@ -121,14 +121,14 @@ def windows_of(
     return replace(own, short=tuple(short.tolist()))
 
 
-@lru_cache(maxsize=64)  # every validation uses the same windows
+@lru_cache(maxsize=64)  # each text is logged once, although every validation asks for the same windows
 def _warn_once(text: str) -> None:
     logger.warning("%s", text)
 
 
 @dataclass(frozen=True)
 class ClipOrder:
-    """The endless order of training: every window once per epoch, each epoch in its own order."""
+    """The endless order of training: every window once per epoch, in a different order in each epoch."""
 
     windows: Windows
     seed: int
@@ -139,15 +139,16 @@ class ClipOrder:
         return self.windows[permuted(index, size=len(self.windows), seed=self.seed, epoch=epoch)]
 
     def choice(self, position: int, count: int) -> int:
-        """Return one of `range(count)`, uniformly drawn, for the clip at a position of the run."""
+        """Draw an index from `range(count)` uniformly for the clip at a position of the run."""
         digest = hashlib.blake2b(f"{self.seed} {position}".encode(), digest_size=8).digest()
         return int.from_bytes(digest, "big") % count
 
 
 def permuted(index: int, *, size: int, seed: int, epoch: int) -> int:
-    """Return the image of an index under a keyed permutation of `range(size)`, which is never in memory.
+    """Return the image of an index under a keyed permutation of `range(size)`, computed without storing it.
 
-    A Feistel network permutes the next power of four; results outside the range are permuted again until inside.
+    A Feistel network permutes the range up to the next power of four; results outside `range(size)` are permuted again
+    until they are inside.
     """
     half = max(_HALF_BITS, ((size - 1).bit_length() + 1) // 2)
     keys = _round_keys(size, seed, epoch)
@@ -179,25 +180,25 @@ def _round_keys(size: int, seed: int, epoch: int) -> tuple[int, ...]:
 
 
 def drawn(id_hash: int, start: int) -> float:
-    """Return a number in [0, 1) for a window: a hash of its episode's identity hash and its first step."""
+    """Return a pseudo-random number in [0, 1) for a window, from its episode's identity hash and its first step."""
     return (_mix((id_hash + (start + 1) * 0x9E3779B97F4A7C15) & _MASK64) >> 11) / (1 << 53)
 
 
 def candidate_strides(control_rate_hz: float) -> tuple[int, ...]:
-    """Return the strides that a model chooses among: 4, 8 and 15 at 15 control steps per second, scaled."""
+    """Return the strides that `data calibrate` compares: 4, 8 and 15 at 15 Hz, scaled to the control rate."""
     return tuple(sorted({max(1, round(stride * control_rate_hz / 15)) for stride in (4, 8, 15)}))
 
 
 def require_stride(config: DataConfig, *, to: str, fix: str = "`vjepa2-ac data calibrate CONFIG` finds one") -> int:
-    """Return the stride of a config.
+    """Return the stride of a config, which must not be auto.
 
     Args:
         config: The data.
-        to: What it is needed for.
-        fix: How to say it.
+        to: What the stride is needed for, for messages.
+        fix: How to set the stride, for messages.
 
     Raises:
-        InputError: It is auto.
+        InputError: The stride is auto.
     """
     if config.stride == "auto":
         raise InputError(where="data.stride", found="auto", needed=f"a number of control steps, to {to}", fix=fix)
@@ -205,14 +206,14 @@ def require_stride(config: DataConfig, *, to: str, fix: str = "`vjepa2-ac data c
 
 
 def require_frames(config: DataConfig, *, to: str) -> None:
-    """Refuse a latent cache, which has no frames but JPEGs to look at.
+    """Refuse a latent cache, which has no frames except small images for display.
 
     Args:
         config: The data.
-        to: What frames are needed for.
+        to: What frames are needed for, for messages.
 
     Raises:
-        InputError: It is a cache.
+        InputError: The data are a latent cache.
     """
     if config.is_cache:
         needed = f"the data set itself, to {to}"
@@ -220,18 +221,18 @@ def require_frames(config: DataConfig, *, to: str) -> None:
 
 
 def spread(size: int, count: int) -> list[int]:
-    """Return at most `count` of `range(size)`, evenly spread, each once."""
+    """Return at most `count` distinct indices from `range(size)`, evenly spread."""
     count = min(size, count)
     return [(2 * number + 1) * size // (2 * count) for number in range(count)]
 
 
 def spread_with_ends(size: int, count: int) -> list[int]:
-    """Return at most `count` of `range(size)`, evenly spread, each once, the first and the last among them."""
+    """Return at most `count` distinct indices from `range(size)`, evenly spread, including the first and the last."""
     return sorted({round(place) for place in np.linspace(0, size - 1, min(size, count))})
 
 
 def far_neighbours(items: list[int]) -> list[int]:
-    """Return sorted items in an order in which neighbours are about half the list apart."""
+    """Reorder sorted items so that consecutive items are about half the list apart."""
     half = (len(items) + 1) // 2
     pairs = itertools.zip_longest(items[:half], items[half:])
     return [item for pair in pairs for item in pair if item is not None]
