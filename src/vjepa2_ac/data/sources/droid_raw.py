@@ -40,20 +40,20 @@ _REQUIRED = {
 }
 _OPTIONAL = {
     "skipped": ("observation/timestamp/skip_action", 1),  # the operator was not in control
-    "velocities": ("action/joint_velocity", 7),  # commanded
+    "velocities": ("action/joint_velocity", 7),  # commanded joint velocities
 }
 
-Arrays = Mapping[str, Shaped[np.ndarray, "steps *numbers"]]  # pose, gripper ...: of control steps
+Arrays = Mapping[str, Shaped[np.ndarray, "steps *numbers"]]  # pose, gripper, ... per control step
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Location of an episode, and what its metadata and videos say."""
+    """Location of an episode, and facts from its metadata and videos."""
 
     folder: str
     version: str
-    serials: dict[str, str]  # of each camera that the metadata name
-    frames: dict[str, int]  # how many the MP4 of each of the config's cameras has, by serial number
+    serials: dict[str, str]  # serial number of each camera in the metadata
+    frames: dict[str, int]  # number of frames in the MP4 of each of the config's cameras, by serial number
 
 
 class RawDroidSource(IndexedSource[RawDroidData, None]):
@@ -61,14 +61,14 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
 
     `infos` reads every trajectory and the headers of the MP4s of the config's cameras, once; data behind a URL is not
     checked again until folders are added or removed. An episode's identity is LAB/outcome/DATE/TIME
-    (`identity_of`). The numbers of a trajectory and the times of a video's frames are kept in the disk
-    cache, so that HDF5 is parsed, and the packets of a video with B-frames are read, once on a machine.
+    (`identity_of`). The numbers of a trajectory and the times of a video's frames are stored in the disk cache, so
+    that each machine parses the HDF5 file and reads the packets of a video with B-frames only once.
 
-    An MP4 holds one frame per control step, in order, whatever rate its header states, and may lack the last step's.
+    An MP4 holds one frame per control step, in order, whatever rate its header states; the last frame may be missing.
     """
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - a video is fetched in blocks
-        """Return one episode; only requested frames are decoded.
+        """Return an episode; only requested frames are decoded.
 
         Raises:
             InputError: A file is missing or damaged, or has changed since it was indexed.
@@ -102,7 +102,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         return read_frames(opened(), [frames[step] for step in steps], where=video, times=times)
 
     def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
-        """Return the cached table, or scan every episode; a changed local file changes the key."""
+        """Return the cached table, or scan all episodes; a changed local file changes the key."""
         config, root = self._config, self._config.path
         folders = find_episodes(root, CONNECTIONS)
         if not folders:
@@ -157,7 +157,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         )
 
     def _numbers(self, place: _Place, serials: tuple[str, ...]) -> Arrays:
-        """Return what is known of the steps that are used, with the poses of some cameras and the place of each frame.
+        """Return the arrays of the used steps, with the poses of some cameras and the index of each frame.
 
         Raises:
             InputError: The trajectory is damaged, incomplete, implausible, or of another length than an MP4.
@@ -186,21 +186,21 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
 
 
 def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[str, Float[np.ndarray, "steps _"]]:
-    """Return the numbers of a trajectory.h5 per step: pose, gripper; skipped and velocities if there are any.
+    """Parse a trajectory.h5 into arrays per step: pose, gripper, and if present skipped, velocities, camera poses.
 
     Args:
         data: The content of the file.
         where: The file, for messages.
-        serials: Cameras whose poses are returned under this name, if there are any.
+        serials: Serial numbers of cameras; the poses of a camera are returned under its serial number.
 
     Raises:
-        InputError: Not HDF5, damaged or incomplete.
+        InputError: The file is not HDF5, damaged or incomplete.
     """
     h5py = require_library("h5py", where=where, called="h5py, which reads trajectory.h5", extra="raw")
     poses = {serial: (f"observation/camera_extrinsics/{serial}_left", 6) for serial in serials}
     found: dict[str, Float[np.ndarray, "steps _"]] = {}
     try:
-        # From memory: HDF5 then never waits for a network, nor crashes on a file that is being truncated.
+        # Read from memory, so that HDF5 never waits for a network or crashes on a file that is being truncated.
         with h5py.File(h5py.h5f.open_file_image(data)) as file:
             for name, (place, width) in (_REQUIRED | _OPTIONAL | poses).items():
                 if place in file:
@@ -219,7 +219,7 @@ def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[st
 
 
 def _array(data: Any, width: int, where: str) -> Float[np.ndarray, "steps width"]:
-    """Return `width` finite numbers per step; for one number, the second axis may be missing."""
+    """Read an HDF5 array of `width` finite numbers per step; for width 1 the second axis may be missing."""
     shape, kind = tuple(getattr(data, "shape", None) or ()), getattr(getattr(data, "dtype", None), "kind", "?")
     fits = shape[1:] == (width,) or (width == 1 and len(shape) == 1)
     if not fits or shape[0] > _MOST_STEPS or kind not in "fiub":
@@ -235,14 +235,14 @@ def _states_of(numbers: Arrays) -> Float[np.ndarray, "steps 7"]:
 
 
 def _named(metadata: Mapping[str, Any], camera: str) -> str | None:
-    """Return the serial number of a camera, which is the name of its MP4; None if the metadata do not name it."""
+    """Return the serial number of a camera, from the name of its MP4 in the metadata; None if it is missing."""
     path = metadata.get(f"{camera}_mp4_path")
     name = PurePosixPath(path).name if isinstance(path, str) else ""
     return name.removesuffix(".mp4") if name.endswith(".mp4") else None
 
 
 def _serial(serials: Mapping[str, str], camera: str, where: str) -> str:
-    """Return the serial number of a camera: left, right, wrist, ext1, ext2, or a serial number itself."""
+    """Return the serial number of a camera, given by a name (left, right, wrist, ext1, ext2) or a serial number."""
     if camera in RAW_CAMERAS and camera not in serials:
         found, fix = f"no {camera}_mp4_path with an MP4", "Set data.camera to one that every episode has"
         raise InputError(where=where, found=found, needed="the path of one in the metadata", fix=fix)
@@ -250,7 +250,7 @@ def _serial(serials: Mapping[str, str], camera: str, where: str) -> str:
 
 
 def _labels(metadata: Mapping[str, Any]) -> dict[str, str | None]:
-    """Return the episode's labels, as far as known: scene, building, operator, task."""
+    """Return the labels scene, building, operator and task of an episode; None where unknown."""
     texts = {key: str(value) for key, value in metadata.items() if isinstance(value, str | int)}
     return {
         "scene": texts.get("scene_id"),
@@ -267,18 +267,18 @@ def _labels(metadata: Mapping[str, Any]) -> dict[str, str | None]:
 class EpisodeFolder:
     """The listing of an episode's folder."""
 
-    path: str  # relative to the data set's; "" is the data set's folder itself
+    path: str  # relative to the data set's folder; "" is the data set's folder itself
     files: tuple[FileInfo, ...]
     videos: tuple[FileInfo, ...]
 
     @property
     def metadata(self) -> str | None:
-        """The name of its metadata file, or None; DROID's uploaders wrote it last, for complete episodes only."""
+        """The name of the metadata file, or None; DROID's upload wrote this file last, for complete episodes only."""
         return next((file.name for file in self.files if _is_metadata(file.name)), None)
 
 
 def find_episodes(root: str, connections: int) -> list[str]:
-    """Return the folders of all episodes, relative to `root`, sorted; "" if `root` is an episode's.
+    """Return the folders of all episodes, relative to `root`, sorted; [""] if `root` itself is an episode.
 
     Raises:
         OSError: A folder cannot be listed.
@@ -307,9 +307,9 @@ def list_episode(root: str, folder: str) -> EpisodeFolder:
 
 
 def identity_of(root: str, folder: str) -> str:
-    """Return LAB/outcome/DATE/TIME if the path ends so, for any part of the tree as `root`.
+    """Return the identity of an episode: LAB/outcome/DATE/TIME if its full path ends so, for any `root` in the tree.
 
-    Otherwise it is the path relative to `root`: it depends on `root`.
+    Otherwise the identity is the path relative to `root`.
     """
     base = root.split("://", 1)[1] if storage.is_url(root) else str(Path(root).resolve())
     parts = [part for part in f"{base}/{folder}".split("/") if part]
@@ -317,15 +317,15 @@ def identity_of(root: str, folder: str) -> str:
 
 
 def success_of(identity: str) -> bool | None:
-    """Return the outcome in an identity, or None."""
+    """Return whether the episode succeeded according to its identity, or None."""
     parts = identity.split("/")
     return parts[-3] == "success" if _ends_as_in_droid(parts) else None
 
 
 def _children(root: str, folder: str) -> list[tuple[str, bool]]:
-    """Return the folders in a folder, and whether each is an episode.
+    """Return (path, whether it is an episode) of the folders in a folder.
 
-    In DROID's own layout the depth shows that, without listing every episode.
+    In DROID's layout the depth of a path identifies episodes, so they need not be listed.
     """
     children = [storage.join(folder, name) for name in list_folder(root, folder)[1]]
     return [(path, success_of(identity_of(root, path)) is not None or _is_episode(root, path)) for path in children]

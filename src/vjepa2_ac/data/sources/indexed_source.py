@@ -1,4 +1,4 @@
-"""The common part of all sources: opened and indexed once, and frames read by control step."""
+"""The common part of all sources: opening and indexing a data set once, and reading frames by control step."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ logger = logging.getLogger(__name__)
 
 
 def open_source(config: DataConfig) -> EpisodeSource:
-    """Return the source of the data; nothing is read yet, and no other form's libraries are imported."""
+    """Create the source of a config without reading anything; only the libraries of this format are imported."""
     module, _, name = config.reader.partition(":")
     source: EpisodeSource = getattr(importlib.import_module(module), name)(config)
     return source
 
 
 def measured_space(config: DataConfig, width: int) -> StateSpace:
-    """Return the space of the states that a source reads: of poses in the base frame, or of vectors so wide."""
+    """Return the space of measured states: poses in the base frame, or vectors of the given width."""
     return POSE if config.states == "pose" else vector_states(width)
 
 
@@ -45,31 +45,34 @@ def spaces_of(config: DataConfig, widths: Widths) -> Spaces:
 
 @dataclass(frozen=True)
 class Scanned:
-    """What the index keeps of an episode that can be used."""
+    """The entry of a usable episode in the index."""
 
     info: EpisodeInfo
-    where: str  # its file, for messages
-    place: Mapping[str, Any] = field(default_factory=dict)  # numbers or bytes: what the source finds it by
+    where: str  # the file of the episode, for messages
+    place: Mapping[str, Any] = field(default_factory=dict)  # numbers or bytes by which the source finds the episode
     states: StatesSummary = UNREAD
     labels: Mapping[str, str | None] = field(default_factory=dict)
-    rate_hz: float | None = None  # control steps per second; None: the index does not know
-    kind: str = ""  # what all episodes must have in common, in words
+    rate_hz: float | None = None  # control steps per second; None: unknown
+    kind: str = ""  # description of the properties that all episodes must share
 
 
 Found = Scanned | EpisodeProblem
 
 
 def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: Progress = no_progress) -> EpisodeTable:
-    """Return the table of all episodes: of those with one identity the first stays, of kinds the most frequent one.
+    """Build the table of all episodes from the results of a scan.
+
+    If several episodes have the same identity, the first is used. Episodes whose kind differs from the most frequent
+    one are problems, like those with a duplicate identity.
 
     Args:
-        found: Every episode, in the source's order.
+        found: The result of each episode, in the source's order.
         config: The data.
-        total: How many there are.
-        progress: Called after each.
+        total: Number of episodes.
+        progress: Called with (done, total) after each episode.
 
     Raises:
-        InputError: No episode can be used: the first one's error.
+        InputError: No episode can be used; raises the error of the first one.
     """
     usable: dict[str, Scanned] = {}
     problems: list[EpisodeProblem] = []
@@ -110,15 +113,14 @@ More = TypeVar("More")
 
 
 class IndexedSource(ABC, Generic[Config, More]):
-    """A source that is opened with the first call; pickled to a loader worker, it takes the index along.
+    """A source that opens its data set on the first call; its pickle for loader workers includes the index.
 
-    Nothing is read before that call. Any number of threads may use it. Besides the table it keeps what else is needed
-    to read an episode.
+    Any number of threads may use a source. It holds the index and the source-specific state that `_look` returns.
     """
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._opening = threading.Lock()  # of this source only: `_look` may open another source
+        self._opening = threading.Lock()  # one lock per source, because `_look` may open another source
         self._known: tuple[EpisodeTable, More] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -129,13 +131,13 @@ class IndexedSource(ABC, Generic[Config, More]):
         """Return identity, length and outcome of every usable episode, and the problems of the others.
 
         Raises:
-            InputError: No data set, one that does not fit the config, or no episode that can be used.
+            InputError: There is no data set, it does not match the config, or no episode can be used.
             OSError: Data behind a URL cannot be read.
         """
         return self._open(progress or no_progress)[0]
 
     def with_raw_states(self) -> Self:
-        """Return the source of the same episodes whose states are the numbers of the data set; the index is shared."""
+        """Return a source of the same episodes that reads states as unconverted vectors; the index is shared."""
         other = type(self)(self._config.model_copy(update={"states": "vector"}))
         other._known = self._known
         return other
@@ -153,15 +155,15 @@ class IndexedSource(ABC, Generic[Config, More]):
     def _scanned(
         self, scan: Callable[[str], Scanned], identities: Mapping[str, str], progress: Progress
     ) -> EpisodeTable:
-        """Return the table of every episode.
+        """Scan all episodes and return their table.
 
         Args:
-            scan: Reads an episode, given by its key among the identities.
-            identities: Of the episodes.
-            progress: Called after each.
+            scan: Reads an episode, given by its key in `identities`.
+            identities: Identities of the episodes by key.
+            progress: Called with (done, total) after each episode.
 
         Raises:
-            InputError: No episode can be used: the first one's error.
+            InputError: No episode can be used; raises the error of the first one.
             OSError: Data behind a URL cannot be read.
         """
 
@@ -176,16 +178,16 @@ class IndexedSource(ABC, Generic[Config, More]):
 
     @abstractmethod
     def _look(self, progress: Progress) -> tuple[EpisodeTable, More]:
-        """Open the data set: read its index from the cache, or scan it."""
+        """Open the data set; return its index, from the cache or by a scan, and the source-specific state."""
 
 
 def frames_by_step(num_steps: int, where: str, decode: FrameReader) -> FrameReader:
-    """Return the reader of the frames of one camera of an episode.
+    """Return a reader of the frames of one camera of an episode that refuses steps outside the episode.
 
     Args:
-        num_steps: Of the episode.
+        num_steps: Number of steps of the episode.
         where: File and episode, for messages.
-        decode: Returns the RGB frames at steps within the episode, in their order.
+        decode: Returns the RGB frames at steps within the episode, in the requested order.
     """
 
     def read(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
@@ -197,10 +199,10 @@ def frames_by_step(num_steps: int, where: str, decode: FrameReader) -> FrameRead
 
 
 def require_as_indexed(found: int, info: EpisodeInfo, where: str) -> None:
-    """Refuse an episode of another length than when it was indexed.
+    """Refuse an episode whose length differs from its length in the index.
 
     Raises:
-        InputError: It is.
+        InputError: The lengths differ.
     """
     if found != info.num_steps:
         needed, fix = f"the {info.num_steps} that were indexed", "Do not change files while a run reads them"

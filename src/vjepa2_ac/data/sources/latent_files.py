@@ -1,24 +1,23 @@
 """The files of a latent cache, and the precision of its latents.
 
-cache.json     what the cache is: its key in full
-episodes.npz   every episode of the data set that it was made from, in its order, as `EpisodeTable.to_bytes` writes them
-kept.npz       the steps that `data.idle` leaves, as `StepSelection.to_bytes` writes them; absent without an idle rule
+cache.json     the full key of the cache
+episodes.npz   all episodes of the encoded data set, in its order, as `EpisodeTable.to_bytes` writes them
+kept.npz       the steps that `data.idle` keeps, as `StepSelection.to_bytes` writes them; absent without an idle rule
 episodes/000/000123-CAMERA.safetensors   the latents of an episode, by its index, and a camera
-episodes/000/000123-CAMERA.broken        in its place: why the episode could not be read (`data.broken_episodes`)
+episodes/000/000123-CAMERA.broken        instead: the reason why the episode is unreadable (`data.broken_episodes`)
 
-Every file gets its name when it is complete, behind a URL, too. A cache is finished when each episode that clips need
-has its file, of each camera. The tensors of such a file (control steps as in `episode`; `frames` are the steps that
-were encoded):
+All files are written atomically, also behind a URL. A cache is finished when each episode that clips need has a file
+for each camera. The tensors of such a file (control steps as in `episode`; `frames` are the encoded steps):
 
 latents        [frames, tokens, dim] bfloat16, float32 or int8
 scales         [frames, tokens] float32, with int8 only: a latent is its value times the scale of its token
 frame_steps    [frames] int32: the control step of each frame, ascending
-states         [steps, state_dim], and where the source has them commands, extrinsics, joint_velocities
-pictures       the frames as the encoder saw them, for people to look at: [bytes] uint8, JPEGs one after the other; or
-               [frames, size, size, 3] uint8, exact, for a decoder to learn from
-picture_ends   [frames] int64: where each JPEG ends
+states         [steps, state_dim], and if the source has them commands, extrinsics, joint_velocities
+pictures       the encoder's input images: [bytes] uint8, concatenated JPEGs for display; or [frames, size, size, 3]
+               uint8, lossless, to train a decoder
+picture_ends   [frames] int64: the end of each JPEG in `pictures`
 
-The header's metadata (texts): id, camera, metadata (JSON), key (the digest of the cache's key).
+The header's metadata (strings): id, camera, metadata (JSON), key (the digest of the cache's key).
 """
 
 from __future__ import annotations
@@ -52,10 +51,10 @@ DTYPES: dict[CacheType, torch.dtype] = {"bf16": torch.bfloat16, "fp32": torch.fl
 OPTIONAL = ("commands", "extrinsics", "joint_velocities")
 Ranges = Sequence[tuple[int, int]]  # (start, length) in bytes
 
-_LARGEST = 127  # of int8
+_LARGEST = 127  # largest quantised value
 _JPEG_QUALITY = 85
-_HEAD_BYTES = 32 << 10  # of a file, read when it is opened: the header, and with it most small tensors
-_LENGTH_BYTES = 8  # before the header: how long it is
+_HEAD_BYTES = 32 << 10  # bytes read when a file is opened: the header and most small tensors
+_LENGTH_BYTES = 8  # length of the number before the header that states the header's length
 _TENSOR_TYPES = {
     "BF16": torch.bfloat16, "F16": torch.float16, "F32": torch.float32, "F64": torch.float64, "BOOL": torch.bool,
     "U8": torch.uint8, "I8": torch.int8, "I16": torch.int16, "I32": torch.int32, "I64": torch.int64,
@@ -65,62 +64,62 @@ FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was
 
 
 def pack_latents(latents: Float[Tensor, "*batch tokens dim"], kind: CacheType) -> StoredLatents:
-    """Return latents in their storage type.
+    """Convert latents to a storage type.
 
-    bf16 rounds to nearest: the error is at most 2**-8 of the value. int8 divides each token by its largest value over
-    127, its scale: the error is at most half a scale. fp32 is exact.
+    bf16 rounds to nearest, with an error of at most 2**-8 of the value. int8 divides each token by a scale, its largest
+    absolute value over 127, with an error of at most half a scale. fp32 is exact.
     """
     if kind != "int8":
         return StoredLatents(latents.to(DTYPES[kind]))
     latents = latents.float()
     scales = latents.abs().amax(dim=-1) / _LARGEST
-    divisor = torch.where(scales > 0, scales, torch.ones_like(scales))  # a token of zeros stays one
+    divisor = torch.where(scales > 0, scales, torch.ones_like(scales))  # a token of zeros stays zero
     values = (latents / divisor[..., None]).round().clamp(-_LARGEST, _LARGEST)
     return StoredLatents(values.to(torch.int8), scales)
 
 
 def unpack_latents(stored: StoredLatents) -> Float[Tensor, "*batch tokens dim"]:
-    """Return stored latents as float32: the encoder's output up to the rounding of `pack_latents`."""
+    """Convert stored latents to float32, which equals the encoder's output up to the rounding of `pack_latents`."""
     values = stored.values.float()
     return values if stored.scales is None else values * stored.scales[..., None]
 
 
 def bytes_per_frame(tokens: int, dim: int, kind: CacheType) -> int:
-    """Return the size of a frame's latents."""
+    """Return the size of a frame's latents in bytes."""
     return tokens * dim * DTYPES[kind].itemsize + (tokens * 4 if kind == "int8" else 0)
 
 
 @dataclass(frozen=True, eq=False)
 class EncodedEpisode:
-    """An episode with latents of frames of one camera."""
+    """An episode with the latents of frames of one camera."""
 
-    episode: Episode  # its states and other data for clips; no frame is read
+    episode: Episode  # provides states and other data of clips; its frames are not read
     camera: str
     steps: Sequence[int]  # control steps of the frames, ascending; there may be none
     latents: StoredLatents  # of these frames, see `pack_latents`
-    pictures: UInt8[np.ndarray, "frames size size 3"]  # these frames, as the encoder saw them
+    pictures: UInt8[np.ndarray, "frames size size 3"]  # the encoder's input images of these frames
 
 
 @dataclass(frozen=True)
 class LatentFiles:
-    """The files of the episodes in a cache's folder. Several processes may write into it.
+    """The files of the episodes in a cache's folder. Several processes may write into the folder.
 
-    Which files there are behind a URL is known from one listing, made when the first is looked for.
+    A folder behind a URL is listed once, when the first file is looked up.
     """
 
-    folder: Path | str  # here, or a URL
+    folder: Path | str  # local folder or URL
     key: str  # digest of the cache's key
-    cache: DiskCache | None = None  # of what is read at a URL; there it is needed
+    cache: DiskCache | None = None  # disk cache of remote data, required for a URL
 
     def path(self, number: int, camera: str) -> str:
-        """Return the file of an episode, by its index in the data set, and a camera."""
+        """Return the path of the file of an episode (by its index in the data set) and a camera."""
         return storage.join(self.folder, _name(number, camera))
 
     def has(self, number: int, camera: str) -> bool:
-        """Return whether a file is there, whole, and of this cache; its header is read.
+        """Return whether a file exists, is complete and belongs to this cache, by reading its header.
 
         Raises:
-            UnreachableError: It cannot be read now.
+            UnreachableError: The file cannot be read now.
         """
         try:
             self.open(number, camera)
@@ -129,14 +128,14 @@ class LatentFiles:
         return True
 
     def size(self, number: int, camera: str) -> int:
-        """Return the size of a file in bytes; 0 if there is none."""
+        """Return the size of a file in bytes; 0 if the file is missing."""
         found = self._found(_name(number, camera))
         return 0 if found is None else found.size
 
     def episodes_without_file(self, numbers: Sequence[int], cameras: Sequence[str]) -> list[int]:
-        """Return the episodes that lack the file of a camera, and the note why it could not be written.
+        """Return the episodes that have neither a file of latents nor a `.broken` file for some camera.
 
-        The folder is listed once and no file is opened: a damaged file is named when it is first read.
+        The folder is listed once and no file is opened, so a damaged file is reported when it is first read.
 
         Raises:
             UnreachableError: The folder cannot be listed now.
@@ -146,16 +145,16 @@ class LatentFiles:
         return [number for number in numbers if any(_name(number, camera, "") not in done for camera in cameras)]
 
     def is_done(self, number: int, camera: str) -> bool:
-        """Return whether a file is there, or in its place the reason why it cannot be; of a URL as it is listed."""
+        """Return whether a file of latents or a `.broken` file exists; behind a URL only the listing is checked."""
         is_there = self.size(number, camera) > 0 if storage.is_url(self.folder) else self.has(number, camera)
         return is_there or self._found(_name(number, camera, _BROKEN)) is not None
 
     def open(self, number: int, camera: str) -> EpisodeFile:
-        """Open a file.
+        """Open the file of an episode and camera.
 
         Raises:
-            InputError: It is missing, damaged, or belongs to another cache; or the episode could not be read.
-            UnreachableError: It cannot be read now.
+            InputError: The file is missing, damaged, or belongs to another cache; or the episode could not be read.
+            UnreachableError: The file cannot be read now.
         """
         place, file, note = (
             self.path(number, camera),
@@ -177,7 +176,7 @@ class LatentFiles:
 
         Raises:
             InputError: The file cannot be written, or the disk is full.
-            UnreachableError: It cannot be written to the URL.
+            UnreachableError: The URL cannot be written.
         """
         episode, latents, camera = encoded.episode, encoded.latents, encoded.camera
         arrays = {
@@ -202,19 +201,19 @@ class LatentFiles:
             storage.remove(storage.join(self.folder, note))
 
     def note_broken(self, number: int, camera: str, reason: str) -> None:
-        """Record that an episode cannot be read, for the other processes and for whoever reads the cache."""
+        """Record that an episode cannot be read, for other processes and for readers of the cache."""
         storage.write(storage.join(self.folder, _name(number, camera, _BROKEN)), reason)
 
     @property
     def broken(self) -> dict[int, str]:
-        """The episodes that could not be read, by their index, and why."""
+        """The reasons of the episodes that could not be read, by the index of the episode."""
         sizes = self._sizes()
         notes = sorted(name for name in sizes if name.endswith(_BROKEN))
-        broken = [note for note in notes if note.removesuffix(_BROKEN) + _WHOLE not in sizes]  # else mended
+        broken = [note for note in notes if note.removesuffix(_BROKEN) + _WHOLE not in sizes]  # else encoded later
         return {int(note.rpartition("/")[2].partition("-")[0]): self._reason(note) for note in broken}
 
     def _sizes(self) -> Mapping[str, int]:
-        """Return the size in bytes of every file, by its name in the folder; of a local folder as they are now."""
+        """Return the size in bytes of every file by its name in the folder; a local folder is listed again."""
         if storage.is_url(self.folder):
             return {name: file.size for name, file in self._listed.items()}
         return storage.file_sizes(str(self.folder))
@@ -239,19 +238,19 @@ def _name(number: int, camera: str, ending: str = _WHOLE) -> str:
 
 
 class EpisodeFile:
-    """An open file; everything is read on request, latents and pictures frame by frame.
+    """An open file of latents, whose content is read on request, latents and images frame by frame.
 
-    The safetensors format is read here by ranges, since the library reads local files only.
+    The safetensors format is parsed here, because the library cannot read parts of remote files.
 
     Args:
         path: The file.
         key: Digest of the key of its cache.
-        size: Of the file, in bytes.
-        read: Returns several (start, length) pieces of it, each complete.
+        size: Size of the file in bytes.
+        read: Returns several (start, length) pieces of the file, each complete.
 
     Raises:
         InputError: The file is missing, damaged, or belongs to another cache.
-        UnreachableError: It cannot be read now.
+        UnreachableError: The file cannot be read now.
     """
 
     def __init__(self, path: str, key: str, size: int, read: Callable[[Ranges], list[bytes]]) -> None:
@@ -277,10 +276,10 @@ class EpisodeFile:
         return self.array("frame_steps")
 
     def array(self, name: str) -> np.ndarray:
-        """Return a whole tensor, such as states.
+        """Read a whole tensor, such as states.
 
         Raises:
-            InputError: There is none of this name.
+            InputError: There is no tensor of this name.
         """
         with self._reading():
             one = self._tensors[name]
@@ -290,7 +289,7 @@ class EpisodeFile:
         """Return the indices of the frames at these control steps.
 
         Raises:
-            InputError: The cache has no frame of one of them.
+            InputError: The cache has no frame at one of the steps.
         """
         there = {step: place for place, step in enumerate(self.frame_steps.tolist())}
         if absent := [step for step in steps if step not in there]:
@@ -299,7 +298,7 @@ class EpisodeFile:
         return [there[step] for step in steps]
 
     def latents(self, places: Sequence[int]) -> StoredLatents:
-        """Return the latents of frames by their index.
+        """Read the latents of frames, given by their indices.
 
         Raises:
             InputError: There are no such latents.
@@ -309,10 +308,10 @@ class EpisodeFile:
             return StoredLatents(*self._rows(names, places))
 
     def pictures(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames size size 3"]:
-        """Return frames as the encoder saw them, by their index.
+        """Read the encoder's input images of frames, given by their indices.
 
         Raises:
-            InputError: One is damaged.
+            InputError: An image is damaged.
         """
         with self._reading():
             stored = self._tensors["pictures"]
@@ -323,7 +322,7 @@ class EpisodeFile:
         return decode_images(jpegs, self.frame_steps[list(places)].tolist(), self.path)
 
     def _rows(self, names: Sequence[str], places: Sequence[int]) -> list[Tensor]:
-        """Return the same rows of several tensors, which are read together."""
+        """Read the same rows of several tensors together."""
         tensors, count = [self._tensors[name] for name in names], len(places)
         pieces = self._pieces([one.range_of(place, place + 1) for one in tensors for place in places])
         parts = (pieces[number * count : (number + 1) * count] for number in range(len(tensors)))
@@ -340,7 +339,7 @@ class EpisodeFile:
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
-        """Raise an error for the user if the file is missing, truncated, no safetensors file, or lacks something."""
+        """Raise an error for the user if the file is missing, truncated, not safetensors, or lacks a tensor."""
         try:
             with storage.user_can_read(self.path, needed="latents of an episode", fix=FIX):
                 yield
@@ -357,11 +356,11 @@ class _Tensor:
 
     dtype: torch.dtype
     shape: tuple[int, ...]
-    start: int  # in the file
+    start: int  # position in the file
 
     @classmethod
     def of(cls, about: Mapping[str, Any], begin: int) -> _Tensor:
-        """Return a tensor of a header; `begin`: where the header ends."""
+        """Create a tensor from its entry in the header; `begin` is the position after the header."""
         start, end = about["data_offsets"]
         one = cls(_TENSOR_TYPES[about["dtype"]], tuple(about["shape"]), begin + start)
         if min(start, *one.shape) < 0 or one.end != begin + end:
@@ -370,17 +369,17 @@ class _Tensor:
 
     @property
     def end(self) -> int:
-        """Where it ends in the file."""
+        """Position after the tensor in the file."""
         return self.start + prod(self.shape) * self.dtype.itemsize
 
     def range_of(self, start: int, stop: int) -> tuple[int, int]:
-        """Return where some of its rows are."""
+        """Return (start, length) in the file of the rows from `start` to `stop`."""
         if not 0 <= start <= stop <= self.shape[0]:
             raise IndexError(f"rows {start} to {stop} of {self.shape[0]}")
         row = prod(self.shape[1:]) * self.dtype.itemsize
         return self.start + start * row, (stop - start) * row
 
     def joined(self, pieces: Sequence[bytes], shape: tuple[int, ...]) -> Tensor:
-        """Return pieces of it as a tensor."""
-        data = bytearray().join(pieces)  # one that can be written to
+        """Join pieces of the tensor's bytes to a tensor of a shape."""
+        data = bytearray().join(pieces)  # torch requires a writable buffer
         return torch.frombuffer(data, dtype=self.dtype).reshape(shape) if data else torch.empty(shape, dtype=self.dtype)

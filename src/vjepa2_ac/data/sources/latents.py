@@ -1,4 +1,4 @@
-"""Source of cached latents, which needs no data set; and the key of a cache: everything that determines its latents."""
+"""Source of cached latents, which needs no data set, and the key of a latent cache."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from vjepa2_ac.storage.structured import read_json_object
 FORMAT = 2  # of the files of a cache
 CACHE, EPISODES, KEPT = "cache.json", "episodes.npz", "kept.npz"  # files, see `latent_files`
 
-_OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # the other keys are of clips
-_NOT_OF_ENCODING = ("data", "format")  # how the names of the other parts begin
-_MOST_BYTES = 1 << 30  # of a table
+_OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # config keys that affect frames, not clips
+_NOT_OF_ENCODING = ("data", "format")  # prefixes of parts that are unrelated to the encoder
+_MOST_BYTES = 1 << 30  # size limit of a table
 _ENCODE = "Run `vjepa2-ac encode`, which resumes where it was stopped; or copy the cache again"
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """What determines a frame's latents besides the frame, and their size; made by `encoding.batch.encoding_of`.
+    """The settings that determine a frame's latents, and the size of the latents; see `encoding.batch.encoding_of`.
 
-    The number of frames per pass of the encoder is not included: it changes only the order of a sum, and on
-    some CPUs nothing (tests/encoding/test_training_cache.py).
+    The number of frames per encoder call is not included, because it changes only the order of a sum, and on some CPUs
+    nothing (tests/encoding/test_training_cache.py).
     """
 
-    parts: Mapping[str, Any]  # of a key
+    parts: Mapping[str, Any]  # parts of a `CacheKey`
     image_size: int
     tokens: int
     dim: int
@@ -50,13 +50,13 @@ class Encoding:
 
 @dataclass(frozen=True)
 class CacheKey:
-    """What determines the content of a folder, as {name: JSON value}; with the names of knobs where they exist."""
+    """The values that determine the content of a folder, as {name: JSON value}; config keys have their own name."""
 
     parts: Mapping[str, Any]
 
     @property
     def digest(self) -> str:
-        """A short hash of it: the name of a cache's folder, also in each of its files."""
+        """A short hash of the key: the name of a cache's folder, which is also stored in each of its files."""
         return hashlib.sha256(json.dumps(dict(self.parts), sort_keys=True).encode()).hexdigest()[:32]
 
     @property
@@ -65,13 +65,13 @@ class CacheKey:
         return tuple(map(str, self.parts["data.camera"]))
 
     def differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
-        """Return the differences from the wanted parts, as "data.stride: 8, not 4"; of these names, or of all."""
-        wanted = json.loads(json.dumps(dict(wanted)))  # as a file has them
+        """Return the differences from other parts, such as "data.stride: 8, not 4", for some names or for all."""
+        wanted = json.loads(json.dumps(dict(wanted)))  # types as in a file
         names = sorted(self.parts.keys() | wanted) if names is None else names
         return [text for name in names for text in _differences(name, self.parts.get(name), wanted.get(name))]
 
     def differences_of(self, encoding: Encoding) -> list[str]:
-        """Return the differences in how frames became latents."""
+        """Return the differences in the settings by which frames became latents."""
         names = sorted(self.parts.keys() | encoding.parts)
         return self.differences(encoding.parts, [one for one in names if not one.startswith(_NOT_OF_ENCODING)])
 
@@ -80,9 +80,9 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
     """Return the cache key of an open data set, whose stride is a number.
 
     Args:
-        config: How its clips are made.
-        fingerprint: Of its episodes.
-        encoding: How frames become latents.
+        config: The config of the data set and its clips.
+        fingerprint: The fingerprint of its episodes.
+        encoding: The settings by which frames become latents.
     """
     return CacheKey({
         "format": FORMAT,
@@ -96,27 +96,27 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
 
 
 def clip_parts(config: DataConfig) -> dict[str, Any]:
-    """Return the parts that determine which frames and other data clips need: checked when a cache is used alone."""
+    """Return the parts that determine the frames and other data of clips, to check a cache that is used by itself."""
     values = values_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
     names = values.keys() - _OF_THE_FRAMES - config.own_sections().keys()
     return {f"data.{name}": values[name] for name in sorted(names)}
 
 
 def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: str) -> None:
-    """Refuse a folder that was begun with another key, or that holds other files; one that is not there passes.
+    """Refuse a folder that was begun with another key, or that holds other files; a missing folder is accepted.
 
     Args:
         folder: The folder, or its URL.
-        name: Its JSON file with the key.
-        key: Of what is about to be written there.
+        name: Name of the JSON file with the key.
+        key: The key of the content that is about to be written.
         where: The folder, for messages.
 
     Raises:
-        InputError: Names what differs.
-        UnreachableError: It cannot be read now.
+        InputError: Lists the differences.
+        UnreachableError: The folder cannot be read now.
     """
     fix = "Name another folder, or delete this one"
-    others = [other for other in storage.list_names(folder) if other[0] != "."]  # first: another process may begin now
+    others = [other for other in storage.list_names(folder) if other[0] != "."]  # listed first, because another process may begin now
     try:
         there = read_json_object(storage.join(folder, name), fix=fix)
     except MissingFileError:
@@ -131,7 +131,7 @@ def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: s
 
 def _differences(name: str, here: Any, there: Any) -> list[str]:
     if here == there or (there is None and name in REMOVED and here in REMOVED[name].values):
-        return []  # equal; or a removed config key that an older version wrote, with the value that holds today
+        return []  # equal, or a config key that was removed since and whose value equals today's behaviour
     if isinstance(here, dict) and isinstance(there, dict):
         inner = sorted(here.keys() | there)
         return [text for key in inner for text in _differences(f"{name}.{key}", here.get(key), there.get(key))]
@@ -144,10 +144,10 @@ def _as_text(value: Any) -> str:
 
 
 def read_key(folder: Path | str) -> CacheKey:
-    """Return the key of a cache: what it is.
+    """Read the key of a latent cache.
 
     Raises:
-        InputError: The folder has none, or one of another format.
+        InputError: The folder has no key, or one of another format.
     """
     where, needed = storage.join(folder, CACHE), f"a folder with the {CACHE} of a latent cache, format {FORMAT}"
     try:
@@ -162,11 +162,11 @@ def read_key(folder: Path | str) -> CacheKey:
 
 
 def read_table(path: str, kind: type[T]) -> T:
-    """Read a table of a cache.
+    """Read a table of a latent cache.
 
     Raises:
         InputError: The file is missing or damaged.
-        UnreachableError: It cannot be read.
+        UnreachableError: The file cannot be read.
     """
     try:
         with storage.user_can_read(path, fix=_ENCODE):
@@ -183,15 +183,15 @@ class _Cache:
 
 
 class LatentSource(IndexedSource[DataConfig, _Cache]):
-    """The episodes of the data set that a latent cache was made from, in that data set's order.
+    """The episodes of the data set from which a latent cache was encoded, in the order of that data set.
 
-    An episode that could not be read while encoding is included, and raises an error here, too: so the clips are those
-    of the data set, in their order.
+    Episodes that could not be read while encoding are included, and reading them raises an error, so that the clips
+    and their order equal those of the data set.
     """
 
     @property
     def key(self) -> CacheKey:
-        """What the cache is."""
+        """The key of the cache."""
         return self._open()[1].key
 
     @property
@@ -200,19 +200,19 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         return self.key.cameras if self._config.camera is None else self._config.cameras
 
     def kept_ranges(self) -> StepSelection | None:
-        """Return the ranges that `data.idle` keeps, from the cache; None: the rule is none.
+        """Return the ranges that `data.idle` keeps, from the cache; None if the rule is none.
 
         Raises:
-            InputError: No cache, or one of other clips than the config's.
+            InputError: There is no cache, or its clips differ from the config's.
         """
         return self._open()[1].kept
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched
-        """Return one episode; only requested latents are read.
+        """Return an episode; only requested latents are read.
 
         Raises:
             InputError: The file is missing or damaged, or the episode could not be read while encoding.
-            UnreachableError: It cannot be read now.
+            UnreachableError: The file cannot be read now.
         """
         table, opened = self._open()
         camera = camera or self.cameras[0]
@@ -231,10 +231,10 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         )
 
     def _require_plausible(self, arrays: Mapping[str, np.ndarray], info: EpisodeInfo, where: str) -> None:
-        """Refuse an episode that no source gives.
+        """Refuse an episode with wrong lengths or implausible numbers, which only a damaged file contains.
 
         Raises:
-            InputError: It has another number of steps, or numbers that are not finite or that no robot has.
+            InputError: The number of steps differs from the index, or numbers are not finite or implausible.
         """
         for name, values in arrays.items():
             width = STATE_DIM if name == "states" and self._config.states == "pose" else np.atleast_2d(values).shape[1]
@@ -246,10 +246,10 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
                 space.require_plausible(values, f"{where}: {name}", fix=FIX)
 
     def settle(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
-        """Return the config with the names of the cameras.
+        """Check that some episodes have files, and return the config with the names of the cameras.
 
         Raises:
-            InputError: Some of these episodes have no files: the cache is unfinished, or was made of others.
+            InputError: Some of these episodes have no files: the cache is unfinished, or was made from others.
             UnreachableError: The folder cannot be listed now.
         """
         table, opened = self._open()
@@ -261,7 +261,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
             raise InputError(where=self._config.path, found=f"no latents of {such}", fix=fix)
         return self._config.model_copy(update={"camera": self.cameras})
 
-    def _look(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - at once
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - opening a cache is fast
         folder = storage.folder_at(self._config.path)
         key = read_key(folder)
         parts = clip_parts(self._config)
@@ -269,7 +269,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         for camera in () if self._config.camera is None else self._config.cameras:
             if camera not in key.cameras:
                 differing.append(f"data.camera: {', '.join(key.cameras)}, not {camera}")
-        if differing:  # of other clips than the config's
+        if differing:  # the clips of the cache differ from the config's
             raise another_cache(folder, differing)
         has_idle_rule = self._config.idle.rule != "none"
         kept = read_table(storage.join(folder, KEPT), StepSelection) if has_idle_rule else None

@@ -43,7 +43,7 @@ from vjepa2_ac.storage.block_file import BlockCachedFile
 FRAME, TIME = "frame_index", "timestamp"
 
 _DATA_BYTES = "data_bytes"  # total size of the Parquet files with rows
-_CHECKS = 2  # of episodes while a data set is indexed, and of how frames are chosen: a new number rebuilds all indexes
+_CHECKS = 2  # version of the checks during indexing and of the choice of frames; a new number rebuilds all indexes
 
 _FIX_VECTORS = "Leave the episode out, or check data.lerobot: state, action"
 
@@ -54,18 +54,18 @@ Content = dict[str, Any]
 class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
     """The episodes of a LeRobot data set, v3.0 or v2.1, in the order of their numbers.
 
-    Of a local data set `infos` checks the states of every episode and the headers of the videos; of a remote one it
-    reads the files in meta, and states are checked when an episode is read (all of them at once if `data.outcome` needs
-    a value that only the rows have). `read` fetches the row groups with the episode's rows; frames are fetched and
-    decoded on request.
+    For a local data set `infos` checks the states of every episode and the headers of the videos. For a remote one it
+    reads only the files in meta, and states are checked when an episode is read; if `data.outcome` needs a value that
+    only the rows have, all states are read. `read` fetches the row groups with the episode's rows; frames are fetched
+    and decoded on request.
     """
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - frames are fetched one by one
-        """Return one episode; see `episode.EpisodeSource`.
+        """Return an episode; see `episode.EpisodeSource`.
 
         Raises:
-            InputError: Its rows are missing or damaged, lack a column, or have implausible states.
-            OSError: They are remote and cannot be read.
+            InputError: The rows are missing or damaged, lack a column, or have implausible states.
+            OSError: The rows are remote and cannot be read.
         """
         table = self.infos()
         info, row = table[index], row_of(table, index)
@@ -90,7 +90,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
 
     @property
     def _data_version(self) -> str:
-        """A version that changes with the data set's files and the wanted columns."""
+        """A version that changes with the data set's files and the required columns."""
         return self._version if self._known is None else self._known[0].texts["index"]
 
     def _open_file(self, path: str) -> str | BlockCachedFile:
@@ -109,7 +109,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             if info.features[key].dtype == "video":
                 files |= listed(info.video_path or "", key)
         fields = config.own_values["lerobot"]
-        fields.pop("action")  # where it matters, it is among the columns
+        fields.pop("action")  # included in the columns if it matters
         parts = {
             **({"vector": wanted_columns(config)} if config.states == "vector" else {}),
             "source": "lerobot",
@@ -156,7 +156,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
             return Scanned(facts, self._where(row), row.place, summary, labels, self._info.fps)
 
-        by_file: dict[str, list[EpisodeRow]] = {}  # so that a row group is decoded once
+        by_file: dict[str, list[EpisodeRow]] = {}  # grouped, so that each row group is decoded once
         for row in rows:
             by_file.setdefault(row.data_file(info), []).append(row)
         found: dict[str, Found] = {}
@@ -167,7 +167,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         return table_of([found[row.id] for row in rows], config, len(rows))
 
     def _content(self, row: EpisodeRow) -> tuple[Content, bool | None]:
-        """Return the data in the rows of an episode, and whether it succeeded; None: they do not say.
+        """Return the data in the rows of an episode, and whether the episode succeeded (None: unknown).
 
         Raises:
             InputError: Rows or columns are missing, have another width, or are implausible states.
@@ -192,7 +192,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             return numbers
 
         def optional(name: str | None) -> Float[np.ndarray, "steps width"] | None:
-            """Return a column that a data set need not have, but then in every file."""
+            """Return an optional column; if the data set has it, every file must have it."""
             return None if name is None or (name not in rows and name not in info.features) else column(name)
 
         states, success = joined(fields.state), optional(fields.success)
@@ -223,8 +223,9 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
     ) -> UInt8[np.ndarray, "time height width 3"]:
         """Return frames from an episode's PNG or JPEG images in the table.
 
-        A table can only give all images of an episode, so they are kept in the disk cache, which gives single ones. A
-        data set larger than the disk cache is not kept: each clip would write an episode and evict another.
+        A table can only be read for whole episodes, so the images are stored in the disk cache, which can return single
+        images. The images of a data set larger than the disk cache are not stored, because each clip would write an
+        episode and evict another.
         """
         where, entry = f"{self._where(row)}: {key}", f"images {self._data_version} {key} {row.id}"
         images = self._files.cache.read_parts(entry, row.length, steps)
@@ -244,7 +245,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
 
 
 def wanted_columns(config: LeRobotData) -> list[str]:
-    """Return the columns that are read if a file has them."""
+    """Return the names of the columns that are read if a file has them."""
     fields = config.lerobot
     optional = [JOINT_VELOCITY, *((fields.success,) if fields.success else ())]
     commands = fields.action if config.actions == "recorded" else ()
@@ -252,7 +253,7 @@ def wanted_columns(config: LeRobotData) -> list[str]:
 
 
 def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
-    """Check that the rows are those of the episode, complete, in order, at the data set's rate."""
+    """Check that the rows of an episode are complete, in order, and at the data set's rate."""
     count = len(rows[EPISODE]) if rows else 0
     if count != length:
         raise InputError(where=where, found=f"{count} rows", needed=f"{length}, says the data set", fix=FIX_EPISODE)

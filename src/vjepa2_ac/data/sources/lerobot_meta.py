@@ -35,18 +35,18 @@ _FIX_VERSION = (
 )
 _FIX_STORAGE = "`vjepa2-ac data converter lance_to_files` prints a script that writes the files a Lance table is of"
 _WAY_TO_HUB = "Check the name in hf://datasets/owner/name; for a private data set, `hf auth login` or set HF_TOKEN"
-TABLES = {  # templates of the files that list the episodes
+TABLES = {  # path templates of the files that list the episodes
     "v2.1": "meta/episodes.jsonl",
     "v3.0": "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
 }
 FIX_EPISODE = "Copy the data set again, or leave the episode out"
-_MOST_BYTES = 1 << 28  # of meta/episodes.jsonl
+_MOST_BYTES = 1 << 28  # size limit of meta/episodes.jsonl
 _FIX_TABLES = "Get the files in meta again"
 _FIX_RANGES = (
     "Correct file_index, from_timestamp and to_timestamp in meta/episodes (they may be wrong for other episodes of the "
     "file, too), or leave both episodes out"
 )
-_ROUNDING_STEPS = 0.25  # by which the ranges of two episodes in a video may overlap
+_ROUNDING_STEPS = 0.25  # the ranges of two episodes in a video may overlap by this many steps
 
 
 @dataclass(frozen=True)
@@ -60,17 +60,17 @@ class Feature:
 
     @property
     def width(self) -> int:
-        """Its width: numbers per step."""
+        """The number of numbers per step."""
         return math.prod(self.shape)
 
     @property
     def is_camera(self) -> bool:
-        """Whether it contains frames that show what a camera saw."""
+        """Whether the feature holds colour images of a camera."""
         return self.dtype in {"video", "image"} and not self.is_depth
 
     @property
     def is_numbers(self) -> bool:
-        """Whether it is a column of numbers."""
+        """Whether the feature is a column of numbers."""
         return self.dtype.startswith(("float", "int", "uint", "bool"))
 
 
@@ -82,7 +82,7 @@ class DatasetInfo:
     version: str
     fps: float
     episodes: int
-    frames: int | None  # of all episodes; None: not said
+    frames: int | None  # total number of frames; None: not stated
     chunk_episodes: int  # v2.1: episodes per chunk folder
     data_path: str
     video_path: str | None
@@ -91,18 +91,18 @@ class DatasetInfo:
 
     @property
     def where(self) -> str:
-        """The file."""
+        """The path of meta/info.json."""
         return storage.join(self.root, INFO)
 
     def split_of(self, episode: int) -> str | None:
-        """Return the name of the split of an episode, given by its number; None: no split has it."""
+        """Return the name of the split that contains an episode number, or None."""
         return next((name for name, episodes in self.splits.items() if episode in episodes), None)
 
     def require_mapping(self, config: LeRobotData) -> None:
-        """Check that the data set has what `data.lerobot` and `data.camera` name, before anything large is read.
+        """Check that the data set has the columns and cameras of the config, before large files are read.
 
         Raises:
-            InputError: A column or camera is missing (lists the existing ones), or they do not form a state.
+            InputError: A column or camera is missing (lists the existing ones), or the columns do not form a state.
         """
         fields = config.lerobot
         columns = [name for name, feature in self.features.items() if feature.is_numbers]
@@ -121,7 +121,7 @@ class DatasetInfo:
             self.camera_key(fields, camera)
 
     def camera_key(self, fields: LeRobotFields, camera: str) -> str:
-        """Return the feature with a camera's frames.
+        """Return the name of the feature with a camera's frames.
 
         Raises:
             InputError: The config or the data set has no such camera.
@@ -138,7 +138,7 @@ class DatasetInfo:
 
 
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
-    """Return the error of a missing name, with the existing ones, and a suggestion."""
+    """Return an error about a missing name, with the existing names and a suggestion."""
     known = list(known)
     fix = f"{did_you_mean(name, known)}It has: {', '.join(known) or 'none'}"
     return InputError(where=where, found=f"no {kind} {name} in {place}", needed="one that it has", fix=fix)
@@ -148,8 +148,8 @@ def read_info(root: str) -> DatasetInfo:
     """Read meta/info.json.
 
     Raises:
-        InputError: There is no data set, it is of another version, or the file is damaged.
-        UnreachableError: It cannot be read.
+        InputError: There is no data set, it has an unsupported version, or the file is damaged.
+        UnreachableError: The file cannot be read.
     """
     where = storage.join(root, INFO)
     try:
@@ -192,14 +192,14 @@ def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
 
 
 def _splits(content: object) -> dict[str, range]:
-    """Return the episodes of each split, from {"train": "0:50"}; other notations are ignored."""
+    """Parse the ranges of episodes of each split, such as {"train": "0:50"}; other notations are ignored."""
     texts = content if isinstance(content, Mapping) else {}
     ranges = {str(name): re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)) for name, text in texts.items()}
     return {name: range(int(part[1]), int(part[2])) for name, part in ranges.items() if part}
 
 
 def _feature(content: Mapping[str, Any]) -> Feature:
-    """Return a feature; a depth map is marked in one of the ways of LeRobot's versions, or by its pixels.
+    """Parse a feature; depth maps are recognised by the marks of any LeRobot version, or by their pixel format.
 
     Source: huggingface/lerobot @ 7427f31, src/lerobot/configs/video.py, is_depth_map.
     """
@@ -219,7 +219,7 @@ def _feature(content: Mapping[str, Any]) -> Feature:
 
 
 def _template(template: str) -> str:
-    """Return a path template such as `chunk-{chunk_index:03d}`, which must not lead out of the data set."""
+    """Check a path template such as `chunk-{chunk_index:03d}`, which must stay inside the data set, and return it."""
     rest = _PLACE.sub("", template)
     if not template or template.startswith("/") or ".." in template.split("/") or "{" in rest or "}" in rest:
         raise ValueError(f"the path template {template!r}")
@@ -227,15 +227,15 @@ def _template(template: str) -> str:
 
 
 def filled(template: str, chunk: int, file: int, key: str = "") -> str:
-    """Return the path, within the data set, of a file: in v3.0 by chunk and file, in v2.1 by chunk and episode."""
+    """Return the path of a file in the data set: in v3.0 by chunk and file, in v2.1 by chunk and episode."""
     return template.format(chunk_index=chunk, episode_chunk=chunk, file_index=file, episode_index=file, video_key=key)
 
 
 def list_by_template(root: str, template: str, key: str = "", *, connections: int = 1) -> dict[str, FileInfo]:
-    """Return the files whose paths fit a template, sorted by path within the data set.
+    """Return the files whose paths match a template, by path in the data set, sorted.
 
     Raises:
-        InputError: One of them is a git-lfs pointer.
+        InputError: A file is a git-lfs pointer.
         OSError: A folder cannot be listed.
     """
     pattern = _PLACE.sub(lambda place: glob.escape(key) if place[1] else "[0-9]*", template)
@@ -262,25 +262,25 @@ class EpisodeRow:
     length: int
     place: Mapping[str, float]  # index; chunk and file of its rows; KEY.chunk, KEY.file and KEY.start_s of each video
     task: str = ""
-    lengths_s: Mapping[str, float] = field(default_factory=dict)  # of its part of each video, where the table says it
+    lengths_s: Mapping[str, float] = field(default_factory=dict)  # duration in each video, if the table has it
     success: bool | None = None
 
     @property
     def index(self) -> int:
-        """Its number."""
+        """The number of the episode."""
         return int(self.place["index"])
 
     @property
     def id(self) -> str:
-        """Its identity: its number, the only name in LeRobot."""
+        """The identity of the episode: its number, the only name in LeRobot."""
         return f"episode_{self.index:06d}"
 
     def data_file(self, info: DatasetInfo) -> str:
-        """Return the path, within the data set, of the file with its rows."""
+        """Return the path, in the data set, of the file with the episode's rows."""
         return filled(info.data_path, int(self.place["chunk"]), int(self.place["file"]))
 
     def video_file(self, info: DatasetInfo, key: str) -> str:
-        """Return the path, within the data set, of the file with its frames."""
+        """Return the path, in the data set, of the video with the episode's frames."""
         chunk, file = (int(self.place[f"{key}.{part}"]) for part in ("chunk", "file"))
         return filled(info.video_path or "", chunk, file, key)
 
@@ -292,13 +292,13 @@ def read_episodes(
     success: str | None,
     open_file: Callable[[str], str | BlockCachedFile],
 ) -> list[EpisodeRow]:
-    """Return every episode, sorted by number.
+    """Read the entries of all episodes, sorted by number.
 
     Args:
-        info: Of the data set.
-        tables: The files that list the episodes, within the data set.
-        videos: Features whose locations are requested.
-        success: Column whose statistics tell the outcome; v2.1 has none.
+        info: Description of the data set.
+        tables: Paths, in the data set, of the files that list the episodes.
+        videos: Video features whose locations are required.
+        success: Column whose statistics contain the outcome; not available in v2.1.
         open_file: Returns the path or file to open for a path.
 
     Raises:
@@ -333,7 +333,7 @@ def read_episodes(
 
 
 def _lines(path: str) -> Iterator[dict[str, Any]]:
-    """Yield what each line of meta/episodes.jsonl says."""
+    """Yield the object on each line of meta/episodes.jsonl."""
     for number, line in enumerate(storage.read_bounded(path, _MOST_BYTES).splitlines(), start=1):
         if line.strip():
             where = f"{path}: line {number}"
@@ -342,7 +342,7 @@ def _lines(path: str) -> Iterator[dict[str, Any]]:
 
 def _row_of(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], outcome: object) -> EpisodeRow:
     index = int(row["episode_index"])
-    if info.version == "v2.1":  # a file for each episode
+    if info.version == "v2.1":  # one file per episode
         places = ("data", *(f"videos/{key}" for key in videos))
         row = {**row, **{f"{place}/chunk_index": index // info.chunk_episodes for place in places}}
         row |= {f"{place}/file_index": index for place in places} | {f"{place}/from_timestamp": 0 for place in places}
@@ -374,16 +374,16 @@ def _row_of(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], ou
 
 
 def require_files(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> None:
-    """Refuse an episode that cannot be used, as far as the data set's tables show.
+    """Refuse an episode that is unusable according to the tables of the data set.
 
     Args:
-        info: Of the data set.
+        info: Description of the data set.
         row: The episode.
-        files: The existing files, within the data set.
-        keys: Features of the cameras that are used.
+        files: Paths of the existing files in the data set.
+        keys: Features of the used cameras.
 
     Raises:
-        InputError: It has no steps; or its rows or frames are missing, or too few.
+        InputError: The episode has no steps, or its rows or frames are missing or too few.
     """
     if row.length == 0:
         raise zero_steps(f"{info.root}: {row.id}")
@@ -409,13 +409,13 @@ def require_files(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Seq
 def require_long_videos(
     info: DatasetInfo, row: EpisodeRow, keys: Sequence[str], header_of: Callable[[str], VideoHeader]
 ) -> None:
-    """Refuse an episode whose video ends before its last step, as far as the header of the video shows.
+    """Refuse an episode whose video ends before its last step according to the header of the video.
 
     Args:
-        info: Of the data set.
+        info: Description of the data set.
         row: The episode.
-        keys: Features of the cameras that are used.
-        header_of: Returns the header of a video, given by its path.
+        keys: Features of the used cameras.
+        header_of: Returns the header of the video at a path.
 
     Raises:
         InputError: A video is too short, or cannot be read.
@@ -431,12 +431,12 @@ def require_long_videos(
 
 
 def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[str]) -> dict[str, InputError]:
-    """Return an error for each episode that claims seconds of a video that another episode claims, by identity.
+    """Return an error for each episode whose time range in a video overlaps that of another episode, by identity.
 
     Args:
-        info: Of the data set.
+        info: Description of the data set.
         rows: All episodes.
-        keys: Features of the cameras that are used.
+        keys: Features of the used cameras.
     """
     errors: dict[str, InputError] = {}
     for key in keys:
@@ -461,7 +461,7 @@ def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[
 
 
 def row_of(table: EpisodeTable, index: int) -> EpisodeRow:
-    """Return the location of an episode of a table; its task stays in the table."""
+    """Return the length and location of an episode of a table, without its task."""
     return EpisodeRow(
         int(table.num_steps[index]), {name: column[index].item() for name, column in table.locators.items()}
     )

@@ -12,14 +12,14 @@ and may hold
 
     any other name     more cameras, shaped as `frames`; `data.camera` chooses by name
     extrinsics         [6] or [steps, 6]: the camera in the base frame; extrinsics_CAMERA: that of one camera
-    joint_velocities   [steps, joints], *commanded*, radians per second: the idle filter's rule `commands` reads them
-    actions            [steps, any], *commanded*: read with data.actions: recorded
+    joint_velocities   [steps, joints], *commanded*, radians per second; used by the rule `commands` of the idle filter
+    actions            [steps, any], *commanded*; read with data.actions: recorded
     success            true or false
-    language           the task as text
-    scene, building, operator, day   texts: what `data.split_by` may keep together
+    language           the instruction as text
+    scene, building, operator, day   texts by which `data.split_by` can group episodes
 
-Of a file that numpy.savez wrote, only the requested frames are read, and their checksum is not checked: it covers all
-frames. Of one that numpy.savez_compressed wrote, the preceding frames must be decompressed, too: slow for long
+From a file of numpy.savez only the requested frames are read, without verifying their checksum, which covers all
+frames. In a file of numpy.savez_compressed the preceding frames must be decompressed, too, which is slow for long
 episodes.
 """
 
@@ -55,24 +55,24 @@ from vjepa2_ac.storage.block_file import BlockCachedFile
 FORMAT_HELP = "docs/data.md says what an episode holds"
 
 _SUFFIX = ".npz"
-_MOST_NUMBERS = 1 << 25  # of an array other than frames: 88 hours of 7 numbers at 15 Hz; 256 MB as float64
+_MOST_NUMBERS = 1 << 25  # limit for arrays other than frames: 88 hours of 7 numbers at 15 Hz; 256 MB as float64
 _MOST_TEXT_BYTES = 1 << 18
 _LABELS = ("scene", "building", "operator", "day")
 _LOCAL_HEADER_BYTES = 30
-_MOST_BYTES = 1 << 30  # of an array that is read completely
-_MOST_UNPACKED, _MOST_RATIO = 1 << 30, 100  # a larger compressed array has at most this many times its packed bytes
-_KINDS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # as numpy writes; others expand without a bound
+_MOST_BYTES = 1 << 30  # limit for an array that is read completely
+_MOST_UNPACKED, _MOST_RATIO = 1 << 30, 100  # above the first size, limit of the ratio of unpacked to packed bytes
+_KINDS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # as numpy writes; others may expand without limit
 _FIX = "Write the file again, with numpy.savez"
 
 
 class NpzSource(IndexedSource[DataConfig, None]):
-    """The episodes of a folder of .npz files, in the order of their paths; a path without .npz is the identity.
+    """The episodes of a folder of .npz files, in the order of their paths; the identity is the path without .npz.
 
-    `infos` reads every file except the frames. Data from URLs is cached on this machine.
+    `infos` reads all files except their frames. Remote data are cached on this machine.
     """
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - files are fetched in blocks
-        """Return one episode; only requested frames are read.
+        """Return an episode; only requested frames are read.
 
         Raises:
             InputError: The file is missing or damaged, or has changed since it was indexed.
@@ -85,10 +85,10 @@ class NpzSource(IndexedSource[DataConfig, None]):
         return episode
 
     def _episode(self, identity: str, version: str, cameras: Sequence[str]) -> tuple[Episode, dict[str, str | None]]:
-        """Return an episode with the frames of the first of some cameras, and its labels.
+        """Return an episode with the frames of the first of some cameras, and the labels of the episode.
 
         Raises:
-            InputError: It is no episode, or impossible for a robot.
+            InputError: The file is not an episode, or its numbers are implausible.
         """
         path, config = self._path(identity), self._config
         with opened_npz(self._files.open(path, version=version), path) as file:
@@ -117,7 +117,7 @@ class NpzSource(IndexedSource[DataConfig, None]):
                 metadata={} if language is None else {"language": language},
                 commands=file.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
             )
-            headers = {name: file.header(name) for name in _LABELS if name in names}  # a camera may be called so, too
+            headers = {name: file.header(name) for name in _LABELS if name in names}  # a camera may have this name
             is_text = {name: one.shape == () and one.dtype.kind == "U" for name, one in headers.items()}
             labels = {name: file.text(name) for name in headers if is_text[name]}
             return episode, {"task": language, **labels}
@@ -130,7 +130,7 @@ class NpzSource(IndexedSource[DataConfig, None]):
             return np.asarray(file.rows(camera, steps))
 
     def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
-        """Return the cached table, or read every episode; a changed file changes the key."""
+        """Return the cached table, or read all episodes; a changed file changes the key."""
         config, root = self._config, self._config.path
         listed = sorted(
             (storage.join(folder, file.name), file.size, file.version)
@@ -164,7 +164,7 @@ def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
     """Open an .npz file, given by its path or as an open remote file, for reading.
 
     Raises:
-        InputError: It is missing, or no .npz file; an UnreachableError if it cannot be read.
+        InputError: The file is missing, or not an .npz file. An UnreachableError if it cannot be read.
     """
     with (
         storage.user_can_read(path, fix="Put it back, or leave the episode out"),
@@ -178,21 +178,21 @@ def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
 
 @dataclass(frozen=True)
 class ArrayHeader:
-    """Shape and type of an array, and where its values begin in the archive's member."""
+    """Shape and type of an array, and the offset of its values in the archive's member."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
     start: int
-    by_columns: bool = False  # in Fortran order, of more than one dimension
+    by_columns: bool = False  # whether the array has several dimensions and Fortran order
 
     @property
     def nbytes(self) -> int:
-        """Size of the values."""
+        """Size of the values in bytes."""
         return prod(self.shape) * self.dtype.itemsize
 
     @property
     def row_bytes(self) -> int:
-        """Size of one row."""
+        """Size of one row in bytes."""
         return prod(self.shape[1:]) * self.dtype.itemsize
 
 
@@ -200,7 +200,7 @@ class NpzFile:
     """An .npz file open for reading.
 
     Raises:
-        InputError: It is not an .npz file; each method raises it for damage, too.
+        InputError: The file is not an .npz file. All methods raise it for a damaged file.
     """
 
     def __init__(self, file: storage.ByteReader, where: str) -> None:
@@ -216,10 +216,10 @@ class NpzFile:
         return tuple(self._members)
 
     def header(self, name: str) -> ArrayHeader:
-        """Return shape and type of an array, without its values; it is refused if the file's size is another."""
+        """Read shape and type of an array without its values; refuse a shape that does not match the stored size."""
         member = self._members[name]
         with self._damage_is_named(name), self._archive.open(member) as file:
-            # Version 1.0 bounds the length of a header, and numpy writes another one only for records of many fields.
+            # Version 1.0 limits the length of a header. Numpy writes other versions only for records of many fields.
             if np.lib.format.read_magic(file) != (1, 0):
                 raise ValueError("an array in another format than numpy writes")
             shape, by_columns, dtype = np.lib.format.read_array_header_1_0(file)
@@ -234,7 +234,7 @@ class NpzFile:
             return header
 
     def array(self, name: str) -> Shaped[np.ndarray, ...]:
-        """Return a complete array; its checksum is verified."""
+        """Read a complete array and verify its checksum."""
         header = self.header(name)
         with self._damage_is_named(name), self._archive.open(self._members[name]) as member:
             if header.nbytes > _MOST_BYTES:
@@ -243,10 +243,10 @@ class NpzFile:
             return values.reshape(header.shape, order="F" if header.by_columns else "C")
 
     def rows(self, name: str, rows: Sequence[int]) -> Shaped[np.ndarray, "rows ..."]:
-        """Return some rows of an array in C order, in this order.
+        """Read some rows of an array in C order, in the requested order.
 
-        Of an uncompressed array only these rows are read, and the checksum is not verified: it covers the whole array.
-        A compressed one is decompressed up to the last of these rows; other rows are not stored.
+        From an uncompressed array only these rows are read, without verifying the checksum, which covers the whole
+        array. A compressed array is decompressed up to the last of these rows, without storing other rows.
         """
         header, member = self.header(name), self._members[name]
         with self._damage_is_named(name), self._archive.open(member) as unpacked:
@@ -260,11 +260,11 @@ class NpzFile:
             return found if (places == np.arange(len(rows))).all() else found[places]
 
     def refused(self, name: str, found: str, needed: str) -> InputError:
-        """Return the error of an array."""
+        """Return an error about an array."""
         return InputError(where=f"{self._where}: {name}", found=found, needed=needed, fix=FORMAT_HELP)
 
     def numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
-        """Return finite numbers of a shape; None stands for any length."""
+        """Read an array of finite numbers of a shape, in which None stands for any length."""
         self._require(name, shape, "biuf", "numbers")
         if (count := prod(self.header(name).shape)) > _MOST_NUMBERS:
             raise self.refused(name, f"{count:,} numbers", f"at most {_MOST_NUMBERS:,} in an episode")
@@ -275,14 +275,14 @@ class NpzFile:
         return values
 
     def text(self, name: str) -> str:
-        """Return a text."""
+        """Read a text."""
         self._require(name, (), "U", "one text")
         if (size := self.header(name).nbytes) > _MOST_TEXT_BYTES:
             raise self.refused(name, f"a text of {size:,} bytes", f"at most {_MOST_TEXT_BYTES:,}")
         return str(self.array(name))
 
     def extrinsics(self, camera: str, steps: int) -> Float64[np.ndarray, "steps 6"] | None:
-        """Return the poses of a camera, repeated for a fixed one; None if there are none."""
+        """Return the poses of a camera at all steps (repeated for a fixed camera), or None if there are none."""
         for name in (f"extrinsics_{camera}", "extrinsics"):
             if name in self.names:
                 one_pose = len(self.header(name).shape) == 1
@@ -291,7 +291,7 @@ class NpzFile:
         return None
 
     def require_frames(self, camera: str, steps: int, *, count: int = 1) -> None:
-        """Refuse an array that cannot be the frames of a camera, without reading it; `count` are read together."""
+        """Refuse an array that cannot be the frames of a camera, by its header; `count` frames are read together."""
         self._require(camera, (steps, None, None, 3), "u", "frames (steps, height, width, 3)")
         header = self.header(camera)
         require_bounded(header.shape[1], header.shape[2], f"{self._where}: {camera}", count=count)
@@ -301,7 +301,7 @@ class NpzFile:
             raise self.refused(camera, "frames in Fortran order", "C order, as by numpy.ascontiguousarray")
 
     def _require(self, name: str, shape: tuple[int | None, ...], kinds: str, meaning: str) -> None:
-        """Refuse an array that is missing, or of another shape or type."""
+        """Refuse an array that is missing or has another shape or type."""
         if name not in self.names:
             there = ", ".join(self.names)[:200] or "none"
             raise self.refused(name, "no such array", f"{meaning}; there are {there}")
@@ -314,7 +314,7 @@ class NpzFile:
             raise self.refused(name, f"shape {header.shape} of {header.dtype}", f"{meaning}: {wanted}")
 
     def _start_of(self, member: zipfile.ZipInfo) -> int:
-        """Return where the bytes of an uncompressed member begin in the file."""
+        """Return the offset in the file of the content of an uncompressed member."""
         self._file.seek(member.header_offset)
         local = self._file.read(_LOCAL_HEADER_BYTES)
         names = int.from_bytes(local[26:28], "little") + int.from_bytes(local[28:30], "little")
@@ -326,7 +326,7 @@ class NpzFile:
             yield
         except UserError:
             raise
-        except Exception as error:  # zipfile, zlib and numpy raise whatever damage makes of a file
+        except Exception as error:  # zipfile, zlib and numpy raise many types of errors for damaged files
             if storage.is_refusal(error):
                 raise
             place = f"{self._where}: {name}" if name else self._where

@@ -1,7 +1,7 @@
-"""Reading the rows of one episode from a Parquet file of many: only its row groups, and the needed columns.
+"""Read the rows of one episode from a Parquet file of many episodes: only its row groups and the required columns.
 
-A stranger's file cannot take all memory: equal values compress so well that a few KB may claim any size, so the numbers
-of rows and values are checked in the footer, and tables of text or images are read a few rows at a time.
+An untrusted file cannot exhaust the memory. Equal values compress so well that a few KB may expand to any size, so the
+numbers of values are checked in the footer, and tables of text or images are read a few rows at a time.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ Columns = Mapping[str, Shaped[np.ndarray, "rows _"]]
 
 EPISODE = "episode_index"
 
-# All limits are far beyond any data set.
-MOST_NUMBERS = 1 << 25  # of one column in a row group
-MOST_TABLE_BYTES = 1 << 28  # of a table of episodes or tasks
-MOST_IMAGE_BYTES = 1 << 32  # in one row group
-_ROWS_AT_ONCE = 64  # where one value may be as large as an image
-_BUFFER_BYTES = 4096  # of a column that is not read
+# All limits are far beyond any real data set.
+MOST_NUMBERS = 1 << 25  # numbers in one column of a row group
+MOST_TABLE_BYTES = 1 << 28  # size of a table of episodes or tasks
+MOST_IMAGE_BYTES = 1 << 32  # size of the images in one row group
+_ROWS_AT_ONCE = 64  # rows per read if a value may be as large as an image
+_BUFFER_BYTES = 4096  # buffer of a column whose values are not read
 _FIX = "Copy the file again, or leave its episodes out"
 
 
 class ParquetRows:
-    """Reads rows of Parquet files; each thread keeps the row group that it decoded last.
+    """A reader of rows of Parquet files; each thread keeps the row group that it decoded last.
 
     Args:
-        files: Opens them, and keeps the rows of each episode: so that a row group of hundreds of episodes is not
+        files: Opens files, and caches the rows of each episode, so that a row group of hundreds of episodes is not
             decoded for each of them.
-        columns: The wanted ones, if a file has them; the index of the episode is always read.
-        version: Of the cached rows: changes with the data set or the wanted columns.
+        columns: The columns to read if a file has them; the index of the episode is always read.
+        version: Version of the cached rows; changes with the data set or the columns.
     """
 
     def __init__(self, files: EpisodeFiles, columns: Sequence[str], version: str) -> None:
         self._files, self._version = files, version
         self._columns = list(dict.fromkeys([EPISODE, *columns]))
-        self._ranges: dict[str, list[tuple[float, float]]] = {}  # of each file that was opened: of each row group
+        self._ranges: dict[str, list[tuple[float, float]]] = {}  # of each row group, by file
         self._last = threading.local()
 
     def rows(self, path: str, episode: int) -> Columns:
@@ -73,7 +73,7 @@ class ParquetRows:
         return self._files.parsed(f"rows {self._version} {path} {episode}", read)
 
     def images(self, path: str, column: str, episode: int) -> list[bytes]:
-        """Return the encoded images of one episode from a column of {bytes, path}.
+        """Read the encoded images of one episode from a column of {bytes, path}.
 
         Raises:
             InputError: The file is missing or damaged, or the column does not contain images.
@@ -92,7 +92,7 @@ class ParquetRows:
 
     @contextmanager
     def _groups_with(self, path: str, episode: int) -> Iterator[tuple[parquet.ParquetFile, list[int]]]:
-        """Open a file, and tell the row groups that may have rows of an episode, as far as its statistics say."""
+        """Open a file; yield it and the row groups that may have rows of an episode, by its statistics."""
         opened = self._files.open(path, version=self._version)
         with _opened(opened, path) as file:
             if path not in self._ranges:
@@ -110,10 +110,10 @@ class ParquetRows:
 
 
 def read_table(opened: str | BlockCachedFile, path: str, wanted: Callable[[str], bool]) -> dict[str, list[Any]]:
-    """Return the wanted columns of a small Parquet file, as lists of Python values.
+    """Read selected columns of a small Parquet file as lists of Python values.
 
     Raises:
-        InputError: It is missing or damaged.
+        InputError: The file is missing or damaged.
         OSError: A remote file cannot be read.
     """
     with _opened(opened, path) as file:
@@ -126,10 +126,10 @@ def read_table(opened: str | BlockCachedFile, path: str, wanted: Callable[[str],
 
 
 def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows _"]:
-    """Return a column of numbers, or of lists of equally many numbers, as [rows, numbers].
+    """Convert a column of numbers, or of lists of equal length, to an array [rows, numbers].
 
     Raises:
-        InputError: It contains something else, or gaps.
+        InputError: The column has other content or missing values.
     """
     import pyarrow as pa
 
@@ -159,7 +159,7 @@ def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
 
 @contextmanager
 def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.ParquetFile]:
-    """Open a Parquet file with verified page checksums; its errors become errors for the user."""
+    """Open a Parquet file with verified page checksums, and convert its errors to errors for the user."""
     pa = parquet_library(path)
     try:
         with pa.parquet.ParquetFile(
@@ -169,7 +169,7 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
     except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError) as error:
         if isinstance(opened, BlockCachedFile) and opened.failure is not None:
             raise opened.failure from None
-        if isinstance(error, OSError) and error.errno is not None:  # a system error, not one of the content
+        if isinstance(error, OSError) and error.errno is not None:  # an error of the operating system
             raise storage.unreadable(path, error, fix=_FIX) from None
         found = f"damaged: {' '.join(str(error).strip().splitlines()[:1])[:200]}"
         raise InputError(where=path, found=found, needed="a whole Parquet file", fix=_FIX) from None
@@ -178,10 +178,10 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
 def _episodes_of_groups(
     file: parquet.ParquetFile, path: str, opened: str | BlockCachedFile, columns: Sequence[str]
 ) -> list[tuple[float, float]]:
-    """Return the least and the greatest episode of each row group; infinite ones if the file does not say.
+    """Return the least and the greatest episode number of each row group; infinite if the file has no statistics.
 
     Raises:
-        InputError: There are no episodes, or a column has more numbers than any robot's.
+        InputError: There is no column of episode numbers, or a column has too many numbers.
         pyarrow.ArrowException, OSError: The footer contradicts itself.
     """
     paths = [file.metadata.schema.column(place).path for place in range(file.metadata.num_columns)]
@@ -203,11 +203,11 @@ def _episodes_of_groups(
 
 
 def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile, places: list[int]) -> None:
-    """Refuse an inconsistent footer entry of some columns, in any row group.
+    """Refuse a file whose footer has inconsistent entries of some columns, in any row group.
 
-    Reading such an entry with pyarrow (`row_group(n).column(p)`) ends the process: a C++ exception that its binding
-    does not expect. A reader of one row makes the same checks, and raises. Of a remote file it reads none, and
-    finds less: the blocks of every row group would be fetched.
+    Reading such an entry with pyarrow (`row_group(n).column(p)`) aborts the process with an unhandled C++ exception.
+    Reading one row makes the same checks and raises a Python error. For a remote file no row is read, which finds fewer
+    errors, because the blocks of every row group would be fetched.
     """
     parquet = parquet_library(str(opened)).parquet
     rows = 1 if isinstance(opened, str) else 0
@@ -219,9 +219,9 @@ def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile
 def _parts_of(
     file: parquet.ParquetFile, path: str, columns: list[str], most_bytes: int, **which: list[int]
 ) -> Iterator[dict[str, list[Any]]]:
-    """Yield some columns a few rows at a time, as Python values, of which all together have a limit.
+    """Yield some columns as Python values, a few rows at a time, up to a limit of their total size.
 
-    Sizes are counted as Python values: the table stores equal ones once, Python a copy of each.
+    Sizes are counted as Python values, because the table stores equal values once, but Python a copy of each.
     """
     total = 0
     for part in file.iter_batches(_ROWS_AT_ONCE, columns=columns, use_threads=False, **which):
@@ -243,7 +243,7 @@ def _bytes_in(value: Any) -> int:
 
 
 def parquet_library(where: str) -> Any:
-    """Return pyarrow, with its module `parquet`."""
+    """Import and return pyarrow, with its module `parquet`."""
     called = "pyarrow, which reads and writes LeRobot data sets"
     require_library("pyarrow.parquet", where=where, called=called, extra="lerobot")
     return require_library("pyarrow", where=where, called=called, extra="lerobot")

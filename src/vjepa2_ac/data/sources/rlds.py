@@ -1,9 +1,9 @@
-"""Source of RLDS episodes: one tf.train.Example each, read without TensorFlow, images on demand.
+"""Source of RLDS episodes, one tf.train.Example each, read without TensorFlow; images are read on demand.
 
-Of a record behind a URL, the positions of its features and images are stored on this machine without limit, some 4 KB
-an episode; its numbers, and the images of steps that clips may come from, within the limit of `data.disk_cache`. The
-first time all of the camera's images are fetched, because only that gives their positions. Later exactly those of a
-clip are, where they are not stored: blocks of any size would be several times as much.
+For a record behind a URL, the positions of its features and images are cached on this machine without limit (about 4 KB
+per episode). Its numbers, and the images of steps that clips may come from, are cached within the limit of
+`data.disk_cache`. The first read fetches all images of the camera, because their positions are not known otherwise.
+Later reads fetch exactly the images of a clip that are not cached; fixed blocks would be several times as large.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from vjepa2_ac.media.images import decode_images
 from vjepa2_ac.storage.block_file import DiskCache
 from vjepa2_ac.storage.remote import read_neighbours
 
-_GAP_BYTES = 1 << 15  # images at most this far apart are fetched by one read
+_GAP_BYTES = 1 << 15  # images at most this far apart are fetched with one request
 _CHUNK_BYTES = 1 << 20  # all of a camera's images are fetched in parallel chunks of this size
 
 
 class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
     """The episodes of an RLDS data set, in the order of its shards.
 
-    `infos` scans every record once and caches the result; `read` reads the states only, and images are read and decoded
-    on request: each camera must have one for every step. A local record is read completely the first time
-    on this machine, and its CRC is checked.
+    `infos` scans every record once and caches the result. `read` reads only the states; images are read and decoded on
+    request, and each camera must have one image per step. The first time on this machine, a local record is read
+    completely and its CRC is checked.
 
-    Behind a URL only parts of a record are fetched, and parts have no CRC: checked are the CRCs of the lengths, the
-    nesting of features and images, and the images' format; the rest is left to the transport.
+    Behind a URL only parts of a record are fetched, which have no CRC. The CRCs of the lengths, the nesting of features
+    and images, and the format of images are checked; otherwise the integrity relies on the transport.
     """
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
-        """Return one episode.
+        """Return an episode.
 
         Raises:
             InputError: The record is damaged, has changed, lacks a feature, or has implausible states.
@@ -95,12 +95,12 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
 
 
 def places_of_records(config: DiskCacheConfig) -> DiskCache:
-    """Return the cache of what is known of records: which are intact, and where their features and images are."""
+    """Return the disk cache of facts about records: whether they are intact, and positions of features and images."""
     return open_cache(cache_folder(config) / "places", None)
 
 
 def images_here(shard: Shard, feature: Place, num_steps: int, where: str) -> FrameReader:
-    """Return the reader of the images in a local shard; `where`: file, record, identity and feature, for messages."""
+    """Return a reader of the images in a local shard; `where` (file, record, identity, feature) is for messages."""
 
     def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
         with open_shard(shard) as read:
@@ -114,9 +114,9 @@ class RemoteEpisode:
     """One record behind a URL: its numbers, and the images of its cameras.
 
     Args:
-        shard: Its file.
-        span: Its position in the file.
-        config: Of the cache of this machine.
+        shard: The file of the record.
+        span: The position of the record in the file.
+        config: Config of the disk cache.
     """
 
     def __init__(self, shard: Shard, span: RecordSpan, config: DiskCacheConfig) -> None:
@@ -125,10 +125,10 @@ class RemoteEpisode:
         self._key = f"{shard.path} {shard.version} {shard.size} {span.offset}"
 
     def record(self, names: Sequence[str]) -> Record:
-        """Return the record with these features fetched, as far as it has them.
+        """Fetch these features of the record, if it has them, and return the record.
 
         Raises:
-            InputError: It cannot be read, or is no Example.
+            InputError: The record cannot be read, or is not an Example.
             UnreachableError: The network fails.
         """
         located = self._located()
@@ -141,12 +141,12 @@ class RemoteEpisode:
         return Record(lambda *place: pieces[place], self._span, located)
 
     def images(self, name: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str) -> FrameReader:
-        """Return the reader of one camera's images.
+        """Return a reader of one camera's images.
 
         Args:
-            name: The feature's.
-            feature: Its position.
-            num_steps: Of the episode.
+            name: The name of the feature.
+            feature: The position of the feature.
+            num_steps: Number of steps of the episode.
             needed: Steps whose images are cached; None: all.
             where: File, record, identity and feature, for messages.
         """
@@ -175,7 +175,7 @@ class RemoteEpisode:
     def _fetch_all(
         self, key: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str
     ) -> dict[int, bytes]:
-        """Fetch all of a camera's images; cache their positions, and the needed ones."""
+        """Fetch all images of a camera; cache their positions and the images of the needed steps."""
         start, end = feature[0], sum(feature)
         chunks = [(place, min(_CHUNK_BYTES, end - place)) for place in range(start, end, _CHUNK_BYTES)]
         data = b"".join(storage.read_ranges(self._shard.path, chunks))
@@ -191,7 +191,7 @@ class RemoteEpisode:
         return images
 
     def _some(self, key: str, places: list[Place], steps: Sequence[int]) -> dict[int, bytes]:
-        """Return images whose positions are known: from the cache, or fetched, neighbours by one read."""
+        """Return images whose positions are known, from the cache or fetched, neighbouring images with one request."""
         images = dict(zip(steps, self._contents.read_parts(key, len(places), steps) or [b""] * len(steps), strict=True))
         lacking = sorted(step for step, image in images.items() if not image)
         fetched = read_neighbours(self._shard.path, [places[step] for step in lacking], _GAP_BYTES)
@@ -202,7 +202,7 @@ def _places_of(read: Read, feature: Place, num_steps: int, where: str) -> list[P
     """Return the position of each image of a feature.
 
     Raises:
-        InputError: It is not a list of images, or not of one for each step.
+        InputError: The feature is not a list of images, or does not have one image per step.
     """
     try:
         places = item_places(read, feature, num_steps + 1)

@@ -1,7 +1,8 @@
-"""An episode in a record: its identity, steps and states; and the index of all, by hopping over most of the data.
+"""Read an episode from an RLDS record, and index all records by reading their headers and skipping most of the data.
 
-The states of a local record are checked, too. Behind a URL a read costs tens of milliseconds: many shards are read at
-once, and of a record only as much as gives its name and its steps; its states are checked when the episode is read.
+While indexing, the states of local records are checked, too. Behind a URL a read takes tens of milliseconds, so many
+shards are read concurrently, and only the identity and the number of steps of a record are read; its states are checked
+when the episode is read.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ from vjepa2_ac.spaces import require_finite, zero_steps
 
 IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
 STEP_FLAG = "steps/is_first"
-_MOST_BYTES = 1 << 28  # of a feature that is read whole: numbers and texts
-_IN_FLIGHT = 128  # reads behind a URL: they are small, and sequential within a shard
-_SAMPLES = 4
+_MOST_BYTES = 1 << 28  # size limit of a feature of numbers or texts, which is read completely
+_IN_FLIGHT = 128  # concurrent reads behind a URL, which are small, and sequential within a shard
+_SAMPLES = 4  # shards whose first record is checked before a remote data set is indexed
 _NUMBERS: tuple[Kind, ...] = ("float_list", "int64_list")  # booleans are stored as integers
 _FIX_IDENTITY = "Name text or integer features in data.fields.identity, or set data.fields.identity: record"
 _PLACE = ("shard", "record", "offset", "length")  # columns of the table
@@ -52,8 +53,8 @@ class Record:
 
     Args:
         read: Returns bytes of the file.
-        span: The record's position in it.
-        located: The position of each feature, if known already.
+        span: The position of the record in the file.
+        located: The position of each feature, if already known.
     """
 
     def __init__(self, read: Read, span: RecordSpan, located: dict[str, Place] | None = None) -> None:
@@ -63,7 +64,7 @@ class Record:
 
     @property
     def place(self) -> str:
-        """The record's file, whose name has split and number of the shard, and its number in the file."""
+        """The name of the record's file (with split and number of the shard), and the record's number in the file."""
         return f"{self._span.path.rsplit('/', 1)[-1]}: record {self._span.number}"
 
     @cached_property
@@ -72,10 +73,10 @@ class Record:
         return self.locate()
 
     def locate(self, enough: Sequence[set[str]] = ()) -> dict[str, Place]:
-        """Return the position of the features up to where all of one of these sets are found.
+        """Return the positions of the features, reading until all features of one of the sets `enough` are found.
 
         Raises:
-            InputError: The record is no Example.
+            InputError: The record is not an Example.
         """
         found: dict[str, Place] = {}
         try:
@@ -92,7 +93,7 @@ class Record:
         """Return the position of a feature.
 
         Raises:
-            InputError: The record lacks it; names the features that it has.
+            InputError: The record lacks the feature; names the existing ones.
         """
         if name not in self.located:
             known = sorted(self.located)
@@ -101,10 +102,10 @@ class Record:
         return self.located[name]
 
     def values(self, name: str, *kinds: Kind) -> Sequence[Any] | np.ndarray:
-        """Return a feature's values.
+        """Read the values of a feature.
 
         Raises:
-            InputError: There is no such feature, it has values of another type or too many, or the file ends within it.
+            InputError: The feature is missing, has another type or is too large, or the file ends within it.
         """
         offset, length = self.place_of(name)
         where = f"{self._span}: {name}"
@@ -123,7 +124,7 @@ class Record:
 
 
 def identity_of(record: Record, fields: RldsFields) -> str:
-    """Return the identity of an episode, which does not depend on the order of records unless that is the identity.
+    """Return the identity of an episode: the values of some features, or the position of the record.
 
     Raises:
         InputError: A feature of the identity is missing, empty, or neither text nor integers.
@@ -149,10 +150,10 @@ def step_features(config: RldsData) -> tuple[str, ...]:
 
 
 def num_steps_of(record: Record, config: RldsData) -> int:
-    """Count the steps by their first flag; without it by the states, if all of their numbers form poses.
+    """Return the number of steps: the length of the flag `is_first`, or of the states if they are complete poses.
 
     Raises:
-        InputError: There is neither.
+        InputError: The record has neither.
     """
     fields = config.fields
     if config.states == "vector" or fields.select is not None:  # only the flag gives the count
@@ -164,13 +165,13 @@ def num_steps_of(record: Record, config: RldsData) -> int:
 
 
 def episode_of(record: Record, config: RldsData, info: EpisodeInfo, read_frames: FrameReader, where: str) -> Episode:
-    """Return the episode in a record; without joint velocities and instruction if the record has none.
+    """Read the episode in a record; joint velocities and instruction are optional.
 
     Args:
         record: The record.
-        config: Names of the features, and what a state is.
-        info: The episode as the index describes it.
-        read_frames: Reads the images of its camera.
+        config: The names of the features and the definition of a state.
+        info: The entry of the episode in the index.
+        read_frames: Reads the images of the camera.
         where: File, record and identity, for messages.
 
     Raises:
@@ -191,10 +192,10 @@ def episode_of(record: Record, config: RldsData, info: EpisodeInfo, read_frames:
 
 
 def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float[np.ndarray, "steps state_dim"]:
-    """Return the measured states (legend: `vjepa2_ac.episode`), checked for plausibility.
+    """Read the measured states (conventions: `vjepa2_ac.episode`) and check that they are plausible.
 
     Raises:
-        InputError: A feature is missing, has no uniform shape over all steps, or has implausible states.
+        InputError: A feature is missing, does not have equally many numbers per step, or has implausible states.
     """
     if steps == 0:
         raise zero_steps(where)
@@ -215,10 +216,11 @@ def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float
 def commands_of(
     record: Record, config: RldsData, steps: int, where: str
 ) -> Float[np.ndarray, "steps action_dim"] | None:
-    """Return the recorded actions, if `data.actions` requests them.
+    """Read the recorded actions if `data.actions` is recorded, otherwise return None.
 
     Raises:
-        InputError: A feature is missing, has no uniform shape over all steps, or has numbers that are not finite.
+        InputError: A feature is missing, does not have equally many numbers per step, or has numbers that are not
+            finite.
     """
     if config.actions != "recorded":
         return None
@@ -239,11 +241,13 @@ def _of_every_step(record: Record, name: str, steps: int, where: str) -> Float[n
 
 
 def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], progress: Progress) -> EpisodeTable:
-    """Return every episode of the shards; of its images only the presence is checked, behind a URL in some episodes.
+    """Index all episodes of the shards.
+
+    Images are only checked for presence, behind a URL only in some episodes.
 
     Args:
-        shards: All of the data set's.
-        config: Names of the features, and what a state is.
+        shards: All shards of the data set.
+        config: The names of the features and the definition of a state.
         cameras: Image features that every episode must have.
         progress: Called with the number of scanned episodes.
 
@@ -265,13 +269,13 @@ def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str
 
 
 def position_of(table: EpisodeTable, shards: Sequence[Shard], index: int) -> tuple[Shard, RecordSpan]:
-    """Return the shard and the position of the record of an episode of a table."""
+    """Return the shard and the position of an episode's record."""
     number, *place = (int(table.locators[name][index]) for name in _PLACE)
     return shards[number], RecordSpan(shards[number].path, *place)
 
 
 def _scan(shard: Shard, place: int, read: Read, config: RldsData, cameras: Sequence[str]) -> Iterator[Found]:
-    """Yield the result of each expected record of a shard; after damage that hides the others, a problem for each."""
+    """Yield the result of each expected record of a shard; records behind a damaged length are problems."""
     offset = 0
     for number in range(shard.episodes):
         hidden = range(number, shard.episodes)
@@ -296,7 +300,8 @@ def _wrong_count(shard: Shard, number: int, found: str) -> EpisodeProblem:
 
 
 def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsData, cameras: Sequence[str]) -> Found:
-    """Return the episode in a record, or why there is none; it is named like the record if it has no identity."""
+    """Return the index entry of a record, or its problem, which has the name of the record if the identity is unknown.
+    """
     is_far, fields, record = storage.is_url(span.path), config.fields, Record(read, span)
     try:
         if is_far:
@@ -310,7 +315,7 @@ def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsDa
     except InputError as error:
         return EpisodeProblem.of(error if is_far else _damage_or(error, read, span), name)
     place = dict(zip(_PLACE, (shard, span.number, span.offset, span.length), strict=True))
-    success = True if "/success/" in name else False if "/failure/" in name else None  # known for DROID only
+    success = True if "/success/" in name else False if "/failure/" in name else None  # only DROID's identities contain the outcome
     info = EpisodeInfo(id=name, num_steps=steps, success=success)
     return Scanned(info, str(span), place, UNREAD if states is None else summary_of(states))
 
@@ -318,10 +323,10 @@ def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsDa
 def _checked_states(
     record: Record, config: RldsData, cameras: Sequence[str], where: str
 ) -> Float[np.ndarray, "steps _"]:
-    """Return the states of a record that has everything an episode needs.
+    """Return the states of a record after checking that it has all features of an episode.
 
     Raises:
-        InputError: A feature is missing, has no uniform shape over all steps, or has implausible numbers.
+        InputError: A feature is missing, does not have equally many numbers per step, or has implausible numbers.
     """
     for name in (*config.fields.identity_features, *step_features(config), *cameras):
         record.place_of(name)
@@ -331,7 +336,7 @@ def _checked_states(
 
 
 def _damage_or(error: InputError, read: Read, span: RecordSpan) -> InputError:
-    """Return the CRC's error if the record is damaged, which is then the error to show."""
+    """Return an error about the CRC if the record is damaged, otherwise the original error."""
     try:
         require_intact(read, span)
     except InputError as damage:
@@ -340,10 +345,10 @@ def _damage_or(error: InputError, read: Read, span: RecordSpan) -> InputError:
 
 
 def _require_fitting(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str]) -> None:
-    """Check the first record of some shards as thoroughly as a local one, before all of them are read.
+    """Check the first record of some remote shards as thoroughly as a local one, before all shards are read.
 
     Raises:
-        InputError: None of them can be used: the settings or the data set are wrong.
+        InputError: None of these records can be used, so the settings or the data set are wrong.
     """
     errors = []
     for shard in shards[:: max(1, len(shards) // _SAMPLES)]:

@@ -1,4 +1,4 @@
-"""The shards of an RLDS data set: which there are, as its dataset_info.json says, and how parts of them are read."""
+"""The shards of an RLDS data set: list them from dataset_info.json, and read parts of them."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from vjepa2_ac.storage.structured import read_json_object
 NEEDED = "a TFRecord file"
 _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
-_MOST_EPISODES = 100_000  # of a shard; DROID's have some 50
-_WINDOW_BYTES = 1 << 15  # a read behind a URL costs as much time as so many bytes
-_WINDOWS = 8  # read last: behind the images of one record is the head of the next
+_MOST_EPISODES = 100_000  # limit per shard; DROID's shards have about 50
+_WINDOW_BYTES = 1 << 15  # transferring this many bytes takes as long as the latency of a request
+_WINDOWS = 8  # number of recent windows that are kept, for example the head of the next record
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,10 @@ class Shard:
 
 
 def find_shards(folder: str) -> list[Shard]:
-    """Return the shards of every split that dataset_info.json lists, in its order; without empty shards.
+    """Return the non-empty shards of all splits in dataset_info.json, in its order.
 
     Raises:
-        InputError: No data set, an unreadable or unsupported description, or missing shards (names them).
+        InputError: There is no data set, its description is invalid or unsupported, or shards are missing.
     """
     where = storage.join(folder, _INFO)
     info = _read_info(folder, where)
@@ -70,10 +70,10 @@ def find_shards(folder: str) -> list[Shard]:
 
 
 def dataset_name(folder: str) -> str:
-    """Return the name that a data set gives itself, whatever its folder is called.
+    """Return the name of a data set in dataset_info.json, which may differ from the name of its folder.
 
     Raises:
-        InputError: As of `find_shards`.
+        InputError: As `find_shards`.
     """
     return str(_read_info(folder, storage.join(folder, _INFO)).get("name", ""))
 
@@ -98,7 +98,7 @@ def _nothing_in(folder: str) -> str:
 
 
 def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int, str]]:
-    """Yield name, number of episodes and split of each shard; TFDS writes a number as one, or as a string."""
+    """Yield (name, number of episodes, split) of each shard; TFDS writes numbers as numbers or as strings."""
     counts = [int(str(count)) for count in split.get("shardLengths", [])]
     for number, count in enumerate(counts):
         if not 0 <= count <= _MOST_EPISODES:
@@ -120,9 +120,9 @@ def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int, str
 
 @contextmanager
 def open_shard(shard: Shard) -> Iterator[Read]:
-    """Open a shard for reads of small parts; of a local one from several threads, of a remote one from one.
+    """Open a shard for reads of small parts; a local shard may be read by several threads, a remote one by one.
 
-    Nothing is mapped into memory: a local file that is truncated during use gives short reads, not a crash.
+    The file is not mapped into memory, so that truncating a local file during use causes short reads, not a crash.
 
     Raises:
         InputError: The file cannot be read, or a local one has changed since the data set was opened.
@@ -145,7 +145,7 @@ def open_shard(shard: Shard) -> Iterator[Read]:
 
 
 class _RemoteWindows:
-    """Reads a shard behind a URL by requests of a window each, of which the last are kept."""
+    """A reader of a shard behind a URL that fetches windows and keeps the most recent ones."""
 
     def __init__(self, shard: Shard) -> None:
         self._shard = shard

@@ -3,10 +3,11 @@
 A file is a sequence of records: u64 little-endian length, masked CRC-32C of the length, data, masked CRC-32C of the
 data. The data of each record is one tf.train.Example: a map from feature names to lists of bytes, floats or integers.
 
-A DROID episode is 18 MB, nearly all of it images; its identity and length are a few hundred bytes. Hopping over tags
-and lengths finds them in a file, and finds single images in a feature. The features of a record have no fixed order:
-TFDS uses that of a hash, which differs between the processes that wrote. But for that order every writer of protobuf
-gives the same bytes, and only these are read: of an entry the name, then the feature; numbers as one packed list.
+A DROID episode has 18 MB, nearly all of it images; its identity and length are a few hundred bytes. They, and single
+images of a feature, are found by reading tags and lengths and skipping the content. The features of a record have no
+fixed order: TFDS uses the order of a hash, which differs between the processes that wrote the files. Apart from that
+order all protobuf writers produce the same bytes, and only this form is supported: in an entry the name precedes the
+feature, and numbers are one packed list.
 
 Source: tensorflow/tensorflow, tensorflow/core/lib/io/record_writer.h and core/example/{example,feature}.proto, and
 protobuf.dev/programming-guides/encoding (the formats; no code).
@@ -24,18 +25,18 @@ import numpy as np
 
 from vjepa2_ac.errors import InputError
 
-Read = Callable[[int, int], bytes]  # (offset, length) -> those bytes; fewer if the file ends
-Place = tuple[int, int]  # of a part of a file: offset and length
+Read = Callable[[int, int], bytes]  # (offset, length) -> bytes of a file; fewer if the file ends
+Place = tuple[int, int]  # offset and length of a part of a file
 Kind = Literal["bytes_list", "float_list", "int64_list"]
 
 HEADER_BYTES = 12
 _FOOTER_BYTES = 4
-_PIECE_BYTES = 1 << 18  # small enough to stay in the processor's cache between reading and checking
+_PIECE_BYTES = 1 << 18  # small enough to remain in the processor's cache between reading and checking
 _MASK_DELTA = 0xA282EAD8
 
 _KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")  # fields 1, 2, 3 of tf.train.Feature
-_FIRST, _SECOND, _THIRD = 0x0A, 0x12, 0x1A  # tags of fields with a length
-_VARINT_BYTES = 10  # at most
+_FIRST, _SECOND, _THIRD = 0x0A, 0x12, 0x1A  # tags of length-delimited fields 1, 2 and 3
+_VARINT_BYTES = 10  # longest varint
 _HEAD_BYTES = 1 + _VARINT_BYTES
 _ENTRY_HEAD_BYTES = 400  # the headers and the name of a feature
 
@@ -46,8 +47,8 @@ class RecordSpan:
 
     path: str
     number: int
-    offset: int  # of its header
-    length: int  # of its data
+    offset: int  # offset of the header in the file
+    length: int  # length of the data
 
     @property
     def data_offset(self) -> int:
@@ -64,14 +65,14 @@ class RecordSpan:
 
 
 def span_at(header: bytes, path: str, number: int, offset: int, size: int) -> RecordSpan:
-    """Return the position of a record, from the bytes at its offset.
+    """Parse the header of a record and return the record's position.
 
     Args:
         header: At least the first 12 bytes of the record, if the file has them.
         path: The file, for messages.
-        number: Of the record in the file.
-        offset: Of the record in the file.
-        size: Of the file.
+        number: Number of the record in the file.
+        offset: Offset of the record in the file.
+        size: Size of the file in bytes.
 
     Raises:
         InputError: The CRC of the length does not match, or the file ends within the record.
@@ -117,7 +118,7 @@ class NotAnExampleError(ValueError):
 def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str, Place]]:
     """Yield the name and position of each feature in file order, reading only as far as the caller iterates.
 
-    A position is that of the serialised tf.train.Feature. No CRC is checked.
+    A position is the position of the serialised tf.train.Feature. No CRC is checked.
 
     Raises:
         NotAnExampleError: The bytes are not an Example.
@@ -141,10 +142,10 @@ def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str,
 
 
 def item_places(read: Read, feature: Place, count: int | None = None) -> list[Place]:
-    """Return the position of each image or text of a feature, without reading them; or of the first `count`.
+    """Return the positions of all (or the first `count`) images or texts of a feature, without reading them.
 
     Raises:
-        NotAnExampleError: It is not a list of bytes, or damaged.
+        NotAnExampleError: The feature is not a list of bytes, or damaged.
     """
     places: list[Place] = []
     start, end = feature[0], sum(feature)
@@ -159,7 +160,7 @@ def item_places(read: Read, feature: Place, count: int | None = None) -> list[Pl
 
 
 def decode_feature(data: bytes) -> tuple[Kind | None, Sequence[Any] | np.ndarray]:
-    """Return kind and values of one serialised tf.train.Feature: bytes, float32 or integers; None: it has no values.
+    """Parse a serialised tf.train.Feature; return its kind (None if it has no values) and its values.
 
     Raises:
         NotAnExampleError: The bytes are not a Feature.
@@ -187,14 +188,14 @@ def write_record(file: BinaryIO, data: bytes) -> None:
 
 
 def encode_example(features: Mapping[str, tuple[Kind, Sequence[Any] | np.ndarray]]) -> bytes:
-    """Return a serialised tf.train.Example: features by name, one that begins another behind it, as protobuf does."""
+    """Serialise a tf.train.Example, with features sorted as protobuf does: a prefix sorts after the longer name."""
     names = sorted(features, key=lambda name: name.encode() + b"\xff")
     entries = [encode_entry(name, *features[name]) for name in names]
     return encode_field(_FIRST, b"".join(entries))
 
 
 def encode_entry(name: str, kind: Kind, values: Sequence[Any] | np.ndarray) -> bytes:
-    """Return one feature with its name, as it lies in an Example."""
+    """Serialise one feature with its name, as an entry of an Example."""
     if kind == "bytes_list":
         content = b"".join(encode_field(_FIRST, value) for value in values)
     elif kind == "float_list":
@@ -219,14 +220,14 @@ def _mask(crc: int) -> int:
 
 
 def _delimited(data: bytes, place: int, tag: int) -> tuple[int, int]:
-    """Return the length of a field with a tag at a place, and where its content starts."""
+    """Parse the head of a length-delimited field at an offset; return its length and the offset of its content."""
     if place < len(data) and data[place] == tag:
         return _varint(data, place + 1)
     raise NotAnExampleError(f"no field {tag >> 3} where one must start")
 
 
 def _content(head: bytes, start: int, end: int, tag: int) -> int:
-    """Return where the content of a field starts, which must fill a message from its start to its end."""
+    """Return the offset of the content of a field that must fill its message from `start` to `end`."""
     length, used = _delimited(head, 0, tag)
     if start + used + length != end:
         raise NotAnExampleError(f"the field at byte {start} does not end where its message does")
@@ -234,8 +235,8 @@ def _content(head: bytes, start: int, end: int, tag: int) -> int:
 
 
 def _integers(packed: bytes) -> Sequence[int] | np.ndarray:
-    """Return packed varints as signed integers of 64 bits."""
-    if packed.isascii():  # each in one byte, as flags are
+    """Decode packed varints to signed 64-bit integers."""
+    if packed.isascii():  # one byte each, as flags
         return np.frombuffer(packed, np.uint8)
     found, place = [], 0
     while place < len(packed):
@@ -246,7 +247,7 @@ def _integers(packed: bytes) -> Sequence[int] | np.ndarray:
 
 
 def _varint(data: bytes, start: int) -> tuple[int, int]:
-    """Return a varint, and the offset of its end."""
+    """Decode a varint; return its value and the offset of its end."""
     value = 0
     for place, byte in enumerate(data[start : start + _VARINT_BYTES]):
         value |= (byte & 0x7F) << 7 * place
@@ -265,5 +266,5 @@ def _varint_of(value: int) -> bytes:
 
 
 def encode_field(tag: int, content: bytes) -> bytes:
-    """Return a field with a length."""
+    """Serialise a length-delimited field."""
     return bytes([tag]) + _varint_of(len(content)) + content
