@@ -136,10 +136,12 @@ def collate(clips: Sequence[Clip]) -> Batch:
         InputError: The frames of two clips differ in size.
     """
     frames = [clip.frames for clip in clips if clip.frames is not None]
-    sizes = [("x".join(map(str, one.shape[1:3])), clip.episode_id) for one, clip in zip(frames, clips, strict=False)]
+    sizes = [
+        ("x".join(map(str, array.shape[1:3])), clip.episode_id) for array, clip in zip(frames, clips, strict=False)
+    ]
     if other := next((pair for pair in sizes if pair[0] != sizes[0][0]), None):
-        (size, first), (another, name) = sizes[0], other
-        found = f"frames of {another} after the crop; those of episode {first} are {size}"
+        (size, first), (other_size, name) = sizes[0], other
+        found = f"frames of {other_size} after the crop; those of episode {first} are {size}"
         fix = "Train on episodes of one size, or set training.batch_size: 1"
         raise with_exclusion(InputError(where=f"episode {name}", found=found, fix=fix), [name])
     latents = [clip.latents for clip in clips if clip.latents is not None]
@@ -165,8 +167,8 @@ default_collate_fn_map[Clip] = _collate_by_default  # PyTorch documents this as 
 
 def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:
     """Join latents and their scales with `torch.stack` or `torch.cat`."""
-    scales = [one.scales for one in latents if one.scales is not None]
-    return StoredLatents(join([one.values for one in latents]), join(scales) if scales else None)
+    scales = [part.scales for part in latents if part.scales is not None]
+    return StoredLatents(join([part.values for part in latents]), join(scales) if scales else None)
 
 
 def no_clips(frames: int, widths: Widths) -> Batch:

@@ -70,7 +70,7 @@ class Dataset:
     def taking_part(self) -> Bool[np.ndarray, " episodes"]:
         """A mask of the episodes that are used; the idle filter may still remove all steps of such an episode."""
         chosen = np.asarray(included(self.table, self.config) & of_outcome(self.table, self.config))
-        chosen[[place for place, _ in self.kept.problems]] = False
+        chosen[[index for index, _ in self.kept.problems]] = False
         return chosen
 
     @property
@@ -161,17 +161,17 @@ class Dataset:
     @cached_property
     def removed(self) -> tuple[Removed, ...]:
         """The parts that the filters removed, in the order of the filters."""
-        included_ones = included(self.table, self.config)
-        chosen = included_ones & of_outcome(self.table, self.config)
-        masks = np.ones(len(self.table), bool), included_ones, chosen, self.taking_part
+        not_excluded = included(self.table, self.config)
+        chosen = not_excluded & of_outcome(self.table, self.config)
+        masks = np.ones(len(self.table), bool), not_excluded, chosen, self.taking_part
         left = [self._count(StepSelection.whole(self.table, mask)) for mask in masks]
-        gone = -np.diff([*left, self._count(self.kept)], axis=0)
+        removed = -np.diff([*left, self._count(self.kept)], axis=0)
         excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
         unread = {"excluded": excluded, "outcome": 0, "broken": len(self.table.problems) - excluded, "idle": 0}
         is_known = self.config.stride != "auto"
         return tuple(
             Removed(name, episodes + unread[name], steps, windows if is_known else None)
-            for name, (episodes, steps, windows) in zip(unread, gone.tolist(), strict=True)
+            for name, (episodes, steps, windows) in zip(unread, removed.tolist(), strict=True)
         )
 
     def _count(self, kept: StepSelection) -> tuple[int, int, int]:
@@ -268,17 +268,17 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     broken.found([problem for problem in table.problems if problem.name not in config.exclude])
     kept = StepSelection.whole(table, chosen)
     if config.idle.rule != "none":
-        found = source.kept_ranges() if config.is_cache else find_ranges(source, table, config, progress)
-        broken.found([problem for place, problem in found.problems if chosen[place]])
-        kept = found.only(chosen)
+        ranges = source.kept_ranges() if config.is_cache else find_ranges(source, table, config, progress)
+        broken.found([problem for index, problem in ranges.problems if chosen[index]])
+        kept = ranges.only(chosen)
     dataset = Dataset(config, source, table, kept, broken)
     dataset = replace(dataset, groups=groups_of(table, dataset.taking_part, config))
     if not len(dataset.episodes):
-        filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
+        filters = ", ".join(f"{removed.name} {removed.episodes}" for removed in dataset.removed if removed.episodes)
         left_out = f" (left out: {filters})" if filters else ""
-        gone = f"none of {counted(len(table) + len(table.problems), 'episode')} is left{left_out}"
+        found = f"none of {counted(len(table) + len(table.problems), 'episode')} is left{left_out}"
         fix = "Look at data.exclude, data.outcome and data.idle" if filters else ""
-        raise InputError(where=f"data.path: {config.path}", found=gone, fix=fix)
+        raise InputError(where=f"data.path: {config.path}", found=found, fix=fix)
     logger.info("%s: %d episodes take part, %d steps of them", config.path, dataset.taking_part.sum(), kept.steps)
     return _settled(dataset)
 
@@ -371,9 +371,9 @@ def require_widths(episode: Episode, widths: Widths) -> None:
     Raises:
         InputError: The widths differ.
     """
-    found = widths_of(episode)
-    if found != widths:
-        wrong = f"states of {found.state} and actions of {found.action} numbers"
+    actual = widths_of(episode)
+    if actual != widths:
+        found = f"states of {actual.state} and actions of {actual.action} numbers"
         needed = f"{widths.state} and {widths.action}, as in the others"
         fix = "Keep the recordings of different robots in different data sets"
-        raise InputError(where=f"episode {episode.info.id}", found=wrong, needed=needed, fix=fix)
+        raise InputError(where=f"episode {episode.info.id}", found=found, needed=needed, fix=fix)

@@ -102,16 +102,16 @@ def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
         OSError: A folder cannot be listed.
         InputError: A name is not UTF-8.
     """
-    folders, known = [""], {storage.absolute(root)}
+    folders, visited = [""], {storage.absolute(root)}
     for _ in range(DEEPEST):
         below: list[str] = []
         listed = in_parallel(lambda folder: list_folder(root, folder), folders, connections)
         for folder, (files, names) in zip(folders, listed, strict=True):
             yield from ((folder, file) for file in files if not file.name.startswith("."))
             below += [storage.join(folder, name) for name in names]
-        places = {storage.absolute(storage.join(root, folder)): folder for folder in reversed(below)}
-        folders = sorted(folder for place, folder in places.items() if place not in known)
-        known |= places.keys()
+        paths = {storage.absolute(storage.join(root, folder)): folder for folder in reversed(below)}
+        folders = sorted(folder for path, folder in paths.items() if path not in visited)
+        visited |= paths.keys()
 
 
 def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
@@ -121,10 +121,10 @@ def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
         OSError: The folder cannot be listed.
         InputError: A name is not UTF-8.
     """
-    place = storage.join(root, folder)
-    listed = storage.list_folder(place)
-    for one in listed:  # identities of episodes must be encodable as UTF-8
-        if not one.name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in one.name):
-            raise InputError(where=place, found=f"the name {one.name!r}", needed="names in UTF-8", fix="Rename it")
-    folders = [one.name for one in listed if not one.is_file and not one.name.startswith(".")]
-    return [one for one in listed if one.is_file], folders
+    path = storage.join(root, folder)
+    entries = storage.list_folder(path)
+    for entry in entries:  # identities of episodes must be encodable as UTF-8
+        if not entry.name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in entry.name):
+            raise InputError(where=path, found=f"the name {entry.name!r}", needed="names in UTF-8", fix="Rename it")
+    folders = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
+    return [entry for entry in entries if entry.is_file], folders

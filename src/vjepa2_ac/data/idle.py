@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 _MOST_BYTES = 1 << 28  # size limit of a published list
 _ALL_BROKEN = 10  # if the first ten episodes are all broken, a setting is wrong, and the first error is raised
 
-Found = list[tuple[int, int]] | EpisodeProblem
+RangesOrProblem = list[tuple[int, int]] | EpisodeProblem
 
 
 def find_ranges(
@@ -45,21 +45,21 @@ def find_ranges(
 
 
 def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress) -> StepSelection:
-    def look(place: int) -> Found:
+    def ranges_of(index: int) -> RangesOrProblem:
         try:
-            return kept_ranges(source.read(place), config.idle)
+            return kept_ranges(source.read(index), config.idle)
         except InputError as error:
-            return EpisodeProblem.of(error, table.identity(place))
+            return EpisodeProblem.of(error, table.identity(index))
 
-    found: list[Found] = []
-    for one in in_parallel(look, range(len(table)), connections_to(config)):
-        found.append(one)
-        progress(len(found), len(table))
-        if len(found) == min(_ALL_BROKEN, len(table)):
-            problems = [problem for problem in found if isinstance(problem, EpisodeProblem)]
-            if len(problems) == len(found):
+    results: list[RangesOrProblem] = []
+    for result in in_parallel(ranges_of, range(len(table)), connections_to(config)):
+        results.append(result)
+        progress(len(results), len(table))
+        if len(results) == min(_ALL_BROKEN, len(table)):
+            problems = [problem for problem in results if isinstance(problem, EpisodeProblem)]
+            if len(problems) == len(results):
                 raise problems[0].error
-    return StepSelection.of_each(found)
+    return StepSelection.of_each(results)
 
 
 def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
@@ -72,25 +72,25 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
     another = "Name the list of this version of the data set, or set data.idle.rule: commands or motion"
     lists = read_json_object(path, most_bytes=_MOST_BYTES, needed=needed)
-    names = [table.identity(place) for place in range(len(table))]
+    names = [table.identity(index) for index in range(len(table))]
     listed = sum(name in lists for name in names)
     if not listed:
         first = next(iter(lists), "none at all")
-        found_there = f"none of the {counted(len(table), 'episode')}; its first is {first}"
+        found = f"none of the {counted(len(table), 'episode')}; its first is {first}"
         needed = "the identities of the episodes" + (f", such as {names[0]}" if names else "")
-        raise InputError(where=where, found=found_there, needed=needed, fix=another)
-    found: list[Found] = []
+        raise InputError(where=where, found=found, needed=needed, fix=another)
+    ranges: list[RangesOrProblem] = []
     for name, steps in zip(names, table.num_steps.tolist(), strict=True):
         pairs = _pairs(lists.get(name, []), steps)
         if pairs is None:
             needed = f"pairs [start, end) of steps from 0 to {steps}, its length, that do not overlap"
             raise InputError(where=f"{where}: {name}", found=shown(lists[name]), needed=needed, fix=another)
-        found.append(pairs)
+        ranges.append(pairs)
     logger.log(
         logging.INFO if listed == len(table) else logging.WARNING,
         "%s: knows %d of the %d episodes; the other %d count as idle", path, listed, len(table), len(table) - listed,
     )  # fmt: skip
-    return StepSelection.of_each(found)
+    return StepSelection.of_each(ranges)
 
 
 def _pairs(ranges: object, steps: int) -> list[tuple[int, int]] | None:
@@ -145,10 +145,10 @@ def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> 
 
 def long_idle_runs(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
     """Return a mask of the steps in idle runs of at least `data.idle.shortest_idle_steps` steps."""
-    found = np.zeros(len(idle), bool)
+    is_long = np.zeros(len(idle), bool)
     for start, end in runs_of(idle):
-        found[start:end] = end - start >= config.shortest_idle_steps
-    return found
+        is_long[start:end] = end - start >= config.shortest_idle_steps
+    return is_long
 
 
 def moving_ranges(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> list[tuple[int, int]]:

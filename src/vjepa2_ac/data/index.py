@@ -107,8 +107,8 @@ class Labels:
     def of(cls, values: Sequence[str | None]) -> Labels:
         """Create labels; None or an empty name means unknown."""
         names = sorted({value for value in values if value})
-        place = {name: number for number, name in enumerate(names)}
-        return cls(tuple(names), np.array([place.get(value or "", _NOT_KNOWN) for value in values], np.int32))
+        number = {name: index for index, name in enumerate(names)}
+        return cls(tuple(names), np.array([number.get(value or "", _NOT_KNOWN) for value in values], np.int32))
 
     def of_episode(self, index: int) -> str | None:
         """Return the name of one episode, or None if unknown."""
@@ -244,15 +244,15 @@ class StepSelection:
     @classmethod
     def of_each(cls, found: Sequence[list[tuple[int, int]] | EpisodeProblem]) -> StepSelection:
         """Create a selection from the ranges or the problem of each episode."""
-        problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, EpisodeProblem))
-        ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
+        problems = tuple((index, part) for index, part in enumerate(found) if isinstance(part, EpisodeProblem))
+        ranges = [(index, *pair) for index, part in enumerate(found) if isinstance(part, list) for pair in part]
         episode, start, end = np.ascontiguousarray(np.array(ranges, np.int32).reshape(-1, 3).T)
         return cls(episode, start, end, problems)
 
     def only(self, episodes: Bool[np.ndarray, " episodes"]) -> StepSelection:
         """Return the part of the selection that belongs to a mask of episodes."""
-        stays = episodes[self.episode]
-        return replace(self, episode=self.episode[stays], start=self.start[stays], end=self.end[stays])
+        selected = episodes[self.episode]
+        return replace(self, episode=self.episode[selected], start=self.start[selected], end=self.end[selected])
 
     def of(self, episode: int) -> StepRanges:
         """Return the ranges of one episode."""
@@ -266,7 +266,7 @@ class StepSelection:
 
     def to_bytes(self) -> bytes:
         """Serialise the selection."""
-        problems = [(place, vars(problem)) for place, problem in self.problems]
+        problems = [(index, vars(problem)) for index, problem in self.problems]
         return pack({"episode": self.episode, "start": self.start, "end": self.end}, problems)
 
     @classmethod
@@ -278,7 +278,7 @@ class StepSelection:
         """
         arrays, problems = unpack(data)
         try:
-            return cls(**arrays, problems=tuple((place, EpisodeProblem(**values)) for place, values in problems))
+            return cls(**arrays, problems=tuple((index, EpisodeProblem(**values)) for index, values in problems))
         except (LookupError, TypeError, ValueError) as error:
             raise NotATableError(f"no ranges of steps ({error})") from None
 
@@ -293,9 +293,9 @@ def identity_hash(identity: str) -> int:
 
 def labels_of(values: Sequence[Mapping[str, str | None]]) -> dict[str, Labels]:
     """Return labels from one {label: name} mapping per episode; labels without any name are dropped."""
-    every = {label for of_one in values for label in of_one}
-    found = {label: Labels.of([of_one.get(label) for of_one in values]) for label in sorted(every)}
-    return {label: labels for label, labels in found.items() if labels.names}
+    names = {name for episode in values for name in episode}
+    all_labels = {name: Labels.of([episode.get(name) for episode in values]) for name in sorted(names)}
+    return {name: labels for name, labels in all_labels.items() if labels.names}
 
 
 def hash_of_states(states: Float[np.ndarray, "steps state_dim"]) -> int:
@@ -339,11 +339,11 @@ def cache_folder(config: DiskCacheConfig) -> Path:
     """
     if config.dir is not None:
         return Path(config.dir)
-    if named := os.environ.get(_CACHE):
+    if configured := os.environ.get(_CACHE):
         try:
-            return Path(places.on_this_machine(named))
+            return Path(places.on_this_machine(configured))
         except ValueError as error:
-            raise InputError(where=_CACHE, found=f"{named!r} {error}", needed="a folder of this machine") from None
+            raise InputError(where=_CACHE, found=f"{configured!r} {error}", needed="a folder of this machine") from None
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
 
 
@@ -377,14 +377,16 @@ def get_or_build(config: DiskCacheConfig, key: str, place: str, build: Callable[
 
     If the data set was moved, paths in cached problems are rewritten from the old folder to `place`.
     """
-    now = storage.absolute(place)
+    folder = storage.absolute(place)
 
-    def build_marked() -> EpisodeTable:
+    def build_with_key() -> EpisodeTable:
         table = build()
-        return replace(table, texts={**table.texts, "index": key, "place": now})
+        return replace(table, texts={**table.texts, "index": key, "place": folder})
 
-    table = get_or_make(config, key, build_marked, EpisodeTable)
-    problems = [replace(one, where=one.where.replace(table.texts["place"], now, 1)) for one in table.problems]
+    table = get_or_make(config, key, build_with_key, EpisodeTable)
+    problems = [
+        replace(problem, where=problem.where.replace(table.texts["place"], folder, 1)) for problem in table.problems
+    ]
     return replace(table, problems=tuple(problems))
 
 
@@ -407,9 +409,9 @@ def get_or_make(config: DiskCacheConfig, key: str, make: Callable[[], T], kind: 
         pass
     except (InputError, NotATableError) as error:
         logger.warning("%s: cannot be used (%s); the index is built again", path, error)
-    made = make()
+    table = make()
     try:
-        storage.write_atomically(path, made.to_bytes() + key.encode())
+        storage.write_atomically(path, table.to_bytes() + key.encode())
     except OSError as error:
         logger.warning("%s: cannot be written (%s); the index will be built again next time", path, error)
-    return made
+    return table

@@ -199,9 +199,9 @@ class _MicroBatches(TorchDataset[Batch]):
         """
         before = storage.bytes_fetched()
         try:
-            read = self._read(positions)
-            clips = [one for one in read if isinstance(one, Clip)]
-            skipped = tuple(one for one in read if isinstance(one, Skipped))
+            results = self._read(positions)
+            clips = [result for result in results if isinstance(result, Clip)]
+            skipped = tuple(result for result in results if isinstance(result, Skipped))
             batch = collate(clips) if clips else no_clips(self.dataset.config.frames, self.dataset.widths)
             batch = replace(batch, bytes_fetched=storage.bytes_fetched() - before, skipped=skipped)
             return batch if get_worker_info() is None else _in_shared_memory(batch)
@@ -209,8 +209,9 @@ class _MicroBatches(TorchDataset[Batch]):
             return error
 
     def _read(self, positions: list[int]) -> list[Clip | Skipped]:
-        data_sets = [one.dataset for one in (self, self.replayed) if one is not None]
-        return list(in_parallel(self._clip, positions, max(connections_to(one.config) for one in data_sets)))
+        datasets = [clips.dataset for clips in (self, self.replayed) if clips is not None]
+        connections = max(connections_to(dataset.config) for dataset in datasets)
+        return list(in_parallel(self._clip, positions, connections))
 
     def _clip(self, position: int) -> Clip | Skipped:
         if self.replayed is not None:
@@ -257,9 +258,9 @@ class Batches(Iterator[Batch]):
         if isinstance(row, UserError):
             self.close()
             raise row
-        for one in row.skipped:
-            broken = self._replayed if one.replayed and self._replayed is not None else self._broken
-            broken.met(one.episode_id, one.reason)
+        for clip in row.skipped:
+            broken = self._replayed if clip.replayed and self._replayed is not None else self._broken
+            broken.met(clip.episode_id, clip.reason)
         return row
 
     def close(self) -> None:
@@ -301,17 +302,17 @@ def results_of_workers(
         prefetch_factor=PREFETCH if workers else None,
         pin_memory=pinned,
     )
-    others = set(multiprocessing.active_children())
+    other_children = set(multiprocessing.active_children())
     rows = iter(loader)
-    ours = set(multiprocessing.active_children()) - others
-    at_exit = partial(_end_workers, ours)
+    worker_processes = set(multiprocessing.active_children()) - other_children
+    at_exit = partial(_end_workers, worker_processes)
     atexit.register(at_exit)  # multiprocessing would send SIGTERM and wait for workers that ignore it
     try:
-        while (row := _next_row(rows, ours)) is not None:
+        while (row := _next_row(rows, worker_processes)) is not None:
             yield row
     finally:
         del rows  # asks the workers to end, and waits for a while
-        _end_workers(ours)
+        _end_workers(worker_processes)
         atexit.unregister(at_exit)
 
 

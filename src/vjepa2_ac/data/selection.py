@@ -46,14 +46,14 @@ def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " epis
     excluded = frozenset(config.exclude)
     hashes = np.array([identity_hash(name) for name in excluded], np.uint64)
     candidates = np.flatnonzero(np.isin(table.id_hash, hashes)).tolist()
-    found = {place: name for place in candidates if (name := table.identity(place)) in excluded}
-    unknown = excluded.difference(found.values(), (problem.name for problem in table.problems))
+    names = {index: name for index in candidates if (name := table.identity(index)) in excluded}
+    unknown = excluded.difference(names.values(), (problem.name for problem in table.problems))
     if unknown:
-        wrong = f"not the identity of any episode: {named(sorted(unknown))}"
+        found = f"not the identity of any episode: {named(sorted(unknown))}"
         needed = "identities as errors name them" + (f", such as {table.identity(0)}" if len(table) else "")
-        raise InputError(where="data.exclude", found=wrong, needed=needed)
+        raise InputError(where="data.exclude", found=found, needed=needed)
     taking_part = np.ones(len(table), bool)
-    taking_part[list(found)] = False
+    taking_part[list(names)] = False
     return taking_part
 
 
@@ -79,14 +79,17 @@ def require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episod
     """
     members = np.flatnonzero(taking_part)
     hashes, counts = np.unique(table.id_hash[members], return_counts=True)
-    places: dict[str, int] = {}
-    for place in members[np.isin(table.id_hash[members], hashes[counts > 1])].tolist():
-        name = table.identity(place)
-        if name in places:
-            found, fix = f"episodes {places[name]} and {place} have the same identity: {name}", config.same_identity_fix
+    indices: dict[str, int] = {}
+    for index in members[np.isin(table.id_hash[members], hashes[counts > 1])].tolist():
+        name = table.identity(index)
+        if name in indices:
+            found, fix = (
+                f"episodes {indices[name]} and {index} have the same identity: {name}",
+                config.same_identity_fix,
+            )
             error = InputError(where=f"data.path: {config.path}", found=found, fix=fix)
             raise with_exclusion(error, [name]) if hashes.size > 1 else error
-        places[name] = place
+        indices[name] = index
 
 
 def max_broken(episodes: int) -> int:
@@ -330,13 +333,13 @@ def groups_of(
     if split_by is None:
         return None
     groups = _groups(table, split_by)
-    lacking = [table.identity(place) for place in np.flatnonzero(taking_part).tolist() if not groups[place]]
-    if lacking:
+    ungrouped = [table.identity(index) for index in np.flatnonzero(taking_part).tolist() if not groups[index]]
+    if ungrouped:
         from_source = split_by in table.labels
         reason = "the data set does not say it of" if from_source else "found nothing in the identities of"
-        another = "choose another field" if from_source else "choose a pattern that fits every identity"
-        found = f"{reason} {len(lacking)} of {counted(taking_part.sum(), 'episode')}: {named(lacking)}"
-        fix = f"Leave these out with data.exclude, or {another}"
+        alternative = "choose another field" if from_source else "choose a pattern that fits every identity"
+        found = f"{reason} {len(ungrouped)} of {counted(taking_part.sum(), 'episode')}: {named(ungrouped)}"
+        fix = f"Leave these out with data.exclude, or {alternative}"
         raise InputError(where=f"data.split_by: {split_by}", found=found, fix=fix)
     hashes = {group: identity_hash(group) for group in groups if group}
     any_hash = next(iter(hashes.values()), 0)
@@ -345,12 +348,13 @@ def groups_of(
 
 def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
     if labels := table.labels.get(split_by):
-        return [labels.of_episode(place) for place in range(len(table))]
-    identities = [table.identity(place) for place in range(len(table))]
+        return [labels.of_episode(index) for index in range(len(table))]
+    identities = [table.identity(index) for index in range(len(table))]
     if split_by not in IN_IDENTITY and re.fullmatch(r"[A-Za-z_]+", split_by):
-        own, such = ", ".join(table.labels) or "none of its own", f", such as {identities[0]}" if identities else ""
-        wrong = f"no such field; this data set has {own}, and its identities may have {', '.join(IN_IDENTITY)}"
-        needed = f"a field, or a regular expression with one group for the identity{such}"
-        raise InputError(where=f"data.split_by: {split_by}", found=wrong, needed=needed)
+        fields = ", ".join(table.labels) or "none of its own"
+        example = f", such as {identities[0]}" if identities else ""
+        found = f"no such field; this data set has {fields}, and its identities may have {', '.join(IN_IDENTITY)}"
+        needed = f"a field, or a regular expression with one group for the identity{example}"
+        raise InputError(where=f"data.split_by: {split_by}", found=found, needed=needed)
     search = re.compile(IN_IDENTITY.get(split_by, split_by)).search
-    return [found.group(1) if (found := search(identity)) else None for identity in identities]
+    return [match.group(1) if (match := search(identity)) else None for identity in identities]

@@ -143,8 +143,8 @@ class ClipChanges:
     @classmethod
     def of(cls, data: DataConfig, seed: int) -> ClipChanges:
         """Create the transforms of a config, once, in the process that starts the workers."""
-        made = ((config.name, TRANSFORMS.make(config.name, config.options)) for config in data.transforms)
-        return cls(tuple(made), seed)
+        transforms = ((config.name, TRANSFORMS.make(config.name, config.options)) for config in data.transforms)
+        return cls(tuple(transforms), seed)
 
     def apply(self, clip: Clip, position: int) -> Clip:
         """Apply all transforms to a clip: a pure function of the clip, the seed and the position in the run.
@@ -161,10 +161,10 @@ class ClipChanges:
 
 def _require_same_form(result: object, before: Clip, name: str) -> None:
     """Refuse the result of a transform if shapes or types differ from its input; the size of frames may differ."""
-    found, needed = ([_form(one, part) for part in ("frames", "states", "actions")] for one in (result, before))
-    for one, other in zip(found, needed, strict=True):
-        if one != other:
-            raise InputError(where=f"data.transforms: {name}", found=one, needed=other)
+    found, needed = ([_form(clip, part) for part in ("frames", "states", "actions")] for clip in (result, before))
+    for form, required_form in zip(found, needed, strict=True):
+        if form != required_form:
+            raise InputError(where=f"data.transforms: {name}", found=form, needed=required_form)
 
 
 def _form(clip: object, part: str) -> str:

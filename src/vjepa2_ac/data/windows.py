@@ -57,8 +57,8 @@ class Windows:
         if not 0 <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
         run = int(np.searchsorted(self._ends, index, side="right"))
-        place = index - (int(self._ends[run]) - int(self.count[run]))
-        return int(self.episode[run]), int(self.first[run]) + self.every * place
+        offset = index - (int(self._ends[run]) - int(self.count[run]))
+        return int(self.episode[run]), int(self.first[run]) + self.every * offset
 
     def steps_of(self, run: int) -> Int[np.ndarray, " n"]:
         """Return the first control steps of all clips of a run."""
@@ -103,7 +103,7 @@ def windows_of(
     length = f"{counted(config.clip_steps, 'step')} for a clip of {config.frames} frames at stride {config.stride}"
     short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
     short = short[np.argsort(table.id_rank[short])]
-    names = tuple(table.identity(place) for place in short[: NAMED + 1].tolist())
+    names = tuple(table.identity(index) for index in short[: NAMED + 1].tolist())
     if len(short) == count:
         longest = int(short[np.argmax(table.num_steps[short])])
         found = f"all {count} {split} episodes are shorter than a clip; the longest,"
@@ -113,12 +113,12 @@ def windows_of(
     if len(short):
         clip = f"a clip of {config.clip_steps} control steps and left out: {named(names, len(short))}"
         _warn_once(f"{config.path}: {len(short)} of {count} {split} episodes are shorter than {clip}")
-    own = starts.of(members[starts.episode])
-    if not len(own):
+    windows = starts.of(members[starts.episode])
+    if not len(windows):
         found = f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})"
         fix = "Lower data.frames or data.stride, or set data.idle.rule: none"
         raise InputError(where=where, found=found, needed=length, fix=fix)
-    return replace(own, short=tuple(short.tolist()))
+    return replace(windows, short=tuple(short.tolist()))
 
 
 @lru_cache(maxsize=64)  # each text is logged once, although every validation asks for the same windows
@@ -228,7 +228,7 @@ def spread(size: int, count: int) -> list[int]:
 
 def spread_with_ends(size: int, count: int) -> list[int]:
     """Return at most `count` distinct indices from `range(size)`, evenly spread, including the first and the last."""
-    return sorted({round(place) for place in np.linspace(0, size - 1, min(size, count))})
+    return sorted({round(position) for position in np.linspace(0, size - 1, min(size, count))})
 
 
 def far_neighbours(items: list[int]) -> list[int]:

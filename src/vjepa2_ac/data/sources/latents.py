@@ -116,7 +116,9 @@ def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: s
         UnreachableError: The folder cannot be read now.
     """
     fix = "Name another folder, or delete this one"
-    others = [other for other in storage.list_names(folder) if other[0] != "."]  # listed first, because another process may begin now
+    others = [
+        other for other in storage.list_names(folder) if other[0] != "."
+    ]  # listed first, because another process may begin now
     try:
         there = read_json_object(storage.join(folder, name), fix=fix)
     except MissingFileError:

@@ -300,8 +300,7 @@ def _wrong_count(shard: Shard, number: int, found: str) -> EpisodeProblem:
 
 
 def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsData, cameras: Sequence[str]) -> Found:
-    """Return the index entry of a record, or its problem, which has the name of the record if the identity is unknown.
-    """
+    """Return the index entry or the problem of a record; a problem has the name `name` if the identity is unknown."""
     is_far, fields, record = storage.is_url(span.path), config.fields, Record(read, span)
     try:
         if is_far:
@@ -315,7 +314,9 @@ def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsDa
     except InputError as error:
         return EpisodeProblem.of(error if is_far else _damage_or(error, read, span), name)
     place = dict(zip(_PLACE, (shard, span.number, span.offset, span.length), strict=True))
-    success = True if "/success/" in name else False if "/failure/" in name else None  # only DROID's identities contain the outcome
+    success = (
+        True if "/success/" in name else False if "/failure/" in name else None
+    )  # only DROID's identities contain the outcome
     info = EpisodeInfo(id=name, num_steps=steps, success=success)
     return Scanned(info, str(span), place, UNREAD if states is None else summary_of(states))
 
