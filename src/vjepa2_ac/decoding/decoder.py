@@ -1,10 +1,10 @@
-"""The decoder: the image of a frame from its latents alone; and its folder, in which nothing is executed.
+"""The decoder, which turns the latents of a frame into an image, and its folder of files (no code is executed).
 
-It is trained on latents of true frames only, without an adversary, and applied to predictions as it is: where a
-prediction is an average of futures, the image is blurred, and that is what it shows. A decoder belongs to an encoder.
-The latents of another one would give images, too, but meaningless ones: they are refused.
+A decoder is trained on the latents of true frames only, without an adversarial loss, and applied to predictions without
+changes. If a prediction averages several possible futures, the image is blurred. A decoder fits one encoder only:
+latents of another encoder would give meaningless images and are rejected.
 
-Source: the idea is that of Assran et al. (2025), V-JEPA 2, appendix B.3; sizes and losses are our own.
+Source of the idea: Assran et al. (2025), V-JEPA 2, appendix B.3; sizes and losses differ.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ Latents = Float[Tensor, "*batch tokens dim"]
 Images = Float[Tensor, "*batch 3 size size"]  # black 0 to white 1
 Size = Literal["linear", "tiny", "small", "medium"]
 
-_MIDDLE, _RANGE = 0.5, 0.25  # of pixels: the network's numbers are about -2 .. 2
+_MIDDLE, _RANGE = 0.5, 0.25  # pixel = output x range + middle; the network's outputs are about -2 .. 2
 _FREQUENCIES = 10_000.0
 _STD = 0.02
-UPSAMPLED = 4  # the resolution of tokens is doubled twice
-_LAST = -2  # of the further layers: the last one with weights
+UPSAMPLED = 4  # factor of upsampling before the last layer: the resolution is doubled twice
+_LAST = -2  # index of the last layer with weights in `Decoder.further`
 
 
 @dataclass(frozen=True)
 class DecoderShape:
-    """What a decoder is: its size, and the sizes of the encoder that it belongs to."""
+    """The size of a decoder, and the sizes of its encoder's latents."""
 
     size: Size
-    dim: Annotated[int, Field(ge=1, le=1 << 14)]  # of a latent
+    dim: Annotated[int, Field(ge=1, le=1 << 14)]  # dimension of a token
     grid: Annotated[int, Field(ge=1, le=256)]  # tokens along each side of a frame
     patch_size: Annotated[int, Field(ge=UPSAMPLED, le=64, multiple_of=UPSAMPLED)]  # pixels
 
@@ -68,11 +68,11 @@ _SIZES = {"tiny": (2, 128, 4, 64, 32), "small": (6, 512, 8, 256, 128), "medium":
 
 
 class Decoder(nn.Module):
-    """Turns the latents of a frame into its image, frame by frame.
+    """A network that decodes the latents of each frame to an image.
 
-    `linear` is one matrix: an image patch from each token. The others add to such a matrix attention blocks over the
-    tokens of the frame, then convolutions that double the resolution twice and end in patches of a quarter of the patch
-    size.
+    The size `linear` has one matrix, which maps each token to an image patch. The other sizes add a second branch:
+    attention blocks over the tokens of the frame, then convolutions that double the resolution twice and predict
+    patches of a quarter of the patch size.
     """
 
     def __init__(self, shape: DecoderShape) -> None:
@@ -84,7 +84,7 @@ class Decoder(nn.Module):
         self.further = None if shape.size == "linear" else _convolved(shape)
 
     def initialise(self, generator: Generator) -> None:
-        """Draw fresh weights; the generator determines them."""
+        """Initialise all weights from a random generator."""
         for module in self.modules():
             if isinstance(module, nn.Linear | nn.Conv2d):
                 fan_in = module.weight[0].numel()
@@ -105,10 +105,10 @@ class Decoder(nn.Module):
         """Return images, black 0 to white 1; not clipped.
 
         Args:
-            latents: Layer-normalised, as the encoder gives them and the predictor predicts them.
+            latents: Layer-normalised latents from the encoder or the predictor.
 
         Raises:
-            ValueError: They are of another size.
+            ValueError: The latents have another size.
         """
         shape = self.shape
         if tuple(latents.shape[-2:]) != (shape.grid**2, shape.dim):
@@ -123,12 +123,12 @@ class Decoder(nn.Module):
 
     @staticmethod
     def as_numbers(images: Images) -> Images:
-        """Return what the layers have to give for an image."""
+        """Return the outputs of the network that correspond to images."""
         return (images - _MIDDLE) / _RANGE
 
     @torch.no_grad()
     def decode(self, latents: Latents, *, chunk: int = 64) -> Images:
-        """Return images between 0 and 1, in float32, some frames at a time: bounds the memory."""
+        """Return images in float32, clipped to 0 .. 1; `chunk` frames at a time bound the memory."""
         frames = latents.reshape(-1, *latents.shape[-2:])
         images: Tensor = torch.cat([self(part).clamp(0.0, 1.0) for part in torch.split(frames, chunk)])
         return images.reshape(*latents.shape[:-2], *images.shape[-3:])
@@ -155,7 +155,7 @@ def _convolved(shape: DecoderShape) -> nn.Sequential:
 
 
 class _Positions(nn.Module):
-    """Adds sines and cosines of each token's row (first half) and column."""
+    """Position encoding: adds sines and cosines of each token's row (first half) and column (second half)."""
 
     table: Tensor
 
@@ -172,7 +172,7 @@ class _Positions(nn.Module):
 
 
 class _Block(nn.Module):
-    """Attention over the tokens of a frame, then an MLP; both after a norm and added to their input."""
+    """Pre-norm transformer block over the tokens of a frame: attention and an MLP, with residual connections."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -191,18 +191,18 @@ class _Block(nn.Module):
 
 
 def as_images(pixels: UInt8[Tensor, "*batch 3 size size"]) -> Images:
-    """Return images as the decoder gives them: black 0, white 1."""
+    """Convert 8-bit images to the decoder's range: black 0, white 1."""
     return pixels.float() / 255.0
 
 
 def as_pixels(images: Images) -> UInt8[np.ndarray, "*batch size size 3"]:
-    """Return images between 0 and 1 for files: rounded to 8 bits, colours last."""
+    """Convert images between 0 and 1 to 8-bit images with the channels last."""
     rounded = (images.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()
     return np.asarray(rearrange(rounded, "... c h w -> ... h w c").numpy())
 
 
 CARD, WEIGHTS = "decoder.json", "decoder.safetensors"
-BUILTIN_DECODER = "decoder"  # the folder of a model of the package that holds its decoder
+BUILTIN_DECODER = "decoder"  # name of the decoder's folder in the folder of a built-in model
 SIMULATED = "frames of the simulated arm"
 
 _NEEDED = "the folder of a decoder, as `vjepa2-ac decoder` writes it"
@@ -211,19 +211,19 @@ _FIX = "Copy the folder again, or train the decoder again"
 
 @dataclass(frozen=True)
 class DecoderCard:
-    """What is known of a decoder."""
+    """Description of a decoder: its shape, its encoder, and how it was trained."""
 
     format: Literal["vjepa2-ac decoder 1"]
     shape: DecoderShape
     encoder: str  # WorldModel.encoder_fingerprint
-    crop: str  # data.crop: frames cut otherwise look otherwise to it
+    crop: str  # data.crop; the decoder fits this crop only
     precision: str  # training.precision, in which the latents were computed
     data: str  # data.path
     cameras: tuple[str, ...]
-    episodes: int  # learned from
-    frames: int
+    episodes: int  # number of training episodes
+    frames: int  # number of training frames
     steps: int
-    held_out: Mapping[str, Any] = field(default_factory=dict)  # by `frame_pairs.measure_decoders`
+    held_out: Mapping[str, Any] = field(default_factory=dict)  # result of `frame_pairs.measure_decoders`
     version: str = __version__
     time: str = ""  # UTC
 
@@ -234,8 +234,8 @@ class TrainedDecoder:
 
     card: DecoderCard
     decoder: Decoder
-    name: str  # as given
-    where: str = "--decoder"  # the option or knob that names it
+    name: str  # folder or builtin: name, as given by the user
+    where: str = "--decoder"  # the option or config key that names it
 
     def to(self, device: torch.device) -> TrainedDecoder:
         """Move the decoder to a device."""
@@ -243,16 +243,16 @@ class TrainedDecoder:
         return self
 
     def as_dict(self) -> dict[str, str]:
-        """Return its name and its encoder's fingerprint, for a JSON of what it has shown."""
+        """Return the name and the encoder's fingerprint as plain values for JSON."""
         return {"name": self.name, "encoder": self.card.encoder}
 
     def require_fit(self, world_model: WorldModel, data: DataConfig, *, subject: str) -> tuple[str, ...]:
-        """Refuse a model with another encoder or crop; log and return a warning if the decoder has seen other data.
+        """Refuse a model with another encoder or crop; log and return a warning if the training data differ.
 
         Args:
-            world_model: Its latents are decoded.
-            data: Of the frames, with their crop.
-            subject: What is decoded, for messages.
+            world_model: The model whose latents are decoded.
+            data: Config of the data, with the crop of the frames.
+            subject: Name of the model, for messages.
 
         Raises:
             InputError: The encoder or the crop differs.
@@ -280,13 +280,13 @@ class TrainedDecoder:
 
 
 def _is_same_data(one: str, other: str) -> bool:
-    """Return whether two data sets are the same, or both show the simulated arm, by their `data.path`."""
+    """Return whether two values of `data.path` are the same data set, or are both of the simulated arm."""
     are_simulated = (path == SIMULATED or Path(path, SIMULATION_FILE).is_file() for path in (one, other))
     return Path(one).resolve() == Path(other).resolve() or all(are_simulated)
 
 
 def save_decoder(folder: Path, card: DecoderCard, weights: Mapping[str, Tensor]) -> None:
-    """Write a decoder into a folder, decoder.json last: a folder that has one is complete.
+    """Write a decoder into a folder. decoder.json is written last, so that a folder with this file is complete.
 
     Raises:
         InputError: The folder cannot be written.
@@ -300,11 +300,11 @@ def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecode
     """Read a decoder, on the CPU.
 
     Args:
-        name: Its folder; or builtin:sim-tiny, for the one in the package.
-        where: The option or knob that names it, for messages.
+        name: The folder of the decoder; or builtin:sim-tiny for the built-in decoder.
+        where: The option or config key that names it, for messages.
 
     Raises:
-        InputError: There is none, or it is incomplete or damaged.
+        InputError: There is no decoder, or it is incomplete or damaged.
     """
     is_ours = str(name).startswith(BUILTIN)
     folder = ASSETS / str(name).removeprefix(BUILTIN) / BUILTIN_DECODER if is_ours else Path(name)
@@ -315,10 +315,10 @@ def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecode
 
 
 def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
-    """Return what is known of a decoder.
+    """Read the description of a decoder.
 
     Raises:
-        InputError: The folder holds none, or decoder.json is damaged.
+        InputError: The folder contains no decoder, or decoder.json is damaged.
     """
     path = folder / CARD
     try:

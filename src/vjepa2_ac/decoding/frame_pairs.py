@@ -1,6 +1,6 @@
-"""The decoder's data, and what needs no training on it: the linear decoder, the mean image, and how well each shows.
+"""The training data of a decoder (pairs of frame and latents), the linear and mean-image baselines, and metrics.
 
-Frames as the encoder saw them, and their latents, are in files of a latent cache.
+The frames, with the crop and size of the encoder's input, and their latents are stored in files of a latent cache.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from vjepa2_ac.media.image_similarity import psnr, ssim
 
 @dataclass(frozen=True)
 class Pairs:
-    """Some frames, and the episode of each."""
+    """Frames with their latents, and the episode of each frame."""
 
     latents: Float[Tensor, "frames tokens dim"]
-    images: UInt8[Tensor, "frames 3 size size"]  # what the encoder saw
+    images: UInt8[Tensor, "frames 3 size size"]  # the encoder's input
     episode_ids: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class FramePairs:
-    """Pairs in files, read by their number."""
+    """Pairs of frame and latents in files, read by index."""
 
     files: LatentFiles
-    frames: tuple[FramesToEncode, ...]  # of each file; at least one
-    episode_ids: tuple[str, ...]  # likewise
+    frames: tuple[FramesToEncode, ...]  # frames of each file, at least one
+    episode_ids: tuple[str, ...]  # episode of each file
 
     @classmethod
     def of(cls, dataset: Dataset, wanted: Sequence[FramesToEncode], files: LatentFiles) -> FramePairs:
@@ -59,10 +59,10 @@ class FramePairs:
         return int(self._ends[-1]) if self.frames else 0
 
     def read(self, numbers: Sequence[int]) -> Pairs:
-        """Return pairs in the given order.
+        """Read pairs by their indices, in this order.
 
         Raises:
-            InputError: A file is gone or damaged.
+            InputError: A file is missing or damaged.
         """
         owners = np.searchsorted(self._ends, numbers, side="right").tolist()
         files = {owner: self.files.open(self.frames[owner].episode, self.frames[owner].camera) for owner in set(owners)}
@@ -94,22 +94,22 @@ def wanted_frames(dataset: Dataset, split: Split, *, frames: int) -> list[Frames
     return wanted
 
 
-_FRAMES = 4_000  # at most, of the linear fit: a matrix of 1,408 x 768 numbers needs no more
+_FRAMES = 4_000  # largest number of frames for the linear fit; enough for a matrix of 1,408 x 768 numbers
 _FRAMES_OF_MEAN = 1_000
 _FITTED_AT_ONCE, _MEASURED_AT_ONCE = 64, 32
-_RIDGE = 1e-4  # of the mean variance of a latent's numbers
+_RIDGE = 1e-4  # ridge, relative to the mean second moment of the latents' components
 
 
 @torch.no_grad()
 def fit_linear(pairs: FramePairs, shape: DecoderShape, device: torch.device, progress: Progress) -> Decoder:
-    """Return the linear decoder with the least squared error on the pairs, up to a small ridge.
+    """Fit the linear decoder by least squares with a small ridge.
 
-    What it shows is there for the taking: the image patch of each token is linear in it.
+    It is a linear probe: everything that it reconstructs is linearly decodable from single tokens.
 
     Args:
         pairs: Frames and their latents.
-        shape: Of the decoder beside it; its size is not used.
-        device: Where products are computed.
+        shape: Shape of the decoder; its `size` is not used.
+        device: Device of the matrix products.
         progress: Called with (done, total) in frames.
     """
     decoder = Decoder(DecoderShape("linear", shape.dim, shape.grid, shape.patch_size))
@@ -148,14 +148,14 @@ def mean_image(pairs: FramePairs) -> Float[Tensor, "3 size size"]:
 def measure_decoders(
     pairs: FramePairs, decoders: dict[str, Decoder], mean: Float[Tensor, "3 size size"], progress: Progress
 ) -> dict[str, Any]:
-    """Return PSNR (dB) and SSIM of each decoder and of the mean image, with intervals over episodes, for JSON.
+    """Measure PSNR (dB) and SSIM of each decoder and of the mean image, with intervals over episodes.
 
-    The PSNR of a frame that is shown exactly is infinite: such frames are no part of its mean, but are counted.
+    The PSNR of an exactly reconstructed frame is infinite. Such frames are left out of the mean PSNR, but counted.
 
     Args:
         pairs: Held-out frames.
-        decoders: By name; on one device.
-        mean: Of training frames.
+        decoders: Decoders by name, on one device.
+        mean: Mean image of the training frames.
         progress: Called with (done, total) in frames.
     """
     found: dict[str, list[np.ndarray]] = defaultdict(list)
@@ -182,6 +182,6 @@ def measure_decoders(
 
 
 def _parts(pairs: FramePairs, numbers: Sequence[int], size: int) -> Iterator[Pairs]:
-    """Read pairs, so many at a time."""
+    """Yield pairs in parts of at most `size`."""
     for first in range(0, len(numbers), size):
         yield pairs.read(numbers[first : first + size])

@@ -1,7 +1,7 @@
-"""Rollouts from one frame as images, under any actions: a strip, a video and a GIF; and the strip of a validation.
+"""Decoded rollouts from one frame with any actions, as image strip, video and GIF; and the image strip of a validation.
 
-The first frame and its state are given; nothing after them is. The states along the way are integrated from the first
-one: those of a recording would tell a model what did happen.
+Only the first frame and its state are given. The later states are integrated from the first one, because recorded
+states would reveal the motion to the model.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from vjepa2_ac.storage import user_can_write, write_atomically
 logger = logging.getLogger(__name__)
 
 Actions = Float[np.ndarray, "steps action_dim"]
-Image = UInt8[np.ndarray, "size size 3"]  # as the encoder sees it
+Image = UInt8[np.ndarray, "size size 3"]  # with the crop and size of the encoder's input
 Film = UInt8[np.ndarray, "steps size size 3"]
 
 STRIP, VIDEO, GIF = "imagined.png", "imagined.mp4", "imagined.gif"
 AS_RECORDED = "as recorded"
 _HAPPENS, _TITLE = "what really happens", "One frame is given, the rest is imagined"
 _MUCH_WORSE_DB = 5.0
-_RATE_HZ = 15.0  # of the video
+_RATE_HZ = 15.0  # frame rate of the video
 _LONGEST_NAME = 44  # characters
-_LEAST_CM, _LEAST_GRIP = 0.15, 0.05  # smaller parts of an action are not named
-_POSE = 7  # numbers
-_WAYS = (("forward", "back"), ("left", "right"), ("up", "down"))  # of x, y, z in the robot base frame
+_LEAST_CM, _LEAST_GRIP = 0.15, 0.05  # smaller components of an action are left out of captions
+_POSE = 7  # width of a pose
+_WAYS = (("forward", "back"), ("left", "right"), ("up", "down"))  # names of +/- x, y, z in the robot base frame
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where imagination begins: all that a model is given."""
+    """The start of a rollout: the input of a model before the first action."""
 
     latents: Float[Tensor, "tokens dim"]
     state: Float[np.ndarray, " state_dim"]
@@ -69,28 +69,28 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class Imagined:
-    """A rollout as images, and what really happened, where somebody knows."""
+    """A decoded rollout, and the true frames if they are known."""
 
     model: str  # base, adapter, model
-    name: str  # of the actions: as recorded, up, ...
+    name: str  # name of the actions: as recorded, up, ...
     actions: Actions
-    frames: Film  # after each action
+    frames: Film  # predicted frame after each action
     truth: Film | None = None
-    outlines: Bool[np.ndarray, "time size size"] | None = None  # where the arm really is, from the start on
+    outlines: Bool[np.ndarray, "time size size"] | None = None  # true silhouette of the arm, start included
 
 
 @dataclass(frozen=True, eq=False)
 class Imagination:
-    """One start, and everything that was imagined from it. All frames are as the encoder sees them."""
+    """All decoded rollouts from one start. All frames have the crop and size of the encoder's input."""
 
     subject: str
-    episode_id: str  # "" of an image that is no part of a data set
+    episode_id: str  # "" for an image that is not from a data set
     start: int  # control step
     seconds_per_step: float
     first: Image
     decoded_first: Image
     rollouts: tuple[Imagined, ...]
-    truth: Film | None = None  # under the recorded actions
+    truth: Film | None = None  # true frames for the recorded actions
     decoded_truth: Film | None = None
     notes: tuple[str, ...] = ()
 
@@ -102,14 +102,14 @@ def rolled_out(
     actions: Actions,
     states: Float[np.ndarray, "steps state_dim"] | None = None,
 ) -> Float[Tensor, "steps tokens dim"]:
-    """Return the latents after each action, each prediction fed back.
+    """Return the predicted latents after each action, in a rollout from one frame.
 
     Args:
-        rollout: Of what predicts: as `WorldModel.rollout`.
+        rollout: The predictor, such as `WorldModel.rollout`.
         start: The first frame and its state.
-        actions: One for each step.
-        states: Those that are known: the recorded ones of recorded actions. None: integrated from the first; a gripper
-            changes as far as it can (`feasible_actions`), since a model has seen nothing else.
+        actions: One action for each step.
+        states: The recorded states, for recorded actions. None: states are integrated from the first one, and gripper
+            commands are clipped to the possible range (`feasible_actions`), as in the training data.
     """
     if states is None:
         states = counterfactual_states(start.state, actions, start.space)[:-1]
@@ -121,7 +121,7 @@ def rolled_out(
 
 
 def worth_knowing(card: DecoderCard, first: Image, decoded_first: Image) -> tuple[str, ...]:
-    """Return a note where the decoder shows the start much worse than it showed its own held-out frames."""
+    """Return a note if the decoder reconstructs the start much worse than its own held-out frames."""
     usual = card.held_out.get("decoder", {}).get("psnr_db", {}).get("value")
     error = np.square(first.astype(np.float64) - decoded_first).mean() / 255**2
     decibels = -10 * np.log10(max(error, 1e-10))
@@ -137,13 +137,16 @@ def worth_knowing(card: DecoderCard, first: Image, decoded_first: Image) -> tupl
 def shown(
     decoder: Decoder, latents: Float[Tensor, "steps tokens dim"], views: int = 1
 ) -> UInt8[np.ndarray, "steps size all 3"]:
-    """Return latents as images for people; of several views, whose tokens follow one another, side by side."""
+    """Decode latents to 8-bit images; several views, whose tokens are concatenated, are put side by side."""
     images = as_pixels(decoder.decode(latents.float().reshape(len(latents) * views, -1, latents.shape[-1])))
     return np.concatenate([images[number::views] for number in range(views)], axis=2)
 
 
 def strip_of(imagination: Imagination) -> FilmStrip:
-    """Return the rows: for each sequence of actions, the recorded one first, what happens, then each model."""
+    """Return the image strip of an imagination: for each action sequence the true frames, then those of each model.
+
+    The recorded action sequence comes first.
+    """
     told, first, decoded_first = imagination, imagination.first[None], imagination.decoded_first[None]
     rows: list[StripRow] = []
     ordered = sorted(told.rollouts, key=lambda one: one.name != AS_RECORDED)
@@ -166,7 +169,7 @@ def strip_of(imagination: Imagination) -> FilmStrip:
 
 
 def _story(one: Imagined) -> str:
-    """Return what is done, in few words."""
+    """Return a short label of a rollout's actions."""
     if one.name == AS_RECORDED:
         return AS_RECORDED
     length = 100 * float(np.linalg.norm(one.actions[0, :3])) if one.actions.shape[1] == _POSE else 0.0
@@ -175,7 +178,7 @@ def _story(one: Imagined) -> str:
 
 
 def _short_action(action: Float[np.ndarray, " action_dim"]) -> str:
-    """Return a pose's action in a few words, in the robot's directions; of a vector nothing."""
+    """Return a short description of a pose action in the robot's directions; empty for a vector."""
     if len(action) != _POSE:
         return ""
     words = []
@@ -195,7 +198,7 @@ def _short(name: str) -> str:
 
 
 def write_imagination(imagination: Imagination, folder: Path, *, reporter: Reporter = SILENT) -> list[Path]:
-    """Write image strip, video and GIF; return the files. Without PyAV a note replaces the MP4.
+    """Write image strip, video and GIF; return their paths. Without PyAV the video is left out, with a note.
 
     Raises:
         InputError: The folder cannot be written.
@@ -216,34 +219,34 @@ def write_imagination(imagination: Imagination, folder: Path, *, reporter: Repor
 
 
 class ImaginedStrip:
-    """The strip of a validation, a hook of training: what base and model predict for one clip, and the true frames.
+    """A training hook that draws an image strip at each validation: true frames, and predictions of base and model.
 
-    The clip is always the same: the validation clip with the most motion (with several processes: of rank 0's clips).
-    Nothing that fails here ends a run: the strip is left out with a warning.
+    The clip is always the validation clip with the most motion (with several processes: of rank 0's clips). An error
+    here does not end the run: the strip is left out with a warning.
 
     Args:
-        config: The run, whose decoder is loaded.
+        config: Config of the run, with `validation.decoder`.
 
     Raises:
-        InputError: `validation.decoder` is no decoder.
+        InputError: `validation.decoder` is not a decoder.
     """
 
     def __init__(self, config: Config) -> None:
         self._decoder: TrainedDecoder = load_decoder(str(config.validation.decoder), where="validation.decoder:")
-        self._most = -1.0  # motion of a clip
-        self._clip: tuple[Batch, int, LatentBatch] | None = None  # its row in a batch; its latents and states alone
-        self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # what happened; read once
+        self._most = -1.0  # motion of the selected clip
+        self._clip: tuple[Batch, int, LatentBatch] | None = None  # its batch, its row in it, and its latents and states
+        self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # its true frames, read once
 
     def require_fit(self, world_model: WorldModel, config: Config) -> None:
-        """Refuse a decoder of another encoder or camera.
+        """Refuse a decoder for another encoder or crop.
 
         Raises:
-            InputError: Names both.
+            InputError: The decoder does not fit the model.
         """
         self._decoder.require_fit(world_model, config.data, subject=config.model.base)
 
     def seen(self, dataset: Dataset, batch: Batch, encoded: LatentBatch) -> None:
-        """Look for the clip with the most motion in a batch of validation clips and its latents."""
+        """Update the clip with the most motion from a batch of validation clips and its latents."""
         self._dataset = dataset
         for row, states in enumerate(encoded.states.double().cpu().numpy()):
             motion = dataset.spaces.state.path_length(states)
@@ -258,17 +261,17 @@ class ImaginedStrip:
             image = draw_strip(strip_of(self.imagine(world_model, device, f"{run.name}, step {step:,}")))
             (run / IMAGINED).mkdir(exist_ok=True)
             write_atomically(run / IMAGINED / f"{checkpoint_name(step)}.png", encode_png(image))
-        except Exception as error:  # an image is not worth a run
+        except Exception as error:  # an error in this image must not end the run
             logger.warning("The predictions at step %d could not be drawn: %s", step, error)
             return None
         return image
 
     @torch.no_grad()
     def imagine(self, world_model: WorldModel, device: torch.device, subject: str) -> Imagination:
-        """Return what the model imagines of the clip, and the base where an adapter can be switched off.
+        """Return the decoded rollout of the model, and of the base model if the adapter can be switched off.
 
         Raises:
-            ValueError: No clip was seen.
+            ValueError: `seen` was not called before.
         """
         if self._clip is None:
             raise ValueError("no clip was seen")

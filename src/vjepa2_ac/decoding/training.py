@@ -1,7 +1,7 @@
-"""Training of a decoder: from the first encoded frame to a folder that `--decoder` takes.
+"""Training of a decoder: encodes frames, trains, measures, and writes a folder for `--decoder`.
 
-The frames of a step are a function of (config, step), so a checkpoint holds weights, their average, AdamW's moments and
-the step. A training that was killed resumes exactly.
+The frames of a step are a function of (config, step), so a checkpoint contains only the weights, their average, AdamW's
+moments and the step. A training that was killed resumes exactly.
 """
 
 from __future__ import annotations
@@ -61,30 +61,30 @@ from vjepa2_ac.storage import atomic_writer, try_writing_at, user_can_write, wri
 from vjepa2_ac.storage.structured import utc_now
 
 KEY, PAIRS, STATE = "key.json", "pairs", "training.pt"
-_LOG_EVERY, _CHECKPOINT_EVERY = 50, 500  # steps; in a short training there are three checkpoints
+_LOG_EVERY, _CHECKPOINT_EVERY = 50, 500  # steps; a short training saves three checkpoints
 _HELD_OUT_FRAMES = 1_000
-_STRUCTURE, _EDGES = 0.2, 0.1  # weights of the second and the third part of the loss
-_SMALLEST = 11  # pixels of an image's side: a window of MS-SSIM has to fit
+_STRUCTURE, _EDGES = 0.2, 0.1  # weights of the second and the third term of the loss
+_SMALLEST = 11  # smallest side of an image in pixels: the window of MS-SSIM must fit
 _SCALES = 3
-_WARMUP, _WARMUP_SHARE = 500, 15  # steps at most; at most one of 15 steps
+_WARMUP, _WARMUP_SHARE = 500, 15  # the warm-up has at most 500 steps, and at most 1/15 of all steps
 _WEIGHT_DECAY, _BETAS, _MAX_GRAD_NORM = 0.05, (0.9, 0.95), 1.0
-_AVERAGE, _AVERAGED_SHARE = 0.999, 4.5  # decay of the average; a short training averages over its last 22 %
-_YOUNG = 9.0  # steps: an average of fewer forgets the first ones faster
+_AVERAGE, _AVERAGED_SHARE = 0.999, 4.5  # largest decay of the average; a short training averages over its last 22 %
+_YOUNG = 9.0  # in early steps the decay is at most step / (step + 9), so that the initial weights are soon forgotten
 
 
 def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bool = False) -> Path:
-    """Train the decoder of a config's encoder and data; resume what an earlier start has left.
+    """Train a decoder for the encoder and the data of a config; resume a training that was stopped.
 
     Args:
-        config: Data, model and `decoder`.
+        config: Config with data, model and `decoder`.
         reporter: Receives messages and the progress of each part of the work.
-        check_only: Do what can fail, and write nothing.
+        check_only: Run all checks, and write nothing.
 
     Returns:
         The folder of the decoder.
 
     Raises:
-        InputError: An input cannot be used, or the folder holds something else.
+        InputError: An input cannot be used, or the folder contains something else.
         StoppedError: A signal asked to stop; the same command resumes.
     """
     ready = _setup(config, reporter)
@@ -104,13 +104,13 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
             _try_one_step(ready)
             _make(ready, reporter)
             reporter.note(f"The decoder is in {folder}: {folder / CARD} says how good it is")
-        shutil.rmtree(ready.files.folder, ignore_errors=True)  # also after a start that was killed by then
+        shutil.rmtree(ready.files.folder, ignore_errors=True)  # also if an earlier start was killed before this line
         (folder / STATE).unlink(missing_ok=True)
     return folder
 
 
 def _make(ready: Setup, reporter: Reporter) -> None:
-    """Encode, fit, train, measure, and write the decoder."""
+    """Encode the frames, fit the linear decoder, train, measure, and write the decoder."""
     device, config = ready.encoder.device, ready.config
     with stop_on_signals() as stop:
         pairs, held_out = (_encoded(ready, split, reporter, stop) for split in ("train", "test"))
@@ -142,7 +142,7 @@ def _make(ready: Setup, reporter: Reporter) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A decoder that can be trained."""
+    """The checked inputs of a decoder's training."""
 
     config: Config
     folder: Path
@@ -155,15 +155,15 @@ class Setup:
 
     @property
     def files(self) -> LatentFiles:
-        """Frames and latents, while it is trained."""
+        """Files of the frames and latents, which exist during training only."""
         return LatentFiles(self.folder / PAIRS, self.key.digest)
 
 
 def _setup(config: Config, reporter: Reporter) -> Setup:
-    """Check config, folder, data and model.
+    """Check and load config, folder, data and model.
 
     Raises:
-        InputError: One of them cannot be used.
+        InputError: One of these cannot be used.
     """
     decoder = config.decoder
     folder = Path(config.run_dir).parent / "decoder" if decoder.folder is None else Path(decoder.folder)
@@ -211,7 +211,7 @@ def _require_space(ready: Setup, reporter: Reporter) -> None:
 
 
 def _try_one_step(ready: Setup) -> None:
-    """Run out of memory now, not after the frames are encoded."""
+    """Run one step on zeros as a memory check, before the frames are encoded."""
     if ready.encoder.device.type == "cuda":
         shape, count = ready.shape, ready.config.decoder.batch_size
         latents = torch.zeros(count, shape.grid**2, shape.dim)
@@ -220,7 +220,7 @@ def _try_one_step(ready: Setup) -> None:
 
 
 def _encoded(ready: Setup, split: Split, reporter: Reporter, stop: StopRequest) -> FramePairs:
-    """Encode the frames of a split that are not there yet; episodes that cannot be read are left out by policy."""
+    """Encode the frames of a split that are not encoded yet; unreadable episodes follow `data.broken_episodes`."""
     shown, wanted, files = reporter.task(f"encoding {split} frames", "frames"), ready.wanted[split], ready.files
 
     def progress(done: int, total: int) -> None:
@@ -237,7 +237,7 @@ def _encoded(ready: Setup, split: Split, reporter: Reporter, stop: StopRequest) 
 
 
 def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Reporter, stop: StopRequest) -> None:
-    """Do the steps that are left after those that were saved."""
+    """Run all steps after the last saved one, and save checkpoints."""
     config, saved = ready.config.decoder, ready.folder / STATE
     first = 0
     if saved.is_file():
@@ -268,7 +268,7 @@ def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Repor
 
 
 def _batches(pairs: FramePairs, config: Config, done: int) -> Generator[tuple[int, Pairs], None, None]:
-    """Yield the frames of each further step; the next ones are read meanwhile."""
+    """Yield the frames of each step after `done`; the next batch is read in the background."""
     size, count, seed = config.decoder.batch_size, len(pairs), config.seed
 
     def read(step: int) -> Pairs:
@@ -287,10 +287,10 @@ def _batches(pairs: FramePairs, config: Config, done: int) -> Generator[tuple[in
 
 
 def decoder_loss(images: Images, targets: Images) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
-    """Return L1 + 0.2 (1 - MS-SSIM) + 0.1 L1 of the gradients along both axes; and the parts.
+    """Return the loss L1 + 0.2 (1 - MS-SSIM) + 0.1 L1 of the image gradients along both axes, and its terms.
 
     Args:
-        images: From the decoder, not clipped.
+        images: Outputs of the decoder, not clipped.
         targets: The encoder's input, between 0 and 1.
     """
     scales = sum(images.shape[-1] >= _SMALLEST << scale for scale in range(_SCALES))
@@ -303,7 +303,7 @@ def decoder_loss(images: Images, targets: Images) -> tuple[Float[Tensor, ""], di
 
 
 def learning_rate_at(step: int, config: DecoderConfig) -> float:
-    """Return the learning rate of step 1 .. steps: a linear warm-up, then half a cosine down to none."""
+    """Return the learning rate of step 1 .. steps: a linear warm-up, then half a cosine down to zero."""
     warmup = min(_WARMUP, config.steps // _WARMUP_SHARE)
     if step <= warmup:
         return config.learning_rate * step / warmup
@@ -315,8 +315,8 @@ class DecoderSteps:
     """A decoder in training: its weights, their moving average, and AdamW.
 
     Args:
-        setup: How it is trained.
-        linear: The decoder from which it starts; None: fresh weights.
+        setup: The inputs of the training.
+        linear: The linear decoder to start from; None: random weights.
     """
 
     def __init__(self, setup: Setup, linear: Decoder | None) -> None:
@@ -333,16 +333,16 @@ class DecoderSteps:
         self.average = {name: one.detach().clone() for name, one in self.decoder.state_dict().items()}
 
     def do(self, step: int, pairs: Pairs) -> dict[str, float]:
-        """Do one optimizer step, counted from 1, and return its metrics.
+        """Run one optimizer step, counted from 1, and return its metrics.
 
         Raises:
-            InputError: Loss or gradients are not finite; nothing was changed.
+            InputError: Loss or gradients are not finite; the weights are unchanged.
         """
         latents, images = pairs.latents.to(self._device), as_images(pairs.images.to(self._device))
         learning_rate = learning_rate_at(step, self._config.decoder)
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
-        needs_loss_scale = self._config.training.precision == "fp16"  # and there is none here
+        needs_loss_scale = self._config.training.precision == "fp16"  # not implemented here, so float32 is used
         with contextlib.nullcontext() if needs_loss_scale else autocast(self._config.training, self._device):
             shown = self.decoder(latents)
         loss, parts = decoder_loss(shown, images)

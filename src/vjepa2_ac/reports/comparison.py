@@ -1,6 +1,6 @@
-"""Comparison of runs that were measured on the same clips, from their metrics.json alone: their rows, joined by key.
+"""Comparison of runs that were measured on the same clips: reads their metrics.json files and joins the rows by key.
 
-Nothing is measured here: missing results have to be written by `vjepa2-ac evaluate` first.
+Nothing is measured here: `vjepa2-ac evaluate` must have written the results before.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from vjepa2_ac.intervals import Estimate, bootstrapped
 from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
 from vjepa2_ac.runs.checkpoint import SAME_RANK, step_of
 
-_LINE = "  {:<22}  {:>10}  {:>17}  {:>21}  {:>18}"  # of the columns, whose heads have three lines
+_LINE = "  {:<22}  {:>10}  {:>17}  {:>21}  {:>18}"  # widths of the columns, whose headers have three lines
 _WHAT = ("", "", "error vs", "one-step error", "action-ranking")
 _OF_WHAT = "with shuffled actions", "error, chance 50 %"
 _BETTER = ("", "", "(lower is better)", "(higher is better)", "(lower is better)")
 _SAME = ("split", "frames", "stride", "cameras")
-_SAME_LATENTS = 1e-3  # errors of persistence that differ by a larger share are of other latents
+_SAME_LATENTS = 1e-3  # if persistence's errors differ by more than this share, the latents are different
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs side by side: rows, of which a run is the model, and curves for a figure."""
+    """Runs side by side: rows and curves, with one model for each run."""
 
     title: str
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...]  # `Row.model` is the name of the run
     seconds: Float[np.ndarray, " horizon"]
-    curves: Mapping[str, tuple[Estimate, ...]]  # run -> rollout error over persistence by horizon
+    curves: Mapping[str, tuple[Estimate, ...]]  # run -> rollout error relative to persistence, by horizon
     notes: tuple[str, ...]
     measured: Mapping[str, Metrics]
     folders: Mapping[str, Path]
 
     def __str__(self) -> str:
-        """Return the checkpoint and the metrics of each run in columns, and the difference of the errors."""
+        """Return a table with the checkpoint and the metrics of each run, and a sentence on the errors' difference."""
         first, key = next(iter(self.measured.values())), f"rollout.{L1.name}.gain_over_base.{len(self.seconds)}"
         has_base = _have_same_base(self.measured.values())
         reference = "base model" if has_base else "persistence"
@@ -60,7 +60,7 @@ class Comparison:
 
     @property
     def _difference(self) -> str:
-        """How the lowest error of the others differs from the first run's, as a sentence."""
+        """A sentence that compares the lowest error of the other runs with the first run's error."""
         gains = {row.model: row.estimate for row in self.rows if row.key == "gain_over_first"}
         (first, measured), best = next(iter(self.measured.items())), max(gains, key=lambda name: gains[name].value)
         if not gains[best].has_interval:
@@ -74,9 +74,10 @@ class Comparison:
 
     @property
     def next_command(self) -> str:
-        """The command that exports the best run by the rule of `checkpoint.keep_best`, or why no run is recommended.
+        """The command that exports the best run, or the reason why no run is recommended.
 
-        The lowest action-ranking error wins; among those within `SAME_RANK` of it, the lowest prediction error.
+        The rule is that of `checkpoint.keep_best`: the lowest action-ranking error; among runs within `SAME_RANK` of
+        it, the lowest prediction error.
         """
         ranks = {name: _number(one.summary.ranks_actions) for name, one in self.measured.items()}
         equal = [name for name, rank in ranks.items() if rank <= min(ranks.values()) + SAME_RANK]
@@ -94,7 +95,7 @@ class Comparison:
 
     @property
     def _too_few(self) -> str:
-        """Why there are no conclusions from so few episodes, as a sentence; empty if there are enough."""
+        """A sentence that there are too few episodes for a conclusion; empty if there are enough."""
         return next(iter(self.measured.values())).summary.predicts.needs.partition(" So far: ")[0]
 
     def _objection(self, best: str) -> str:
@@ -109,13 +110,14 @@ class Comparison:
 
 
 def compare(folders: Sequence[Path]) -> Comparison:
-    """Compare what was evaluated in each run; the gain over the first one is paired by clip.
+    """Compare the evaluations of several runs; the gain over the first run is paired by clip.
 
     Args:
-        folders: Of the runs.
+        folders: The folders of the runs.
 
     Raises:
-        InputError: Fewer than two, one is named twice or was not evaluated, or they were measured on different clips.
+        InputError: There are fewer than two runs, a run is named twice or was not evaluated, or the runs were measured
+            on different clips.
     """
     if len(folders) < 2:
         raise InputError(where="runs to compare", found=f"{len(folders)}", needed="two or more to compare")
@@ -159,7 +161,10 @@ def _check_same_clips(one: Metrics, other: Metrics, first: Path, second: Path) -
 
 
 def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
-    """Return the share by which each error over persistence is below the first run's, at the last horizon, paired."""
+    """Return the relative gain of each run over the first run at the last horizon, paired by clip.
+
+    The errors are first divided by those of persistence.
+    """
     (name, first), *others = measured.items()
     ids = [episode for episode, _ in first.clips.named]
     found = []
@@ -173,7 +178,7 @@ def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
 
 
 def _last(metrics: Metrics) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of each clip at the last horizon: of what was evaluated, and of persistence."""
+    """Return the errors of each clip at the last horizon: of the evaluated model, and of persistence."""
     errors, persistence = metrics.by_clip.models[metrics.trained], metrics.by_clip.persistence
     return np.array(errors)[:, -1], np.array(persistence)[:, -1]
 
@@ -187,7 +192,7 @@ def _shown(share: float, form: str) -> str:
 
 
 def _step(metrics: Metrics) -> int | None:
-    """Return the optimizer steps of the measured checkpoint; None: a model, which has no checkpoints."""
+    """Return the number of optimizer steps of the measured checkpoint; None for a model without checkpoints."""
     return step_of(Path(metrics.about.checkpoint_path).name)
 
 
@@ -197,7 +202,7 @@ def _curve(metrics: Metrics) -> tuple[Estimate, ...]:
 
 
 def _have_same_base(measured: Iterable[Metrics]) -> bool:
-    """Return whether all runs were compared with a base model, and with the same one: of equal errors."""
+    """Return whether all runs were compared with the same base model, recognised by equal errors."""
     errors = []
     for one in measured:
         if one.base is None and not one.about.is_base:

@@ -1,4 +1,4 @@
-"""Figures of an evaluation: curves by horizon, use of the actions, landscapes, example clips; and of a comparison."""
+"""Plots of an evaluation (errors by horizon, use of the actions, landscapes, example clips) and of a comparison."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ from vjepa2_ac.reports.comparison import Comparison
 
 _COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE}
 _RUNS = (BLUE, ORANGE, GREEN, "#8f5bb0", RED, "#0b7f8a", "#8a6d0b", "#333333")
-_DASHES = ("-", "--", ":")  # after all colours
+_DASHES = ("-", "--", ":")  # the next line style is used after all colours
 _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
-_GREY_PX = 224  # side of a frame that stands for those that a cache does not have
+_GREY_PX = 224  # side of the grey image that is shown if a cache has no frames
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
-    """Write the figure of an evaluation as PNG; it is written atomically."""
+    """Write the plot of an evaluation as a PNG file, atomically."""
     with written_figure(path, 9.2, 4.9, dpi=150) as figure:
         headline(figure, visible(evaluation.title)[-80:])
         left, right = figure.subfigures(1, 2, width_ratios=[4, 5], wspace=0.02)
@@ -62,7 +62,7 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
 
 
 def plot_comparison(comparison: Comparison, path: Path) -> Path:
-    """Write the curves of several runs as PNG; it is written atomically."""
+    """Write the curves of several runs as a PNG file, atomically."""
     styles = itertools.cycle({"linestyle": dashes, "color": colour} for dashes in _DASHES for colour in _RUNS)
     with written_figure(path, 9.2, 4.7, dpi=130) as figure:
         axes = figure.subplots()
@@ -74,11 +74,11 @@ def plot_comparison(comparison: Comparison, path: Path) -> Path:
     return path
 
 
-Draw = Callable[[Any, Evaluation], None]  # on a figure
+Draw = Callable[[Any, Evaluation], None]  # draws an evaluation on a Matplotlib figure
 
 
 def drawings(evaluation: Evaluation) -> Iterator[tuple[str, str, tuple[float, float], Draw]]:
-    """Yield the figures that can be drawn: part of the page, description, width and height in inches, and how."""
+    """Yield the plots of an evaluation: part of the page, description, width and height in inches, draw function."""
     yield "errors", "Open-loop L1 error over persistence by horizon", (6.4, 3.6), draw_errors
     yield "actions", "One-step error with other actions", (6.4, 3.0), draw_use_of_actions
     if clips := _landscape_clips(evaluation):
@@ -88,7 +88,7 @@ def drawings(evaluation: Evaluation) -> Iterator[tuple[str, str, tuple[float, fl
 
 
 def draw_errors(figure: Any, evaluation: Evaluation) -> None:
-    """Draw the error over persistence of every model by horizon."""
+    """Draw the error of each model relative to persistence, by horizon."""
     axes = figure.subplots()
     curves = {name: over_persistence(model.errors, "rollout") for name, model in evaluation.models.items()}
     seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
@@ -101,7 +101,7 @@ def draw_errors(figure: Any, evaluation: Evaluation) -> None:
 
 
 def draw_use_of_actions(figure: Any, evaluation: Evaluation) -> None:
-    """Draw the one-step error of every model with true and wrong actions."""
+    """Draw the one-step error of each model with true, zero and shuffled actions."""
     axes = figure.subplots()
     width = 0.8 / len(evaluation.models)
     for i, (name, colour) in enumerate(_colours(evaluation.models).items()):
@@ -151,7 +151,7 @@ def _plane(axes: Any, landscapes: Landscapes, place: int, first: int, second: in
 
 
 def example_strip(evaluation: Evaluation, example: Example) -> FilmStrip:
-    """Return an example clip: its frames, and the error of each patch over them; grey without frames."""
+    """Return the image strip of an example clip: frames, and errors by patch over them (over grey without frames)."""
     steps = 1 + len(example.errors[PERSISTENCE])
     frames = np.full((steps, _GREY_PX, _GREY_PX, 3), 128, np.uint8) if example.frames is None else example.frames
     worst = max(float(errors.max()) for errors in example.errors.values())
@@ -165,7 +165,7 @@ def example_strip(evaluation: Evaluation, example: Example) -> FilmStrip:
 
 
 def decoded_strip(evaluation: Evaluation, strip: DecodedStrip) -> FilmStrip:
-    """Return the decoded images of an example clip."""
+    """Return the image strip of an example clip with decoded images."""
     labels: dict[str, tuple[str, Kind]] = {
         "truth": ("what happened", "recorded"),
         "decoded_truth": ("the same,\ndecoded", "decoded"),
@@ -182,7 +182,7 @@ def decoded_strip(evaluation: Evaluation, strip: DecodedStrip) -> FilmStrip:
 def _overlay(
     frame: UInt8[np.ndarray, "height width 3"], errors: Float[np.ndarray, "grid grid"] | None, worst: float
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Return errors as colours over a grey frame."""
+    """Draw errors as colours over a greyscale frame."""
     grey = np.repeat(frame.mean(axis=-1, keepdims=True), 3, axis=-1)
     if errors is None:
         return grey.astype(np.uint8)
@@ -190,7 +190,7 @@ def _overlay(
 
 
 def _curves(axes: Any, seconds: np.ndarray, curves: Iterable[tuple[Curve, dict[str, str]]]) -> list[Any]:
-    """Draw persistence, and curves with their intervals, each in its style; return the lines."""
+    """Draw persistence and the curves with their intervals; return the lines for the legend."""
     drawn = [axes.axhline(1.0, color=GREY, linestyle="--")]
     for curve, style in curves:
         low, high = [one.low for one in curve], [one.high for one in curve]
@@ -207,5 +207,5 @@ def _colours(names: Iterable[str]) -> dict[str, str]:
 
 
 def _short(name: str) -> str:
-    """Return the end of a name, in lines of a legend."""
+    """Return the last 48 characters of a name, wrapped for a legend."""
     return textwrap.fill(visible(name)[-48:], 24)

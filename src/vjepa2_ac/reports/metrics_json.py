@@ -1,4 +1,4 @@
-"""metrics.json: the rows of an evaluation, the arrays that they come from, and the rows as metrics.csv.
+"""Writing and reading of metrics.json (rows of an evaluation and the arrays behind them), and writing of metrics.csv.
 
 Images are in the report only. The schema is in docs/evaluation_reference.md.
 """
@@ -26,7 +26,8 @@ from vjepa2_ac.storage.structured import json_text, message_of
 
 METRICS_FILE = "metrics.json"
 FORMAT = 6  # incremented when a reader of the file would have to change
-_NEEDS = {  # parts of an evaluation: a word of the note that says why a part is missing, and what the part needs
+# Part of an evaluation: words by which a note on its absence is recognised, and the text if there is no such note.
+_NEEDS = {
     "base": ("no base", "The comparison needs a base model; a model without one was evaluated."),
     "distribution": ("spread", "The spread is a variance over clips and needs two clips or more."),
     "landscapes": ("energy landscapes", "They are measured by `vjepa2-ac evaluate --ranking-clips 32 --landscapes 8`."),
@@ -40,17 +41,17 @@ _NEEDS = {  # parts of an evaluation: a word of the note that says why a part is
 
 @dataclass(frozen=True)
 class WrittenClips:
-    """What readers need of `clips`."""
+    """The part of `clips` in metrics.json that is read back."""
 
     count: int
     episodes: int
     fingerprint: str
-    named: tuple[tuple[str, int], ...]  # episode, first control step
+    named: tuple[tuple[str, int], ...]  # episode and first control step of each clip
 
 
 @dataclass(frozen=True)
 class WrittenErrors:
-    """The L1 errors of rollouts, clip by clip, which `compare` pairs between runs: [clips][horizon]."""
+    """The L1 errors of rollouts by clip, [clips][horizon]; `compare` pairs them between runs."""
 
     persistence: list[list[float]]
     models: dict[str, list[list[float]]]
@@ -58,7 +59,7 @@ class WrittenErrors:
 
 @dataclass(frozen=True)
 class Metrics:
-    """The content of metrics.json that programs read, but for what the rows come from."""
+    """The part of metrics.json that is read back."""
 
     format: Literal[6]
     summary: Summary
@@ -68,21 +69,21 @@ class Metrics:
     clips: WrittenClips
     rows: tuple[Row, ...]
     by_clip: WrittenErrors
-    ranked: str | None = None  # how actions were ranked; None: they were not
+    ranked: str | None = None  # description of the action ranking; None: not measured
 
     @property
     def models(self) -> tuple[str, ...]:
-        """The models, what was evaluated last."""
+        """Names of the models; the evaluated model is the last."""
         return tuple(self.by_clip.models)
 
     def of(self, key: str, model: str | None = None) -> Row | None:
-        """Return the row of a key for a model, by default the evaluated one; None: it was not measured."""
+        """Return the row with a key for a model (default: the evaluated model); None: not measured."""
         name = model or self.trained
         return next((row for row in self.rows if row.key == key and row.model == name), None)
 
 
 def not_measured(one: Evaluation) -> dict[str, str]:
-    """Return the parts of an evaluation that were not measured, with the reason of each."""
+    """Return the parts of an evaluation that were not measured, with the reasons."""
     model = one.models[one.trained]
     parts = {**vars(one), **vars(model), "base": one.base}
     return {
@@ -99,11 +100,11 @@ def write_metrics(evaluation: Evaluation, path: Path, summary: Summary | None = 
 
 
 def read_metrics(folder: Path) -> Metrics:
-    """Return the metrics that `vjepa2-ac evaluate` wrote into a folder.
+    """Read the metrics that `vjepa2-ac evaluate` wrote into a folder.
 
     Raises:
-        InputError: There is nothing, it is damaged, or of another format.
-        UnreachableError: It cannot be read.
+        InputError: There is no metrics.json, or it is damaged or has another format.
+        UnreachableError: The file cannot be read.
     """
     path, fix = folder / METRICS_FILE, f"Write it with `{shell_command('evaluate', folder)}`"
     try:
@@ -151,7 +152,7 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
                 for name, model in one.models.items()
             },
         },
-        "models": {  # what rows come from, but for errors
+        "models": {  # the arrays behind the rows; those of the errors are in `by_clip`
             name: {key: getattr(model, key) for key in ("role", "ranking", "landscapes", "distribution")}
             for name, model in one.models.items()
         },
@@ -171,7 +172,7 @@ def _rounded(value: Any) -> Any:
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> Path:
-    """Write every row with its fields as columns, atomically; a missing number is nan."""
+    """Write all rows as CSV, atomically; columns are the fields of `Row`, missing numbers are nan."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, [one.name for one in fields(Row)], lineterminator="\n")
     writer.writeheader()

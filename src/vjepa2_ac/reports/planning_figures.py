@@ -1,4 +1,4 @@
-"""Figures of planning: a plan, and the goals of a demonstration."""
+"""Plots for planning: a decision, and the goals of a demonstration."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vjepa2_ac.media.figure import BLUE, GREY, MEANING, ORANGE, RED, Kind, headl
 from vjepa2_ac.planning.decision import PlanResult, summarize
 from vjepa2_ac.spaces import POSE
 
-if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
+if TYPE_CHECKING:  # not imported at run time: each plot needs only one of these packages
     from vjepa2_ac.evaluation.imagined import ImaginedPlan
     from vjepa2_ac.goals.make_goals import MadeGoals
     from vjepa2_ac.planning.planner import Plan
@@ -26,19 +26,19 @@ PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
 
 _FRAME = "#e8b10c"
 _WIDTH, _ROW, _ROW_OF_IMAGINED = 9.2, 2.6, 1.8  # inches
-_MOST_NUMBERS = 8  # of a vector
-_ACROSS = 4  # images of goals in a row
-_MOST_GOALS = 3  # that are shown: the first ones, and the last
+_MOST_NUMBERS = 8  # largest number of curves for a vector
+_ACROSS = 4  # goal images per row
+_MOST_GOALS = 3  # largest number of goals in the plot of a plan: the first ones, and the last
 _STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": RED, "edgecolors": "white", "zorder": 5}
 
 
 def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = None) -> Path:
-    """Write the figure of a decision as PNG; it is written atomically.
+    """Write the plot of a decision as a PNG file, atomically.
 
     Args:
         answer: The decision.
         path: The file.
-        imagined: What the planner imagined; None: nobody has decoded it.
+        imagined: Decoded predicted frames of the plan; None: not decoded.
     """
     rows: list[tuple[float, Callable[[Any, PlanResult], None]]] = [(_ROW, _pictures)]
     if imagined is not None:
@@ -49,7 +49,9 @@ def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = No
             rows.append((_ROW, _slices))
     heights = [height for height, _ in rows]
     with written_figure(path, _WIDTH, 0.5 + sum(heights), dpi=130) as figure:
-        headline(figure, summarize(answer).partition(". ")[0])  # what it does; how it was found is printed
+        headline(
+            figure, summarize(answer).partition(". ")[0]
+        )  # the motion only; the search is described on the console
         parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, (_, draw) in zip(parts, rows, strict=True):
             draw(part, answer)
@@ -74,7 +76,7 @@ def _pictures(part: Any, answer: PlanResult) -> None:
 
 
 def _imagined(part: Any, answer: PlanResult, imagined: ImaginedPlan) -> None:
-    """Draw the start, the imagined steps and the goal, time from left to right; frames have the colours of films."""
+    """Draw the start, the predicted frames and the goal from left to right, framed in the colours of image strips."""
     panels: list[tuple[str, Kind, np.ndarray]] = [("start, decoded", "decoded", imagined.start)]
     for step, image in imagined.steps.items():
         is_last = step == answer.space.steps
@@ -92,7 +94,7 @@ def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
     factor = answer.state_space.shown_factor
     first, upper = answer.actions[0] * factor, answer.space.upper[0].double().numpy() * factor
-    shown = answer.controller.shown_axes  # one again where there are fewer than three numbers
+    shown = answer.controller.shown_axes  # with fewer than three components one is shown twice
     across, up, third = shown[0], shown[min(1, len(shown) - 1)], shown[-1]
     for number, (one, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
         tried = one.elites[:, 0].double().numpy() * factor
@@ -102,7 +104,7 @@ def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     elites.set(title="Best of each iteration,\nfirst action (dark: last)")
     heights.axhspan(-upper[third], upper[third], color=GREY, alpha=0.12, linewidth=0)
     heights.scatter(len(plan.iterations) + 1, first[third], **_STAR)
-    for axes in (heights, energies):  # iterations are whole, however few
+    for axes in (heights, energies):  # integer ticks, since the axis counts iterations
         axes.xaxis.get_major_locator().set_params(integer=True)
     title = "Their height" if answer.state_space.is_pose else "Another number"
     heights.set(title=title, xlabel="iteration (star: chosen)", ylabel=_label(answer, third))
@@ -111,7 +113,7 @@ def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
 
 
 def _plane(axes: Any, answer: PlanResult, across: int, up: int) -> None:
-    """Draw the limits of two numbers of the first action, and the chosen one."""
+    """Draw the limits of two components of the first action, and the chosen action."""
     factor = answer.state_space.shown_factor
     width, height = (answer.space.upper[0, axis].item() * factor for axis in (across, up))
     corner = -width, -height
@@ -175,7 +177,7 @@ def _slices(part: Any, answer: PlanResult) -> None:
 
 
 def plot_goals(made: MadeGoals, path: Path) -> Path:
-    """Write the contact sheet of goals as PNG; it is written atomically."""
+    """Write the contact sheet of goals as a PNG file, atomically."""
     images = [made.first, *(goal.image for goal in made.goals)]
     rows = -(-len(images) // _ACROSS)
     states = made.states

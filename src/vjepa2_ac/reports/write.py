@@ -1,6 +1,7 @@
-"""The files of an evaluation: metrics.json, metrics.csv, evaluation.png, and one HTML page.
+"""Writing of the files of an evaluation: metrics.json, metrics.csv, evaluation.png, and one HTML page.
 
-The page shows the summary and a video first, then every number and plot, folded; it needs no network and no script.
+The page begins with the summary and a video. All numbers and plots follow in collapsed sections. The page needs no
+network access and no JavaScript.
 """
 
 from __future__ import annotations
@@ -32,16 +33,16 @@ from vjepa2_ac.reports.metrics_json import METRICS_FILE, not_measured, write_csv
 from vjepa2_ac.storage import write_atomically
 
 PLOT, REPORT = "evaluation.png", "report.html"
-MOST_CLIPS = 4  # example clips, and as many decoded ones
-_BYTES = 3_000_000  # of all clips together
-_AT_AN_END = 10.0  # percent of the width of a bar, free on both sides
-LONGEST_S = 6.0  # of the film
-MOST_BYTES = 600_000  # likewise
-_STEP_S, _FIRST_S, _LAST_S = 0.5, 1.2, 1.8  # how long frames are shown
+MOST_CLIPS = 4  # largest number of example clips, and of decoded clips
+_BYTES = 3_000_000  # largest size of all clips together
+_AT_AN_END = 10.0  # margin on both sides of a bar, in percent of its width
+LONGEST_S = 6.0  # longest duration of the video, in seconds
+MOST_BYTES = 600_000  # largest size of the video
+_STEP_S, _FIRST_S, _LAST_S = 0.5, 1.2, 1.8  # display times of the middle, first and last frames
 _QUALITIES = (85, 70, 50, 30, 10)
-_THIN = 32  # a gap, or the bar of time, is so many times thinner than an image is wide
-_GREY, _PASSED = 170, (31, 111, 180)  # of gaps and bar, on white as well as on black
-_PARTS = {  # title, and how the keys of the rows begin; the template explains each
+_THIN = 32  # width of an image divided by the width of a gap or the height of the progress bar
+_GREY, _PASSED = 170, (31, 111, 180)  # colours of gaps and progress bar, visible on white and on black
+_PARTS = {  # title, and a pattern for the keys of the rows
     "errors": ("Error by horizon", r"rollout\.\w+\.over_persistence"),
     "base": ("Compared with the base", r"rollout\."),
     "actions": ("Use of the actions", "one_step|cost_of|gap_of|ranking"),
@@ -58,8 +59,8 @@ class PageImage(NamedTuple):
     """An image of the page."""
 
     url: str
-    described: str
-    clip: Example | DecodedStrip | None = None  # that it shows
+    described: str  # text for `alt`
+    clip: Example | DecodedStrip | None = None  # the clip that the image shows
 
 
 class PagePart(NamedTuple):
@@ -75,8 +76,8 @@ class PagePart(NamedTuple):
 def report_page(evaluation: Evaluation, summary: Summary) -> str:
     """Return an evaluation and its summary as one HTML page that needs no network, no script and no other file.
 
-    The same evaluation and summary give the same bytes. It is smaller than 5 MB for any evaluation of usual length:
-    clips, points of curves and episodes are limited, and images of clips have the best quality that fits.
+    The same evaluation and summary give the same bytes. The page stays below 5 MB: numbers of clips, points of curves
+    and episodes are limited, and images of clips have the best quality that fits.
     """
     rows = rows_of(evaluation)
     environment = Environment(
@@ -107,15 +108,15 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
 
 
 def coded(text: str) -> Markup:
-    """Return a text as HTML, with what is between backticks as code."""
+    """Return a text as HTML; text between backticks becomes code."""
     parts = [escape(visible(part)) for part in text.split("`")]
-    if len(parts) % 2 == 0:  # a backtick without its partner
+    if len(parts) % 2 == 0:  # an unpaired backtick
         return Markup("`").join(parts)
     return Markup("").join(Markup("<code>{}</code>").format(part) if n % 2 else part for n, part in enumerate(parts))
 
 
 def bar_of(verdict: Verdict) -> dict[str, float]:
-    """Return the positions of a verdict's number, its interval and its baseline, in percent of a width."""
+    """Return the positions of a verdict's number, interval and baseline on a bar, in percent of its width."""
     value = verdict.value
     if value is None:
         return {}
@@ -141,7 +142,10 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
 
 
 def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> list[tuple[str, Row, Row | None]]:
-    """Return the most important rows that the summary does not show: label, the evaluated model's, the base model's."""
+    """Return the most important rows that the summary does not show.
+
+    Each tuple has a label, the row of the evaluated model, and the row of the base model.
+    """
     last, ahead = evaluation.horizon, f"{evaluation.seconds_ahead:.1f} s ahead"
     labels = {
         f"rollout.{L1.name}.over_persistence.{last}": f"L1 error / persistence, {ahead}",
@@ -149,7 +153,7 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
         "one_step.moving": "one-step L1 error / persistence, moving steps",
         f"spread.{last}": f"spread of the predictions, {ahead}",
     }
-    if evaluation.base is None:  # the first verdict is on this error
+    if evaluation.base is None:  # the first verdict already shows this error
         del labels[f"rollout.{L1.name}.over_persistence.{last}"]
     if summary.plans is None:
         del labels["ranking.rank"]
@@ -162,7 +166,7 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
 
 
 def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
-    """Return example clips, and their decoded images, in the best quality in which all of them fit."""
+    """Return images of the example clips and of their decoded frames, in the best quality within the size limit."""
     examples = evaluation.examples[:MOST_CLIPS]
     decoded = () if evaluation.decoded is None else evaluation.decoded.strips[:MOST_CLIPS]
     strips = [example_strip(evaluation, one) for one in examples] + [decoded_strip(evaluation, one) for one in decoded]
@@ -177,18 +181,18 @@ def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
 
 
 class PageFilm(NamedTuple):
-    """One clip as a video. URLs are data: URLs."""
+    """One clip as a video, with data: URLs."""
 
-    url: str  # animated
-    still: str  # its last frame
-    captions: tuple[str, ...]  # of the columns
+    url: str  # the animated image
+    still: str  # the last frame
+    captions: tuple[str, ...]  # captions of the columns
     clip: DecodedStrip
 
 
 def film_of(evaluation: Evaluation) -> PageFilm | None:
-    """Return the video of the decoded clip with the median error, else of the first one; None: none is decoded.
+    """Return a video of the decoded clip with the median error, or of the first one; None: there are no decoded clips.
 
-    The first frame is given to all models.
+    Frame 0 is the true frame in all columns, since all models receive it.
     """
     strips = () if evaluation.decoded is None else evaluation.decoded.strips
     if not strips:
@@ -206,7 +210,7 @@ def film_of(evaluation: Evaluation) -> PageFilm | None:
 
 
 def _frame(images: Sequence[Frame], passed: float) -> Frame:
-    """Return images side by side, and below them a bar for the share of the time that has passed."""
+    """Return images side by side with a progress bar below, for the share `passed` of the time."""
     thin = max(1, images[0].shape[1] // _THIN)
     with_gaps = [np.pad(one, ((0, thin), (0, thin), (0, 0)), constant_values=_GREY) for one in images]
     frame = np.concatenate(with_gaps, axis=1)[:, :-thin]
@@ -215,12 +219,12 @@ def _frame(images: Sequence[Frame], passed: float) -> Frame:
 
 
 def webp_urls(films: Sequence[Sequence[Frame]], seconds: Sequence[float] = (1.0,), *, at_most: int) -> list[str]:
-    """Return films, or images of one frame each, as WebP in data: URLs, in the best quality in which all fit.
+    """Encode videos (or images, as single frames) as WebP data: URLs, in the best quality within a size limit.
 
     Args:
-        films: The frames of each.
-        seconds: How long each frame is shown.
-        at_most: Bytes of all together; if even the lowest quality takes more, it is that one.
+        films: The frames of each video.
+        seconds: Display time of each frame.
+        at_most: Largest total size in bytes. If the lowest quality exceeds it, the lowest quality is used.
     """
     encoded: list[bytes] = []
     for quality in _QUALITIES:
@@ -232,27 +236,27 @@ def webp_urls(films: Sequence[Sequence[Frame]], seconds: Sequence[float] = (1.0,
 
 @dataclass(frozen=True)
 class Evaluated:
-    """The result of an evaluation, and its files."""
+    """The result of an evaluation, and the files that were written."""
 
     evaluation: Evaluation
-    summary: Summary  # the verdicts; as text by `str`
-    files: tuple[Path, ...]  # written files
+    summary: Summary  # `str(summary)` is the printed text
+    files: tuple[Path, ...]
 
     @property
     def report(self) -> Path:
-        """The page."""
+        """Path of the HTML page."""
         return self.files[-1]
 
     @property
     def error_over_persistence(self) -> dict[str, Curve]:
-        """The L1 error of each model's rollout over that of copying the first frame, by horizon (index h - 1)."""
+        """L1 rollout error of each model relative to persistence, by horizon (index h - 1)."""
         return {name: over_persistence(one.errors, "rollout") for name, one in self.evaluation.models.items()}
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path) -> Evaluated:
-    """Write metrics.json, metrics.csv, figure and report of an evaluation, each atomically; return it with its summary.
+    """Write metrics.json, metrics.csv, plot and report of an evaluation, each atomically.
 
-    The summary has the planning verdict of a closed loop of the same checkpoint, if the run has one.
+    The summary includes the planning verdict of a closed-loop benchmark of the same checkpoint, if the run has one.
     """
     rows, about = rows_of(evaluation), evaluation.about
     summary = summarize(evaluation, rows)
