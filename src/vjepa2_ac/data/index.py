@@ -141,13 +141,13 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         """Create a table without the optional columns; an existing table is returned unchanged.
 
         Raises:
-            InputError: An identity contains a NUL character, which arrays of type S lose at the end of a text.
+            InputError: An identity contains a NUL character.
         """
         if isinstance(infos, EpisodeTable):
             return infos
-        if wrong := next((info.id for info in infos if "\0" in info.id), None):
-            found, fix = "a NUL character in its identity", "Remove it where the data set stores the identity"
-            raise InputError(where=f"episode {wrong!r}", found=found, fix=fix)
+        for info in infos:
+            if "\0" in info.id:
+                raise nul_error(info.id, f"episode {info.id!r}")
         ids = np.array([info.id.encode() for info in infos] or [b""])[: len(infos)]
         return cls(
             num_steps=np.array([info.num_steps for info in infos], np.int32),
@@ -284,6 +284,12 @@ class StepSelection:
 
 
 T = TypeVar("T", EpisodeTable, StepSelection)
+
+
+def nul_error(identity: str, where: str) -> InputError:
+    """Return the error of an identity with a NUL character, which arrays of type S lose at the end of a text."""
+    text, fix = f"a NUL character in the identity {identity!r}", "Remove it where the data set stores the identity"
+    return InputError(where=where, found=text, needed="text without NUL characters", fix=fix)
 
 
 def identity_hash(identity: str) -> int:

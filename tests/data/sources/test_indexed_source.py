@@ -1,6 +1,7 @@
 """What all sources have in common: they are opened once, may contain one another, and refuse unusable identities."""
 
 import pickle
+import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -74,7 +75,13 @@ def test_a_source_that_contains_another_opens_and_is_pickled_with_its_index(tmp_
 
 
 @pytest.mark.parametrize("identity", ["a\0", "\0", "a\0b"])
-def test_an_identity_with_a_nul_is_refused(identity: str, tmp_path: Path) -> None:
+def test_an_identity_with_a_nul_is_a_problem_of_that_episode(identity: str, tmp_path: Path) -> None:
     found = [Scanned(EpisodeInfo(name, 30), f"file {name!r}") for name in ("a", identity, "é")]
-    with pytest.raises(InputError, match=r"episode '.*\\x00.*': a NUL character in its identity"):
-        table_of(found, DataConfig(path=str(tmp_path)), 3)
+    table = table_of(found, DataConfig(path=str(tmp_path)), 3)
+    assert [info.id for info in table] == ["a", "é"]
+    [problem] = table.problems
+    assert problem.name == identity
+    assert re.search(r"^file .*: a NUL character in the identity '.*\\x00", str(problem.error))
+    assert EpisodeTable.from_bytes(table.to_bytes()).problems == table.problems
+    with pytest.raises(InputError, match=r"episode .*: a NUL character in the identity"):
+        EpisodeTable.of([EpisodeInfo("a", 30), EpisodeInfo(identity, 30)])

@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import EpisodeFiles, connections_to, in_parallel
-from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, StatesSummary, labels_of
+from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, StatesSummary, labels_of, nul_error
 from vjepa2_ac.episode import EpisodeInfo, EpisodeSource, FrameReader, Progress, Widths, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import CAMERA_POSE, POSE, POSE_CHANGE, Spaces, StateSpace, vector_states
@@ -80,6 +80,8 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
     for done, one in enumerate(found, start=1):
         if isinstance(one, EpisodeProblem):
             problems.append(one)
+        elif "\0" in one.info.id:
+            problems.append(EpisodeProblem.of(nul_error(one.info.id, one.where), one.info.id))
         elif (first := usable.setdefault(one.info.id, one)) is one:
             kinds[one.kind] = kinds.get(one.kind, 0) + 1
         else:
