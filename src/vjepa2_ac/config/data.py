@@ -133,7 +133,7 @@ class DataConfig(Section):
     affects: ClassVar[Affects] = Affects.CLIPS
     kinds: ClassVar[dict[str, type[DataConfig]]] = {}  # all known data formats: source -> subclass
     reader: ClassVar[str]  # the class that reads the episodes, as module:class; imported when the data are opened
-    is_cache: ClassVar[bool] = False  # whether it is a latent cache read by LatentSource: no frames, one stride
+    is_cache: ClassVar[bool] = False  # whether it is a latent cache, without frames and with one stride
     has_camera_poses: ClassVar[bool] = True
     has_vectors: ClassVar[bool] = True  # whether `states: vector` is possible
     same_identity_fix: ClassVar[str] = ""  # the fix in the error about two episodes of one identity
