@@ -1,1 +1,1 @@
-"""The world model: frames become latents, and latents and actions become the latents of the next step."""
+"""The world model: an encoder of frames to latents, and a predictor of the next latents from latents and actions."""

@@ -1,4 +1,7 @@
-"""The folder of trained weights: an adapter or a predictor, with a card that names its base; it is not trusted."""
+"""Save and load trained weights: an adapter or a predictor, with a card that identifies the base model.
+
+The files are not trusted.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ FULL_WEIGHTS = "predictor.safetensors"
 
 @dataclass(frozen=True)
 class Heads:
-    """Fresh heads: the widths of actions and states, and their seed."""
+    """New input layers: the widths of actions and states, and the seed of their initial weights."""
 
     action_dim: VectorWidth
     state_dim: VectorWidth
@@ -50,21 +53,21 @@ class Heads:
 
 @dataclass(frozen=True)
 class Card:
-    """The trained weights' kind and base."""
+    """The card of trained weights: their kind, and the base model they belong to."""
 
     kind: Literal["lora", "none"]
     base_predictor: str
     encoder: str
-    encoder_in_words: str  # for people; the fingerprint decides
-    fresh_heads: Heads | None = None  # None: the base's own heads are used
+    encoder_in_words: str  # description for users; only the fingerprint is compared
+    fresh_heads: Heads | None = None  # None: the input layers are those of the base model
 
 
 def save_trained(model: WorldModel, folder: str | Path) -> None:
-    """Write the trained weights: an adapter in PEFT's format, or the whole predictor; and the base's identity.
+    """Save the trained weights (an adapter in PEFT's format or the whole predictor) and the base model's identity.
 
     Args:
         model: The adapted model.
-        folder: Where to.
+        folder: The folder to write into.
 
     Raises:
         OSError: The disk is full, or another system error.
@@ -85,56 +88,57 @@ def save_trained(model: WorldModel, folder: str | Path) -> None:
 
 
 def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
-    """Load what `save_trained` wrote onto its base, or into an existing adapter.
+    """Load weights from `save_trained` into a base model, or into a model that is adapted already.
 
     Args:
-        model: The base, or a model adapted in the same way; it is not wrapped again.
-        folder: The folder.
-        trainable: Whether it can be trained; None leaves an existing adapter unchanged, and freezes a new one.
+        model: The base model, or a model adapted in the same way, which is not wrapped again.
+        folder: The folder with the weights.
+        trainable: Whether the weights can be trained; None keeps the state of an existing adapter and freezes a new
+            one.
 
     Raises:
-        InputError: The folder is not an adapter, is damaged, belongs to another base, or differs from the existing
-            one.
+        InputError: The folder contains no trained weights, is damaged, belongs to another base model, or differs from
+            the existing adapter.
     """
     folder = Path(folder)
-    fresh, card = model.adaptation is None, read_card(folder, model)
+    is_new, card = model.adaptation is None, read_card(folder, model)
     heads = card.fresh_heads
-    if heads is not None and fresh and model.fresh_heads is None:
+    if heads is not None and is_new and model.fresh_heads is None:
         fit_heads(model, Widths(heads.state_dim, heads.action_dim), heads.seed)
     if card.kind == "lora":
         _load_lora(model, folder)
     else:
         weights = _read_weights(folder / FULL_WEIGHTS, model.predictor.state_dict())
-        if fresh:
+        if is_new:
             train_everything(model)
         model.predictor.load_state_dict(weights)
-    if fresh or trainable is not None:
+    if is_new or trainable is not None:
         set_trainable(model, bool(trainable))
 
 
 def _load_lora(model: WorldModel, folder: Path) -> None:
     path = folder / ADAPTER_FILE
-    knobs = knobs_of(read_json_object(path, needed=NEEDED, fix=FIX), where=str(path))
+    config = knobs_of(read_json_object(path, needed=NEEDED, fix=FIX), where=str(path))
     if model.adaptation is None:
         try:
-            wrap(model, knobs)
+            wrap(model, config)
         except InputError as error:
             where = f"{path}: {error.where}"
             raise InputError(where=where, found=error.found, needed=error.needed, fix=error.fix) from None
     else:
-        own = knobs_of(lora_config(model).to_dict(), where=str(folder))
+        existing = knobs_of(lora_config(model).to_dict(), where=str(folder))
         for name in AdapterConfig.model_fields.keys() - {"dropout"}:
-            if (found := getattr(knobs, name)) != (needed := getattr(own, name)):
+            if (found := getattr(config, name)) != (needed := getattr(existing, name)):
                 found, needed = f"an adapter with {name} {found}", f"{needed}, as the model has"
                 raise InputError(where=str(folder), found=found, needed=needed)
     set_peft_model_state_dict(model.predictor, _read_weights(folder / LORA_WEIGHTS, lora_weights(model)))
 
 
 def read_card(folder: Path, model: WorldModel) -> Card:
-    """Return the card of trained weights, after checking that they belong to this model.
+    """Read the card of trained weights, and check that they belong to this model.
 
     Raises:
-        InputError: The folder is of another kind or damaged, or its weights belong to another base.
+        InputError: The folder contains no trained weights or is damaged, or they belong to another base model.
     """
     path, needed = folder / CARD, "the card of an adapter, as save_trained writes it"
     card = record_of(Card, read_json_object(path, needed=needed), where=str(path), needed=needed)
@@ -146,12 +150,12 @@ def read_card(folder: Path, model: WorldModel) -> Card:
     ):
         if found != needed:
             own, others = f"{found[:12]}{this}", f"{needed[:12]}{trained_on}"
-            said = f"an adapter trained on another {part} ({others}) than this model's ({own})"
+            description = f"an adapter trained on another {part} ({others}) than this model's ({own})"
             fix = "Set model.base (or model.encoder) to what it was trained on"
-            raise InputError(where=str(path), found=said, fix=fix)
+            raise InputError(where=str(path), found=description, fix=fix)
     if model.adaptation is not None and model.adaptation.kind != card.kind:
-        said = f"an adapter of kind {card.kind}, and the model has one of kind {model.adaptation.kind}"
-        raise InputError(where=str(folder), found=said, fix="Set adapter.kind to the one it was trained with")
+        description = f"an adapter of kind {card.kind}, and the model has one of kind {model.adaptation.kind}"
+        raise InputError(where=str(folder), found=description, fix="Set adapter.kind to the one it was trained with")
     return card
 
 

@@ -1,9 +1,9 @@
-"""Attention of the networks: rotary position tables over time, height and width; and block-causal attention.
+"""Rotary position tables over time, height and width, and block-causal attention.
 
-In the latter a token of step t sees every token of steps up to t. There may be more keys than queries: the queries are
-then those of the last steps. Three exact ways to compute it:
-    dense     one attention with a mask: the plain reference
-    per_step  one attention per step, on the keys up to it, without a mask: computes about half as much
+In block-causal attention a token of step t attends to all tokens of steps up to t. If there are more keys than queries,
+the queries belong to the last steps. There are three exact implementations:
+    dense     one attention with a mask: the reference
+    per_step  one attention per step, on the keys up to this step, without a mask: about half the computation
     flex      FlexAttention with a block mask, compiled: for training on CUDA
 """
 
@@ -31,31 +31,31 @@ class TokenLayout:
     steps: int
     grid: int
     conditioning: int = 0
-    start: int = 0  # the first step's position in time
-    interleaved: bool = False  # V-JEPA 2.1: the two of a pair have one frequency
-    scaled_to: int | None = None  # V-JEPA 2.1: rows and columns of any grid are at the places of one of so many
+    start: int = 0  # position in time of the first step
+    interleaved: bool = False  # V-JEPA 2.1: both numbers of a pair have the same frequency
+    scaled_to: int | None = None  # V-JEPA 2.1: positions of any grid are scaled to those of a grid of this size
 
     @property
     def tokens_per_step(self) -> int:
-        """Conditioning tokens and patches of one step."""
+        """The number of conditioning tokens and patches per step."""
         return self.conditioning + self.grid**2
 
 
 class RotaryTables(NamedTuple):
-    """Tables by which every layer rotates queries and keys; always float32, so positions stay exact in bfloat16."""
+    """Tables with which every layer rotates queries and keys; float32, because bfloat16 would round positions."""
 
     cosine: Float32[Tensor, "sequence 1 head_dim"]
-    signed_sine: Float32[Tensor, "sequence 1 head_dim"]  # minus for the first of a pair, plus for the second
+    signed_sine: Float32[Tensor, "sequence 1 head_dim"]  # negative for the first number of a pair
 
 
 @lru_cache(maxsize=32)
 def rotary_tables(layout: TokenLayout, head_dim: int, device: torch.device) -> RotaryTables:
-    """Return the rotary tables of a sequence; the same tables for the same shape.
+    """Return the rotary tables of a sequence. Tables are cached per layout, head width and device.
 
-    The head is cut into three equal parts of 2*((head_dim//3)//2) for time, height and width; the rest is not rotated.
-    Conditioning tokens are rotated in the time part only. Pairs are neighbours (2i, 2i+1), yet in V-JEPA 2 and every
-    predictor the frequencies are tiled ([w0..w9, w0..w9]): the released weights were trained so. In V-JEPA 2.1 they are
-    interleaved ([w0, w0, w1, w1, ..]).
+    A head is split into three equal parts of 2*((head_dim//3)//2) for time, height and width; the rest is not rotated.
+    Conditioning tokens are rotated in the time part only. Pairs are neighbours (2i, 2i+1). In V-JEPA 2 and in all
+    predictors the frequencies are nevertheless tiled ([w0..w9, w0..w9]), because the released weights were trained this
+    way. In V-JEPA 2.1 they are interleaved ([w0, w0, w1, w1, ..]).
 
     Source: facebookresearch/vjepa2 @ c2963a4, src/models/utils/modules.py, rotate_queries_or_keys and ACRoPEAttention;
     of V-JEPA 2.1 @ 204698b, app/vjepa_2_1/models/utils/modules.py.
@@ -75,13 +75,13 @@ def rotary_tables(layout: TokenLayout, head_dim: int, device: torch.device) -> R
 def rotate(
     tokens: Float[Tensor, "batch sequence heads head_dim"], tables: RotaryTables
 ) -> Float[Tensor, "batch sequence heads head_dim"]:
-    """Return queries or keys rotated by their position: computed in float32, returned in the input's type."""
+    """Return queries or keys rotated by their position, computed in float32 and returned in the input's data type."""
     apply: Callable[..., Tensor] = _Rotation.apply
     return apply(tokens, *tables)
 
 
 class _Rotation(torch.autograd.Function):
-    """Rotates pairs, in two passes over the tokens; its gradient is the inverse rotation, and saves no token."""
+    """The rotation of pairs, in two passes over the tokens; the gradient is the inverse rotation, saving no tokens."""
 
     @staticmethod
     def forward(ctx: Any, tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
@@ -95,9 +95,9 @@ class _Rotation(torch.autograd.Function):
 
 
 def _turned(tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
-    # Computed in float32, as the tables are, and written in the type of the tokens, without a pass to cast it. A
-    # compiler fuses that pass by itself, and torch 2.11 loses the gradient of what an autograd.Function writes in place
-    # and then returns (PyTorch issue 180642); there even a cast that changes nothing loses it.
+    # `out` lets addcmul compute in float32 and write in the data type of the tokens, without a further pass for a cast.
+    # A compiler fuses this pass by itself. In compiled code torch 2.11 loses the gradient of a tensor that an
+    # autograd.Function writes in place and returns (PyTorch issue 180642), even after a cast that changes nothing.
     if torch.compiler.is_compiling():
         turned = torch.addcmul(tokens * cosine, _swapped(tokens), signed_sine)
         return turned if turned.dtype == tokens.dtype else turned.to(tokens.dtype)
@@ -111,7 +111,7 @@ def _swapped(tokens: Tensor) -> Tensor:
 
 
 def _places(layout: TokenLayout, device: torch.device) -> Float32[Tensor, "sequence 3"]:
-    """Return time, height and width of every token; conditioning tokens have only a time."""
+    """Return the positions (time, height, width) of all tokens; conditioning tokens have height and width 0."""
     grid = torch.arange(layout.grid, dtype=torch.float32, device=device)
     if layout.scaled_to is not None:
         grid = grid * (layout.scaled_to - 1) / (layout.grid - 1)
@@ -123,10 +123,10 @@ def _places(layout: TokenLayout, device: torch.device) -> Float32[Tensor, "seque
 
 
 AttentionKind = Literal["auto", "dense", "per_step", "flex"]
-Attend = Callable[[Tensor, Tensor, Tensor, int], Tensor]  # of queries, keys, values and tokens per step
+Attend = Callable[[Tensor, Tensor, Tensor, int], Tensor]  # arguments: queries, keys, values, tokens per step
 
-_FLEX_HEAD_DIM = 16  # minimum of its kernels
-_FLEX_STEPS = 4  # minimum that is worth a compilation
+_FLEX_HEAD_DIM = 16  # minimum head width of FlexAttention's kernels
+_FLEX_STEPS = 4  # minimum number of steps for which a compilation is worthwhile
 
 
 def block_causal_attention(
@@ -136,11 +136,11 @@ def block_causal_attention(
     tokens_per_step: int,
     kind: AttentionKind | Attend = "auto",
 ) -> Float[Tensor, "batch heads sequence head_dim"]:
-    """Return the attention in which a token of step t sees all tokens of steps <= t.
+    """Return the attention in which a token of step t attends to all tokens of steps <= t.
 
-    `auto` uses `flex` on CUDA if Triton is installed, with gradients on and at least four steps; `per_step`
-    everywhere else. Each length and each number of clips is compiled anew: lengths vary in evaluation and planning, and
-    the short ones at the start of a rollout are not worth it. A function in place of a kind computes it.
+    `auto` uses `flex` on CUDA if Triton is installed, gradients are enabled and there are at least four steps,
+    otherwise `per_step`. The reason is that FlexAttention is compiled again for each length and number of clips, and
+    lengths vary in evaluation and planning. `kind` may also be a function that computes the attention.
 
     Raises:
         InputError: FlexAttention was compiled for too many sizes; uncompiled it would hold all scores in memory.

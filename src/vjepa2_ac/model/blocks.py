@@ -18,7 +18,7 @@ _PLAIN = "training.compile=off (planning.compile=off)"  # blocks are not compile
 
 
 class OutputLinear(nn.Linear):
-    """A linear layer into the residual stream: initialised smaller by sqrt(2 * layer), layer from 1."""
+    """A linear layer whose output is added to the residual; initial weights are divided by sqrt(2 * layer), from 1."""
 
     def __init__(self, inputs: int, outputs: int, layer: int) -> None:
         super().__init__(inputs, outputs)
@@ -26,7 +26,7 @@ class OutputLinear(nn.Linear):
 
 
 class Attention(nn.Module):
-    """Layers around block-causal attention; queries, keys and values have one type (SDPA refuses mixed types)."""
+    """The layers of block-causal attention. Queries, keys and values get the same data type, which SDPA requires."""
 
     def __init__(self, width: int, heads: int, layer: int) -> None:
         super().__init__()
@@ -43,7 +43,7 @@ class Attention(nn.Module):
         Float[Tensor, "batch heads sequence head_dim"],
         Float[Tensor, "batch heads sequence head_dim"],
     ]:
-        """Return queries and keys, rotated, and values."""
+        """Return rotated queries, rotated keys, and values."""
         query, key, value = (project(tokens).unflatten(-1, (self.heads, -1)) for project in (self.q, self.k, self.v))
         query, key = rotate(query, tables), rotate(key, tables)
         return query.transpose(1, 2), key.transpose(1, 2), value.transpose(1, 2)
@@ -79,7 +79,7 @@ class Block(nn.Module):
         self.attn = Attention(width, heads, layer)
         self.norm2 = nn.LayerNorm(width, eps=NORM_EPSILON)
         self.mlp = Mlp(width, hidden, layer)
-        self.compiled: When = "never"  # its halves
+        self.compiled: When = "never"  # when the two halves of the block are compiled
 
     def forward(
         self,
@@ -93,19 +93,21 @@ class Block(nn.Module):
         """Return the tokens after this block, and a copy of the keys and values of the first `keep` tokens, if any.
 
         Args:
-            tokens: Tokens of whole steps.
-            tables: Their positions.
-            tokens_per_step: How many make a step.
-            kind: How to compute attention.
-            keep: How many tokens' keys and values to return; keys are rotated already.
-            past: Results of earlier calls, in their order: the tokens come after these, and see them. Separate
-                arguments, because checkpointing handles only tensors among its arguments.
+            tokens: The tokens of whole steps.
+            tables: The rotary tables of the tokens.
+            tokens_per_step: Number of tokens per step.
+            kind: The implementation of attention.
+            keep: Number of tokens whose keys (rotated) and values are returned.
+            past: Keys and values from earlier calls, in their order; the tokens follow them and attend to them. They
+                are separate arguments, because gradient checkpointing handles only tensors among its arguments.
         """
         before, after = _before_attention, _after_attention
         if self.compiled == "always" or (self.compiled == "with gradients" and torch.is_grad_enabled()):
             before, after = compiled(before, way_out=_PLAIN), compiled(after, way_out=_PLAIN)
         query, key, value = before(self, tokens, tables)
-        kept = torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None  # a copy: the rest can be freed
+        kept = (
+            torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None
+        )  # a copy, so that the rest is freed
         if past:
             key, value = torch.cat((*past, torch.stack((key, value))), dim=3)
         gathered = block_causal_attention(query, key, value, tokens_per_step, kind)
@@ -151,10 +153,10 @@ def normalised(norm: nn.LayerNorm, tokens: Tensor) -> Tensor:
 
 
 def without_needless_autocast(tokens: Tensor, weights: Tensor) -> AbstractContextManager[object]:
-    """Disable autocast where tokens and weights have its type already.
+    """Disable autocast if tokens and weights have its data type already.
 
-    There its only effect is that norms are computed from a float32 copy, and each following layer casts the result
-    back. Norm kernels compute in float32 anyway: the same numbers, with a fifth of the bytes.
+    Autocast would then only compute norms from a float32 copy, and each following layer would cast the result back.
+    Norm kernels compute in float32 anyway, so that the numbers are the same with a fifth of the bytes.
     """
     kind = tokens.device.type
     if torch.is_autocast_enabled(kind) and tokens.dtype == weights.dtype == torch.get_autocast_dtype(kind):
@@ -168,7 +170,7 @@ def hidden_width(width: int, mlp_ratio: float) -> int:
 
 
 def mlp_ratio_of(width: int, hidden: int, expected: float) -> float:
-    """Return a ratio for which `hidden_width` is `hidden`: the expected one if it fits."""
+    """Return a ratio for which `hidden_width` returns `hidden`; the expected ratio if it fits."""
     if hidden_width(width, expected) == hidden:
         return expected
     exact = hidden / width

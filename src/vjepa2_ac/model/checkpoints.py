@@ -1,8 +1,8 @@
-"""The world model that a config starts from, and the formats of checkpoints that it can be read from.
+"""Load the base model of a config, and read and write all checkpoint formats.
 
-Meta's `.pt` of either family, a transformers folder, the same from the Hub, and a folder of this project are all
-described by one record for an encoder, `FoundEncoder`, from which a network is filled. Every tensor is matched or
-refused.
+Supported are Meta's `.pt` of both families, a transformers folder, also from the Hub, and a folder of this project. An
+encoder in any format is described by `FoundEncoder`, from which a network is filled. Tensors that do not match the
+network are errors.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ from vjepa2_ac.storage.transfer import from_hub
 logger = logging.getLogger(__name__)
 
 ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
-"""Keys of an encoder in a file. The first key in the file is used: Meta uses an average of weights; `encoder` has the
-weights that were trained by gradient."""
+"""Keys of encoders in a file; the first of them that the file contains is used. Meta uses an average of the weights;
+`encoder` contains the weights that were trained by gradient descent."""
 FIX = "`vjepa2-ac download --list` shows those that are published; the Hub has facebook/vjepa2-vitl-fpc64-256"
 
 Part = Family | Literal["predictor"]  # whose names
 Rename = Callable[[str], tuple[str, int | None]]
-"""Our name of a tensor -> the file's, and which third of a fused one it is (None: all of it)."""
+"""Our name of a tensor -> name in the file, and which third of a fused tensor it is (None: the whole tensor)."""
 
 _PARTS = 'both parts, as of torch.save({"encoder": ..., "predictor": ...}, FILE), or model.encoder.path for the encoder'
 _NEEDED = "a checkpoint of V-JEPA 2, 2.1 or 2-AC as Meta publishes it"
@@ -88,9 +88,9 @@ _NON_COMMERCIAL = "The weights that jepa-wms publishes so are CC-BY-NC 4.0: for 
 
 
 def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
-    """Return the world model to start from, on the CPU.
+    """Return the base model on the CPU.
 
-    It is `model.base`; or, for `random`, a fresh predictor of `model.sizes` on `model.encoder` or on a random encoder.
+    It is `model.base`; for `random`, a new predictor of `model.sizes` with `model.encoder` or with a random encoder.
 
     Raises:
         InputError: There is no such model or encoder, it cannot be read, or contradicts the config.
@@ -116,12 +116,12 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
 
 
 def base_sizes(config: ModelConfig) -> ModelSizes:
-    """Return the sizes of the model that `load_base` would give, without reading a weight.
+    """Return the sizes of the model that `load_base` would return, without reading weights.
 
-    For an official `.pt`, or where nothing is there yet, they are those of `model.sizes`.
+    For an official `.pt`, or if the model does not exist yet, they are those of `model.sizes`.
 
     Raises:
-        InputError: There is a folder, but it is not a world model; or `model.encoder` names none.
+        InputError: The folder is not a world model; or `model.encoder` is not an encoder.
     """
     if config.encoder is not None:
         return expected_sizes(config.encoder, config.sizes.whole)
@@ -133,17 +133,17 @@ def base_sizes(config: ModelConfig) -> ModelSizes:
 
 
 def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:
-    """Read Meta's checkpoint. Every tensor is matched; only a `pos_embed` of the encoder may remain.
+    """Load Meta's checkpoint. Every tensor must match, except a `pos_embed` of the encoder.
 
-    The file is mapped: in addition to the weights in `dtype` memory holds only pages of the file, which the system can
-    take back. If there are several encoders, the first of `ENCODER_KEYS` is used: Meta's code trains the predictor on
-    `target_encoder`.
+    The file is memory-mapped: in addition to the weights in `dtype`, memory contains only pages of the file, which the
+    system can free. If there are several encoders, the first of `ENCODER_KEYS` is used: Meta's code trains the
+    predictor on `target_encoder`.
 
     Args:
         path: The `.pt` file.
-        sizes: Sizes that tensors do not show: image size, heads, extrinsics. Any other size that differs from both the
-            default and the tensors is a contradiction.
-        dtype: Type of the weights in memory.
+        sizes: Sizes that the tensors do not determine: image size, heads, extrinsics. Any other size must be the
+            default or that of the tensors.
+        dtype: Data type of the weights in memory.
 
     Raises:
         InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
@@ -152,11 +152,11 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
 
 
 def to_official(model: WorldModel) -> dict[str, Any]:
-    """Return the weights by Meta's names, q, k and v fused: `torch.save` of it is an official checkpoint.
+    """Return the weights in the format of an official checkpoint: with Meta's names, and q, k and v fused.
 
     Raises:
-        InputError: States and actions differ in width from Meta's code, which has no predictor without states either.
-        ValueError: There is an adapter: merge it first.
+        InputError: Meta's code does not support the widths of states and actions, or a predictor without states.
+        ValueError: The model has an adapter, which must be merged first.
     """
     if model.predictor is not model.base_predictor:
         raise ValueError("an adapter is on: merge_adapter first")
@@ -175,7 +175,7 @@ def to_official(model: WorldModel) -> dict[str, Any]:
 
 
 def _of_meta(file: MetaFile, encoder: FoundEncoder | None, given: ModelSizes, dtype: torch.dtype) -> WorldModel:
-    """Return the model of the predictor in a file and an encoder; None: that of the file."""
+    """Return a model with the predictor in a file and an encoder; None: the encoder in the file."""
     found = encoder or encoder_in_file(file, None, given.encoder.frame, given.encoder.heads)
     predictor = file.tensors("predictor")
     if "mask_tokens" in {name.partition(".")[0] for name in predictor} and "action_encoder.weight" not in predictor:
@@ -219,7 +219,7 @@ def _on_encoder(found: FoundEncoder, sizes: ModelSizes, dtype: torch.dtype) -> W
 
 
 def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: FoundEncoder, given: ModelSizes) -> ModelSizes:
-    """Return the sizes of the tensors; heads, image size and extrinsics are those given."""
+    """Return the sizes of the tensors; heads, image size and extrinsics are taken from `given`."""
     own = given.predictor
     try:
         width, hidden = len(predictor["action_encoder.weight"]), len(predictor["predictor_blocks.0.mlp.fc1.weight"])
@@ -250,7 +250,7 @@ def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: FoundEncode
 
 @dataclass(frozen=True, eq=False)
 class FoundEncoder:
-    """An encoder whose values are not read yet."""
+    """An encoder in a file or folder, whose values are not read yet."""
 
     where: str  # for messages
     sizes: EncoderSizes
@@ -265,7 +265,7 @@ class FoundEncoder:
         """Return the same encoder without the blocks after a layer.
 
         Raises:
-            InputError: It has fewer blocks.
+            InputError: The encoder has fewer blocks.
         """
         depth = self.sizes.depth
         if layer > depth:
@@ -282,11 +282,11 @@ class FoundEncoder:
 
 
 def find_encoder(config: EncoderConfig) -> FoundEncoder:
-    """Return the encoder that a config names; from the Hub it is downloaded first. No weight is read.
+    """Find the encoder of a config without reading its weights; download it first if it is on the Hub.
 
     Raises:
-        InputError: There is none, it is of another kind or damaged, or the config contradicts it.
-        UnreachableError: The Hub cannot be reached, and the repository is not in its cache.
+        InputError: The encoder does not exist, has another format, is damaged, or contradicts the config.
+        UnreachableError: The Hub cannot be reached, and the repository is not in the local cache.
     """
     path = find_encoder_path(config.path)
     if path is not None and not path.is_dir():
@@ -319,10 +319,10 @@ def sizes_with(found: FoundEncoder, given: ModelSizes) -> ModelSizes:
 
 
 def expected_sizes(config: EncoderConfig, given: ModelSizes) -> ModelSizes:
-    """Return the sizes of a model with this encoder; of a published file that is not here yet, from its name.
+    """Return the sizes of a model with this encoder; for a published file that is not downloaded yet, from its name.
 
     Raises:
-        InputError: As `find_encoder`.
+        InputError: See `find_encoder`.
     """
     known = published_as(Path(config.path).name)
     if known is None or Path(config.path).exists():
@@ -337,12 +337,12 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
 
     Args:
         file: The file.
-        key: Which encoder; None: the first that is there.
-        frame: How a frame enters.
-        heads: The attention heads of an encoder that is not as wide as a published one.
+        key: The key of the encoder; None: the first of `ENCODER_KEYS` in the file.
+        frame: How a frame is encoded.
+        heads: Number of attention heads, for an encoder whose width is not that of a published one.
 
     Raises:
-        InputError: There is no such key, what is there is no encoder, or the number of heads is not known.
+        InputError: There is no such key, its value is not an encoder, or the number of heads is not known.
     """
     there = [name for name in ENCODER_KEYS if name in file.parts]
     if key is None and there:
@@ -400,7 +400,7 @@ class _TransformersConfig(BaseModel):
 
 
 def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> FoundEncoder:
-    """Return the encoder in a folder of transformers or of this project; `name` is what the user called it."""
+    """Return the encoder in a folder of transformers or of this project; `name` is the value from the config."""
     card = read_json_object(folder / CONFIG, needed=ENCODER_NEEDED, fix=FIX)
     if config.key is not None:
         found = f"{name}, a folder, which holds one encoder"
@@ -420,7 +420,7 @@ def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> FoundEncode
 
 
 def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, name: str) -> FoundEncoder:
-    """Return the encoder of a plain or a classification model; the masked predictor and the head are not read."""
+    """Return the encoder of a plain or a classification model of transformers, without masked predictor and head."""
     fields = record_of(_TransformersConfig, card, where=str(folder / CONFIG), needed=ENCODER_NEEDED, fix=FIX)
     tensors = _mapped(sorted(folder.glob("*.safetensors")))
     prefix = next((one for one in _PREFIXES_ON_THE_HUB if any(tensor.startswith(one) for tensor in tensors)), None)
@@ -445,7 +445,7 @@ def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, na
 
 
 def _mapped(files: list[Path]) -> dict[str, Tensor]:
-    """Return the tensors of safetensors files, mapped: their values are read when they are used."""
+    """Return the memory-mapped tensors of safetensors files; values are read when they are used."""
     found: dict[str, Tensor] = {}
     for path in files:
         with open_safetensors(path, needed=ENCODER_NEEDED) as file:
@@ -458,23 +458,23 @@ def _mapped(files: list[Path]) -> dict[str, Tensor]:
 
 @dataclass(frozen=True)
 class MetaFile:
-    """A mapped checkpoint."""
+    """A memory-mapped checkpoint of Meta."""
 
     path: Path
     parts: Mapping[str, Any]  # by its keys
 
     @classmethod
     def open(cls, path: Path) -> MetaFile:
-        """Map a file; reads no values, and executes nothing.
+        """Memory-map a file, without reading tensor values or executing code.
 
         Raises:
-            InputError: There is no such file, or it is of another kind, truncated, a git-lfs pointer or a pipe.
-            UnreachableError: It cannot be read.
+            InputError: There is no such file, or it has another format, is truncated, a git-lfs pointer or a pipe.
+            UnreachableError: The file cannot be read.
         """
         with storage.user_can_read(path, needed=_NEEDED, fix=FIX):
             try:
                 whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-            except Exception as error:  # a damaged pickle ends in any of them
+            except Exception as error:  # a damaged pickle raises errors of any type
                 if storage.is_refusal(error):
                     raise
                 found, fix = _problem_of(path, error)
@@ -487,7 +487,7 @@ class MetaFile:
         """Return the tensors of a part by Meta's names without prefixes.
 
         Raises:
-            InputError: There is no such part, it holds more than tensors, or nothing.
+            InputError: There is no such part, or it is empty or contains other values than tensors.
         """
         part = self.parts.get(key)
         if not isinstance(part, dict) or not part or not all(isinstance(value, Tensor) for value in part.values()):
@@ -498,14 +498,14 @@ class MetaFile:
         return named
 
     def lacks(self, what: str, fix: str = FIX, *, part: str | None = None) -> InputError:
-        """Return the error of a file without a part, or of a part without a tensor, with the names that are there."""
+        """Return the error for a missing part, or a missing tensor in a part, with the names that exist."""
         names = ", ".join(list(self.parts if part is None else self.tensors(part))[:8])
         found = f"no {what} (keys: {names})" if part is None else f"no {what} in {part} (its tensors: {names})"
         return InputError(where=str(self.path), found=found, needed=_PARTS, fix=fix)
 
 
 def official_name(name: str, part: Part) -> tuple[str, int | None]:
-    """Return Meta's name of one of our tensors, and which third of a fused one it is (None: all of it)."""
+    """Return Meta's name of one of our tensors, and which third of a fused tensor it is (None: the whole tensor)."""
     for pattern, replacement in _NAMES[part]:
         name = re.sub(pattern, replacement, name)
     fused = re.sub(r"\.attn\.[qkv]\.", ".attn.qkv.", name)
@@ -515,7 +515,7 @@ def official_name(name: str, part: Part) -> tuple[str, int | None]:
 def fill(
     network: nn.Module, weights: Mapping[str, Tensor], rename: Rename, dtype: torch.dtype, *, where: str, fix: str
 ) -> None:
-    """Load mapped weights into a network on the meta device, each cast as it is read; none requires a gradient.
+    """Load memory-mapped weights into a network on the meta device, cast each as it is read, and freeze them.
 
     Raises:
         InputError: A tensor is missing, unknown or of another shape, or a weight is not finite.
@@ -537,7 +537,7 @@ def fill(
 
 
 def to_official_names(weights: Mapping[str, Tensor], part: Part) -> dict[str, Tensor]:
-    """Return our weights by Meta's names, q, k and v fused."""
+    """Return our weights with Meta's names, and q, k and v fused."""
     pieces: dict[str, list[Tensor]] = {}
     for name, value in weights.items():  # q, k and v in this order, as everywhere
         pieces.setdefault(official_name(name, part)[0], []).append(value.detach())
@@ -545,10 +545,10 @@ def to_official_names(weights: Mapping[str, Tensor], part: Part) -> dict[str, Te
 
 
 def depth_of(names: Mapping[str, object], blocks: str) -> int:
-    """Return the number of blocks whose tensors are there.
+    """Return the number of blocks that have tensors.
 
     Raises:
-        KeyError: None is.
+        KeyError: No block has tensors.
     """
     numbers = [int(name.split(".")[1]) for name in names if re.match(rf"{blocks}\.\d{{1,6}}\.", name)]
     if not numbers:

@@ -1,13 +1,12 @@
-"""Compilation of predictor blocks in halves, before and after attention, once for all blocks.
+"""Compilation of predictor blocks with torch.compile, in two halves: before and after attention.
 
-Attention is not compiled here: SDPA is one kernel already, and FlexAttention is compiled by itself (`attention`). So no
-half sees keys of earlier steps, whose number grows with every step, and a mask is no part of it. Weights are arguments:
-all blocks with the same kind of layers share what was compiled for the first of them. PyTorch compiles again for
-another number of tokens or clips (then for any), with and without gradients, and where nothing before a block is
-trained.
+Attention is not compiled here: SDPA is a single kernel, and FlexAttention is compiled separately (`attention`). The
+halves therefore depend neither on the keys of earlier steps, whose number grows with every step, nor on a mask. Weights
+are arguments, so that all blocks with the same kind of layers share one compilation. PyTorch compiles again for another
+number of tokens or clips (then for any number), with and without gradients, and if nothing before a block is trained.
 
-A failed compilation or recompilation is an error: PyTorch would continue without it, which is slow for a block, and for
-FlexAttention holds all scores in memory.
+A failed compilation or recompilation is an error. PyTorch would continue without it, which is slow for a block, and
+makes FlexAttention hold all scores in memory.
 """
 
 from __future__ import annotations
@@ -31,14 +30,14 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function, *, way_out: str, dynamic: bool | None = None) -> Function:
-    """Return the compiled function, the same object for all callers; it is compiled when called.
+    """Return the compiled function, the same object for all callers; compilation happens at the first call.
 
-    The compiled function raises `InputError` if it was compiled for `VARIANTS` kinds of input already.
+    The compiled function raises `InputError` if it was already compiled for `VARIANTS` kinds of input.
 
     Args:
-        function: Compiled as one graph.
-        way_out: The setting that disables compilation.
-        dynamic: False: for each size separately; None: PyTorch decides.
+        function: The function, compiled as one graph.
+        way_out: The setting that disables compilation, for the error message.
+        dynamic: False: compile for each size separately; None: PyTorch decides.
     """
     return cast("Function", _compiled(function, BACKEND, way_out, dynamic))
 
@@ -50,7 +49,7 @@ def has_triton() -> bool:
 
 
 def missing_for_compilation(device: str) -> str | None:
-    """Return what this machine lacks to compile for a kind of device, cpu or cuda; None if nothing."""
+    """Return what this machine lacks for compilation on a device type (cpu or cuda), or None."""
     if device == "cuda" and not has_triton():
         return "Triton is not installed"
     given = os.environ.get("CC" if device == "cuda" else "CXX")
@@ -61,14 +60,14 @@ def missing_for_compilation(device: str) -> str | None:
 
 
 def require_compiler(device: str, *, where: str) -> None:
-    """Refuse to compile blocks for a kind of device, cpu or cuda, without a compiler.
+    """Check that blocks can be compiled on a device type.
 
     Args:
-        device: The kind of device.
-        where: The setting that requests it.
+        device: The device type, cpu or cuda.
+        where: The setting that requests compilation.
 
     Raises:
-        InputError: There is none; says what is missing.
+        InputError: The compiler is not installed; names what is missing.
     """
     missing = missing_for_compilation(device)
     if missing:

@@ -1,4 +1,4 @@
-"""Distances between latents, number by number: the loss, the energy of a plan and the evaluation take means of them.
+"""Elementwise distances between latents, whose means are the loss, the energy of a plan and evaluation metrics.
 
 Both are computed in float32. PyTorch is not imported.
 """
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 def absolute_difference(
     predicted: Float[Tensor, "*predicted dim"], true: Float[Tensor, "*true dim"]
 ) -> Float[Tensor, "*broadcast dim"]:
-    """Return the size of each difference: its mean is the L1 distance."""
+    """Return the absolute difference of each element; the mean is the L1 distance."""
     return (predicted.float() - true.float()).abs()
 
 
 def squared_difference(
     predicted: Float[Tensor, "*predicted dim"], true: Float[Tensor, "*true dim"]
 ) -> Float[Tensor, "*broadcast dim"]:
-    """Return the square of each difference: its mean is the squared L2 distance."""
+    """Return the squared difference of each element; the mean is the mean squared error."""
     return (predicted.float() - true.float()).square()

@@ -20,20 +20,20 @@ with quiet_imports():
     from transformers import VJEPA2Config
     from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
-ENCODE_CHUNK = 16  # frames that go through the network at once: bounds its memory
-TUBELET = 2  # frames per tubelet: the same one twice
+ENCODE_CHUNK = 16  # frames per forward pass; limits the memory
+TUBELET = 2  # frames per tubelet; both are the same frame here
 _GRID_OF_POSITIONS = 16  # V-JEPA 2.1 scales the positions of any grid to those of 256 px
-_LEVELS = 4  # of V-JEPA 2.1, each with a norm of its own; the last one's is the last norm
+_LEVELS = 4  # levels of V-JEPA 2.1, each with a norm; the norm of the last level is the last norm of the network
 
 
 class Encoder(nn.Module):
-    """Encodes frames to features, each frame independently; frozen, and always in eval mode.
+    """The frozen encoder of single frames to features, always in eval mode.
 
-    The network is the encoder of transformers' `VJEPA2Model` (its masked predictor is never built), with rotary
-    tables computed once and in float32 (transformers computes angles in the type of the weights), and with patches
-    embedded by one matrix product. V-JEPA 2.1 has other rotary positions, and adds a learned vector for the kind of
-    input, a video's or an image's, to every patch; its weights that no output here depends on (norms of lower levels,
-    the patches of the other kind) are kept, so that a file can be written again.
+    The network is the encoder of transformers' `VJEPA2Model`, without its masked predictor. Rotary tables are computed
+    once and in float32 (transformers computes angles in the data type of the weights), and patches are embedded by one
+    matrix product. V-JEPA 2.1 has other rotary positions, and adds a learned vector for the kind of input (video or
+    image) to every patch. Its weights without influence on the output (norms of lower levels, the patch embedding of
+    the other kind) are kept, so that a checkpoint can be written again.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
@@ -53,7 +53,7 @@ class Encoder(nn.Module):
                 "this version of transformers rotates queries and keys elsewhere; 5.17 to 5.23 are tested"
             )
         for block in self.vit.layer:
-            block.attention = _ExactAttention(self.vit.config, layout)  # the names of the weights stay
+            block.attention = _ExactAttention(self.vit.config, layout)  # its weights have the same names
         self.vit.layernorm = _PreciseNorm(width, eps=NORM_EPSILON)
         self.requires_grad_(False)
         self.eval()
@@ -62,14 +62,14 @@ class Encoder(nn.Module):
     def forward(
         self, frames: Float[Tensor, "frames 3 height width"], chunk: int = ENCODE_CHUNK
     ) -> Float[Tensor, "frames tokens dim"]:
-        """Return the features of normalised frames, not yet layer-normalised without affine, in float32.
+        """Return the features of normalised frames in float32, before the layer normalisation of latents.
 
         Args:
             frames: Frames normalised as in training.
-            chunk: Frames that go through the network at once: bounds the memory.
+            chunk: Number of frames per forward pass; limits the memory.
 
         Raises:
-            ValueError: The frames differ in size from the model's: the positions would be wrong.
+            ValueError: The frames have another size than the model's, for which the positions would be wrong.
         """
         if frames.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(
@@ -84,11 +84,11 @@ class Encoder(nn.Module):
         return torch.cat(features)
 
     def train(self, mode: bool = True) -> Encoder:  # noqa: ARG002  # a frozen encoder has one mode
-        """Stay in eval mode, independent of the surrounding model."""
+        """Keep eval mode, independently of the surrounding model."""
         return super().train(False)
 
     def reset_last_norm(self) -> None:
-        """Make the last norm one without weights: those read belong to a layer that is not here."""
+        """Reset the weights of the last norm, because the loaded ones belong to a later layer that was removed."""
         nn.init.ones_(self.vit.layernorm.weight)
         nn.init.zeros_(self.vit.layernorm.bias)
 
@@ -108,10 +108,10 @@ class Encoder(nn.Module):
 
 
 class _FramePatches(nn.Conv3d):
-    """The patch embedding; of a tubelet of identical frames the kernel is summed over time, once.
+    """The patch embedding of tubelets of two identical frames, as a matrix product with the kernel summed over time.
 
-    Half the arithmetic of the convolution, and a matrix product, which does not depend on cuDNN: some versions have no
-    fast 3D convolution in bfloat16.
+    It needs half the arithmetic of the convolution, and does not depend on cuDNN, of which some versions have no fast
+    3D convolution in bfloat16.
     """
 
     def __init__(self, width: int, patch_size: int) -> None:
@@ -135,7 +135,7 @@ class _FramePatches(nn.Conv3d):
 
 
 class _PatchesByKind(_FramePatches):
-    """The patch embeddings of V-JEPA 2.1: of tubelets and of images, each with a vector that says which they are.
+    """The patch embeddings of V-JEPA 2.1 for tubelets and for images, each with a learned vector for the kind of input.
 
     Source: facebookresearch/vjepa2 @ 204698b, app/vjepa_2_1/models/vision_transformer.py.
     """
@@ -158,14 +158,14 @@ class _PatchesByKind(_FramePatches):
 
 
 class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformers has no types
-    """transformers' attention, rotated by tables that are computed once, in float32."""
+    """The attention of transformers with rotary tables that are computed once, in float32."""
 
     def __init__(self, config: Any, layout: TokenLayout) -> None:
         super().__init__(config, config.hidden_size, config.num_attention_heads)
         self.layout = layout
 
     def get_position_ids(self, x: Tensor, masks: Any = None) -> None:  # transformers' names
-        """Compute no positions, which would be ten kernels of every layer: those of the layout are in its tables."""
+        """Skip the computation of positions, ten kernels per layer: the tables contain those of the layout."""
 
     def apply_rotary_embeddings(self, qk: Tensor, pos_ids: Any) -> Tensor:  # noqa: ARG002  # positions are the layout's
         """Return queries or keys [batch heads sequence head_dim], rotated by their position."""
@@ -174,7 +174,7 @@ class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformer
 
 
 class _PreciseNorm(nn.LayerNorm):
-    """The last norm, in float32: its result is normalised again, so rounding it before would only lose precision."""
+    """The last norm, computed in float32, because its result is normalised again and rounding would lose precision."""
 
     def forward(self, tokens: Tensor) -> Tensor:
         return layer_norm(tokens.float(), self.normalized_shape, self.weight.float(), self.bias.float(), self.eps)

@@ -1,6 +1,6 @@
-"""Trainable weights: a LoRA adapter on the predictor, or the whole predictor: added, switched off, merged.
+"""Add, disable and merge trainable weights: a LoRA adapter on the predictor, or the whole predictor.
 
-The only module that uses PEFT. Saving and loading: `adapter_folder`.
+`adapter_folder` saves and loads them.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ _INFORMATIONAL = frozenset({  # origin and purpose
     "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_type", "peft_version",
     "revision", "task_type",
 })  # fmt: skip
-_LITERAL = re.compile(r"[\w.]+")  # names of layers, which as regular expressions cannot take long
+_LITERAL = re.compile(r"[\w.]+")  # names of layers; as regular expressions they are fast to match
 _MOST_RANK, _MOST_ALPHA = 1024, 1e6
 
 
 class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no types
-    """PEFT's linear layer with a low-rank adapter; plain LoRA takes fewer passes over the tokens.
+    """PEFT's linear layer with a low-rank adapter, with fewer passes over the tokens for plain LoRA.
 
-    PEFT casts tokens to the adapter's float32 and autocast casts them back; dropout, scaling and adding are separate
-    passes, and so are their gradients. Here only the two small matrices are cast, and the matrix products scale and
-    add. In float32 the result is the same to rounding; in bfloat16 it is rounded less often. Everything except plain
-    LoRA on a frozen layer (DoRA, a disabled or merged adapter, types that do not match) is left to PEFT. Hooks on the
-    layer and the matrices inside are not called, and there are no second derivatives.
+    PEFT casts tokens to the adapter's float32 and autocast casts them back; dropout, scaling and addition are separate
+    passes, and so are their gradients. Here only the two small matrices are cast, and the matrix products include
+    scaling and addition. In float32 the result is the same up to rounding; in bfloat16 it is rounded less often. PEFT
+    computes everything except plain LoRA on a frozen layer: DoRA, a disabled or merged adapter, data types that do not
+    match. Hooks on the inner layer and matrices are not called, and there are no second derivatives.
     """
 
     def forward(self, tokens: Float[Tensor, "*batch inputs"], *args: Any, **kwargs: Any) -> Tensor:
@@ -61,14 +61,14 @@ class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no typ
         return low_rank_linear(tokens.to(dtype), self.base_layer, self, masking, self.scaling[name])
 
     def matrices(self) -> tuple[Tensor, ...]:
-        """Return the two matrices of the adapter that is computed here; none if there are several adapters."""
+        """Return the two matrices of the active adapter; empty if there are several adapters."""
         names = self.active_adapters
         if len(names) != 1 or names[0] not in self.lora_A:
             return ()
         return self.lora_A[names[0]].weight, self.lora_B[names[0]].weight
 
     def _dtype_of_plain_lora(self, tokens: Tensor) -> torch.dtype | None:
-        """Return the type to compute in; None if PEFT computes."""
+        """Return the data type of the computation; None if PEFT computes."""
         adapters, layer = self.active_adapters, self.base_layer
         if self.disable_adapters or self.merged or len(adapters) != 1 or adapters[0] not in self.lora_A:
             return None
@@ -95,18 +95,18 @@ class TrainableReport(NamedTuple):
 
 
 def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
-    """Make a model trainable: its predictor gets an adapter, or is trained completely. Trained weights are float32.
+    """Add an adapter to the predictor of a model, or train the whole predictor. Trained weights are float32.
 
-    A fresh adapter does not change the output: its second matrix is zero, unless `peft.init_lora_weights` is `false` or
-    `orthogonal`.
+    A new adapter does not change the output, because its second matrix is zero, unless `peft.init_lora_weights` is
+    `false` or `orthogonal`.
 
     Args:
-        model: The base.
-        config: What is trained.
-        seed: Determines the first matrices.
+        model: The base model.
+        config: The config of the adapter.
+        seed: The seed of the first matrices.
 
     Raises:
-        InputError: A target matches no layer, another knob does not fit the predictor or PEFT, or a fresh head
+        InputError: A target matches no layer, another key does not fit the predictor or PEFT, or a new input layer
             (`fit_heads`) would not be trained.
         ValueError: The model is already adapted.
     """
@@ -120,7 +120,7 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)  # of initialisations that are drawn by PEFT
         wrap(model, config, start=config.peft.get("init_lora_weights", True))
-    knobs_of(lora_config(model).to_dict(), where="adapter.peft")  # or it could not be read again
+    knobs_of(lora_config(model).to_dict(), where="adapter.peft")  # check that the saved adapter can be loaded
     layers = lora_layers(model)
     if config.peft.get("init_lora_weights", True) is True:
         _draw_first_matrices(layers, torch.Generator().manual_seed(seed))
@@ -132,23 +132,23 @@ def with_adapter(predictor: ActionConditionedPredictor, config: AdapterConfig, s
 
     Args:
         predictor: The predictor, not adapted.
-        config: What is trained.
+        config: The config of the adapter.
         start: PEFT's `init_lora_weights`.
 
     Raises:
-        InputError: A knob does not fit the predictor, or PEFT refuses it.
+        InputError: A key does not fit the predictor, or PEFT refuses it.
     """
     arguments = _peft_arguments(predictor, config) | {"init_lora_weights": start}
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", RuntimeWarning)  # a pattern that no layer has
+            warnings.simplefilter("error", RuntimeWarning)  # PEFT warns about a pattern that matches no layer
             peft_config = LoraConfig(**arguments)
             peft_config._register_custom_module({nn.Linear: LoraLinear})
             wrapped = get_peft_model(predictor, peft_config)
     except (ArithmeticError, AttributeError, RuntimeWarning, TypeError, ValueError, re.error) as error:
         needed = "options of PEFT's LoraConfig, which fit the predictor"
         raise InputError(where="adapter.peft", found=str(error), needed=needed) from None
-    wrapped.train(predictor.training)  # PEFT's dropout is enabled at first
+    wrapped.train(predictor.training)  # PEFT creates dropout in training mode
     for name, value in wrapped.named_parameters():
         if _is_trained(name):
             value.data = value.data.float()
@@ -156,7 +156,7 @@ def with_adapter(predictor: ActionConditionedPredictor, config: AdapterConfig, s
 
 
 def trainable_report(model: WorldModel) -> TrainableReport:
-    """Return the number of trained parameters (also if they are frozen now), of the predictor's own, and of all."""
+    """Count the trained parameters (even if frozen now), those of the predictor without adapter, and all parameters."""
     trained = 0 if model.adaptation is None else sum(value.numel() for value in _added(model))
     own = sum(value.numel() for value in base_weights(model.base_predictor).values())
     encoder = sum(value.numel() for value in model.encoder.parameters())
@@ -172,7 +172,7 @@ def adaptation_of(model: WorldModel) -> Adaptation:
     """Return how a model was adapted.
 
     Raises:
-        ValueError: It is not adapted.
+        ValueError: The model is not adapted.
     """
     if model.adaptation is None:
         raise ValueError("this model has not been adapted: add_adapter or load_trained first")
@@ -188,10 +188,12 @@ def train_everything(model: WorldModel) -> None:
 
 
 def wrap(model: WorldModel, config: AdapterConfig, start: bool | str = True) -> None:
-    """Put a LoRA adapter around the predictor; errors as of `with_adapter`."""
+    """Add a LoRA adapter to the predictor of a model; raises the errors of `with_adapter`."""
     base = model.predictor_fingerprint()
     checkpointing = model.base_predictor.gradient_checkpointing
-    model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
+    model.set_gradient_checkpointing(
+        False
+    )  # otherwise PEFT adds an input hook, which only re-entrant checkpointing needs
     model.predictor = with_adapter(model.base_predictor, config, start)
     model.set_gradient_checkpointing(checkpointing)
     model.adaptation = Adaptation("lora", base, model.encoder_fingerprint())
@@ -225,7 +227,7 @@ def lora_weights(model: WorldModel) -> dict[str, Tensor]:
 
 
 def lora_config(model: WorldModel) -> Any:
-    """Return the config that is written: it names its layers, and so holds no regular expression of the user's."""
+    """Return PEFT's config for saving, with names of layers instead of regular expressions from the user."""
     predictor: Any = model.predictor
     own, layers = predictor.peft_config["default"], lora_layers(model)
     names = [name.removesuffix(".weight") for name in base_weights(model.base_predictor) if name.endswith(".weight")]
@@ -251,14 +253,14 @@ def lora_config(model: WorldModel) -> Any:
 
 
 def set_trainable(model: WorldModel, trainable: bool) -> None:
-    """Thaw or freeze what was added."""
+    """Unfreeze or freeze the trained weights."""
     model.predictor.requires_grad_(False)
     for value in _added(model):
         value.requires_grad_(trainable)
 
 
 def _added(model: WorldModel) -> Iterator[nn.Parameter]:
-    """Yield what is trained: an adapter and whole heads, or every weight of the predictor that has an input."""
+    """Yield the trained weights: an adapter and whole layers, or all weights of the predictor that have an input."""
     lora = isinstance(model.predictor, PeftModel)
     for name, value in model.predictor.named_parameters():
         if _is_trained(name) if lora else name.split(".", 1)[0] not in model.base_predictor.unused_layers:
@@ -266,16 +268,17 @@ def _added(model: WorldModel) -> Iterator[nn.Parameter]:
 
 
 def knobs_of(values: Mapping[str, Any], *, where: str) -> AdapterConfig:
-    """Return the knobs of a saved adapter, which may be a stranger's, from its options of PEFT's LoraConfig.
+    """Return the adapter config for a saved adapter, from its options of PEFT's LoraConfig.
 
-    Layers are named, never matched by a regular expression, and options have plain values: none of them runs code,
-    takes long, or takes more memory than an adapter of rank 1,024. PEFT never sees the file.
+    The file may be untrusted, and PEFT never reads it. Layers are selected by name, never by a regular expression, and
+    options have plain values. No option can therefore run code, take long, or need more memory than an adapter of rank
+    1,024.
 
     Raises:
-        InputError: It is another kind of adapter, or has an option that is not read.
+        InputError: It is another kind of adapter, or has an option that is not supported.
     """
     defaults: dict[str, Any] = LoraConfig().to_dict()
-    given: dict[str, Any] = {"kind": "lora", "rslora": False}  # not rsLoRA: PEFT's default
+    given: dict[str, Any] = {"kind": "lora", "rslora": False}  # PEFT's default
     given |= {ours: values[peft] for peft, ours in PEFT_NAMES.items() if values.get(peft) is not None}
     options = {name: value for name, value in values.items() if name not in _INFORMATIONAL and name not in PEFT_NAMES}
     options = {name: value for name, value in options.items() if not _is_off(value, defaults.get(name))}
@@ -295,7 +298,7 @@ def _is_off(value: object, default: object) -> bool:
 
 
 def _can_be_read(name: str, value: object, default: object) -> bool:
-    """Return whether an option is a pattern of whole names, a start (a knob says which), or a number as PEFT has it."""
+    """Return whether an option is supported: a pattern of whole names, an initialisation, or a number."""
     if name in {"rank_pattern", "alpha_pattern"}:
         kinds, most = ((int,), _MOST_RANK) if name == "rank_pattern" else ((int, float), _MOST_ALPHA)
         return isinstance(value, dict) and all(
@@ -305,12 +308,12 @@ def _can_be_read(name: str, value: object, default: object) -> bool:
 
 
 def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig) -> dict[str, Any]:
-    """Return the arguments of PEFT's LoraConfig, sets of targets replaced by their layers.
+    """Return the arguments of PEFT's LoraConfig, with sets of targets replaced by the names of layers.
 
     Layers without input cannot have an adapter; `all` excludes layers that are trained directly.
 
     Raises:
-        InputError: A target or a layer to train whole matches no layer, or a layer is named twice.
+        InputError: An entry of `targets` or `modules_to_save` matches no layer, or a layer is in both.
     """
     whole = config.modules_to_save
     if missing := [name for name in whole if not hasattr(predictor, name)]:
@@ -333,14 +336,14 @@ def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig
     return arguments | {"target_modules": targets, "modules_to_save": list(whole) or None} | config.peft
 
 
-# ---- without it, and for good ----
+# ---- disable or merge an adapter ----
 
 
 @contextmanager
 def base_only(model: WorldModel) -> Iterator[None]:
-    """Let the model predict as its base within the block; a model without adapter is the base.
+    """Make the model predict as its base model within the block.
 
-    A model with fresh heads returns to their initial values: not a base for comparison.
+    New input layers (`fit_heads`) get their initial values, with which the model is no base model for comparison.
     """
     if model.adaptation is None:
         yield
@@ -375,9 +378,9 @@ def merge_adapter(model: WorldModel) -> None:
 
 
 def unadapted_copy(model: WorldModel) -> WorldModel:
-    """Return a model for inference with a shared encoder and its own predictor, into which the adapter is merged.
+    """Return a copy for inference that shares the encoder and has a predictor with the adapter merged into it.
 
-    The given model is not changed.
+    The original model is not changed.
     """
     own = WorldModel.empty(model.sizes)
     own.encoder, own.predictor = model.encoder, copy.deepcopy(model.predictor)

@@ -1,4 +1,4 @@
-"""Low-rank update of a frozen linear layer, inside its matrix products and in their type; needs PyTorch alone."""
+"""Low-rank update of a frozen linear layer, computed within its matrix products. Needs only PyTorch."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from torch.nn.functional import linear
 class LowRankLayer:
     """A layer with a low-rank update whose two matrices can be cast for all micro-steps at once (`CastMatrices`)."""
 
-    cast: tuple[Tensor, Tensor] | None = None  # its matrices in the arithmetic's type, while `CastMatrices` holds them
+    cast: tuple[Tensor, Tensor] | None = (
+        None  # copies in the data type of the arithmetic, during `CastMatrices.current`
+    )
 
     def matrices(self) -> tuple[Tensor, ...]:
-        """Return the two matrices; none if this layer does not compute them itself."""
+        """Return the two matrices; empty if PEFT computes this layer."""
         raise NotImplementedError
 
 
@@ -29,14 +31,14 @@ def low_rank_linear(
     dropout: nn.Module | None,
     scale: float,
 ) -> Tensor:
-    """Return the output of a frozen layer and its update, computed in the type of the tokens.
+    """Return the output of a frozen layer and its update, computed in the data type of the tokens.
 
     Args:
         tokens: The input.
         layer: The frozen layer.
-        update: Holds the two matrices.
-        dropout: Masks the input of the update; None: nothing is masked.
-        scale: Of the update.
+        update: The layer with the two matrices.
+        dropout: Dropout on the input of the update, or None.
+        scale: The scale of the update.
     """
     dtype, matrices = tokens.dtype, update.matrices()
     cast: tuple[Tensor | None, ...]
@@ -51,11 +53,11 @@ def low_rank_linear(
 
 
 class CastMatrices:
-    """The matrices of adapters in the arithmetic's type, cast together once per step instead of at each use.
+    """The matrices of adapters in the data type of the arithmetic, cast together once per step instead of at each use.
 
     Args:
         module: The module with the adapters.
-        dtype: Of the arithmetic.
+        dtype: The data type of the arithmetic.
     """
 
     def __init__(self, module: nn.Module, dtype: torch.dtype) -> None:
@@ -69,7 +71,7 @@ class CastMatrices:
 
     @contextmanager
     def current(self) -> Iterator[None]:
-        """Cast now, and let all layers use the result within the block: the matrices must not change."""
+        """Cast now, and make all layers use the copies within the block, in which the matrices must not change."""
         if self._own:
             with torch.no_grad():
                 torch._foreach_copy_(self._cast, self._own)
@@ -83,11 +85,11 @@ class CastMatrices:
 
 
 class _LowRankLinear(torch.autograd.Function):
-    """`tokens @ weight.T + bias + scale * masked @ first.T @ second.T`, the weight frozen; all of one type.
+    """`tokens @ weight.T + bias + scale * masked @ first.T @ second.T` with a frozen weight, all of one data type.
 
-    If the matrices have another type, they are also given in this one, which is used to compute; their gradients have
-    their own type. Saved for the gradient are the adapter's input (masked, else the tokens) and the values between its
-    matrices; for a frozen adapter neither.
+    If the matrices have another data type, copies in this data type are passed as well and used for the computation;
+    the gradients have the data type of the matrices. Saved for the gradient are the adapter's input (masked, or the
+    tokens) and the values between its matrices; nothing for a frozen adapter.
     """
 
     @staticmethod
@@ -134,7 +136,7 @@ class _LowRankLinear(torch.autograd.Function):
 
 
 def _plus_product(total: Tensor, left: Tensor, right: Tensor, scale: float) -> Tensor:
-    """Return `total + scale * left @ right` in the memory of the total; a compiler chooses the memory itself."""
+    """Return `total + scale * left @ right`, computed in place unless a compiler traces the function."""
     if torch.compiler.is_compiling():  # torch 2.11 would lose the gradient of the result (PyTorch issue 180642)
         return torch.addmm(total, left, right, alpha=scale)
     return torch.addmm(total, left, right, alpha=scale, out=total)  # PyTorch's FLOP counter knows this operation

@@ -1,6 +1,6 @@
-"""Files of models: their paths, their sizes without reading a weight, and the download of published files.
+"""Find model files, read their sizes without reading weights, and download published files.
 
-PyTorch is not imported. A download resumes where it stopped, is checked, then renamed.
+PyTorch is not imported. An interrupted download resumes; a complete one is checked and then renamed.
 Sources: facebookresearch/vjepa2 @ 204698b, src/hub/backbones.py and app/vjepa_2_1/models; the models' cards on the Hub.
 """
 
@@ -36,10 +36,10 @@ _FIX = "Of a run, `vjepa2-ac export RUN FOLDER` makes one"
 
 
 def find_base(name: str) -> Path:
-    """Return the file or folder that `model.base` names.
+    """Return the file or folder of `model.base`.
 
     Raises:
-        InputError: There is none.
+        InputError: It does not exist.
     """
     needed = f"the official .pt, a folder written by `vjepa2-ac export`, or {_TINY}"
     fix = "`vjepa2-ac download` fetches the official checkpoint to checkpoints/vjepa2-ac-vitg.pt"
@@ -47,10 +47,10 @@ def find_base(name: str) -> Path:
 
 
 def find_encoder_path(name: str) -> Path | None:
-    """Return the file or folder that `model.encoder.path` names; None: it is on the Hub.
+    """Return the file or folder of `model.encoder.path`; None if it is on the Hub.
 
     Raises:
-        InputError: There is none.
+        InputError: It does not exist.
     """
     if name.startswith(HUB):
         return None
@@ -59,10 +59,10 @@ def find_encoder_path(name: str) -> Path | None:
 
 
 def require_model(config: ModelConfig) -> None:
-    """Refuse a config whose model or encoder does not exist on this machine.
+    """Check that the model and the encoder of a config exist on this machine.
 
     Raises:
-        InputError: It does not exist.
+        InputError: One of them does not exist.
     """
     if not config.is_random:
         find_base(config.base)
@@ -71,15 +71,15 @@ def require_model(config: ModelConfig) -> None:
 
 
 def require_base_of_run(config: ModelConfig, run: Path, command: Sequence[str] = ()) -> None:
-    """Refuse a run whose base or encoder is no longer at its path.
+    """Check that the base model and the encoder of a run still exist at their paths.
 
     Args:
-        config: The model of the run.
-        run: Its folder.
-        command: The words of a command that takes the new path; none: the command that resumes the run is advised.
+        config: The section `model` of the run.
+        run: The run folder.
+        command: The command to recommend with the new path; if empty, the command that resumes the run.
 
     Raises:
-        InputError: It is not there; says how to give the new path.
+        InputError: One of them does not exist; the message shows how to set the new path.
     """
     try:
         require_model(config)
@@ -113,12 +113,12 @@ def read_sizes(folder: Path) -> ModelSizes:
 
 
 def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
-    """Refuse sizes that were given, and are not those of the model.
+    """Refuse configured sizes that differ from those of the model.
 
-    Only those of a config that differ from the default count as given: a run's own config spells out every default.
+    Sizes that equal the default are not compared, because the config of a run contains all defaults.
 
     Raises:
-        InputError: Names what differs.
+        InputError: A size differs; names it.
     """
     actual, configured, default = (flat(sizes.model_dump()) for sizes in (found, given, ModelSizes()))
     wrong = [key for key in flat(SizesConfig().model_dump()) if configured[key] not in (actual[key], default[key])]
@@ -128,7 +128,7 @@ def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
 
 
 def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
-    """Return the origin of the encoder of a model in a folder; None: not known, or it belongs to the model.
+    """Return the origin of the encoder in a model folder; None if it is not known, or was trained with the model.
 
     Raises:
         InputError: The record of the origin is damaged.
@@ -150,7 +150,7 @@ class EncoderShape:
 
     @property
     def parameters(self) -> int:
-        """About how many weights it has: those of blocks and patches, without biases and norms."""
+        """The approximate number of weights: blocks and patch embedding, without biases and norms."""
         return self.depth * (4 * self.width**2 + 2 * self.width * self.hidden) + 2 * 3 * 16**2 * self.width
 
     def sizes(self, family: Family, frame: FramePath) -> EncoderSizes:
@@ -166,17 +166,17 @@ VIT_g = EncoderShape("ViT-g", 1408, 40, 22, 6144)
 VIT_G = EncoderShape("ViT-G", 1664, 48, 26, 8192)
 
 HEADS: Mapping[int, int] = {one.width: one.heads for one in (VIT_B, VIT_L, VIT_H, VIT_g, VIT_G)}
-"""Width of an encoder -> its attention heads, which its tensors do not show."""
+"""Width of an encoder -> number of attention heads, which tensors do not determine."""
 
 
 @dataclass(frozen=True)
 class EncoderOrigin:
-    """The file or repository that an encoder was read from."""
+    """The file or repository from which an encoder was loaded."""
 
-    file: str  # its name
-    key: str = ""  # of the weights in it; "" of a folder
-    licence: str = ""  # where it is known
-    heads_are_told: bool = True  # False: of a model whose own fingerprint does not know them
+    file: str  # name of the file or repository
+    key: str = ""  # key of the weights in the file; "" for a folder
+    licence: str = ""  # "" if it is not known
+    heads_are_told: bool = True  # whether the number of heads is part of the fingerprint
 
     def __str__(self) -> str:
         key = f", {self.key}" if self.key else ""
@@ -231,7 +231,7 @@ class Published:
 
     @property
     def config_key(self) -> str:
-        """The config key that takes the file."""
+        """The config key to which the file can be assigned."""
         return "model.base" if self.name == OFFICIAL else "model.encoder.path"
 
 
@@ -249,7 +249,7 @@ PUBLISHED: tuple[Published, ...] = (
 
 
 def published_as(file_name: str) -> Published | None:
-    """Return the published file of this name, Meta's or ours, exactly as it is spelt; None: it is none of them."""
+    """Return the published file with exactly this name, Meta's or ours; None if there is none."""
     return next((one for one in PUBLISHED if file_name in {one.remote, one.file}), None)
 
 
@@ -260,7 +260,7 @@ def find_published(text: str) -> Published:
         text: Our name, or Meta's name of the file.
 
     Raises:
-        InputError: None has this name.
+        InputError: No published checkpoint has this name.
     """
     name = text.removesuffix(".pt")
     meant = next((one for one in PUBLISHED if name in {one.name, one.remote.removesuffix(".pt")}), None)
@@ -283,19 +283,19 @@ def download(
     reporter: Reporter = SILENT,
     policy: RetryPolicy = _POLICY,
 ) -> Path:
-    """Fetch a file to `path`; a partial file of an earlier call is resumed.
+    """Download a file to `path`, and resume a partial download from an earlier call.
 
     Args:
-        url: What to fetch.
+        url: The URL of the file.
         path: The path of the complete file, which exists only after the download has finished. An existing file is
             kept if its size fits.
-        known: The published checkpoint, whose size is checked; None: any file.
+        known: The published checkpoint, whose size is checked; None for any file.
         reporter: Receives the progress in megabytes.
-        policy: The number of attempts in a row without a new byte, and the waits between them.
+        policy: The number of consecutive attempts without a new byte, and the waits between them.
 
     Raises:
-        InputError: The server does not say how large the file is, or sends another size than the published file can
-            have; the disk has too little space; the path cannot be written.
+        InputError: The server does not send the size of the file, or a size that the published file cannot have; the
+            disk has too little space; the path is not writable.
         UnreachableError: The server refuses, or cannot be reached.
     """
     path = Path(path)
@@ -362,7 +362,7 @@ def _fetch(url: str, part: Path, known: Published | None, reporter: Reporter, ti
 
 
 def _require_size(known: Published | None, size: int, *, where: str) -> None:
-    """Refuse another size than the known one; the range around an estimate excludes a proxy's answer."""
+    """Refuse a file of another size than the published one; estimated sizes still exclude error pages from a proxy."""
     if known is None:
         return
     around = [round(known.gigabytes * share * 10**9) for share in (1 - _TOLERANCE, 1 + _TOLERANCE)]

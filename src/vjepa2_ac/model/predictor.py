@@ -1,4 +1,4 @@
-"""The action-conditioned predictor: layers, forward pass, key-value cache, transformers model, and rollout."""
+"""The action-conditioned predictor as a transformers model, its key-value cache, one-step prediction and rollout."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ with quiet_imports():
 
 
 class KeyValueCache:
-    """The keys (rotated) and values of earlier steps, in every layer of a predictor; empty at first.
+    """The rotated keys and the values of earlier steps in all layers of a predictor; empty at first.
 
-    Gradients flow through it into the passes that filled it. It stores the pieces as they were added: a block
-    concatenates them while it computes, so that with gradient checkpointing no step is stored twice.
+    Gradients flow through the cache into the passes that filled it. The pieces are stored as they were added, and
+    blocks concatenate them during computation, so that no step is stored twice with gradient checkpointing.
     """
 
     def __init__(self, pieces: tuple[tuple[Tensor, ...], ...] = ()) -> None:
-        self._pieces = pieces  # of each layer
+        self._pieces = pieces  # one tuple per layer
 
     @property
     def tokens(self) -> int:
-        """Number of tokens in the cache."""
+        """The number of tokens in the cache."""
         return sum(piece.shape[3] for piece in self._pieces[0]) if self._pieces else 0
 
     def layer(self, index: int) -> tuple[Float[Tensor, "2 batch heads _ head_dim"], ...]:
-        """Return the keys and values of a layer, piece by piece."""
+        """Return the pieces with keys and values of a layer."""
         return self._pieces[index] if self._pieces else ()
 
     def append(self, added: Sequence[Float[Tensor, "2 batch heads tokens head_dim"]]) -> None:
@@ -48,20 +48,21 @@ class KeyValueCache:
         self._pieces = tuple((*pieces, piece) for pieces, piece in zip(before, added, strict=True))
 
     def copy(self) -> KeyValueCache:
-        """Return a cache that can grow independently; no tensor is copied."""
+        """Return a cache with the same tensors that can grow independently."""
         return KeyValueCache(self._pieces)
 
 
 class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
-    """Sizes of the predictor in the form transformers stores them: those that `new_predictor` sets."""
+    """The sizes of a predictor as a config of transformers; `new_predictor` sets them."""
 
     model_type = "vjepa2_ac_predictor"
 
 
 class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # transformers has no types
-    """Predicts, for every step, the latents of the next one from the latents, states and actions up to it.
+    """A transformer that predicts the latents of each next step from the latents, states and actions up to this step.
 
-    The tokens of a step, in order: action, (state), (extrinsics), patches. Output: patches only, not normalised.
+    The tokens of a step are, in order: action, (state), (extrinsics), patches. The output has only the patches, which
+    are not normalised.
 
     Source: facebookresearch/vjepa2 @ c2963a4, src/models/ac_predictor.py, VisionTransformerPredictorAC.
     """
@@ -89,18 +90,18 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         self.predictor_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
         self.predictor_proj = nn.Linear(width, config.latent_dim)
         self.attention: AttentionKind | Attend = "auto"
-        self.gradient_checkpointing = False  # the name transformers switches
-        self.has_dropout = False  # of blocks, which must draw the same masks when they are recomputed
+        self.gradient_checkpointing = False  # transformers sets the attribute of this name
+        self.has_dropout = False  # whether recomputed blocks must draw the same dropout masks
         self.post_init()
 
     @property
     def grid(self) -> int:
-        """Patches along one side of a frame."""
+        """The number of patches along one side of a frame."""
         return int(self.config.image_size // self.config.patch_size)
 
     @property
     def unused_layers(self) -> tuple[str, ...]:
-        """Layers without input."""
+        """The names of layers that have no input."""
         return ("extrinsics_encoder",) if self.config.use_states and not self.config.use_extrinsics else ()
 
     def forward(
@@ -112,17 +113,17 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         cache: KeyValueCache | None = None,
         keep: int | None = None,
     ) -> Float[Tensor, "batch time tokens dim"]:
-        """Return, at each step, the prediction of the next step's latents, not yet normalised.
+        """Return for each step the predicted latents of the next step, not yet normalised.
 
-        Inputs of any float type are cast to the weights' type.
+        Inputs of any float type are cast to the data type of the weights.
 
         Args:
-            latents: Latents of consecutive steps.
-            actions: The action of each.
-            states: The state of each; not used, and of any width, where the model has no states.
-            extrinsics: The camera of each, where the model uses it.
-            cache: The steps come after those in the cache and attend to them; then they are added to it.
-            keep: Number of steps to add to the cache, from the first; None: all.
+            latents: The latents of consecutive steps.
+            actions: The action of each step.
+            states: The state of each step; ignored, and of any width, if the model has no states.
+            extrinsics: The camera pose of each step, if the model uses it.
+            cache: The steps follow those in the cache and attend to them; then they are added to the cache.
+            keep: Number of steps to add to the cache, from the first; None for all steps.
 
         Raises:
             ValueError: Extrinsics are missing or unexpected.
@@ -159,7 +160,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
     def _through_blocks(
         self, tokens: Tensor, layout: TokenLayout, cache: KeyValueCache | None, keep: int | None
     ) -> Tensor:
-        """Return the tokens after all blocks, which attend to the cache; new keys and values are added to it."""
+        """Return the output tokens of all blocks, which attend to the cache; add new keys and values to the cache."""
         tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
         how = (tables, layout.tokens_per_step, self.attention)
         steps = layout.steps if keep is None else min(keep, layout.steps)
@@ -180,7 +181,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
 
     @property
     def _dtype(self) -> torch.dtype:
-        """The base's type; a directly trained head may have another."""
+        """The data type of the base weights; a directly trained input layer may have another."""
         return self.predictor_norm.weight.dtype
 
     def initialise(self, generator: Generator) -> None:
@@ -189,15 +190,14 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             initialise(module, generator)
 
     def start_at_persistence(self, generator: Generator) -> None:
-        """Initialise a predictor close to copying: it reads latents through a rotation, and writes through its inverse.
+        """Initialise the predictor close to persistence: the input layer is a rotation, the output layer its inverse.
 
-        These two layers are the network's only path from input to output. With random initialisation a tiny predictor
-        spends most of its training on learning to copy. A predictor narrower than a latent passes on only a random part
-        of it (`ModelSizes.too_narrow_to_copy`).
+        Without this initialisation a tiny predictor spends most of its training on learning to copy. A predictor
+        narrower than the latents can copy only a random part of them (`ModelSizes.too_narrow_to_copy`).
         """
         shape = self.predictor_embed.weight.shape
         drawn = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)
-        drawn = drawn.double()  # threads would change the last bits
+        drawn = drawn.double()  # in float32 the last bits would depend on the number of threads
         rotation, triangle = torch.linalg.qr(drawn)
         rotation = rotation * triangle.diagonal().sign()
         with torch.no_grad():
@@ -205,17 +205,17 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             self.predictor_proj.weight.copy_(self.predictor_embed.weight.T)
 
     def _init_weights(self, module: nn.Module) -> None:
-        """Initialise one module: called by transformers for weights that a checkpoint lacks."""
+        """Initialise one module; transformers calls this for weights that a checkpoint does not contain."""
         initialise(module)
 
     @property
     def is_gradient_checkpointing(self) -> bool:
-        """Whether blocks are recomputed in the backward pass; PEFT reads this, and transformers' own property warns."""
+        """Whether blocks are recomputed in the backward pass. PEFT reads this; transformers' property would warn."""
         return self.gradient_checkpointing
 
 
 def new_predictor(sizes: ModelSizes) -> ActionConditionedPredictor:
-    """Return the predictor of a world model of these sizes, not yet initialised."""
+    """Return a predictor of these sizes, not yet initialised."""
     own = sizes.predictor.model_dump()
     renamed = {"width": "hidden_size", "depth": "num_hidden_layers", "heads": "num_attention_heads"}
     fields = {renamed.get(name, name): value for name, value in own.items()}
@@ -226,7 +226,7 @@ def new_predictor(sizes: ModelSizes) -> ActionConditionedPredictor:
 
 
 def _in_own_type(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Apply a layer that may be trained, hence float32, in a predictor of another type; autocast casts by itself."""
+    """Apply a layer that may be trained, hence float32, in a predictor of another data type, without autocast."""
     if torch.is_autocast_enabled(values.device.type):
         return layer(values)  # type: ignore[no-any-return]  # PEFT may be around it, untyped
     return layer(values.to(layer.weight.dtype)).to(dtype)  # type: ignore[no-any-return]  # the same
@@ -244,8 +244,8 @@ class LatentDynamics(nn.Module):
 
     @property
     def base_predictor(self) -> Any:
-        """The predictor itself, without a surrounding adapter."""
-        wrapped = getattr(self.predictor, "get_base_model", None)  # PEFT's
+        """The predictor without PEFT's wrapper."""
+        wrapped = getattr(self.predictor, "get_base_model", None)  # a method of PEFT's wrapper
         return wrapped() if wrapped else self.predictor
 
     def predict(
@@ -257,9 +257,9 @@ class LatentDynamics(nn.Module):
         cache: KeyValueCache | None = None,
         keep: int | None = None,
     ) -> Float[Tensor, "batch time tokens dim"]:
-        """Return, at each step, the prediction of the next step's latents from the given ones (teacher forcing).
+        """Return for each step the predicted latents of the next step, from the true latents (teacher forcing).
 
-        With a cache the steps come after those in it; the first `keep` of them are added to it (None: all).
+        With a cache the steps follow those in the cache; the first `keep` steps are added to it (None: all).
         """
         return normalise_latents(self.predictor(latents, actions, states, extrinsics, cache=cache, keep=keep))
 
@@ -271,15 +271,15 @@ class LatentDynamics(nn.Module):
         extrinsics: Float[Tensor, "batch time 6"] | None = None,
         cache: KeyValueCache | None = None,
     ) -> Float[Tensor, "batch steps tokens dim"]:
-        """Return predictions of the steps after the context, each fed back to predict the next.
+        """Return a rollout: predictions of the steps after the context, each used as input for the next prediction.
 
-        With frames counted from 0, the context holds frames 0 .. context-1 and the result frames context .. time: the
-        first is predicted from the context alone, so index h - 1 is horizon h, and there are time - context + 1 of
-        them. Actions and states are the true ones throughout. A context need not be true: to continue from a
-        known prediction, append it to the context.
+        With frames counted from 0, the context contains frames 0 .. context-1 and the result frames context .. time.
+        The first is predicted from the context alone, so that index h - 1 is horizon h, and there are time - context +
+        1 predictions. The context may end with a prediction, to continue a rollout from it.
 
-        The context is computed at once, then one step at a time: keys and values are cached. With a cache, context,
-        actions and states come after the steps in it; it is not changed, so that many rollouts can start from it.
+        The context is computed in one pass, then one step at a time with cached keys and values. With a cache, context,
+        actions and states follow the steps in the cache. The cache is not changed, so that many rollouts can start from
+        it.
 
         Raises:
             ValueError: There are fewer actions than context latents.
@@ -292,7 +292,7 @@ class LatentDynamics(nn.Module):
         predicted = []
         for end in range(first, last + 1):
             camera = None if extrinsics is None else extrinsics[:, start:end]
-            keep = None if end < last else 0  # nothing comes after the last
+            keep = None if end < last else 0  # the last step needs not be cached
             following = self.predict(latents, actions[:, start:end], states[:, start:end], camera, cache, keep)
             latents, start = following[:, -1:], end
             predicted.append(latents)
@@ -315,5 +315,5 @@ class LatentDynamics(nn.Module):
 
 
 def normalise_latents(features: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
-    """Return features layer-normalised over `dim` without affine, in float32."""
+    """Return features layer-normalised over `dim`, without affine parameters, in float32."""
     return layer_norm(features.float(), features.shape[-1:])

@@ -1,6 +1,7 @@
-"""The world model, an encoder and a predictor: encode, predict, roll out, save and load.
+"""The world model (encoder and predictor): encode, predict, roll out, save and load.
 
-`fit_heads` adds input heads for robots whose states or actions differ from the base's; these heads must be trained.
+`fit_heads` adds new input layers for robots whose states or actions have other widths than in the base model; these
+layers must be trained.
 """
 
 from __future__ import annotations
@@ -34,41 +35,41 @@ ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
 class Adaptation:
     """The adaptation of the predictor by `model.lora`."""
 
-    kind: Literal["lora", "none"]  # as in config.AdapterConfig; none: every weight is trained
-    base: str  # fingerprint of the predictor it started from
-    encoder: str  # fingerprint of the encoder whose latents it learns from
-    start: dict[str, Tensor] | None = None  # kind none: the weights it started from
+    kind: Literal["lora", "none"]  # as in config.AdapterConfig; none: all weights are trained
+    base: str  # fingerprint of the predictor before training
+    encoder: str  # fingerprint of the encoder
+    start: dict[str, Tensor] | None = None  # with kind none: the weights before training
 
 
 class Fingerprints(NamedTuple):
     """Hashes of a model's weights."""
 
     encoder: str
-    base: str  # of the predictor before it was adapted
-    predictor: str  # with the trained weights
+    base: str  # the predictor before it was adapted
+    predictor: str  # the predictor with the trained weights
 
 
 @dataclass(frozen=True)
 class FreshHeads:
-    """New input heads of the predictor (`fit_heads`), for states or actions whose widths differ from the base's."""
+    """New input layers of the predictor (`fit_heads`), for states or actions of other widths than the base model's."""
 
-    replaced: dict[str, Tensor]  # the base's own, by their names in the predictor
-    seed: int  # of the new ones
+    replaced: dict[str, Tensor]  # the weights of the base model's layers, by their names in the predictor
+    seed: int  # seed of the new layers
 
 
 class AbsentEncoder(nn.Module):
-    """Placeholder of a removed encoder."""
+    """A placeholder for a removed encoder."""
 
     def __init__(self, fingerprint: str) -> None:
         super().__init__()
-        self.fingerprint = fingerprint  # of the removed one
+        self.fingerprint = fingerprint  # that of the removed encoder
 
 
 class WorldModel(LatentDynamics):
     """A frozen encoder and an action-conditioned predictor.
 
-    Latents and predictions are layer-normalised over `dim` without affine, and float32 whatever the weights' type:
-    inputs are cast inside. `model.lora.add_adapter` selects the trained weights; before that there are none.
+    Latents and predictions are layer-normalised over `dim` without affine parameters, and are float32 for weights of
+    any data type. `model.lora.add_adapter` selects the weights to train; without it all weights are frozen.
 
     Create one with `random`, `from_pretrained` or `model.checkpoints.load_official`.
     """
@@ -81,8 +82,8 @@ class WorldModel(LatentDynamics):
         self.predictor.requires_grad_(False)
         self.adaptation: Adaptation | None = None
         self.fresh_heads: FreshHeads | None = None
-        self.merged_from: Fingerprints | None = None  # before an adapter was merged
-        self.encoder_origin: EncoderOrigin | None = None  # of an encoder that was read by itself
+        self.merged_from: Fingerprints | None = None  # fingerprints before an adapter was merged
+        self.encoder_origin: EncoderOrigin | None = None  # None if the encoder was loaded together with the predictor
 
     @classmethod
     def random(
@@ -94,10 +95,11 @@ class WorldModel(LatentDynamics):
         at_persistence: bool = False,
         device: torch.device | str = "cpu",
     ) -> WorldModel:
-        """Return a freshly initialised model: the same weights for the same sizes, seed and kind of device.
+        """Return a randomly initialised model, with the same weights for the same sizes, seed and device type.
 
-        Weights are drawn as in the released recipe; with `at_persistence` the predictor starts close to copying. They
-        are drawn on their device: the full size takes half a minute of one CPU core, and no time on a GPU.
+        Weights are drawn as in the released recipe; with `at_persistence` the predictor starts close to persistence.
+        They are drawn on the device: the full size takes half a minute on one CPU core, and no noticeable time on a
+        GPU.
         """
         model = cls.empty(sizes).to_empty(device=device)
         generator = torch.Generator(device).manual_seed(seed)
@@ -106,7 +108,7 @@ class WorldModel(LatentDynamics):
         return model.to(dtype)
 
     def draw_predictor(self, generator: torch.Generator, dtype: torch.dtype, *, at_persistence: bool = False) -> None:
-        """Initialise the predictor on the generator's device; it may be without weights."""
+        """Initialise the predictor on the generator's device; it may be on the meta device before."""
         predictor = self.base_predictor.to_empty(device=generator.device)
         predictor.initialise(generator)
         if at_persistence:
@@ -121,7 +123,7 @@ class WorldModel(LatentDynamics):
 
     @classmethod
     def from_pretrained(cls, folder: str | Path, dtype: torch.dtype | None = None) -> WorldModel:
-        """Read a folder written by `save_pretrained`; `dtype` None keeps the type of each file.
+        """Load a model from a folder written by `save_pretrained`; `dtype` None keeps the data type of each file.
 
         Raises:
             InputError: The folder is not a world model, is incomplete or damaged.
@@ -136,13 +138,14 @@ class WorldModel(LatentDynamics):
         return model
 
     def save_pretrained(self, folder: str | Path) -> None:
-        """Write config.json, encoder.safetensors and predictor/ (which transformers can load by itself).
+        """Save the model as config.json, encoder.safetensors and predictor/ (which transformers can load).
 
-        The folder is written elsewhere, then moved, config.json last: a folder that has one is complete.
+        The files are written into a temporary folder and then moved, config.json last, so that a folder with a
+        config.json is complete.
 
         Raises:
-            InputError: The folder cannot be written.
-            ValueError: There is an adapter: merge it first, or save it with `adapter_folder.save_trained`. Or the
+            InputError: The folder is not writable.
+            ValueError: The model has an adapter (merge it first, or save it with `adapter_folder.save_trained`), or the
                 encoder was removed.
         """
         if self.predictor is not self.base_predictor:
@@ -162,17 +165,17 @@ class WorldModel(LatentDynamics):
 
     @property
     def image_size(self) -> int:
-        """Height and width of a frame in pixels."""
+        """The height and width of a frame in pixels."""
         return self.sizes.image_size
 
     @property
     def num_tokens(self) -> int:
-        """Tokens of one frame."""
+        """The number of tokens per frame."""
         return self.sizes.tokens_per_frame
 
     @property
     def latent_dim(self) -> int:
-        """Width of a latent."""
+        """The width of a latent."""
         return self.sizes.encoder.width
 
     @property
@@ -180,14 +183,14 @@ class WorldModel(LatentDynamics):
         """The encoder.
 
         Raises:
-            ValueError: It was removed.
+            ValueError: The encoder was removed.
         """
         if isinstance(self.encoder, Encoder):
             return self.encoder
         raise ValueError("the encoder was set aside: latents come from a cache")
 
     def set_encoder_aside(self) -> None:
-        """Remove the encoder's weights permanently: latents come from a cache. The fingerprint is kept."""
+        """Remove the encoder's weights permanently, because latents come from a cache. The fingerprint is kept."""
         if isinstance(self.encoder, Encoder):
             self.encoder = AbsentEncoder(self.encoder_fingerprint())
 
@@ -199,7 +202,7 @@ class WorldModel(LatentDynamics):
 
         Args:
             frames: Frames normalised as in training (ImageNet mean and std).
-            chunk: Frames that go through the encoder at once: bounds the memory.
+            chunk: Number of frames per forward pass of the encoder; limits the memory.
 
         Raises:
             ValueError: The frames have another size than `image_size`; or the encoder was removed.
@@ -208,7 +211,7 @@ class WorldModel(LatentDynamics):
         return rearrange(features, "(batch time) tokens dim -> batch time tokens dim", batch=len(frames))
 
     def encoder_fingerprint(self) -> str:
-        """Return a hash of the encoder's tensors and of what they do not show: part of the key of cached latents."""
+        """Return a hash of the encoder's tensors and other properties, which is part of the key of cached latents."""
         if isinstance(self.encoder, AbsentEncoder):
             return self.encoder.fingerprint
         tensors, beyond = fingerprint(self.encoder.state_dict()), self.encoder_beyond_tensors
@@ -218,9 +221,9 @@ class WorldModel(LatentDynamics):
 
     @property
     def encoder_beyond_tensors(self) -> dict[str, str | int]:
-        """The properties that latents depend on and tensors do not show.
+        """The properties on which latents depend, but which the tensors do not determine.
 
-        There are none for V-JEPA 2's tubelets with the published heads, or where a model was made with its encoder.
+        Empty for tubelets of V-JEPA 2 with the published number of heads, and for a model created with its encoder.
         """
         sizes, origin, beyond = self.sizes.encoder, self.encoder_origin, dict[str, str | int]()
         if sizes.family != "v2":
@@ -231,7 +234,7 @@ class WorldModel(LatentDynamics):
 
     @property
     def encoder_in_words(self) -> str:
-        """The encoder and where it came from, for cards."""
+        """A description of the encoder and its origin, for cards."""
         sizes, frame = self.sizes.encoder, ""
         if sizes.family != "v2":
             frame = f", each frame as {'a tubelet' if sizes.frame == 'tubelet' else 'an image'}"
@@ -239,7 +242,7 @@ class WorldModel(LatentDynamics):
         return f"V-JEPA {sizes.family[1:]}, {sizes.depth} blocks of {sizes.width}, {sizes.heads} heads{frame}{origin}"
 
     def fingerprints(self) -> Fingerprints:
-        """Hash the model, with its adapter separate from its base; for one that was merged, what it was before."""
+        """Return the hashes of base and trained weights; for a merged model those before the merge."""
         if self.merged_from is not None:
             return self.merged_from
         adapted, whole = self.adaptation, fingerprint(self.predictor.state_dict())
@@ -248,7 +251,7 @@ class WorldModel(LatentDynamics):
         return Fingerprints(self.encoder_fingerprint(), self.predictor_fingerprint(), whole)
 
     def predictor_fingerprint(self) -> str:
-        """Return a hash of the predictor's own weights; independent of an adapter and of fresh heads."""
+        """Return a hash of the base model's predictor, independent of an adapter and of new input layers."""
         replaced = {} if self.fresh_heads is None else self.fresh_heads.replaced
         return fingerprint(base_weights(self.base_predictor) | replaced)
 
@@ -256,7 +259,7 @@ class WorldModel(LatentDynamics):
 def fingerprint(weights: Mapping[str, Tensor]) -> str:
     """Return the SHA-256 of names, shapes and values rounded to bfloat16.
 
-    Rounding makes it independent of the type in which a checkpoint was loaded, float32 or bfloat16.
+    Because of the rounding it is the same for a checkpoint loaded as float32 or as bfloat16.
     """
     digest = hashlib.sha256()
     for name, value in sorted(weights.items()):
@@ -276,7 +279,7 @@ def base_weights(predictor: nn.Module) -> dict[str, Tensor]:
 
 
 def heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
-    """Return the input heads of a model of these sizes that do not fit states and actions of these widths.
+    """Return the names of the input layers that do not fit states and actions of these widths.
 
     States of any width fit a model without states.
     """
@@ -289,10 +292,10 @@ def heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
 
 
 def require_trained(heads: tuple[str, ...], config: AdapterConfig) -> None:
-    """Refuse to leave a fresh head untrained.
+    """Check that new input layers are trained.
 
     Raises:
-        InputError: An adapter is trained and a head is not among its modules_to_save; says what to set.
+        InputError: An adapter is trained, and a new layer is not in its modules_to_save; shows the setting.
     """
     missing = [name for name in heads if name not in config.modules_to_save]
     if config.kind == "none" or not missing:
@@ -303,16 +306,16 @@ def require_trained(heads: tuple[str, ...], config: AdapterConfig) -> None:
 
 
 def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
-    """Replace the input heads that do not fit states and actions of these widths by fresh ones.
+    """Replace the input layers that do not fit states and actions of these widths by new ones.
 
-    They are initialised as in the released recipe, each from the seed and its own name. The base's identity does not
-    change (`WorldModel.predictor_fingerprint`), but without training the model predicts noise.
+    They are initialised as in the released recipe, from the seed and the name of the layer. The identity of the base
+    model (`WorldModel.predictor_fingerprint`) does not change, but without training the model predicts noise.
 
     Returns:
-        A line for each replaced head; none if all fit.
+        A line for each replaced layer.
 
     Raises:
-        ValueError: The model is adapted, or has fresh heads already.
+        ValueError: The model is adapted, or has new input layers already.
     """
     heads = heads_to_replace(model.sizes, widths)
     if not heads:
@@ -338,23 +341,23 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
 
 
 def widths_of_model(sizes: ModelSizes) -> Widths:
-    """Return the widths of a model's states and actions; without states, that of its actions for both.
+    """Return the widths of a model's states and actions.
 
-    A plan changes states by actions: where the model does not tell the width of a state, it is that of an action.
+    For a model without states the width of a state is that of an action, because a plan adds actions to states.
     """
     own = sizes.predictor
     return Widths(state=own.state_dim if own.use_states else own.action_dim, action=own.action_dim)
 
 
 def widths_as_text(sizes: ModelSizes) -> str:
-    """Return which states and actions a model takes, for messages."""
+    """Describe the states and actions that a model accepts, for messages."""
     own = sizes.predictor
     states = f"states of {own.state_dim}" if own.use_states else "any states"
     return f"{states} and actions of {own.action_dim} numbers"
 
 
 def seed_of(*parts: object) -> int:
-    """Return a seed that these values determine, such as a seed of the user and a step."""
+    """Return a seed derived from these values, for example from the seed of the config and a step."""
     digest = hashlib.blake2b("/".join(map(str, parts)).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") >> 1
 
