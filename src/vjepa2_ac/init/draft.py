@@ -32,7 +32,7 @@ _FEW_EPISODES = 500  # up to this number the advice for few demonstrations appli
 _MOST_TESTED = 0.35  # largest test share
 _SHARES = ((5_000, 0.02), (500, 0.05), (100, 0.1), (0, 0.15))  # held-out share if there are more episodes than this
 _LEAST_FRAMES = 3  # two rollout steps and the first frame
-_PASSES = 3  # passes over the data
+_PASSES = 3  # clips for each control step of the data
 _LEAST_STEPS, _MOST_STEPS = 200, 100_000
 _SHORT = 100  # control steps; shorter episodes are used without a filter for idle steps
 _CACHE_SHARE = 1 / 3  # share of the free disk space that a latent cache may use
@@ -321,8 +321,8 @@ def _steps(data: FoundData, clips_a_step: int) -> Knob:
         return Knob(_LEAST_STEPS, "a first run; docs/training.md says how many")
     steps_for_passes = math.ceil(_PASSES * data.steps / _CLIPS_A_STEP / 100) * 100  # each control step starts a clip
     steps = max(_LEAST_STEPS, min(_MOST_STEPS, steps_for_passes))
-    passes = steps * clips_a_step / data.steps
-    return Knob(steps, f"{passes:.2g} passes over the data; more lower the error, but planning may get worse")
+    clips = steps * clips_a_step / data.steps
+    return Knob(steps, f"{clips:.2g} clips for each control step of the data; more steps may make planning worse")
 
 
 def _fresh_predictor(model: ModelChoice) -> Knobs:
