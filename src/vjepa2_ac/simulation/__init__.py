@@ -1,1 +1,1 @@
-"""Simulation: robot data and a test without a robot, from a Franka-like arm in MuJoCo (extra `sim`)."""
+"""Simulation of a Franka-like arm in MuJoCo (extra `sim`): recording of data, and tests of models in closed loop."""

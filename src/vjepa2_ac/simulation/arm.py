@@ -1,4 +1,4 @@
-"""The simulated arm: follows commands with a lag, is filmed by three cameras, and may push and grasp a block."""
+"""The simulated arm, which follows commands with a lag, has three cameras, and can push and grasp a block."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from vjepa2_ac.simulation.motion import (
 )
 from vjepa2_ac.spaces import euler_from_matrices
 
-State = Float[np.ndarray, " 7"]  # or an action; legend: episode.py
-Block = Float[np.ndarray, " 4"]  # its pose, as in `TaskProblem`
-Mark = Float[np.ndarray, " 2"]  # its middle, likewise
+State = Float[np.ndarray, " 7"]  # a state or an action; conventions: episode.py
+Block = Float[np.ndarray, " 4"]  # pose of the block, as in `TaskProblem`
+Mark = Float[np.ndarray, " 2"]  # centre of the mark, as in `TaskProblem`
 
 WRIST_FOV_DEG = 70.0
-_EXTERIOR_TURNS_DEG = {"exterior_1": 0.0, "exterior_2": -100.0}  # of the cameras that stand still
+_EXTERIOR_TURNS_DEG = {"exterior_1": 0.0, "exterior_2": -100.0}  # azimuth of the fixed cameras, relative to the domain
 
 
 class SimulatedArm:
-    """A Franka-like arm in a domain. Motion is kinematic: the joints are set, there are no collisions.
+    """A Franka-like arm in a domain. Its motion is kinematic: joints are set directly, without collisions.
 
-    States are *measured*, in the robot base frame (legend: episode.py).
+    States are *measured*, in the robot base frame (conventions: episode.py).
 
     Args:
-        domain: Its world.
+        domain: The world of the arm.
         size: Height and width of the images.
-        views: How many of the cameras that stand still are seen side by side where none is named.
+        views: Number of fixed cameras whose images are concatenated if no camera is named.
 
     Raises:
         UnreachableError: MuJoCo is not installed.
@@ -57,8 +57,8 @@ class SimulatedArm:
         self.set_joints(rest_joints(domain), 0.0)
 
     def reset_clock(self) -> None:
-        """Let the moving objects start where they are for a new arm, at the next `set_joints`."""
-        self._time_s = 1 / CONTROL_RATE_HZ  # `__init__` has set the joints once
+        """Reset the time of the moving objects, so that they start as for a new arm at the next `set_joints`."""
+        self._time_s = 1 / CONTROL_RATE_HZ  # as after `__init__`, which sets the joints once
 
     @property
     def joints(self) -> Joints:
@@ -77,14 +77,14 @@ class SimulatedArm:
 
     @property
     def block(self) -> Block | None:
-        """Pose of the block; None: there is none."""
+        """Pose of the block; None if there is no block."""
         return None
 
     def place(self, block: Block | None, mark: Mark | None) -> None:
-        """Put the block (at a pose at once, at rest) and the mark on the table; this arm has neither."""
+        """Set the poses of the block and of the mark. This arm has neither, so the call has no effect."""
 
     def set_joints(self, joints: Joints, closedness: float, control_steps: int = 1) -> None:
-        """Put the arm at joint angles at once; what circles on the table goes on for so many control steps."""
+        """Set the joint angles directly, and advance the moving objects by `control_steps`."""
         self._closedness = closedness
         self._data.qpos[:7] = joints
         self._data.qpos[7:9] = FINGER_TRAVEL_M * (1.0 - closedness)
@@ -92,23 +92,23 @@ class SimulatedArm:
         self._mujoco.mj_kinematics(self._model, self._data)
 
     def joints_for(self, state: State) -> Joints:
-        """Return joint angles that bring the flange from here to a pose.
+        """Return joint angles for a pose of the flange, starting from the current joint angles.
 
         Raises:
-            OutOfReachError: There are none.
+            OutOfReachError: No joint angles within the limits reach the pose.
         """
         return inverse_kinematics(state[:6], self.joints, rest=rest_joints(self.domain))
 
     def set_state(self, state: State) -> None:
-        """Put the flange at a pose, at once.
+        """Set the pose of the flange and the gripper directly.
 
         Raises:
-            OutOfReachError: No joint angles lead there.
+            OutOfReachError: No joint angles within the limits reach the pose.
         """
         self.set_joints(self.joints_for(state), float(state[6]))
 
     def can_reach(self, state: State) -> bool:
-        """Return whether a command to move the flange from here to this pose can be followed."""
+        """Return whether the flange can be commanded from its current pose to this pose."""
         with suppress(OutOfReachError):
             self.joints_for(state)
             return True
@@ -118,7 +118,7 @@ class SimulatedArm:
         """Move the flange towards a state for some control steps and return the measured state.
 
         Raises:
-            OutOfReachError: No joint angles lead there.
+            OutOfReachError: No joint angles within the limits reach the state.
         """
         return self.command_joints(self.joints_for(target), float(target[6]), control_steps)
 
@@ -131,16 +131,16 @@ class SimulatedArm:
         return self.state
 
     def image(self, camera: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
-        """Return the current image of `exterior_1`, `exterior_2` or `wrist`; None: what is seen of this arm.
+        """Return the current image of `exterior_1`, `exterior_2` or `wrist`; None: of all views of this arm.
 
         Raises:
-            ValueError: No such camera.
+            ValueError: There is no such camera.
         """
         names = self._views if camera is None else (camera,)
         return np.concatenate([self._camera(name).image(self._data) for name in names], axis=1)
 
     def silhouette(self, camera: str = "exterior_1") -> Bool[np.ndarray, "height width"]:
-        """Return which pixels of the current image of a camera show the arm, a block, or things that circle."""
+        """Return which pixels of the current image of a camera show the arm, the block, or moving objects."""
         return self._camera(camera).silhouette(self._data)
 
     def _camera(self, camera: str) -> RayCamera:
@@ -165,7 +165,7 @@ class SimulatedArm:
         self._circles.move(self._data, self._time_s)
 
     def _camera_pose(self, camera: str) -> Float[np.ndarray, "4 4"]:
-        """Return the frame of a camera in the world; the one on the hand looks past the fingers."""
+        """Return the frame of a camera in the world. The wrist camera is mounted on the hand, beside the fingers."""
         if camera in _EXTERIOR_TURNS_DEG:
             return self.domain.camera.turned(_EXTERIOR_TURNS_DEG[camera]).pose()
         if camera != "wrist":
@@ -179,40 +179,40 @@ class SimulatedArm:
 
 
 class _Circles:
-    """The bodies that circle on the table, each about where it was put, at a radius and a speed of its own."""
+    """Objects that move on circles around their initial positions on the table, with different radii and speeds."""
 
     def __init__(self, model: Any, domain: Domain) -> None:
         bodies = [body for body in map(model.body, range(model.nbody)) if body.name.startswith(MOVING)]
         count, rng = len(bodies), np.random.default_rng([domain.clutter_seed, domain.moving])
-        self._places = [body.mocapid[0] for body in bodies]  # among all mocap bodies
+        self._mocap_ids = [body.mocapid[0] for body in bodies]
         self._middles_m = np.array([body.pos[:2] for body in bodies]).reshape(count, 2)
         self._radii_m, self._phases = rng.uniform(0.05, 0.12, count), rng.uniform(0.0, 2 * np.pi, count)
         self._speeds = rng.uniform(0.5, 2.0, count) * rng.choice([-1.0, 1.0], count)  # radians per second
 
     def move(self, data: Any, seconds: float) -> None:
-        """Put them where they are at a moment; the kinematics are out of date then."""
+        """Set the positions of the objects at a time; the kinematics must be updated afterwards."""
         angles = self._phases + self._speeds * seconds
-        ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        data.mocap_pos[self._places, :2] = self._middles_m + self._radii_m[:, None] * ways
+        directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        data.mocap_pos[self._mocap_ids, :2] = self._middles_m + self._radii_m[:, None] * directions
 
 
-Look = Callable[[SimulatedArm], None]  # at every control step, at the time of its measurements
+Look = Callable[[SimulatedArm], None]  # called at every control step, at the time of its measurements
 
-_GRIP_STAYS = 0.05  # a gripper command that changes by less keeps the last command, and so its force
-_MOVED, _FINGERS, _BLOCK = slice(0, 9), slice(7, 9), slice(9, 16)  # of qpos
+_GRIP_STAYS = 0.05  # smaller changes of the gripper command are ignored, so that the gripping force is constant
+_MOVED, _FINGERS, _BLOCK = slice(0, 9), slice(7, 9), slice(9, 16)  # parts of qpos
 
 
 class ContactArm(SimulatedArm):
-    """A Franka-like arm that pushes and grasps a block. States are measured, in the robot base frame.
+    """A Franka-like arm that can push and grasp a block. States are measured, in the robot base frame.
 
-    A gripper that is stopped by an object is measured at its position, as on a real robot; commanded to stay there, it
-    keeps holding.
+    If an object stops the gripper, the measured closedness is that of its real position, as on a real robot. A command
+    to stay at this closedness keeps the gripping force.
 
     Args:
-        domain: Its world.
+        domain: The world of the arm.
         size: Height and width of the images.
-        mark: Whether a mark lies on the table: a flat disc that is seen, and touched by nothing.
-        views: As of `SimulatedArm`.
+        mark: Whether there is a mark on the table: a flat disc without collisions.
+        views: As for `SimulatedArm`.
     """
 
     def __init__(
@@ -229,12 +229,12 @@ class ContactArm(SimulatedArm):
     @property
     def block(self) -> Block:
         """Position of the block's centre and its rotation about z, in the robot base frame: metres, radians."""
-        turn, place = self.domain.base_pose()[:3, :3], self._data.qpos[_BLOCK]
-        rotation = turn.T @ Rotation.from_quat(place[3:], scalar_first=True).as_matrix()
-        return np.append(turn.T @ place[:3], np.arctan2(rotation[1, 0], rotation[0, 0]))
+        turn, pose = self.domain.base_pose()[:3, :3], self._data.qpos[_BLOCK]
+        rotation = turn.T @ Rotation.from_quat(pose[3:], scalar_first=True).as_matrix()
+        return np.append(turn.T @ pose[:3], np.arctan2(rotation[1, 0], rotation[0, 0]))
 
     def place(self, block: Block | None, mark: Mark | None) -> None:
-        """Put the block, upright and at rest, and the mark at once; None: it stays."""
+        """Set the pose of the block, upright and at rest, and the position of the mark; None: unchanged."""
         base = self.domain.base_pose()[:3, :3]
         if block is not None:
             turn = Rotation.from_matrix(base)
@@ -246,11 +246,11 @@ class ContactArm(SimulatedArm):
         self._mujoco.mj_kinematics(self._model, self._data)
 
     def set_joints(self, joints: Joints, closedness: float, control_steps: int = 1) -> None:
-        """Put the arm at joint angles at once, at rest; it drops what it held."""
+        """Set the joint angles directly, at rest; a grasped object is released."""
         super().set_joints(joints, closedness, control_steps)
         self._data.qvel[_MOVED] = 0.0
         self._data.qacc_warmstart[:] = 0.0
-        self._wanted = self._data.qpos[_MOVED].copy()
+        self._setpoint = self._data.qpos[_MOVED].copy()
         self._grip = closedness
 
     def command_joints(self, goal: Joints, closedness: float, control_steps: int = 1) -> State:
@@ -259,9 +259,9 @@ class ContactArm(SimulatedArm):
             self._grip = closedness
         ends = np.append(goal, [FINGER_TRAVEL_M * (1.0 - self._grip)] * 2)
         for _ in range(control_steps * SUBSTEPS):
-            way = self._share * (ends - self._wanted)
-            self._wanted += way
-            self._data.ctrl[:] = self._wanted + self._ahead * way  # the servos have no lag of their own
+            change = self._share * (ends - self._setpoint)
+            self._setpoint += change
+            self._data.ctrl[:] = self._setpoint + self._ahead * change  # compensates the servos' damping
             self._mujoco.mj_step(self._model, self._data)
         self._pass_time(control_steps)
         self._mujoco.mj_kinematics(self._model, self._data)

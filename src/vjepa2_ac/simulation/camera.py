@@ -1,4 +1,4 @@
-"""The camera: which rays meet what, and the image that they make. No OpenGL is needed."""
+"""Render camera images by ray casting in MuJoCo, without OpenGL."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from vjepa2_ac.simulation.domains import ARM_GROUP, STATIC_GROUP, CameraPlace, Domain, load_mujoco
 
-FRAME_SIZE = 180, 320  # height and width: size of DROID's images in RLDS
+FRAME_SIZE = 180, 320  # height and width, as in DROID's RLDS data
 
-Pose = Float[np.ndarray, "4 4"]  # x right, y down, z into the image, in the world
+Pose = Float[np.ndarray, "4 4"]  # camera frame in the world: x right, y down, z into the image
 Point = Float[np.ndarray, " 3"]
-Spots = Float[np.ndarray, "spots 3"]
-Rays = Float[np.ndarray, "rays 3"]  # of length 1
+Spots = Float[np.ndarray, "spots 3"]  # points on surfaces
+Rays = Float[np.ndarray, "rays 3"]  # unit vectors
 
-_SKIN_M = 6e-3  # a point does not shade itself
+_SKIN_M = 6e-3  # tolerance with which a point does not shade itself
 _LAMP_M = 2.2  # distance of the lamp from the origin of the world
 _LAMP_CELLS = 160  # cells along each edge of the lamp's view
 _LAMP_HALF_VIEW = 1.6  # tangent of half its opening angle; the arm is always inside
@@ -33,7 +33,7 @@ class Hits(NamedTuple):
 
 
 class Caster:
-    """MuJoCo's ray casting on one group of geoms, and bounding spheres of the arm's geoms (indices and radii)."""
+    """MuJoCo's ray casting on one group of geoms, and the bounding spheres (indices, radii) of the arm's geoms."""
 
     def __init__(self, model: Any) -> None:
         self._mujoco, self._model = load_mujoco(), model
@@ -61,7 +61,9 @@ class Caster:
 
 
 class View:
-    """Unit rays from one point, sorted into the cells of a grid: those that may hit the arm are found without casting.
+    """Unit rays from one point, sorted into the cells of a grid.
+
+    With the grid, the rays that may hit the arm are found without casting.
 
     Args:
         pose: Frame of the view in the world: x right, y down, z forward.
@@ -77,11 +79,11 @@ class View:
         inside = rays @ self._rotation
         ahead = inside[:, 2] > 1e-6
         column, row = self._cell(inside[:, :2] / np.where(ahead, inside[:, 2], 1.0)[:, None]).T
-        found = ahead & (column >= 0) & (column < cells[0]) & (row >= 0) & (row < cells[1])
-        self._index = np.where(found, row * cells[0] + column, cells[0] * cells[1]).astype(np.int64)
+        is_in_grid = ahead & (column >= 0) & (column < cells[0]) & (row >= 0) & (row < cells[1])
+        self._index = np.where(is_in_grid, row * cells[0] + column, cells[0] * cells[1]).astype(np.int64)
 
     def near_arm(self, caster: Caster, data: Any) -> Int[np.ndarray, " near"]:
-        """Return the rays in the cells that a sphere around one of the arm's geoms touches."""
+        """Return the indices of the rays that may hit the arm, by the bounding spheres of its geoms."""
         radii, inside = caster.radii, (data.geom_xpos[caster.arm] - self.origin) @ self._rotation
         ends = inside[:, 2] - radii, inside[:, 2] + radii
         if ends[0].min() <= 0.0:  # the view is inside the arm
@@ -99,13 +101,13 @@ class View:
         return np.asarray(np.floor((slopes / self._half_view + 1.0) / 2.0 * self._cells))
 
 
-def unit(ways: Float[np.ndarray, "ways 3"]) -> Float[np.ndarray, "ways 3"]:
-    """Return vectors of length 1 in the same directions."""
-    return np.asarray(ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9))
+def unit(vectors: Float[np.ndarray, "vectors 3"]) -> Float[np.ndarray, "vectors 3"]:
+    """Normalise vectors to length 1."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
 
 
-_SHADOW = 0.35  # share of the lamp's light that remains in the shadow
-_FAR_M = 20.0  # assumed distance of the background for a ray that meets nothing
+_SHADOW = 0.35  # share of the lamp's light that reaches a point in the shadow
+_FAR_M = 20.0  # assumed distance of the background for a ray without a hit
 
 
 @dataclass(frozen=True)
@@ -124,8 +126,8 @@ class RayCamera:
     """A camera in the world that casts one ray per pixel.
 
     Args:
-        model: The scene from `scene.compile_scene`.
-        domain: Its appearance.
+        model: The scene from `domains.compile_scene`.
+        domain: The domain of the scene, for light and patterns.
         pose: The camera's frame in the world: x right, y down, z into the image.
         vertical_fov_deg: Angle from the upper to the lower edge of the image.
         size: Height and width of the image.
@@ -150,7 +152,7 @@ class RayCamera:
         self._background: _Background | None = None
 
     def move(self, pose: Pose) -> None:
-        """Move the camera; the next image is cast anew, including walls and table."""
+        """Move the camera. The next image recomputes the static background."""
         self._pose = pose
         self._background = None
 
@@ -168,14 +170,14 @@ class RayCamera:
         return pixels.reshape(self._height, self._width, 3)
 
     def silhouette(self, data: Any) -> Bool[np.ndarray, "height width"]:
-        """Return which pixels of the image show what can move: the arm, a block, things that circle."""
+        """Return which pixels of the image show the arm, the block or moving objects."""
         behind = self._background = self._background or self._see_background(data)
         shown = np.zeros(self._height * self._width, dtype=bool)
         shown[self._see_arm(data, behind)[0]] = True
         return shown.reshape(self._height, self._width)
 
     def _see_arm(self, data: Any, behind: _Background) -> tuple[Int[np.ndarray, " seen"], Hits]:
-        """Return the pixels that show what can move, and what their rays hit."""
+        """Return the pixels that show the arm, the block or moving objects, and the hits of their rays."""
         view = behind.from_camera
         near = view.near_arm(self._caster, data)
         hits = self._caster.cast(data, view.origin, view.rays[near], ARM_GROUP)
@@ -186,7 +188,7 @@ class RayCamera:
         size = (self._width, self._height)
         across, down = (
             ((np.arange(count) + 0.5) / count * 2 - 1) * half for count, half in zip(size, self._half_view, strict=True)
-        )  # the middle of each pixel
+        )  # through the centre of each pixel
         rays = np.stack(np.broadcast_arrays(across[None, :], down[:, None], 1.0), axis=-1).reshape(-1, 3)
         rays = unit(rays) @ self._pose[:3, :3].T
         view = View(self._pose, rays, self._half_view, size)
@@ -200,7 +202,7 @@ class RayCamera:
         return _Background(lit, shaded, distance, spots, view, from_lamp)
 
     def _light(self, data: Any, spots: Any, hits: Hits, group: int) -> tuple[Any, Any]:
-        """Return the colour of points in ambient light, and the lamp's part; the group casts shadows on itself."""
+        """Return the colours of points from ambient light and from the lamp; the group casts shadows on itself."""
         colour = self._colours.at(hits.geoms, spots)
         to_lamp = unit(self._lamp - spots)
         shine = np.einsum("ij,ij->i", hits.normals, to_lamp).clip(0.0, 1.0)
@@ -211,7 +213,7 @@ class RayCamera:
 
 
 class _Colours:
-    """Colours by geom, and by position for those with a pattern, so that images have texture."""
+    """Colours of geoms. Table, floor and walls have patterns that depend on the position."""
 
     def __init__(self, model: Any, seed: int) -> None:
         self._colours = model.geom_rgba[:, :3].astype(np.float32)
@@ -219,7 +221,7 @@ class _Colours:
         patterns: list[Callable[[Any], Any]] = [_planks, _tiles, _panels]
         if seed:
             rng = np.random.default_rng(seed)
-            patterns = [_drawn(patterns[place], rng) for place in rng.permutation(3)]
+            patterns = [_vary_pattern(patterns[index], rng) for index in rng.permutation(3)]
         self._patterns = [
             (np.array([name.startswith(start) for name in names]), pattern)
             for start, pattern in zip(("table", "floor", "wall"), patterns, strict=True)
@@ -227,22 +229,22 @@ class _Colours:
 
     def at(self, geoms: Any, spots: Any) -> Any:
         colour = self._colours[geoms]
-        for chosen, pattern in self._patterns:
-            index = np.flatnonzero(chosen[geoms])
+        for is_patterned, pattern in self._patterns:
+            index = np.flatnonzero(is_patterned[geoms])
             if len(index):
                 colour[index] *= pattern(spots[index])[:, None]
         return colour
 
 
-def _drawn(pattern: Callable[[Any], Any], rng: np.random.Generator) -> Callable[[Any], Any]:
-    """Return a pattern that is turned, larger or smaller, and stronger or fainter."""
+def _vary_pattern(pattern: Callable[[Any], Any], rng: np.random.Generator) -> Callable[[Any], Any]:
+    """Return a pattern with random rotation, scale and contrast."""
     turn, scale, strength = rng.uniform(0.0, np.pi), rng.uniform(0.5, 2.0), rng.uniform(0.5, 2.5)
     ways = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, scale]]) / scale
     return lambda spots: 1.0 + strength * (pattern(spots @ ways) - 1.0)
 
 
 def _planks(spots: Any) -> Any:
-    """Boards along x, each of its own shade, with a faint grain."""
+    """Return the brightness of boards along x, each with its own shade and a faint grain."""
     board = np.floor(spots[:, 1] / 0.125)
     tone = 0.93 + 0.07 * np.sin(board * 12.9898)
     grain = 0.03 * np.sin(60.0 * spots[:, 1] + 2.0 * np.sin(5.0 * spots[:, 0] + board))
@@ -251,13 +253,13 @@ def _planks(spots: Any) -> Any:
 
 
 def _tiles(spots: Any) -> Any:
-    """A chequered floor."""
+    """Return the brightness of a chequered floor."""
     odd = (np.floor(spots[:, 0] / 0.4) + np.floor(spots[:, 1] / 0.4)) % 2
     return (0.85 + 0.3 * odd).astype(np.float32)
 
 
 def _panels(spots: Any) -> Any:
-    """Wide upright panels over a dark skirting, brighter towards the top."""
+    """Return the brightness of wide vertical panels above a dark skirting board, brighter towards the top."""
     along = spots[:, 0] + spots[:, 1]
     panel = np.floor(along / 0.6) % 2
     shade = 0.86 + 0.10 * panel + 0.08 * np.clip(spots[:, 2], -0.7, 1.5)

@@ -1,4 +1,4 @@
-"""Domains of the simulated arm: camera positions, appearance, and how the arm is mounted; their scenes in MuJoCo.
+"""Domains of the simulated arm (cameras, appearance, mounting of the arm), and their scenes in MuJoCo.
 
 The origin of the world frame is on the table under the robot: x to the front, y to the robot's left, z up. The robot
 base may be rotated about z (`base_yaw_deg`); states and actions are in the *base* frame, images show the world.
@@ -24,7 +24,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """Position and direction of a camera: around `look_at_m`; azimuth 0 is in front of the robot, 90 at its left."""
+    """Position of a camera that looks at `look_at_m`. Azimuth 0 is in front of the robot, 90 degrees at its left."""
 
     azimuth_deg: float
     elevation_deg: float
@@ -43,7 +43,7 @@ class CameraPlace:
         return pose
 
     def turned(self, angle_deg: float) -> CameraPlace:
-        """Return the same position, rotated further on the circle."""
+        """Return the position with a larger azimuth."""
         return replace(self, azimuth_deg=self.azimuth_deg + angle_deg)
 
 
@@ -64,21 +64,21 @@ class Look:
 
 @dataclass(frozen=True)
 class Domain:
-    """A world in which episodes are recorded."""
+    """A world: camera, appearance, mounting and lag of the arm, and objects on the table."""
 
     name: str
     camera: CameraPlace
     look: Look
-    base_yaw_deg: float = 0.0  # mounting of the robot: the same action moves the arm in another direction in the image
+    base_yaw_deg: float = 0.0  # rotation of the robot's base about z; changes the direction of an action in the image
     lag_s: float = 0.08  # time constant with which the measured pose follows the commanded one
     clutter_seed: int = 0  # selects the objects on the table, and their positions
     texture_seed: int = 0  # selects the patterns of table, floor and walls; 0: planks, tiles, panels
-    moving: int = 0  # so many of the five objects circle on the table, touching nothing
+    moving: int = 0  # number of the five objects that move on circles on the table, without collisions
 
     def base_pose(self) -> Float[np.ndarray, "4 4"]:
         """Return the robot base frame in the world."""
         pose = np.eye(4)
-        from scipy.spatial.transform import Rotation  # late: the names of domains are needed before
+        from scipy.spatial.transform import Rotation  # late, so that the names of domains need no SciPy
 
         pose[:3, :3] = Rotation.from_euler("z", self.base_yaw_deg, degrees=True).as_matrix()
         return pose
@@ -86,7 +86,7 @@ class Domain:
 
 @dataclass(frozen=True)
 class DomainRanges:
-    """The ranges of `sample_domain`, drawn uniformly."""
+    """The ranges from which `sample_domain` draws uniformly."""
 
     azimuth_deg: Range = (25.0, 75.0)
     elevation_deg: Range = (18.0, 38.0)
@@ -97,8 +97,8 @@ class DomainRanges:
     light_azimuth_deg: Range = (0.0, 360.0)
     light_elevation_deg: Range = (40.0, 75.0)
     ambient: Range = (0.35, 0.6)
-    textures: bool = False  # whether patterns are drawn, too
-    moving: int = 0  # objects that circle
+    textures: bool = False  # whether patterns are random, too
+    moving: int = 0  # number of moving objects
 
 
 DOMAIN_A = Domain(
@@ -113,7 +113,7 @@ DOMAIN_A = Domain(
         wall=(0.47, 0.53, 0.58),
     ),
 )
-"""The nominal world: camera at the robot's front left, a white arm before blue-grey."""
+"""The domain of the base model: camera at the robot's front left, a white arm on a blue-grey background."""
 
 DOMAIN_B = Domain(
     name="B",
@@ -133,7 +133,7 @@ DOMAIN_B = Domain(
     lag_s=0.10,
     clutter_seed=7,
 )
-"""The shifted world: camera turned by 43 degrees, a dark arm before wood, other light, the robot turned by 30."""
+"""The shifted domain: camera rotated by 43 degrees, dark arm on wood, other light, robot rotated by 30 degrees."""
 
 DOMAINS = {domain.name: domain for domain in (DOMAIN_A, DOMAIN_B)}
 
@@ -142,7 +142,7 @@ def named_domain(name: str) -> Domain:
     """Return domain `A` or `B`.
 
     Raises:
-        InputError: There is no domain of that name.
+        InputError: There is no domain with this name.
     """
     if name not in DOMAINS:
         raise InputError(where="domain", found=repr(name), needed=f"one of {', '.join(DOMAINS)}, or random")
@@ -150,9 +150,9 @@ def named_domain(name: str) -> Domain:
 
 
 def sample_domain(rng: np.random.Generator, ranges: DomainRanges = DomainRanges()) -> Domain:
-    """Return a random world: camera, light, colours and mounting, for training a base over many of them.
+    """Return a random domain (camera, light, colours, mounting), for training a base model on many domains.
 
-    The arm is always light before dark or dark before light, so that it is visible.
+    The arm is always light on a dark background or dark on a light one, so that it is visible.
     """
 
     def draw(bounds: Range) -> float:
@@ -195,20 +195,20 @@ def _sample_colours(rng: np.random.Generator) -> Look:
     )
 
 
-STATIC_GROUP, ARM_GROUP = 0, 1  # geom groups: static, and moving
+STATIC_GROUP, ARM_GROUP = 0, 1  # geom groups: static geoms; the arm, the block and moving objects
 FINGER_TRAVEL_M = 0.04
 FINGER_INSIDE_M, FINGER_OUTSIDE_M, FINGER_HALF_M = 0.004, 0.028, 0.014
-"""Of a closed finger: from the middle of the hand to its inner and outer side, and half its width across."""
+"""Distances from the middle of the hand to the inner and outer side of a closed finger, and half the finger's width."""
 FINGERTIP_M = 0.15  # length of the fingers beyond the flange
 BLOCK_M = 0.06  # edge length of the block, a cube
-MARK_M = 0.055  # radius of the mark, a flat disc: it is seen on all sides of a block that lies in its middle
+MARK_M = 0.055  # radius of the mark, a flat disc; it is visible on all sides of a block in its centre
 WORK_AREA_M = ((0.28, 0.74), (-0.38, 0.38))
 """Ranges of x and y in the world that are kept free of other objects, for the block."""
-SUBSTEPS = 32  # steps of physics per control step
-MOVING = "moving"  # how the names of bodies begin that circle
+SUBSTEPS = 32  # physics steps per control step
+MOVING = "moving"  # prefix of the names of moving bodies
 
 _SCENE = "assets/simulation/arm.xml"
-_COLOURED = ("arm", "joints", "hand", "table", "floor", "wall")  # classes of geoms, and colours of a Look
+_COLOURED = ("arm", "joints", "hand", "table", "floor", "wall")  # classes of geoms, which are also fields of `Look`
 
 
 def load_mujoco() -> Any:
@@ -223,41 +223,42 @@ def load_mujoco() -> Any:
 def compile_scene(domain: Domain, *, block: bool = False, mark: bool = False) -> Any:
     """Return the compiled `mujoco.MjModel` of a domain.
 
-    It has seven hinges `joint1` .. `joint7`, two slides `finger1`, `finger2`, and the site `flange`.
+    The model has seven hinges `joint1` .. `joint7`, two slides `finger1`, `finger2`, and the site `flange`.
 
     Args:
-        domain: Its world.
-        block: Whether the free body `block` lies in the work area, which is cleared for it, and servos drive the arm.
-        mark: Whether a coloured disc lies on the table: the mocap body `mark`, which nothing touches.
+        domain: The domain.
+        block: Whether to add the free body `block`, keep the work area free of other objects, and drive the arm by
+            servos.
+        mark: Whether to add a coloured disc on the table: the mocap body `mark`, without collisions.
 
     Raises:
         UnreachableError: MuJoCo is not installed.
     """
     mujoco = load_mujoco()
-    root = ET.fromstring(importlib.resources.files("vjepa2_ac").joinpath(_SCENE).read_text())  # noqa: S314 - our own
+    root = ET.fromstring(importlib.resources.files("vjepa2_ac").joinpath(_SCENE).read_text())  # noqa: S314 - packaged
     world, actuators = root.findall("worldbody")[0], root.findall("actuator")[0]
     bodies = {body.get("name"): body for body in world.iter("body")}
-    for one in root.iter("default"):
-        if (name := one.get("class", "").split("_")[-1]) in _COLOURED:
-            geom = one.find("geom")
-            (ET.SubElement(one, "geom") if geom is None else geom).set("rgba", _text(*getattr(domain.look, name), 1.0))
+    for element in root.iter("default"):
+        if (name := element.get("class", "").split("_")[-1]) in _COLOURED:
+            geom = ET.SubElement(element, "geom") if (existing := element.find("geom")) is None else existing
+            geom.set("rgba", _text(*getattr(domain.look, name), 1.0))
     bodies["link0"].set("euler", _text(0.0, 0.0, np.deg2rad(domain.base_yaw_deg)))
-    for number, thing in enumerate(_things(np.random.default_rng(domain.clutter_seed), avoid_work_area=block)):
+    for number, geom_values in enumerate(_clutter(np.random.default_rng(domain.clutter_seed), avoid_work_area=block)):
         if number < domain.moving:
-            body = ET.SubElement(world, "body", name=f"{MOVING}{number}", mocap="true", pos=thing.pop("pos"))
-            ET.SubElement(body, "geom", thing | {"group": str(ARM_GROUP), "contype": "0", "conaffinity": "0"})
+            body = ET.SubElement(world, "body", name=f"{MOVING}{number}", mocap="true", pos=geom_values.pop("pos"))
+            ET.SubElement(body, "geom", geom_values | {"group": str(ARM_GROUP), "contype": "0", "conaffinity": "0"})
         else:
-            ET.SubElement(world, "geom", thing)
-    for name, wanted in {"block": block, "mark": mark}.items():
-        if not wanted:
+            ET.SubElement(world, "geom", geom_values)
+    for name, is_included in {"block": block, "mark": mark}.items():
+        if not is_included:
             world.remove(bodies[name])
     if not block:
         root.remove(actuators)
     return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
 
 
-def _things(rng: np.random.Generator, *, avoid_work_area: bool) -> Iterator[dict[str, str]]:
-    """Yield the attributes of five objects on the table, outside the robot's foot."""
+def _clutter(rng: np.random.Generator, *, avoid_work_area: bool) -> Iterator[dict[str, str]]:
+    """Yield the geom attributes of five objects on the table, in front of the robot's base."""
     for index in range(5):
         x, y = rng.uniform(0.25, 0.8), rng.uniform(-0.5, 0.5)
         size, height = rng.uniform(0.02, 0.04), rng.uniform(0.02, 0.05)
@@ -270,5 +271,5 @@ def _things(rng: np.random.Generator, *, avoid_work_area: bool) -> Iterator[dict
 
 
 def _text(*numbers: float) -> str:
-    """Return numbers as text, exactly."""
+    """Return numbers as text without rounding."""
     return " ".join(repr(float(number)) for number in numbers)

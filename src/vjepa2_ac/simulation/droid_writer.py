@@ -1,6 +1,6 @@
-"""Writer of data sets in DROID's RLDS schema, field for field, so that TFDS itself reads them.
+"""Write data sets in exactly DROID's RLDS schema, so that TFDS can read them.
 
-Source: measured on files that TFDS wrote in DROID's schema (layout, kinds of lists, names; no code).
+Source: files that TFDS wrote in DROID's schema (layout, types of lists, names; no code was used).
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ _ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "droid"
 
 @dataclass(frozen=True)
 class DroidEpisode:
-    """One demonstration as DROID records it.
+    """One demonstration with the fields of DROID.
 
     Discount, reward and the first, last and terminal flags follow from the length and `/success/` in the path.
     """
 
-    file_path: str  # …/success/… or …/failure/…; with the folder it is the episode's identity
+    file_path: str  # …/success/… or …/failure/…; together with the folder it identifies the episode
     recording_folderpath: str
-    arrays: Mapping[str, Float[np.ndarray, "steps width"]]  # by feature: `action_dict/joint_position`
+    arrays: Mapping[str, Float[np.ndarray, "steps width"]]  # by feature, for example `action_dict/joint_position`
     images: Mapping[str, Sequence[bytes]]  # one JPEG per step for each of CAMERAS
     language_instruction: str = ""
 
@@ -47,13 +47,13 @@ def write_droid_rlds(
 ) -> Path:
     """Write episodes as a data set in DROID's RLDS schema and return its folder; one episode is in memory at a time.
 
-    Episodes are assigned to the shards in turn. An incomplete folder is never a data set.
+    Episodes are assigned to the shards in turn. An interrupted call leaves no folder that is read as a data set.
 
     Args:
-        folder: New or empty.
-        episodes: What is written.
-        shards: TFRecord files.
-        notes: Other text files beside the shards, by name; TFDS and our reader use only those that they know.
+        folder: A new or empty folder.
+        episodes: The episodes to write.
+        shards: Number of TFRecord files.
+        notes: Contents of additional text files in the folder, by name.
 
     Raises:
         InputError: The folder exists and is not empty, or cannot be written, or there are fewer episodes than shards.
@@ -88,7 +88,7 @@ def write_droid_rlds(
 
 
 def dataset_info(name: str, version: str, counts: Sequence[int], num_bytes: int) -> dict[str, Any]:
-    """Return dataset_info.json of one `train` split with these numbers of episodes per shard."""
+    """Return the content of dataset_info.json for one split, `train`, with the given numbers of episodes per shard."""
     split = {
         "filepathTemplate": "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}",
         "name": "train",

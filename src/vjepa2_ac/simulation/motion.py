@@ -1,4 +1,4 @@
-"""Motion: the arm's kinematics, and how joints follow commands on drawn ways."""
+"""Kinematics of the arm, and random reaching motions whose commands the joints follow with a lag."""
 
 from __future__ import annotations
 
@@ -27,18 +27,20 @@ LENGTH_M, TWIST_DEG, OFFSET_M, LOW, HIGH = np.array([
     [0.0, 90.0, 0.0, -0.0175, 3.7525],
     [0.088, 90.0, 0.0, -2.8973, 2.8973],
 ]).T  # fmt: skip
-"""Seven revolute joints, each in the frame of the one before: Rx(twist) Tx(length) Rz(angle) Tz(offset); limits in rad.
+"""Seven revolute joints. The transform from the previous joint is Rx(twist) Tx(length) Rz(angle) Tz(offset).
+
+LOW and HIGH are the joint limits in radians.
 
 Source: Franka Emika, robot and interface specifications: DH parameters (Craig) and joint limits.
 """
 HOME = np.array([0.0, -0.4, 0.0, -2.4, 0.0, 2.0, 0.8])
-"""The gripper points down in front of the robot; the flange is near (0.42, 0, 0.46)."""
+"""Rest position: the gripper points down in front of the robot; the flange is near (0.42, 0, 0.46) m."""
 
 _TOLERANCE_M, _TOLERANCE_RAD, _ITERATIONS = 1e-5, 1e-4, 200
 
 
 class OutOfReachError(ValueError):
-    """No joint angles within the limits bring the flange to this pose."""
+    """No joint angles within the limits reach a pose of the flange."""
 
 
 def forward_kinematics(joints: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch 6"]:
@@ -48,13 +50,13 @@ def forward_kinematics(joints: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarra
 
 
 def inverse_kinematics(pose: Float[np.ndarray, " 6"], start: Joints = HOME, *, rest: Joints = HOME) -> Joints:
-    """Return joint angles that bring the flange to a pose: to 0.01 mm and 0.006 degrees, within the limits.
+    """Return joint angles within the limits that reach a pose of the flange, to 0.01 mm and 0.006 degrees.
 
-    Damped least squares, the damping falling with the error; the redundant degree of freedom is pulled to `rest`: a
-    smooth path of poses, each started at the previous solution, gives a smooth path of joints.
+    The method is damped least squares with a damping that decreases with the error. The redundant degree of freedom is
+    pulled towards `rest`. A smooth path of poses, each started at the previous solution, gives a smooth path of joints.
 
     Raises:
-        OutOfReachError: The pose was not reached from `start`, nor from `rest`.
+        OutOfReachError: The pose is reached neither from `start` nor from `rest`.
     """
     rotation = matrices_from_euler(pose[3:])
     for first in (start, rest):
@@ -70,7 +72,7 @@ def inverse_kinematics(pose: Float[np.ndarray, " 6"], start: Joints = HOME, *, r
 
 
 def _limited_step(jacobian: Jacobian, error: Float[np.ndarray, " 6"], joints: Joints, rest: Joints) -> Joints:
-    """Return the joints after one step; a joint pushed against its limit stays, and the others compensate."""
+    """Return the joint angles after one step. A joint that would exceed its limit is fixed; the others compensate."""
     free = np.ones(7)
     for _ in range(3):
         step = _step(jacobian * free, error, (rest - joints) * free)
@@ -82,9 +84,9 @@ def _limited_step(jacobian: Jacobian, error: Float[np.ndarray, " 6"], joints: Jo
 
 
 def _step(jacobian: Jacobian, error: Float[np.ndarray, " 6"], to_rest: Joints) -> Joints:
-    """Return one damped step towards the pose, and in its null space towards rest.
+    """Return one damped step towards the pose, and in its null space towards the rest position.
 
-    The pull to rest fades with the error: near the pose it must not disturb the convergence.
+    The pull to the rest position decreases with the error, so that it does not slow down the convergence.
     """
     size = float(np.linalg.norm(error))
     damped = jacobian @ jacobian.T + (1e-7 + 0.05 * size**2) * np.eye(6)
@@ -135,7 +137,7 @@ GRIPPER_LAG_S = 0.12
 
 @dataclass(frozen=True)
 class MotionRecipe:
-    """Ranges of random reaching. The box is in the world frame, for the flange."""
+    """Ranges of random reaching motions. The box of flange positions is in the world frame."""
 
     stride: int = 4  # control steps per model step
     reach_m: float = 0.075  # largest displacement per axis and model step
@@ -172,11 +174,11 @@ def random_reaching(
 ) -> Motion:
     """Return a random demonstration of `steps` control steps.
 
-    The same generator gives the same motion in the *world*, whatever the mounting of the robot.
+    The same generator gives the same motion in the *world*, independently of the mounting of the robot.
     """
-    ways = -(-steps // recipe.stride) + 1
-    times = np.arange(ways + 1) * recipe.stride
-    positions, turns, closed = _waypoints(ways, rng, recipe)
+    segments = -(-steps // recipe.stride) + 1
+    times = np.arange(segments + 1) * recipe.stride
+    positions, turns, closed = _waypoints(segments, rng, recipe)
     path = PchipInterpolator(times, np.concatenate([positions, turns[:, None]], axis=1))(np.arange(steps + 1))
     gripper = closed[np.arange(steps + 1) // recipe.stride]
     joints = [rest := rest_joints(domain)]
@@ -192,34 +194,38 @@ def random_reaching(
 
 
 def rest_joints(domain: Domain) -> Float[np.ndarray, " 7"]:
-    """Return joint angles with the gripper over the middle of the table, however the robot is mounted."""
+    """Return joint angles with the gripper over the middle of the table, for the mounting of the robot in a domain."""
     joints = HOME.copy()
     joints[0] -= np.deg2rad(domain.base_yaw_deg)
     return joints
 
 
 def downward_poses(path: Float[np.ndarray, "steps 4"]) -> Float[np.ndarray, "steps 6"]:
-    """Return poses with the gripper pointing down; a rotation of 0 holds the fingers across the robot's front."""
+    """Return poses with the gripper pointing down, from x, y, z and the rotation about the vertical.
+
+    At a rotation of 0 the fingers open along the robot's left-right axis.
+    """
     down = np.tile([np.pi, 0.0], (len(path), 1))
     return np.concatenate([path[:, :3], down, path[:, 3:] - np.pi / 4], axis=1)
 
 
 def poses_in_base(poses: Float[np.ndarray, "steps 6"], domain: Domain) -> Float[np.ndarray, "steps 6"]:
-    """Return poses of the world frame in the robot base frame."""
+    """Convert poses from the world frame to the robot base frame."""
     to_base = domain.base_pose()[:3, :3].T
     rotations = to_base @ matrices_from_euler(poses[:, 3:])
     return np.concatenate([poses[:, :3] @ to_base.T, euler_from_matrices(rotations)], axis=1)
 
 
 def tracking_share(lag_s: float) -> float:
-    """Return the share of the distance to the command that is covered in one control step."""
+    """Return the share of the distance to the command that the arm covers in one control step."""
     return float(1.0 - np.exp(-1.0 / (CONTROL_RATE_HZ * lag_s)))
 
 
 def follow(commands: Float[np.ndarray, "steps_and_one dim"], share: float) -> Float[np.ndarray, "steps dim"]:
-    """Return the measurements if commands are followed with a lag, from rest at the first command, which is left out.
+    """Return the measurements of an arm that follows commands with a lag, starting at rest at the first command.
 
-    Measurement t is taken when command t is issued, so it can follow only the commands before it.
+    The first command has no measurement. Measurement t is taken when command t is issued, so it depends only on earlier
+    commands.
     """
     measured = np.empty_like(commands[1:], dtype=np.float64)
     measured[0] = commands[0]
@@ -229,17 +235,17 @@ def follow(commands: Float[np.ndarray, "steps_and_one dim"], share: float) -> Fl
 
 
 def _waypoints(
-    ways: int, rng: np.random.Generator, recipe: MotionRecipe
-) -> tuple[Float[np.ndarray, "ways 3"], Float[np.ndarray, " ways"], Float[np.ndarray, " ways"]]:
-    """Return positions, rotations about the vertical and closedness; a step out of the box is mirrored back."""
+    segments: int, rng: np.random.Generator, recipe: MotionRecipe
+) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """Return waypoints: positions, rotations about the vertical, closedness. Steps out of the box are reversed."""
     low, high = np.append(recipe.low_m, -recipe.max_turn_rad), np.append(recipe.high_m, recipe.max_turn_rad)
     drift = np.append(recipe.drift_m or np.zeros(3), 0.0)
     reach = np.append(0.3 * drift[:3] if recipe.drift_m else [recipe.reach_m] * 3, recipe.turn_rad)
-    points, closed = [rng.uniform(low, high - ways * drift)], [float(rng.uniform() < 0.5)]
-    for _ in range(ways):
-        way = drift + rng.uniform(-reach, reach)
-        outside = (points[-1] + way < low) | (points[-1] + way > high)
-        points.append(points[-1] + np.where(outside, -way, way))
+    points, closed = [rng.uniform(low, high - segments * drift)], [float(rng.uniform() < 0.5)]
+    for _ in range(segments):
+        step = drift + rng.uniform(-reach, reach)
+        outside = (points[-1] + step < low) | (points[-1] + step > high)
+        points.append(points[-1] + np.where(outside, -step, step))
         closed.append(1.0 - closed[-1] if rng.uniform() < recipe.gripper_share else closed[-1])
     path = np.array(points)
     return path[:, :3], path[:, 3], np.array(closed)

@@ -1,4 +1,4 @@
-"""References for a planner, which look at no image: zero actions, random actions, and oracles."""
+"""Reference policies for a planner that use no images: zero actions, random actions, scripted experts."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from vjepa2_ac.simulation.rollout import Action, Image, Observation, Trial, put,
 from vjepa2_ac.simulation.tasks import GRASP_M, RELEASED, TaskName, TaskProblem, make_problem
 from vjepa2_ac.spaces import apply_action
 
-_ALMOST = 1 - 1e-9  # of a limit: rounding must not exceed it
+_ALMOST = 1 - 1e-9  # factor that keeps actions within a limit despite rounding
 
 
 class ZeroActions:
-    """Does not move the arm. Base class of the references.
+    """Returns the zero action. Base class of the reference policies.
 
     Args:
         limits: The allowed actions.
@@ -36,19 +36,19 @@ class ZeroActions:
 
     def act(self, observation: Observation) -> State:
         """Return the next action, within the limits."""
-        return shortened(self._way(observation), self._limits)
+        return shortened(self._change(observation), self._limits)
 
-    def _way(self, observation: Observation) -> State:
-        """Return the action before it is shortened."""
+    def _change(self, observation: Observation) -> State:
+        """Return the desired change of the state, before it is shortened to the limits."""
         return np.zeros_like(observation.state)
 
 
 class RandomActions(ZeroActions):
-    """Draws actions uniformly from the allowed ones; the same trial gets the same actions.
+    """Draws actions uniformly within the limits; the same trial gets the same actions.
 
     Args:
         limits: The allowed actions: `xyz`, `rotation` and `gripper` of each axis.
-        seed: Of the actions, with that of the trial.
+        seed: Seed of the actions, combined with that of the trial.
     """
 
     name, why = "random", "random"
@@ -61,35 +61,37 @@ class RandomActions(ZeroActions):
         """Seed the generator for this trial."""
         self._rng = np.random.default_rng([self._seed, trial.seed])
 
-    def _way(self, observation: Observation) -> State:
+    def _change(self, observation: Observation) -> State:
         return np.asarray(self._rng.uniform(-1.0, 1.0, size=len(observation.state)) * farthest(self._limits))
 
 
 class Oracle(ZeroActions):
-    """Knows the goal state and observes the block, and does a task of the simulated arm as fast as allowed.
+    """A scripted policy that uses the goal state and the pose of the block, and moves as fast as the limits allow.
 
-    It does not rotate.
+    It does not rotate the hand.
     """
 
     name, why = "oracle", "scripted"
 
     def reset(self, trial: Trial, goal_image: Image) -> None:  # noqa: ARG002
-        """Set the goal.
+        """Set the problem to solve.
 
         Raises:
-            ValueError: It is a trial of another environment.
+            ValueError: The trial belongs to another environment than the simulated arm.
         """
         if trial.problem is None:
             raise ValueError(f"trial {trial.seed} is none of the simulated arm: use Expert")
         self._problem = trial.problem
 
-    def _way(self, observation: Observation) -> State:
-        way, state, block = _WAYS.get(self._problem.task), observation.state, observation.block
-        return _reach_way(self._problem, state) if way is None or block is None else way(self._problem, state, block)
+    def _change(self, observation: Observation) -> State:
+        script, state, block = _SCRIPTS.get(self._problem.task), observation.state, observation.block
+        if script is None or block is None:
+            return _reach_change(self._problem, state)
+        return script(self._problem, state, block)
 
 
 class Expert:
-    """Lets the scripted expert of an environment act."""
+    """A policy that lets the scripted expert of an environment act."""
 
     name, why = "expert", "scripted"
 
@@ -97,91 +99,91 @@ class Expert:
         """Start an episode."""
 
     def act(self, observation: Observation) -> Action | None:  # noqa: ARG002
-        """Leave the action to the environment."""
+        """Return None, with which the environment's expert acts."""
         return None
 
 
 def farthest(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
-    """Return the largest size of each component of an action; 0 where it is fixed."""
+    """Return the largest absolute value of each number of an action; 0 if the number is fixed."""
     gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
     return np.array([*limits.xyz_m, *[limits.rotation] * 3, gripper])
 
 
-def shortened(way: Float[np.ndarray, " 7"], limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
-    """Return the displacement of a model step, in its direction, clipped to the limits.
+def shortened(change: Float[np.ndarray, " 7"], limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
+    """Shorten a change of the state to the limits of one model step, without changing its direction.
 
-    Position, rotation and gripper are scaled independently; a fixed axis is left out.
+    Position, rotation and gripper are scaled independently. Fixed axes are set to zero.
     """
     reach = farthest(limits)
-    way = np.where(reach > 0, way, 0.0)
+    change = np.where(reach > 0, change, 0.0)
     for part in (slice(0, 3), slice(3, 6), slice(6, 7)):
-        beyond = np.abs(way[part]) / np.where(reach[part] > 0, reach[part], 1.0)
-        way[part] *= min(1.0, _ALMOST / max(float(beyond.max()), 1e-12))
-    return way
+        beyond = np.abs(change[part]) / np.where(reach[part] > 0, reach[part], 1.0)
+        change[part] *= min(1.0, _ALMOST / max(float(beyond.max()), 1e-12))
+    return change
 
 
-_PUSH_M = 0.035  # per model step: a block that is hit faster slides on
-_NEAR_M = 0.006  # a block closer to its goal is not moved
-_OVER_M = 0.012  # closer to the place of the grasp than this, fingers can close
-_CLEAR_M = 0.065  # above the place of the grasp, fingers pass over the block
-_PLACED_M, _LOW_M = 0.02, 0.01  # a block that is closer to the mark's middle and to the table is let go
-_CARRY_M, _LIFTED_M = 0.08, 0.03  # height over the table of a carried block, and the least before it is carried
-_TO_MARK_M = 0.03  # a block that is closer to the mark's middle goes down
+_PUSH_M = 0.035  # longest step while pushing; a block that is hit faster keeps sliding
+_NEAR_M = 0.006  # a block closer to its goal than this is not pushed
+_OVER_M = 0.012  # the fingers close if the flange is closer to the grasp position than this
+_CLEAR_M = 0.065  # height above the grasp position at which the fingers pass over the block
+_PLACED_M, _LOW_M = 0.02, 0.01  # a block closer to the centre of the mark and to the table is released
+_CARRY_M, _LIFTED_M = 0.08, 0.03  # height above the table of a carried block, and the lowest height for carrying
+_TO_MARK_M = 0.03  # a block closer to the centre of the mark than this is lowered
 
 
-def _reach_way(problem: TaskProblem, state: State) -> State:
-    """Straight to the goal."""
-    way: np.ndarray = problem.goal - state
-    way[3:6] = 0.0
-    return way
+def _reach_change(problem: TaskProblem, state: State) -> State:
+    """Move straight to the goal."""
+    change: np.ndarray = problem.goal - state
+    change[3:6] = 0.0
+    return change
 
 
-def _push_way(problem: TaskProblem, state: State, block: Block) -> State:
-    """Push the block along the line to its goal: forwards, straight behind the block."""
-    goal, way = problem.ends[1, :2], np.zeros_like(state)
+def _push_change(problem: TaskProblem, state: State, block: Block) -> State:
+    """Push the block along the line to its goal, with the gripper straight behind it."""
+    goal, change = problem.ends[1, :2], np.zeros_like(state)
     direction = goal - problem.ends[0, :2]
     direction = direction / np.linalg.norm(direction)
-    if (goal - block[:2]) @ direction < _NEAR_M:  # the rest is too short, or it slid past
-        return way
+    if (goal - block[:2]) @ direction < _NEAR_M:  # at the goal, or past it
+        return change
     to_block = block[:2] - state[:2]
     beside = to_block - direction * (to_block @ direction)
     ahead = direction * ((problem.goal[:2] - state[:2]) @ direction)
-    way[:2], way[2], way[6] = ahead + beside, problem.goal[2] - state[2], 1.0 - state[6]
-    way[:3] *= min(1.0, _PUSH_M / float(np.linalg.norm(way[:3])))
-    return way
+    change[:2], change[2], change[6] = ahead + beside, problem.goal[2] - state[2], 1.0 - state[6]
+    change[:3] *= min(1.0, _PUSH_M / float(np.linalg.norm(change[:3])))
+    return change
 
 
-def _pick_way(problem: TaskProblem, state: State, block: Block) -> State:
-    """Move over the block, down, close, and lift."""
+def _pick_change(problem: TaskProblem, state: State, block: Block) -> State:
+    """Grasp the block and lift it."""
     if not _holds(state, block):
-        return _grasp_way(state, block)
-    way = np.zeros_like(state)
-    way[:3], way[6] = problem.goal[:3] - state[:3], 1.0 - state[6]  # lift, and keep closing
-    return way
+        return _grasp_change(state, block)
+    change = np.zeros_like(state)
+    change[:3], change[6] = problem.goal[:3] - state[:3], 1.0 - state[6]  # lift, and keep closing
+    return change
 
 
-def _place_way(problem: TaskProblem, state: State, block: Block) -> State:
-    """Pick the block up, carry it over the mark, put it down, open, and move up."""
-    goal, way = problem.ends[1], np.zeros_like(state)
+def _place_change(problem: TaskProblem, state: State, block: Block) -> State:
+    """Grasp the block, carry it over the mark, put it down, open the gripper, and move up."""
+    goal, change = problem.ends[1], np.zeros_like(state)
     to_goal = goal[:3] - block[:3]
     if np.linalg.norm(to_goal[:2]) < _PLACED_M and -to_goal[2] < _LOW_M:
-        way[6] = -state[6]
+        change[6] = -state[6]
         if state[6] < RELEASED:
-            way[:3] = problem.goal[:3] - state[:3]
-        return way
+            change[:3] = problem.goal[:3] - state[:3]
+        return change
     if not _holds(state, block):
-        return _grasp_way(state, block)
-    way[:3], way[6] = to_goal, 1.0 - state[6]
+        return _grasp_change(state, block)
+    change[:3], change[6] = to_goal, 1.0 - state[6]
     if np.linalg.norm(to_goal[:2]) > _TO_MARK_M:
-        way[2] += _CARRY_M
-        way[:2] *= float(block[2] - goal[2] > _LIFTED_M)  # first up
-    return way
+        change[2] += _CARRY_M
+        change[:2] *= float(block[2] - goal[2] > _LIFTED_M)  # lift first
+    return change
 
 
-_WAYS: dict[TaskName, Callable[[TaskProblem, np.ndarray, np.ndarray], np.ndarray]] = {
-    "push": _push_way,
-    "pick": _pick_way,
-    "place": _place_way,
+_SCRIPTS: dict[TaskName, Callable[[TaskProblem, np.ndarray, np.ndarray], np.ndarray]] = {
+    "push": _push_change,
+    "pick": _pick_change,
+    "place": _place_change,
 }
 
 
@@ -193,40 +195,41 @@ def _holds(state: State, block: Block) -> bool:
     return bool(np.linalg.norm(_to_grasp(state, block)) < _OVER_M * 1.5 and state[6] > RELEASED)
 
 
-def _grasp_way(state: State, block: Block) -> State:
-    """Move over the block, down, and close."""
-    way, to_place = np.zeros_like(state), _to_grasp(state, block)
-    if np.linalg.norm(to_place) < _OVER_M:
-        way[6] = 1.0 - state[6]
+def _grasp_change(state: State, block: Block) -> State:
+    """Move over the block, down, and close the gripper."""
+    change, to_grasp = np.zeros_like(state), _to_grasp(state, block)
+    if np.linalg.norm(to_grasp) < _OVER_M:
+        change[6] = 1.0 - state[6]
     else:
-        way[:3], way[6] = to_place, -state[6]
-        if np.linalg.norm(to_place[:2]) > _OVER_M:
-            way[2] = max(way[2], min(0.0, way[2] + _CLEAR_M))  # not down on the block's edge
-    return way
+        change[:3], change[6] = to_grasp, -state[6]
+        if np.linalg.norm(to_grasp[:2]) > _OVER_M:
+            change[2] = max(change[2], min(0.0, change[2] + _CLEAR_M))  # stays above the block while moving over it
+    return change
 
 
 # ---- demonstrations with a block: the oracle with noise, or random play ----
 
-_NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's step
-_LOWEST_M, _HIGHEST_M = 0.155, 0.34  # of the flange while playing
-_TO_BLOCK = 0.5  # probability that a step of play goes to the block, or through it
-_AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # of the flange while playing, in the world
+_NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's action
+_LOWEST_M, _HIGHEST_M = 0.155, 0.34  # bounds of the flange's height during random play
+_TO_BLOCK = 0.5  # probability that an action of random play goes to the block, or through it
+_AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # bounds of the flange's (x, y) during random play, in the world
 
 
 def play(
     arm: SimulatedArm, task: TaskName, steps: int, rng: np.random.Generator, *, script: bool, look: Look | None = None
 ) -> Motion:
-    """Return a demonstration of `steps` control steps with an arm that touches the block.
+    """Carry out a demonstration of `steps` control steps with a block, and return its motion.
 
-    Afterwards arm and block are where control step `steps` would be measured; fewer steps are the beginning of more.
+    Afterwards arm and block are in the state in which control step `steps` would be measured. A shorter demonstration
+    equals the beginning of a longer one.
 
     Args:
-        arm: From `arm_for` of this task.
-        task: One with a block: the problem at the start, and whether the gripper is used.
-        steps: Control steps; 0: only the start is drawn.
+        arm: The arm from `arm_for` for this task.
+        task: A task with a block. It determines the start, and whether the gripper is used.
+        steps: Number of control steps; 0: only set the start.
         rng: The only source of randomness.
-        script: Whether an oracle solves the problem, with noise; otherwise, random play.
-        look: Called with the arm.
+        script: Whether an oracle with noise solves the problem; otherwise actions are random play.
+        look: Called with the arm at every control step.
 
     Raises:
         UnreachableError: MuJoCo is not installed.
@@ -256,32 +259,32 @@ def play(
 
 
 def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
-    """Return a step to or through the block, or anywhere; but for `push`, sometimes the gripper opens or closes."""
+    """Return a random action, towards or through the block or anywhere; except for `push` the gripper may move, too."""
     state, block = arm.state, arm.block
     if block is None:
         raise ValueError("there is no block to play with")
     turn = arm.domain.base_pose()[:3, :3]
-    way = np.zeros(ACTION_DIM)
+    change = np.zeros(ACTION_DIM)
     if rng.uniform() < _TO_BLOCK:
         height = GRASP_M if problem.task != "push" else problem.goal[2] - block[2]
-        way[:3] = block[:3] - state[:3] + np.append(rng.normal(0.0, 0.03, size=2), height)
-        way[:2] *= rng.uniform(0.6, 1.8)
+        change[:3] = block[:3] - state[:3] + np.append(rng.normal(0.0, 0.03, size=2), height)
+        change[:2] *= rng.uniform(0.6, 1.8)
     else:
-        way[:3] = rng.uniform(-1.0, 1.0, size=3) * limits.xyz_m
+        change[:3] = rng.uniform(-1.0, 1.0, size=3) * limits.xyz_m
     if problem.task != "push" and rng.uniform() < 0.25:
-        way[6] = rng.choice([-1.0, 1.0]) * limits.gripper
-    way = shortened(way, limits)
-    place = turn @ (state[:3] + way[:3])
+        change[6] = rng.choice([-1.0, 1.0]) * limits.gripper
+    change = shortened(change, limits)
+    target = turn @ (state[:3] + change[:3])
     low, high = np.append(_AREA[0], _LOWEST_M), np.append(_AREA[1], _HIGHEST_M)
-    way[:3] = turn.T @ np.clip(place, low, high) - state[:3]
-    return shortened(way, limits)
+    change[:3] = turn.T @ np.clip(target, low, high) - state[:3]
+    return shortened(change, limits)
 
 
 def _sent(arm: SimulatedArm, action: Float[np.ndarray, " 7"]) -> tuple[np.ndarray, float]:
-    """Return the joints and closedness of a step's command, as far along it as joint angles exist."""
+    """Return the commanded joints and closedness for an action, or for its largest reachable part."""
     joints, target = arm.joints, apply_action(arm.state, action)
-    for way in [target, *reversed(states_along(arm.state, action)[:-1])]:
+    for state in [target, *reversed(states_along(arm.state, action)[:-1])]:
         with suppress(OutOfReachError):
-            joints = arm.joints_for(way)
+            joints = arm.joints_for(state)
             break
     return joints, float(np.clip(target[6], 0.0, 1.0))

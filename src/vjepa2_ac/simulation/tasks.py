@@ -1,6 +1,6 @@
-"""Tasks of the simulated robot: start and target of arm and block, and the criterion of success.
+"""Tasks of the simulated arm: start and goal of arm and block, and the criterion of success.
 
-They are drawn in the world frame: a problem looks the same in every domain, however the robot is mounted.
+Problems are drawn in the world frame, so they are the same in every domain, independently of the robot's mounting.
 """
 
 from __future__ import annotations
@@ -28,44 +28,44 @@ from vjepa2_ac.simulation.motion import MotionRecipe, downward_poses, poses_in_b
 TaskName = Literal["reach", "push", "pick", "place"]
 
 SUCCESS_M: dict[TaskName, float] = {"reach": 0.05, "push": 0.04, "pick": 0.05, "place": 0.04}
-"""Closer than this at the end is a success: the flange to its goal (reach), or the block's middle to its own.
+"""Largest distance to the goal that counts as success: of the flange (reach), or of the block's centre.
 
-place: as push, since the block lies on the table, too; its middle is on the mark then, with 1.5 cm to the edge. That is
-not all: `TaskProblem.succeeded`.
+For place it is the same as for push, because the block is on the table in both; the block's centre is then on the mark,
+at least 1.5 cm from its edge. Place has further conditions: see `TaskProblem.succeeded`.
 """
 
 STEPS: dict[TaskName, int] = {"reach": 8, "push": 8, "pick": 12, "place": 18}
-"""Default number of model steps of an episode; place: the paper's 4 + 10 + 4 of pick-and-place."""
+"""Default number of model steps per episode; for place the paper's 4 + 10 + 4 steps of pick-and-place."""
 
 REACH_WAY_M, PUSH_WAY_M, LIFT_M, PLACE_WAY_M = (0.12, 0.25), (0.10, 0.16), (0.10, 0.14), (0.10, 0.20)
-"""Distance between start and goal: of the flange (reach), of the block (push, place), of the block upwards (pick)."""
+"""Ranges of the distance from start to goal: of the flange (reach), of the block (push, place), of its lift (pick)."""
 
-GRASP_M = FINGERTIP_M - 0.02  # height of the flange over the middle of a block that is to be grasped
+GRASP_M = FINGERTIP_M - 0.02  # height of the flange above the centre of the block when grasping it
 
 HOLDING = 1.0 - (BLOCK_M / 2 - FINGER_INSIDE_M) / FINGER_TRAVEL_M  # closedness of a gripper that holds the block
 
-RELEASED = HOLDING - 0.1  # A gripper that is less closed than this holds no block: 4 mm are left on each side
+RELEASED = HOLDING - 0.1  # closedness below which the block is released, with 4 mm of space on each side
 
-_FLANGE_AREA = np.array([[0.32, -0.26], [0.62, 0.26]])  # low and high (x, y) in the world
+_FLANGE_AREA = np.array([[0.32, -0.26], [0.62, 0.26]])  # lower and upper bounds of (x, y) in the world
 _BLOCK_AREA = np.array([[0.36, -0.26], [0.64, 0.26]])
-_PUSHING_M = 0.17  # height of the flange while pushing: the fingertips are 2 cm over the table
-_GRASP_AREA = _FLANGE_AREA * 0.8 + 0.2 * _FLANGE_AREA.mean(axis=0)  # of a block that is to be picked up, or put down
-_LIES_M = 0.01  # a block whose middle is at most this far from the height of a lying one lies on the table
-_MOST_TURNED_RAD = 0.4  # of block and hand, from straight ahead
+_PUSHING_M = 0.17  # height of the flange while pushing, with the fingertips 2 cm above the table
+_GRASP_AREA = _FLANGE_AREA * 0.8 + 0.2 * _FLANGE_AREA.mean(axis=0)  # area in which a block is picked up or put down
+_LIES_M = 0.01  # tolerance of the height of a block that is on the table
+_MOST_TURNED_RAD = 0.4  # largest rotation of block and hand from straight ahead
 
 
 @dataclass(frozen=True)
 class TaskProblem:
-    """One start and one goal of the simulated arm. All poses are in its base frame (legend: episode.py).
+    """Start and goal of the simulated arm. All poses are in its base frame (conventions: episode.py).
 
-    A block is given by its centre and its rotation about z: x, y, z in metres, radians.
+    The pose of a block is its centre (x, y, z in metres) and its rotation about z in radians.
     """
 
     task: TaskName
     index: int
     start: State
-    goal: State  # of the arm in the goal image
-    block_start: Block | None = None  # None: there is no block
+    goal: State  # state of the arm in the goal image
+    block_start: Block | None = None  # None: the task has no block
     block_goal: Block | None = None
 
     @property
@@ -73,7 +73,7 @@ class TaskProblem:
         """Start and goal of the block.
 
         Raises:
-            ValueError: There is none.
+            ValueError: The task has no block.
         """
         if self.block_start is None or self.block_goal is None:
             raise ValueError(f"{self.task} is done without a block")
@@ -81,16 +81,16 @@ class TaskProblem:
 
     @property
     def mark(self) -> Mark | None:
-        """Middle of the mark on the table, x and y: under the block's goal (place); None: there is none."""
+        """Centre (x, y) of the mark on the table under the block's goal; None for tasks other than place."""
         return self.block_goal[:2] if self.task == "place" and self.block_goal is not None else None
 
     def distance_m(self, state: State, block: Block | None = None) -> float:
-        """Return the distance of the moved object to its goal: of the block if there is one, else of the flange.
+        """Return the distance to the goal, of the block if the task has one, else of the flange.
 
-        Rotations and the gripper do not count.
+        Rotations and the gripper are ignored.
 
         Raises:
-            ValueError: The problem has a block, and none is given.
+            ValueError: The task has a block, but `block` is None.
         """
         if self.block_goal is None:
             return float(np.linalg.norm(state[:3] - self.goal[:3]))
@@ -99,12 +99,12 @@ class TaskProblem:
         return float(np.linalg.norm(block[:3] - self.block_goal[:3]))
 
     def succeeded(self, state: State, block: Block | None = None) -> bool:
-        """Return whether the task is done in a state of arm and block.
+        """Return whether a state of arm and block is a success.
 
-        The distance is below `SUCCESS_M`; place: and the block lies on the table, and the gripper has released it.
+        The distance must be below `SUCCESS_M`. For place, the block must also be on the table and released.
 
         Raises:
-            ValueError: The problem has a block, and none is given.
+            ValueError: The task has a block, but `block` is None.
         """
         near = self.distance_m(state, block) < SUCCESS_M[self.task]
         if self.task != "place" or block is None or self.block_goal is None:
@@ -113,18 +113,18 @@ class TaskProblem:
 
 
 def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskProblem:
-    """Return a problem: a pure function of its arguments, and the same in the world in every domain.
+    """Return a problem. It is a pure function of the arguments, and the same in the world frame in every domain.
 
-    reach: both ends in the box of `MotionRecipe`, gripper pointing down, the same rotation and gripper at both.
-    push: the closed gripper is behind the block, low; the goal is straight ahead, the gripper still behind the block.
-    pick: the open gripper is over the block; at the goal it holds the block in the air.
-    place: the open gripper is over the block; at the goal the block lies on the mark, and the gripper is over it, open.
+    reach: start and goal are in the box of `MotionRecipe`, with the same rotation and gripper; the gripper points down.
+    push: the closed gripper starts behind the block, near the table. At the goal the block is moved straight ahead.
+    pick: the open gripper starts above the block. At the goal it holds the block in the air. place: the open gripper
+    starts above the block. At the goal the block is on the mark, with the open gripper above it.
 
     Args:
         task: The task.
-        domain: Determines only the frame of the problem.
-        seed: Of the problems.
-        index: Of the problem.
+        domain: Determines only the frame of the problem's poses.
+        seed: Seed of all problems.
+        index: Number of the problem.
     """
     drawn = _DRAWN[task](np.random.default_rng([seed, index, list(_DRAWN).index(task)]))
     poses = poses_in_base(downward_poses(_with(drawn.flange, drawn.turn)), domain)
@@ -138,10 +138,10 @@ def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskP
 
 @dataclass(frozen=True)
 class _Drawn:
-    """Start and goal in the world frame."""
+    """Start and goal of a problem in the world frame."""
 
     flange: Float[np.ndarray, "2 3"]
-    turn: float  # rotation of the hand about the vertical, at both
+    turn: float  # rotation of the hand about the vertical, at start and goal
     closedness: tuple[float, float]
     blocks: Float[np.ndarray, "2 4"] | None = None
 
@@ -157,7 +157,7 @@ def _reach(rng: np.random.Generator) -> _Drawn:
 
 
 def _push(rng: np.random.Generator) -> _Drawn:
-    """Push forwards with the fingers' broad side, or to the left or right with a finger's outer side."""
+    """Draw a problem of pushing forwards with the fingers' broad side, or sideways with one finger's outer side."""
     while True:
         turn = rng.uniform(-_MOST_TURNED_RAD, _MOST_TURNED_RAD)
         side = int(rng.integers(-1, 2))  # right, ahead, left
@@ -200,20 +200,20 @@ _DRAWN: dict[TaskName, Callable[[np.random.Generator], _Drawn]] = {
     "pick": _pick,
     "place": _place,
 }
-"""The functions that draw a problem; a task's place among them is the number of its random stream."""
+"""Functions that draw a problem. The order matters: a task's index is part of the seed of its problems."""
 
 
 def _inside(places: Float[np.ndarray, "places 2"], area: Float[np.ndarray, "2 2"]) -> bool:
     return bool(((places >= area[0]) & (places <= area[1])).all())
 
 
-def _with(places: Float[np.ndarray, "places dim"], value: float) -> Float[np.ndarray, "places dim+1"]:
-    """Return places with one more coordinate, the same for all."""
-    return np.concatenate([places, np.full((len(places), 1), value)], axis=1)
+def _with(points: Float[np.ndarray, "points dim"], value: float) -> Float[np.ndarray, "points dim+1"]:
+    """Append the same coordinate to all points."""
+    return np.concatenate([points, np.full((len(points), 1), value)], axis=1)
 
 
 def arm_for(task: TaskName, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE, views: int = 1) -> SimulatedArm:
-    """Return an arm for a task: `reach` needs no contacts, `place` a mark on the table.
+    """Return an arm for a task: without contacts for `reach`, with a mark on the table for `place`.
 
     Raises:
         UnreachableError: MuJoCo is not installed.
