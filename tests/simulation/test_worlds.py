@@ -59,7 +59,7 @@ def test_a_policy_that_knows_the_goal_reaches_it_in_any_world() -> None:
         def reset(self, trial: Trial, goal_image: Image) -> None:  # noqa: ARG002
             self.place = fake_world.place_of(trial.seed)
 
-        def _way(self, observation: Observation) -> np.ndarray:
+        def _change(self, observation: Observation) -> np.ndarray:
             return np.append(self.place - observation.state[:3], np.zeros(4))
 
     with OtherWorld(command()) as world:

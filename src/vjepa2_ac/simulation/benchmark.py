@@ -1,4 +1,4 @@
-"""The closed-loop benchmark: a model that plans and its references in the same trials; and its video."""
+"""The closed-loop benchmark: a planning model and reference policies in the same trials, with a video of the model."""
 
 from __future__ import annotations
 
@@ -60,18 +60,18 @@ JOINT_FIELDS = ("steps/observation/joint_position", "steps/observation/gripper_p
 
 
 class Planning:
-    """A policy: a world model that plans from the images and the measured state.
+    """A policy that plans with a world model from images and the measured state.
 
     Args:
-        controller: Plans with the model; its last `decision` can be read after every action.
-        name: Of the model, as shown in tables.
+        controller: Plans the actions; its attribute `decision` is the last decision.
+        name: Name of the model in tables.
     """
 
     def __init__(self, controller: Controller, name: str = "model") -> None:
         self.controller, self.name, self.why = controller, name, ""
 
     def reset(self, trial: Trial, goal_image: Image) -> None:
-        """Give the planner the goal image, or the sub-goals; without their gripper modes if it moves joints."""
+        """Set the goal image or the sub-goals. For a model of joints the gripper modes of sub-goals are ignored."""
         if not trial.goals:
             self.controller.reset(goal_image)
             return
@@ -79,10 +79,10 @@ class Planning:
         self.controller.follow(trial.goals if has_gripper else [replace(goal, gripper=None) for goal in trial.goals])
 
     def act(self, observation: Observation) -> Action:
-        """Return the first action of a plan; for joints as a change, even if the model's actions are targets.
+        """Return the first action of a plan, as a change of the pose or of the joints.
 
         Raises:
-            ValueError: The model moves joints, and they are not measured.
+            ValueError: The model needs joint angles, which this environment does not measure.
         """
         spaces = self.controller.spaces
         state = observation.joints if spaces.state.position is None else observation.state
@@ -94,14 +94,14 @@ class Planning:
 
 
 def require_to_act(subject: Subject, *, world: bool) -> None:
-    """Refuse a model that takes what is not measured, or whose model step has no known length.
+    """Check that a model needs only measured inputs, and that the length of its model step is known.
 
     Args:
-        subject: Loaded for planning.
-        world: Whether it acts in a third-party environment, whose camera's pose is not known.
+        subject: The model, loaded for planning.
+        world: Whether it acts in a third-party environment, in which the pose of the camera is unknown.
 
     Raises:
-        InputError: It cannot act.
+        InputError: The model cannot act in this environment.
     """
     data = subject.config.data
     require_stride(data, to="act", fix="Say which, as data.stride=4")
@@ -119,14 +119,14 @@ def require_to_act(subject: Subject, *, world: bool) -> None:
 
 
 def policy_of(subject: Subject, arm: SimulatedArm | None) -> Planning:
-    """Return the policy of a model for an arm; None: for a third-party environment.
+    """Return the policy of a model for the simulated arm, or for a third-party environment if `arm` is None.
 
     Raises:
-        InputError: As `require_to_act`.
+        InputError: As for `require_to_act`.
     """
     require_to_act(subject, world=arm is None)
     name = Path(subject.name).name or subject.name
-    if name in {ZeroActions.name, RandomActions.name, Oracle.name}:  # in tables these are the references
+    if name in {ZeroActions.name, RandomActions.name, Oracle.name}:  # names of the reference policies in tables
         name = f"model {name}"
     uses_camera = subject.world_model.sizes.predictor.use_extrinsics
     controller = Controller.of_subject(subject, extrinsics=arm.extrinsics() if arm and uses_camera else None)
@@ -136,7 +136,7 @@ def policy_of(subject: Subject, arm: SimulatedArm | None) -> Planning:
 # ---- the problems ----
 
 FILM = "closed_loop.mp4"
-FORMAT = 2  # incremented when a reader of the file would have to change
+FORMAT = 2  # incremented at changes that require changes of readers
 
 SubGoals = Literal["none", "demonstration", "every-step"]
 _HELP = {
@@ -147,23 +147,23 @@ _HELP = {
 
 @dataclass(frozen=True)
 class BenchmarkOptions:
-    """The problems of a benchmark, how long a policy may take for each, and the sub-goals of the model."""
+    """The options of a benchmark: problems, steps per problem, and sub-goals of the model."""
 
     task: TaskName = "reach"
     domain: str | Domain = "A"  # A, B, or a domain
-    episodes: int = 50  # number of problems, from number 0 on
-    seed: int = 0  # of the problems; settings that were chosen on one seed have to be reported on another
-    steps: int | None = None  # model steps of an episode; None: the task's default
-    stride: int = 4  # control steps of a model step (15 per second); in a benchmark the model's
-    films: int = 6  # episodes, the first ones, whose frames are stored for a video; 0: no video
-    sub_goals: SubGoals = "none"  # from key frames or every step of the expert's solution
+    episodes: int = 50  # number of problems
+    seed: int = 0  # seed of the problems; report options that were selected on one seed with another seed
+    steps: int | None = None  # model steps per episode; None: the task's default
+    stride: int = 4  # control steps (15 per second) per model step; a benchmark uses the model's stride
+    films: int = 6  # number of first episodes whose frames are stored for a video; 0: no video
+    sub_goals: SubGoals = "none"  # sub-goals of the model, from key frames or all steps of the oracle's solution
 
     @property
     def world(self) -> Domain:
         """The domain.
 
         Raises:
-            InputError: There is none of this name.
+            InputError: There is no domain with this name.
         """
         return named_domain(self.domain) if isinstance(self.domain, str) else self.domain
 
@@ -171,7 +171,7 @@ class BenchmarkOptions:
         """Return the trials of the simulated arm.
 
         Raises:
-            InputError: There is no domain of this name.
+            InputError: There is no domain with this name.
         """
         task, domain, steps = self.task, self.world, self.steps or STEPS[self.task]
         problems = (make_problem(task, domain, self.seed, index) for index in range(self.episodes))
@@ -194,18 +194,18 @@ class BenchmarkOptions:
 def run_task(
     options: BenchmarkOptions, policy: Policy, arm: SimulatedArm | None = None, progress: Progress = no_progress
 ) -> ClosedLoopResult:
-    """Let a policy do a task of the simulated arm repeatedly.
+    """Run a policy in all trials of a task with the simulated arm.
 
     Args:
         options: The problems.
         policy: The policy.
-        arm: In their domain, from `arm_for` of this task, to be reused; None: a new one.
+        arm: An arm to reuse, from `arm_for` with this task and domain; None: a new one.
         progress: Called with the number of finished decisions, from 0 on.
 
     Raises:
-        InputError: No such domain.
+        InputError: There is no such domain.
         UnreachableError: MuJoCo is not installed.
-        ValueError: An action that is no action.
+        ValueError: The policy returned an invalid action.
     """
     environment = ArmEnvironment(arm or arm_for(options.task, options.world))
     return run_trials(environment, policy, options.trials(), options.films, progress)
@@ -213,7 +213,7 @@ def run_task(
 
 @dataclass(frozen=True)
 class ClosedLoopBenchmark:
-    """The results of a model (first), zero actions, chance and the expert (last), in the same trials."""
+    """The results of a model (first), reference policies, and the oracle or expert (last) in the same trials."""
 
     subject: Subject
     trials: Trials
@@ -221,21 +221,21 @@ class ClosedLoopBenchmark:
 
     @property
     def conditions(self) -> str:
-        """Where, and with which sub-goals the model acts, as text."""
+        """The domain or environment, and the sub-goals of the model, as text."""
         return f"in {self.trials.place}{_HELP.get(self.trials.about['sub_goals'], '')}"
 
 
 def run_benchmark(subject: Subject, options: BenchmarkOptions, reporter: Reporter = SILENT) -> ClosedLoopBenchmark:
-    """Let a model, zero actions, random actions and an oracle solve the same problems with the simulated arm.
+    """Run a model, zero actions, random actions and an oracle on the same problems with the simulated arm.
 
     Args:
-        subject: The model and its planning settings.
+        subject: The model and its planning config.
         options: The problems, and the sub-goals of the model.
         reporter: Shows the progress of each policy.
 
     Raises:
-        InputError: No such domain, a model that needs what the arm does not measure, or a problem that the oracle does
-            not solve although its demonstration is required.
+        InputError: There is no such domain, the model needs inputs that the arm does not measure, or the oracle does
+            not solve a problem whose demonstration is needed for sub-goals.
         UnreachableError: MuJoCo or PyAV is missing.
     """
     if options.films:
@@ -259,41 +259,44 @@ def demonstrated_goals(
     """Return the sub-goals of a problem from the oracle's solution.
 
     Args:
-        trial: The problem, and the length of a model step.
-        arm: Of its task and in its domain, from `arm_for`; its pose does not matter, and is another one afterwards.
-        limits: Of the oracle's actions; its gripper is free.
-        sub_goals: Key frames: where the gripper changes, the arm stops, and the end; or `every-step`.
+        trial: The problem, and the stride.
+        arm: An arm from `arm_for` with this task and domain. Its pose is changed.
+        limits: Limits of the oracle's actions; its gripper is not limited.
+        sub_goals: "demonstration" for key frames (the gripper changes, the arm stops, the end), or "every-step".
 
     Raises:
         InputError: The oracle does not succeed within these limits and the steps of the task.
     """
-    shown = demonstrate(trial, arm, limits)
-    keys = gripper_key_frames(shown.states, OF_MODEL_STEPS)
-    return goals_of_episode(shown, with_frames_between(keys, 1) if sub_goals == "every-step" else keys, sub_goals)
+    episode = demonstrate(trial, arm, limits)
+    keys = gripper_key_frames(episode.states, OF_MODEL_STEPS)
+    return goals_of_episode(episode, with_frames_between(keys, 1) if sub_goals == "every-step" else keys, sub_goals)
 
 
 def demonstrate(trial: Trial, arm: SimulatedArm, limits: LimitsConfig) -> EpisodeResult:
-    """Let the oracle solve a problem; return the record with its frames. Arguments and errors: `demonstrated_goals`."""
+    """Let the oracle solve a problem; return the episode with its frames. Arguments, errors: `demonstrated_goals`."""
     task: TaskName = "reach" if trial.problem is None else trial.problem.task
     steps = max(trial.steps, STEPS[task])
     free = limits.model_copy(update={"gripper_mode": "free", "gripper": LimitsConfig().gripper})
-    shown = run(ArmEnvironment(arm), Oracle(free), replace(trial, steps=steps), keep_frames=True)
-    if not shown.success:
+    episode = run(ArmEnvironment(arm), Oracle(free), replace(trial, steps=steps), keep_frames=True)
+    if not episode.success:
         where = f"demonstration of problem {trial.seed} ({task})"
-        left = f"{100 * shown.distances_m[-1]:.1f} cm from its goal after {counted(steps, 'model step')}"
+        left = f"{100 * episode.distances_m[-1]:.1f} cm from its goal after {counted(steps, 'model step')}"
         fix = "Allow it longer steps along each axis (planning.limits.xyz), or more of them"
         raise InputError(where=where, found=f"the oracle ends {left}", needed="a demonstration that succeeds", fix=fix)
-    return shown
+    return episode
 
 
 def goals_of_episode(shown: EpisodeResult, keys: Sequence[KeyFrame], sub_goals: SubGoals) -> tuple[SubGoal, ...]:
-    """Return frames of an episode as sub-goals, each for 3 model steps fewer or more than here; of `every-step` 1."""
+    """Return frames of an episode as sub-goals.
+
+    The allowed duration of each sub-goal is that in the episode, plus or minus 3 model steps (1 for `every-step`).
+    """
     images = [] if shown.frames is None else [shown.frames[key.frame] for key in keys]
     return sub_goals_of(images, keys, Timing(1, slack=1 if sub_goals == "every-step" else 3), shown.states)
 
 
 def with_goals(trials: Trials, goals: Sequence[Sequence[SubGoal]]) -> Trials:
-    """Return trials with sub-goals for the model."""
+    """Return trials with the given sub-goals."""
     pairs = zip(trials.trials, goals, strict=True)
     return replace(trials, trials=tuple(replace(trial, goals=tuple(made)) for trial, made in pairs))
 
@@ -301,7 +304,7 @@ def with_goals(trials: Trials, goals: Sequence[Sequence[SubGoal]]) -> Trials:
 def try_policies(
     environment: Environment, policies: Sequence[Policy], trials: Trials, films: int, reporter: Reporter
 ) -> tuple[ClosedLoopResult, ...]:
-    """Let policies act in the same trials; some episodes of the first one, the model, are filmed."""
+    """Run several policies in the same trials; store frames for a video for the first policy only."""
     results = list[ClosedLoopResult]()
     for policy in policies:
         progress = reporter.task(f"{trials.task}: {policy.name}", "decisions")
@@ -310,7 +313,7 @@ def try_policies(
 
 
 def write_benchmark(benchmark: ClosedLoopBenchmark, folder: Path, verdict: Mapping[str, Any]) -> tuple[Path, ...]:
-    """Write closed_loop.json with a verdict, and a video of what was filmed; return the files.
+    """Write closed_loop.json with the results and the verdict, and a video if frames were stored; return the files.
 
     Raises:
         UnreachableError: PyAV is missing.
@@ -351,14 +354,14 @@ def _metrics(result: ClosedLoopResult) -> dict[str, Any]:
 
 
 def _rounded(numbers: Float[np.ndarray, "episodes _"]) -> list[list[float]]:
-    return [[round(one, 4) for one in row] for row in numbers.tolist()]
+    return [[round(number, 4) for number in row] for row in numbers.tolist()]
 
 
-_HOLD = 4  # number of repetitions of the first and the last image of an episode
+_HOLD = 4  # repetitions of the first and the last image of an episode
 
 
 def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
-    """Yield the frames of the video, one per model step, the first and last of an episode repeated."""
+    """Yield the frames of the video, one per model step; the first and the last frame of an episode are repeated."""
     trials, steps = result.trials, result.trials.steps
     for number, episode in enumerate(result.episodes, start=1):
         if episode.frames is None:
@@ -367,7 +370,7 @@ def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]
         for step, (frame, distance_m) in enumerate(zip(episode.frames, episode.distances_m, strict=True)):
             outcome = f"   {'reached' if episode.success else 'missed'}" if step == steps else ""
             caption = f"{result.policy}:   {100 * distance_m:.1f} cm from the goal{outcome}"
-            scale = max(1, FRAME_SIZE[1] // int(frame.shape[1]))  # captions need room over the images
+            scale = max(1, FRAME_SIZE[1] // int(frame.shape[1]))  # enlarges small frames, so that captions fit
             large = side_by_side([frame], [caption], f"{about}    step {step} of {steps}", enlarged=2 * scale)
             image = below_each_other([large, side_by_side([episode.goal_image], ["goal"], enlarged=scale)])
             yield from itertools.repeat(image, _HOLD if step in {0, steps} else 1)

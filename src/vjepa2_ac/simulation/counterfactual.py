@@ -1,7 +1,7 @@
-"""Counterfactuals: what really happens in a recorded simulated episode under actions that were not taken.
+"""Counterfactuals: simulate the outcome of other actions in a recorded simulated episode.
 
-The episode is simulated again up to a control step, and what is there is compared with what was recorded; from there
-the arm carries out other actions as in the closed loop (`rollout.send_action`: same targets, same lag).
+The episode is simulated again up to a control step, and the state is compared with the recorded one. From this step the
+arm carries out other actions as in closed loop (`rollout.send_action`, with the same targets and the same lag).
 """
 
 from __future__ import annotations
@@ -28,8 +28,10 @@ from vjepa2_ac.storage.places import SIMULATION_FILE
 RECORDED_CAMERAS = {"exterior_1_left": "exterior_1", "exterior_2_left": "exterior_2", "wrist_left": "wrist"}
 """Camera of a data set, as in `data.fields.cameras` -> camera of the simulated arm."""
 
-_NUM_ARMS = 4  # of `explore`, each at its own start
-_STATE_TOLERANCE = 1e-5  # metres, radians, closedness: recorded states are float32, other libraries round otherwise
+_NUM_ARMS = 4  # cached resimulations of `explore`, each from another start
+_STATE_TOLERANCE = (
+    1e-5  # metres, radians, closedness; recorded states are float32, and library versions round differently
+)
 
 
 Actions = tuple[tuple[float, ...], ...]
@@ -37,44 +39,44 @@ Actions = tuple[tuple[float, ...], ...]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What happened: rendered and measured at the start and after every model step."""
+    """The simulated outcome of actions, rendered and measured at the start and after every model step."""
 
-    frames: UInt8[np.ndarray, "time height width 3"]  # through JPEG, as those of the data set
-    silhouettes: Bool[np.ndarray, "time height width"]  # which pixels show the arm, or a block
+    frames: UInt8[np.ndarray, "time height width 3"]  # compressed as JPEG, like those of the data set
+    silhouettes: Bool[np.ndarray, "time height width"]  # which pixels show the arm, the block or moving objects
     states: Float[np.ndarray, "time 7"]  # measured
-    reached: Bool[np.ndarray, " time-1"]  # whether joint angles reach each action's target; else the arm went part way
+    reached: Bool[np.ndarray, " time-1"]  # whether the arm reached the target of each action
 
 
 @dataclass(eq=False)
 class Resimulation:
-    """A recorded episode at a control step, simulated again: every outcome begins there. `resimulate` makes one."""
+    """A recorded episode, simulated again up to a control step at which outcomes start. Created by `resimulate`."""
 
     spec: RecordingSpec
-    number: int  # under which the episode was recorded
+    number: int  # number of the episode in its recording
     start: int  # control step
-    camera: str  # of the simulated arm
+    camera: str  # camera of the simulated arm
     arm: SimulatedArm
-    done: Actions | None = None  # that led to where the arm is; None: it is elsewhere
+    done: Actions | None = None  # actions from the start to the arm's current state; None: the arm is in another state
 
     def under(self, actions: Float[np.ndarray, "steps 7"], stride: int) -> Outcome:
-        """Carry out actions of model steps (legend: episode.py), each from the state that is measured then.
+        """Carry out actions from the start, each relative to the measured state, and return the outcome.
 
         Args:
-            actions: One for each model step; none: only the start.
-            stride: Control steps of a model step.
+            actions: One action per model step (conventions: episode.py); may be empty.
+            stride: Control steps per model step.
         """
         arm = self.arm
         self.done = None
         carry_out(arm, self.number, self.spec, until=self.start)
 
-        def look() -> tuple[Any, ...]:
+        def observe() -> tuple[Any, ...]:
             return arm.image(self.camera), arm.silhouette(self.camera), arm.state
 
-        seen, reached = [look()], []
+        observations, reached = [observe()], []
         for action in actions:
             reached.append(send_action(arm, np.asarray(action, dtype=np.float64), stride))
-            seen.append(look())
-        images, silhouettes, states = zip(*seen, strict=True)
+            observations.append(observe())
+        images, silhouettes, states = zip(*observations, strict=True)
         encoded = [encode_jpeg(image, quality=JPEG_QUALITY) for image in images]
         return Outcome(
             frames=decode_images(encoded, range(len(encoded)), "a simulated frame"),
@@ -85,17 +87,17 @@ class Resimulation:
 
 
 def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "exterior_1_left") -> Resimulation:
-    """Simulate an episode of a recorded data set again up to a control step, and make sure that it is the same.
+    """Simulate a recorded episode again up to a control step, and check that the state equals the recorded one.
 
     Args:
-        folder: Of the data set, with its `simulation.json`.
-        episode: As its source reads it, of poses.
-        start: Control step from which other actions are taken.
-        camera: Of the data set, as in `data.fields.cameras`.
+        folder: Folder of the data set, with its `simulation.json`.
+        episode: The recorded episode, with poses as states.
+        start: Control step at which outcomes start.
+        camera: A camera of the data set, as in `data.fields.cameras`.
 
     Raises:
-        InputError: The data set was not simulated, or does not say how; it has no such episode, step or camera; or the
-            simulation comes to another state than was recorded.
+        InputError: The data set was not simulated or has no `simulation.json`; there is no such episode, step or
+            camera; or the state differs from the recorded one.
         UnreachableError: MuJoCo is not installed.
     """
     simulation, where = read_simulation(folder), f"{folder}: {episode.info.id}"
@@ -107,10 +109,12 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
     if episode.states.shape != (steps, 7):
         found, needed = "x".join(map(str, episode.states.shape)), f"{steps}x7, as simulated: data.states: pose"
         raise InputError(where=where, found=f"states of {found} numbers", needed=needed)
-    eye = RECORDED_CAMERAS[camera] if simulation.cameras == 3 else "exterior_1"  # recorded with one, all are the same
+    eye = (
+        RECORDED_CAMERAS[camera] if simulation.cameras == 3 else "exterior_1"
+    )  # a recording with one camera repeats its image
     again = Resimulation(simulation, number, start, eye, arm_of(number, simulation))
     off = np.abs(again.under(np.zeros((0, 7)), 1).states[0] - np.asarray(episode.states[start], dtype=np.float64))
-    off[3:6] = np.minimum(off[3:6], np.abs(2 * np.pi - off[3:6]))  # -pi and pi are one angle
+    off[3:6] = np.minimum(off[3:6], np.abs(2 * np.pi - off[3:6]))  # -pi and pi are the same angle
     if off.max() > _STATE_TOLERANCE:
         found = f"simulated again, the state differs by up to {off.max():.2g}"
         fix = f"Record it again with these versions of the libraries: {SIMULATION_FILE} names those that recorded it"
@@ -119,18 +123,20 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
 
 
 def simulated_outcome(dataset: Dataset, episode: int, start: int) -> Callable[[np.ndarray], tuple[Any, Any]] | None:
-    """Return what happens from a control step on: actions -> frames and silhouettes; None: data were not simulated.
+    """Return a function that simulates actions from a control step on; None if the data were not simulated.
+
+    The function returns the frames and the silhouettes.
 
     Raises:
-        InputError, UnreachableError: As `resimulate`.
+        InputError, UnreachableError: As for `resimulate`.
     """
     if not Path(dataset.config.path, SIMULATION_FILE).is_file():
         return None
     arm = _of_dataset(dataset, episode, start)
 
     def outcome(actions: np.ndarray) -> tuple[Any, Any]:
-        happens = arm.under(actions, dataset.config.model_stride)
-        return happens.frames, happens.silhouettes
+        simulated = arm.under(actions, dataset.config.model_stride)
+        return simulated.frames, simulated.silhouettes
 
     return outcome
 
@@ -141,10 +147,10 @@ def _of_dataset(dataset: Dataset, episode: int, start: int) -> Resimulation:
 
 
 class SimulatedFutures:
-    """Simulates recorded episodes again, with other actions from a control step on.
+    """Simulates recorded episodes with other actions from a control step on.
 
     Raises:
-        InputError: The simulation gives other states than `simulation.json` and the recording say.
+        InputError: A simulated state differs from the recorded one.
     """
 
     def __init__(self, dataset: Dataset) -> None:
@@ -153,19 +159,19 @@ class SimulatedFutures:
 
     @classmethod
     def of(cls, dataset: Dataset) -> SimulatedFutures | None:
-        """Return the futures of a data set; None if the data were not simulated."""
+        """Return the simulator of a data set; None if the data were not simulated."""
         return cls(dataset) if Path(dataset.config.path, SIMULATION_FILE).is_file() else None
 
     def __call__(
         self, episode: int, step: int, actions: Actions, cancelled: Cancelled
     ) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, " 7"], bool]:
-        """Return frame and state after actions, and whether the arm reached the target of the last one.
+        """Return frame and state after actions, and whether the arm reached the target of the last action.
 
         Args:
-            episode: Its number in the data set.
-            step: Control step from which the actions are done.
-            actions: Of model steps.
-            cancelled: Called before each action.
+            episode: Index of the episode in the data set.
+            step: Control step at which the actions start.
+            actions: One action per model step.
+            cancelled: Called before each action; returns whether to cancel.
 
         Raises:
             SearchCancelledError: It was cancelled.

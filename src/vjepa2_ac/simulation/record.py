@@ -1,6 +1,6 @@
-"""Recording of a simulated data set: demonstrations, filmed, written as RLDS in DROID's schema; and `simulation.json`.
+"""Record demonstrations of the simulated arm as RLDS in DROID's schema, with a `simulation.json`.
 
-The latter has everything that determines the episodes, so that each can be simulated again.
+`simulation.json` contains everything that determines the episodes, so that each can be simulated again.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ INSTRUCTIONS: dict[RecordedTask | None, str] = {
     "pick": "pick up the block",
     "place": "put the block on the mark",
 }
-"""Language instruction of an episode; None: random reaching, without a block."""
+"""Language instruction by task; None is random reaching without a block."""
 
 
 def default_steps(task: RecordedTask | None) -> int:
-    """Return the control steps of an episode, enough for its task: the script of `place` releases the block late."""
+    """Return the default number of control steps per episode; `place` needs more than the other tasks."""
     return 81 if task == "place" else 41
 
 
@@ -56,21 +56,23 @@ _MOTION, _WORLD, _SUCCESS = range(3)  # random streams of an episode
 
 @dataclass(frozen=True)
 class RecordingSpec:
-    """What an episode of a simulated data set is."""
+    """The options that determine the episodes of a simulated data set."""
 
-    domain: str | Domain | DomainRanges = "A"  # or its name; ranges, or `random`: another world in every episode
+    domain: str | Domain | DomainRanges = (
+        "A"  # a domain or its name; with ranges or `random` each episode has another one
+    )
     steps: Annotated[int, Field(ge=2, le=1_000_000)] = 41  # control steps (15 per second); see `default_steps`
     seed: Annotated[int, Field(ge=0)] = 0  # determines motion, outcome and worlds
-    cameras: Literal[1, 2, 3] = 1  # so many have an image of their own, those that stand still first
-    recipe: MotionRecipe = field(default_factory=MotionRecipe)  # ranges of the motion, without a task
-    task: RecordedTask | None = None  # with a block: half of the episodes by script, half at random
+    cameras: Literal[1, 2, 3] = 1  # number of rendered cameras, fixed ones first; the others repeat the first image
+    recipe: MotionRecipe = field(default_factory=MotionRecipe)  # ranges of random reaching, if there is no task
+    task: RecordedTask | None = None  # a task with a block: half of the episodes are scripted, half are random play
 
     @property
     def worlds(self) -> Domain | DomainRanges:
-        """The world of all episodes, or the ranges to draw each one's from.
+        """The domain of all episodes, or the ranges from which the domain of each episode is drawn.
 
         Raises:
-            InputError: No domain has this name.
+            InputError: There is no domain with this name.
         """
         if not isinstance(self.domain, str):
             return self.domain
@@ -78,10 +80,10 @@ class RecordingSpec:
 
 
 def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
-    """Return an arm in the world of an episode; with a task it has contacts.
+    """Return an arm in the domain of an episode, with contacts if there is a task.
 
     Raises:
-        InputError: An unknown domain.
+        InputError: The domain is unknown.
         UnreachableError: MuJoCo is not installed.
     """
     worlds = spec.worlds
@@ -92,17 +94,17 @@ def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
 def carry_out(
     arm: SimulatedArm, index: int, spec: RecordingSpec, *, until: int | None = None, look: Look | None = None
 ) -> Motion:
-    """Carry out an episode, and return its motion.
+    """Carry out an episode and return its motion.
 
     Args:
-        arm: From `arm_of`; its pose does not matter.
+        arm: An arm from `arm_of`.
         index: Number of the episode.
-        spec: What an episode is.
-        until: Control step at which arm and block are left, as they were when it was measured; None: after the last.
-        look: Called with the arm.
+        spec: The options of the recording.
+        until: Control step whose measured state arm and block have afterwards; None: after the last one.
+        look: Called with the arm at every control step.
     """
     rng = _stream(index, spec, _MOTION)
-    if spec.task is not None:  # contacts depend on all that happened before
+    if spec.task is not None:  # contacts depend on all earlier steps, so these are simulated, too
         return play(arm, spec.task, spec.steps if until is None else until, rng, script=index % 2 == 0, look=look)
     arm.reset_clock()
     motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
@@ -115,7 +117,7 @@ def carry_out(
 
 
 def episode_folder(index: int, seed: int, domain_name: str) -> str:
-    """Return the source folder stored in the episode; as in DROID, the only record of success or failure."""
+    """Return the source folder that is stored in the episode. As in DROID, only its name contains the outcome."""
     succeeded = np.random.default_rng([seed, index, _SUCCESS]).uniform() < SUCCESS_SHARE
     minute, hour, day = index % 60, index // 60 % 24, 1 + index // 1440 % 28
     place = f"{domain_name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"
@@ -128,7 +130,7 @@ def _stream(index: int, spec: RecordingSpec, purpose: int) -> np.random.Generato
 
 # ---- the data set ----
 
-JPEG_QUALITY = 85  # some 11 KB an image, as in DROID
+JPEG_QUALITY = 85  # about 11 KB per image, as in DROID
 _SIMULATED_CAMERAS = dict(zip(CAMERAS, ("exterior_1", "exterior_2", "wrist"), strict=True))
 
 
@@ -141,20 +143,20 @@ def record_dataset(
     workers: int = 1,
     progress: Progress = no_progress,
 ) -> Path:
-    """Record episodes and write them as a data set; the same arguments give the same bytes, whatever `workers`.
+    """Record episodes and write them as a data set. The same arguments give the same bytes for any number of workers.
 
-    Other versions of MuJoCo, NumPy or the JPEG library may change last digits and bytes, not the episodes.
+    Other versions of MuJoCo, NumPy or the JPEG library may change last digits and bytes.
 
     Args:
-        folder: The folder of the data set; must be new or empty.
-        spec: What an episode is.
+        folder: A new or empty folder for the data set.
+        spec: The options of the recording.
         episodes: Number of episodes.
-        shards: TFRecord files; one for every 32 episodes by default.
-        workers: Processes. More than one needs `if __name__ == "__main__":` in a script that calls this.
+        shards: Number of TFRecord files; None: one per 32 episodes.
+        workers: Number of processes. More than one requires `if __name__ == "__main__":` in a calling script.
         progress: Called with (episodes done, episodes in total).
 
     Raises:
-        InputError: An unknown domain, a number out of range, or a folder that is in use or cannot be written.
+        InputError: The domain is unknown, a number is out of range, or the folder is not empty or cannot be written.
         UnreachableError: MuJoCo is not installed.
     """
     load_mujoco()
@@ -177,18 +179,18 @@ def record_dataset(
 
 
 def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
-    """Return one episode: a pure function of its arguments.
+    """Record one episode. The result is a pure function of the arguments.
 
     Raises:
-        InputError: An unknown domain.
+        InputError: The domain is unknown.
         UnreachableError: MuJoCo is not installed.
     """
     arm = arm_of(index, spec)
     images: dict[str, list[bytes]] = {feature: [] for feature in CAMERAS[: spec.cameras]}
 
     def take(arm: SimulatedArm) -> None:
-        for feature, taken in images.items():
-            taken.append(encode_jpeg(arm.image(_SIMULATED_CAMERAS[feature]), quality=JPEG_QUALITY))
+        for feature, jpegs in images.items():
+            jpegs.append(encode_jpeg(arm.image(_SIMULATED_CAMERAS[feature]), quality=JPEG_QUALITY))
 
     motion = carry_out(arm, index, spec, look=take)
     folder = episode_folder(index, spec.seed, arm.domain.name)
@@ -202,7 +204,7 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
 
 
 def _arrays(motion: Motion) -> dict[str, Float[np.ndarray, "steps width"]]:
-    """Return commands and measurements by DROID's features; velocities are what the commands ask for, per second."""
+    """Return commands and measurements by DROID's feature names; velocities are those of the commands, per second."""
     poses, gripper = motion.commanded_poses, motion.commanded_gripper[:, None]
     angles = np.concatenate([poses[:, :3], np.unwrap(poses[:, 3:], axis=0)], axis=1)
     return {
@@ -220,9 +222,9 @@ def _arrays(motion: Motion) -> dict[str, Float[np.ndarray, "steps width"]]:
 
 
 def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "steps dim"]:
-    """Return the velocity that led to each position; the first equals the second."""
-    ways = np.diff(positions, axis=0)
-    return np.concatenate([ways[:1], ways]) * CONTROL_RATE_HZ
+    """Return the velocity before each position; the first one equals the second."""
+    changes = np.diff(positions, axis=0)
+    return np.concatenate([changes[:1], changes]) * CONTROL_RATE_HZ
 
 
 # ---- simulation.json ----
@@ -230,33 +232,33 @@ def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "s
 _PROGRAM, _LIBRARIES = "vjepa2-ac", ("mujoco", "numpy", "scipy", "simplejpeg")  # other versions may change last digits
 _NEEDED = "what `vjepa2-ac simulate record` writes"
 _AGAIN = "Record it again: the same options give the same episodes"
-_NUMBER = re.compile(r"_(\d{6,})/")  # as `episode_folder` writes it
+_NUMBER = re.compile(r"_(\d{6,})/")  # number of an episode in the result of `episode_folder`
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedSimulation(RecordingSpec):
-    """Everything that determines the episodes of a data set; the worlds are no name."""
+    """The content of simulation.json: everything that determines the episodes, with domains written out."""
 
-    version: str  # of this program
-    libraries: dict[str, str]  # and of those that determine last digits
+    version: str  # version of this package
+    libraries: dict[str, str]  # versions of libraries that affect last digits
     episodes: Annotated[int, Field(ge=1)]
 
     @classmethod
     def of(cls, spec: RecordingSpec, episodes: int) -> RecordedSimulation:
-        """Return the record of a data set, worlds and recipe written out, whatever names and defaults mean later."""
+        """Return the record of a data set. Domains are written out, so that it does not depend on later definitions."""
         libraries, how = {name: version(name) for name in _LIBRARIES}, vars(spec) | {"domain": spec.worlds}
         return cls(version=version(_PROGRAM), libraries=libraries, episodes=episodes, **how)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the content of the file: one of its keys `domain` and `ranges` has the world or worlds."""
+        """Return the content of the file as plain values; one of the keys `domain` and `ranges` is None."""
         values, key = asdict(self), "domain" if isinstance(self.domain, Domain) else "ranges"
         return values | {"domain": None, "ranges": None} | {key: values["domain"]}
 
     def number_of(self, episode_id: str) -> int:
-        """Return the number under which an episode was recorded, from its identity.
+        """Return the number of an episode in the recording, from its identity.
 
         Raises:
-            InputError: It is no episode of this data set.
+            InputError: The episode is not one of this data set.
         """
         match = _NUMBER.search(episode_id)
         number = int(match[1]) if match else self.episodes
@@ -269,13 +271,14 @@ class RecordedSimulation(RecordingSpec):
 
 
 def read_simulation(folder: str | Path) -> RecordedSimulation:
-    """Read how a data set was simulated.
+    """Read the simulation.json of a data set.
 
     Args:
-        folder: Of the data set, on this machine or behind a URL.
+        folder: Folder or URL of the data set.
 
     Raises:
-        InputError: It was not simulated, or by an older version that did not write the file; or the file is damaged.
+        InputError: There is no such file, because the data were not simulated or an older version recorded them; or
+            the file is damaged.
         UnreachableError: The network fails.
     """
     where = storage.join(str(folder), SIMULATION_FILE)

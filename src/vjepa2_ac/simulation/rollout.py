@@ -1,4 +1,4 @@
-"""Trials of policies in environments: one loop, the record of an episode, and the metrics over all episodes."""
+"""Run policies in environments: the loop of an episode, its record, and the metrics over all episodes."""
 
 from __future__ import annotations
 
@@ -23,42 +23,43 @@ from vjepa2_ac.spaces import apply_action
 
 Image = UInt8[np.ndarray, "height width 3"]
 Action = Float[np.ndarray, " dim"]
-_PARTS = 8  # of a displacement that cannot be completed
+_PARTS = 8  # number of parts into which an unreachable displacement is divided
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One attempt at a task: where it starts, its goal, and how long it may take."""
+    """One attempt at a task: its start, its goal, and the number of steps."""
 
-    seed: int  # of the environment's reset; the number of the problem
-    steps: int  # model steps
-    stride: int  # control steps of a model step
+    seed: int  # seed of the environment's reset, which is the number of the problem
+    steps: int  # number of model steps
+    stride: int  # control steps per model step
     problem: TaskProblem | None = None  # start and goal of the simulated arm; None: the seed determines them
     goal_image: Image | None = None  # None: the environment returns it at its reset
-    goals: tuple[SubGoal, ...] = ()  # sub-goals, the last one included; empty: the goal image alone
+    goals: tuple[SubGoal, ...] = ()  # sub-goals, including the final goal; empty: only the goal image
 
 
 class Observation(NamedTuple):
-    """What a policy receives."""
+    """The input of a policy."""
 
     image: Image
     state: State  # measured
     block: Block | None = None  # None: the task has none, or it is not measured
-    joints: Float[np.ndarray, " 8"] | None = None  # angles and closedness; None: they are not measured
+    joints: Float[np.ndarray, " 8"] | None = None  # joint angles and closedness; None: not measured
 
 
 class Environment(Protocol):
-    """Where policies act, with the interface of Gymnasium's environments."""
+    """An environment, with the interface of Gymnasium."""
 
     def reset(self, *, seed: int, options: Mapping[str, Any]) -> tuple[Observation, dict[str, Any]]:
         """Start an episode.
 
         Args:
-            seed: Of the episode: the same seed starts the same episode.
+            seed: Seed of the episode; the same seed starts the same episode.
             options: `problem` and `stride` of the trial.
 
         Returns:
-            The observation; and `distance_m` of what the task moves to its goal, `success`, and `goal_image`, or None.
+            The observation, and a dictionary with `distance_m` (distance to the goal), `success`, and `goal_image`
+            (or None).
         """
 
     def step(self, action: Action | None) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -69,39 +70,39 @@ class Environment(Protocol):
                 the environment's expert acts.
 
         Returns:
-            Observation, reward, terminated, truncated, and as of `reset`, with `target` (the pose that was held), or
-            with `is_reachable` (whether the action was).
+            Observation, reward, terminated, truncated, and a dictionary as for `reset`, in addition with `target` (the
+            commanded pose) or `is_reachable` (whether the arm could carry out the action).
         """
 
 
 class Policy(Protocol):
-    """Chooses the action of the next model step."""
+    """Selects the action of the next model step."""
 
     name: str
-    why: str  # reason for the last action, short enough to be counted
+    why: str  # reason for the last action, one of few texts, so that reasons can be counted
 
     def reset(self, trial: Trial, goal_image: Image) -> None:
-        """Start an episode. Only an oracle uses more of the trial than images."""
+        """Start an episode. Only an oracle uses more of the trial than its images."""
 
     def act(self, observation: Observation) -> Action | None:
         """Return the action of the next model step, in the base frame; None: the environment's expert acts."""
 
 
 class Step(NamedTuple):
-    """A model step of an episode: what was observed after it."""
+    """A model step of an episode, with the observation after it."""
 
     observation: Observation
     info: dict[str, Any]
-    action: Action | None = None  # that led here; None at the start, or of the environment's expert
-    seconds: float = 0.0  # taken by the policy
+    action: Action | None = None  # the action before this observation; None at the start, or if the expert acted
+    seconds: float = 0.0  # duration of the policy's decision
     why: str = ""
 
 
 def steps_of(environment: Environment, policy: Policy, trial: Trial) -> Iterator[Step]:
-    """Yield the start of a trial, and each model step of the policy.
+    """Run a policy in a trial, and yield the start and each model step.
 
     Raises:
-        ValueError: An action of other than 7 or 8 finite numbers.
+        ValueError: The policy returned an action that is not 7 or 8 finite numbers.
     """
     options = {"problem": trial.problem, "stride": trial.stride}
     observation, info = environment.reset(seed=trial.seed, options=options)
@@ -126,24 +127,24 @@ class EpisodeResult:
 
     trial: Trial
     states: Float[np.ndarray, "time 7"]  # measured, in the robot base frame
-    actions: Float[np.ndarray, "steps dim"]  # of the policy; NaN: the environment's expert acted
-    blocks: Float[np.ndarray, "time 4"] | None  # pose of the block, as in `TaskProblem`; None: there is none
-    distances_m: Float[np.ndarray, " time"]  # of what the task moves, to its goal
+    actions: Float[np.ndarray, "steps dim"]  # actions of the policy; NaN: the environment's expert acted
+    blocks: Float[np.ndarray, "time 4"] | None  # pose of the block, as in `TaskProblem`; None: no block
+    distances_m: Float[np.ndarray, " time"]  # distance to the goal, of the flange or of the block
     reached: Bool[np.ndarray, " time"]  # whether the task is done, see `TaskProblem.succeeded`
-    seconds: Float[np.ndarray, " steps"]  # taken by the policy
-    whys: tuple[str, ...]  # of each action
-    unreachable: int  # commands that the arm could not follow completely
+    seconds: Float[np.ndarray, " steps"]  # duration of each decision
+    whys: tuple[str, ...]  # reason for each action
+    unreachable: int  # number of commands that the arm could not follow completely
     goal_image: Image
     frames: UInt8[np.ndarray, "time height width 3"] | None  # if they are stored
 
     @property
     def success(self) -> bool:
-        """Whether the goal is reached at the end."""
+        """Whether the task is done at the end of the episode."""
         return bool(self.reached[-1])
 
     @property
     def steps_needed(self) -> int | None:
-        """Model steps after which it stays reached; None: it is not reached at the end."""
+        """Number of model steps after which the task stays done; None if it is not done at the end."""
         if not self.success:
             return None
         not_done = np.flatnonzero(~self.reached)
@@ -151,7 +152,7 @@ class EpisodeResult:
 
     @property
     def success_ever(self) -> bool:
-        """Whether the goal was reached after any of the steps, perhaps in passing."""
+        """Whether the task was done after any of the steps."""
         return bool(self.reached[1:].any())
 
 
@@ -163,17 +164,17 @@ def run(
     keep_frames: bool = False,
     progress: Callable[[int], None] = lambda _: None,
 ) -> EpisodeResult:
-    """Let a policy act in an environment, and return the record.
+    """Run a policy in a trial and return the record of the episode.
 
     Args:
-        environment: Where it acts.
+        environment: The environment.
         policy: The policy.
-        trial: Start, goal and limits.
-        keep_frames: Whether the result holds the camera images.
+        trial: Start, goal and number of steps.
+        keep_frames: Whether to store the camera images.
         progress: Called with the number of finished model steps.
 
     Raises:
-        ValueError: As `steps_of`.
+        ValueError: As for `steps_of`.
     """
     steps = list[Step]()
     for step in steps_of(environment, policy, trial):
@@ -182,11 +183,11 @@ def run(
         steps.append(step)
     observations, infos = [step.observation for step in steps], [step.info for step in steps]
     goal_image = infos[0].get("goal_image") if trial.goal_image is None else trial.goal_image
-    blocks = [one.block for one in observations if one.block is not None]
+    blocks = [observation.block for observation in observations if observation.block is not None]
     no_action = np.full(7, np.nan)
     return EpisodeResult(
         trial=trial,
-        states=np.stack([one.state for one in observations]),
+        states=np.stack([observation.state for observation in observations]),
         actions=np.stack([no_action if step.action is None else step.action for step in steps[1:]]),
         blocks=np.stack(blocks) if blocks else None,
         distances_m=np.array([info["distance_m"] for info in infos]),
@@ -195,7 +196,7 @@ def run(
         whys=tuple(step.why for step in steps[1:]),
         unreachable=sum(not info.get("is_reachable", True) for info in infos),
         goal_image=observations[-1].image if goal_image is None else goal_image,
-        frames=np.stack([one.image for one in observations]) if keep_frames else None,
+        frames=np.stack([observation.image for observation in observations]) if keep_frames else None,
     )
 
 
@@ -206,18 +207,18 @@ class ArmEnvironment:
     """The simulated arm as an environment.
 
     Args:
-        arm: In the domain of the problems, from `arm_for` of their task; its pose does not matter.
+        arm: An arm from `arm_for` with the task and domain of the problems. Its pose is changed.
     """
 
     def __init__(self, arm: SimulatedArm) -> None:
         self.arm = arm
 
     def reset(self, *, seed: int = 0, options: Mapping[str, Any]) -> tuple[Observation, dict[str, Any]]:  # noqa: ARG002
-        """Put arm and block where the problem in `options` starts.
+        """Set arm and block to the start of the problem in `options`.
 
         Raises:
-            OutOfReachError: The problem's own start or goal cannot be reached.
-            ValueError: A block is to be moved and the arm has none.
+            OutOfReachError: The arm cannot reach the start or the goal of the problem.
+            ValueError: The task has a block, but the arm has none.
         """
         self._problem, self._stride, arm = options["problem"], options["stride"], self.arm
         goal_image = put(arm, self._problem.goal, self._problem.block_goal, self._problem.mark).image()
@@ -226,10 +227,10 @@ class ArmEnvironment:
         return observation, info | {"goal_image": goal_image}
 
     def step(self, action: Action | None) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Carry out an action: of 7 numbers the change of the pose, of 8 that of the joints, within their limits.
+        """Carry out an action: 7 numbers change the pose, 8 numbers change joints and gripper within their limits.
 
         Raises:
-            ValueError: There is no action.
+            ValueError: The action is None.
         """
         if action is None:
             raise ValueError("the simulated arm has no expert: use the policy Oracle")
@@ -253,9 +254,9 @@ class ArmEnvironment:
 
 
 def put(arm: SimulatedArm, state: State, block: Block | None, mark: Mark | None = None) -> SimulatedArm:
-    """Put arm, block and mark at the start of an episode, and moving objects where they start.
+    """Set arm, block, mark and moving objects to the start of an episode; return the arm.
 
-    The arm gets there via its rest pose: its redundant joint must not depend on the past.
+    The arm is set to its rest pose first, so that its redundant joint does not depend on earlier episodes.
     """
     arm.reset_clock()
     arm.set_joints(rest_joints(arm.domain), 0.0)
@@ -265,10 +266,10 @@ def put(arm: SimulatedArm, state: State, block: Block | None, mark: Mark | None 
 
 
 def send_action(arm: SimulatedArm, action: State, stride: int) -> bool:
-    """Command the state after an action for `stride` control steps; return whether it can be reached.
+    """Command the state after an action for `stride` control steps; return whether the arm can reach it.
 
-    The target is that action from the *measured* state. If no joint angles reach it, the arm moves along the straight
-    line as far as possible.
+    The target is relative to the *measured* state. If the arm cannot reach it, the arm moves as far as possible along
+    the straight line to it.
     """
     target = target_of(arm.state, action)
     with suppress(OutOfReachError):
@@ -283,14 +284,14 @@ def send_action(arm: SimulatedArm, action: State, stride: int) -> bool:
 
 
 def target_of(state: State, action: State) -> State:
-    """Return the state after an action, its closedness within 0 .. 1."""
+    """Return the state after an action, with its closedness clipped to 0 .. 1."""
     target = np.asarray(apply_action(state, action))
     target[6] = np.clip(target[6], 0.0, 1.0)
     return target
 
 
 def states_along(state: State, action: State) -> list[State]:
-    """Return equally spaced states on the straight line of an action, the nearest first."""
+    """Return equally spaced states on the straight line from a state to the state after an action."""
     shares = np.arange(1, _PARTS + 1)[:, None] / _PARTS
     return list(apply_action(np.tile(state, (_PARTS, 1)), shares * action))
 
@@ -300,24 +301,24 @@ def states_along(state: State, action: State) -> list[State]:
 
 @dataclass(frozen=True)
 class Trials:
-    """The trials of a benchmark: the same for every policy, so that metrics can be paired."""
+    """The trials of a benchmark. They are the same for all policies, so that metrics can be paired."""
 
     task: str
-    place: str  # where it is done
-    criterion: str  # when it is done, in a few words
-    seconds_per_step: float  # length of a model step
+    place: str  # name of the domain or environment
+    criterion: str  # short description of success
+    seconds_per_step: float  # duration of a model step
     trials: tuple[Trial, ...]
-    about: Mapping[str, Any]  # plain values, for JSON
+    about: Mapping[str, Any]  # description as plain values, for JSON
 
     @property
     def steps(self) -> int:
-        """Model steps of an episode."""
+        """Model steps per episode."""
         return self.trials[0].steps
 
 
 @dataclass(frozen=True)
 class ClosedLoopResult:
-    """A policy's episodes of a task; arrays hold one row per episode, estimates have 95 % intervals over episodes."""
+    """The episodes of one policy. Arrays have one row per episode; estimates have 95 % intervals over episodes."""
 
     trials: Trials
     policy: str
@@ -325,40 +326,40 @@ class ClosedLoopResult:
 
     @property
     def distance_cm(self) -> Float[np.ndarray, "episodes time"]:
-        """Distance to the goal before the first step and after each."""
+        """Distance to the goal in cm, before the first step and after each step."""
         return np.stack([episode.distances_m for episode in self.episodes]) * 100
 
     @property
     def successes(self) -> Bool[np.ndarray, " episodes"]:
-        """Whether the goal is reached at the end."""
+        """Whether the task is done at the end of each episode."""
         return np.array([episode.success for episode in self.episodes])
 
     @property
     def seconds(self) -> Float[np.ndarray, "episodes steps"]:
-        """Seconds of each decision."""
+        """Duration of each decision in seconds."""
         return np.stack([episode.seconds for episode in self.episodes])
 
     @property
     def unreachable(self) -> Int[np.ndarray, " episodes"]:
-        """Commands that the arm could not follow completely."""
+        """Number of commands per episode that the arm could not follow completely."""
         return np.array([episode.unreachable for episode in self.episodes])
 
     @property
     def success_rate(self) -> Estimate:
-        """Share of episodes with the goal reached at the end."""
+        """Fraction of episodes in which the task is done at the end."""
         return share_of(int(self.successes.sum()), len(self.episodes))
 
     @property
     def why_counts(self) -> dict[str, int]:
-        """How often each reason was given for an action, the most common first."""
+        """Number of actions by reason, the most common reason first."""
         return dict(Counter(why for episode in self.episodes for why in episode.whys).most_common())
 
     @property
     def estimates(self) -> dict[str, Estimate | None]:
         """The metrics over all episodes.
 
-        success_ever counts the goal after any step, which is optimistic; steps_needed is of episodes with success, and
-        None without any.
+        success_ever counts episodes in which the task was done after any step, which is optimistic. steps_needed is the
+        mean over successful episodes, and None if there are none.
         """
         needed = [episode.steps_needed for episode in self.episodes if episode.steps_needed is not None]
         return {
@@ -377,22 +378,22 @@ def _mean(values: Float[np.ndarray, " episodes"]) -> Estimate:
 def run_trials(
     environment: Environment, policy: Policy, trials: Trials, films: int = 0, progress: Progress = no_progress
 ) -> ClosedLoopResult:
-    """Let a policy act in all trials.
+    """Run a policy in all trials.
 
     Args:
-        environment: Where it acts.
+        environment: The environment.
         policy: The policy.
         trials: The trials.
-        films: Number of episodes, the first ones, whose frames are stored.
+        films: Number of first episodes whose frames are stored.
         progress: Called with the number of finished decisions, from 0 on.
 
     Raises:
-        ValueError: As `run`.
+        ValueError: As for `run`.
     """
-    total, done = len(trials.trials) * trials.steps, list[EpisodeResult]()
+    total, episodes = len(trials.trials) * trials.steps, list[EpisodeResult]()
     progress(0, total)
     for trial in trials.trials:
-        first = len(done) * trials.steps
+        first = len(episodes) * trials.steps
         report = lambda step, first=first: progress(first + step, total)  # noqa: E731
-        done.append(run(environment, policy, trial, keep_frames=len(done) < films, progress=report))
-    return ClosedLoopResult(trials, policy.name, tuple(done))
+        episodes.append(run(environment, policy, trial, keep_frames=len(episodes) < films, progress=report))
+    return ClosedLoopResult(trials, policy.name, tuple(episodes))

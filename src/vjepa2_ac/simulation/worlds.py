@@ -1,7 +1,7 @@
-"""Third-party environments: each is a program in an environment of its own that models act and experts record in.
+"""Third-party environments, each in its own process, for closed-loop tests and for recording their experts.
 
-The program reads requests and writes answers, one JSON object a line, on its standard input and output, within limits
-of time and size. It imports nothing of this project, so that its pins are its own. Protocol: docs/worlds.md.
+The process reads requests and writes answers, one JSON object per line, on standard input and output, with limits of
+time and size. It does not import this project, so it can use its own versions of libraries. Protocol: docs/worlds.md.
 """
 
 from __future__ import annotations
@@ -59,28 +59,28 @@ from vjepa2_ac.spaces import POSE, actions_from_states
 from vjepa2_ac.storage import atomic_writer, user_can_write
 from vjepa2_ac.storage.structured import record_of
 
-_ANSWER_S = 120.0
-LOADING = 5  # the first answer may take this many times as long
-_ENDS_S = 10.0  # time that a program has to exit when its input has ended
-_MOST_BYTES = 64 << 20  # of a line: an image of 16 million pixels in base64
-_MOST_SHOWN = 200  # bytes of a wrong line
-_ERROR_BYTES, _ERROR_LINES = 64 << 10, 5  # of the error output: kept, and shown
+_ANSWER_S = 120.0  # default timeout of an answer
+LOADING = 5  # factor of the timeout for the first answer
+_ENDS_S = 10.0  # time for a program to exit after its input is closed
+_MOST_BYTES = 64 << 20  # size limit of a line; fits an image of 16 million pixels in base64
+_MOST_SHOWN = 200  # bytes of an invalid line in an error message
+_ERROR_BYTES, _ERROR_LINES = 64 << 10, 5  # stored bytes and displayed lines of the error output
 _KEEPER = "import os, sys; world = int(sys.stdin.readline()); sys.stdin.read(); os.killpg(world, 9)"
 PROTOCOL = "docs/worlds.md has the protocol; examples/worlds programs that follow it"
-TRIES = 2  # times as many problems as required are drawn, until the expert has solved enough of them
+TRIES = 2  # at most this many times the required number of problems are tried with the expert
 
 
 class WorldProcess(ExitStack):
-    """A program that answers each line of its input with one line; `close` ends it and every process of its group.
+    """A program that answers each line of its input with one line; `close` ends it and all processes of its group.
 
-    A second process, the keeper, kills the group when this process dies, even by SIGKILL: the keeper's input ends then,
-    because only this process can write to it. Unlike prctl(PR_SET_PDEATHSIG) this works on every Unix, whatever thread
-    started the world, and reaches the children of a shell.
+    A second process, the keeper, kills the group when this process dies, even by SIGKILL, because the keeper's input is
+    then closed. Unlike prctl(PR_SET_PDEATHSIG), this works on every Unix and from any thread, and it also ends the
+    children of a shell.
 
     Args:
-        command: The program and its arguments, as in a shell.
-        timeout_s: Longest wait for an answer; for the first one, which includes loading, `LOADING` times as long. None:
-            120 seconds.
+        command: The program and its arguments, in shell syntax.
+        timeout_s: Timeout of an answer in seconds; for the first one, which includes loading, it is multiplied by
+            `LOADING`. None: 120 seconds.
 
     Raises:
         InputError: The program cannot be started.
@@ -105,10 +105,10 @@ class WorldProcess(ExitStack):
         self.callback(self._end)
 
     def exchange(self, request: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Send a request and return its answer; None: return what the program writes at its start.
+        """Send a request and return the answer; without a request return the first message of the program.
 
         Raises:
-            InputError: There is no answer in time, or it is no JSON object, or an error, or not the only one.
+            InputError: There is no answer in time, the answer is not exactly one JSON object, or it is an error.
         """
         if request is not None:
             self._send(f"{json.dumps(request)}\n".encode())
@@ -122,7 +122,7 @@ class WorldProcess(ExitStack):
         return answer
 
     def refused(self, found: str, needed: str = "", fix: str = PROTOCOL) -> InputError:
-        """Return an error that names the command of this world."""
+        """Return an error that names the command of this environment."""
         return InputError(where=self.where, found=found, needed=needed, fix=fix)
 
     def _started(self, words: list[str], errors: int) -> Any:
@@ -132,15 +132,15 @@ class WorldProcess(ExitStack):
     def _send(self, line: bytes) -> None:
         if self._poll.poll(0) and (unasked := os.read(self._output, _MOST_SHOWN)):
             raise self.refused(f"it wrote {_shown(unasked)} without a request", "one answer for each request")
-        with suppress(BrokenPipeError):  # the program has ended, which `_line` reports
-            if self._process.stdin.write(line) is None:  # written as a whole or not at all: it is below PIPE_BUF
+        with suppress(BrokenPipeError):  # the program has exited, which `_line` reports
+            if self._process.stdin.write(line) is None:  # lines below PIPE_BUF are written completely or not at all
                 raise self.refused("it does not read its requests", "one answer for each request")
 
     def _line(self, limit_s: float) -> bytes:
         """Return the next line of the program's output.
 
         Raises:
-            InputError: It does not end in time, or is too long, or is not the last one, or the output has ended.
+            InputError: The line is not complete in time, is too long, is followed by more output, or the output ended.
         """
         parts, end_s = [b""], time.monotonic() + limit_s
         while b"\n" not in parts[-1]:
@@ -167,7 +167,7 @@ class WorldProcess(ExitStack):
         return self.refused("\n".join([found, *(line[:_MOST_SHOWN] for line in lines)]) + "\n", fix=fix)
 
     def _read_errors(self) -> None:
-        """Keep the end of the error output, so that neither memory nor disk fills, and the program never waits."""
+        """Read the error output continuously and store its end, so that the program never blocks on a full pipe."""
         while part := self._process.stderr.read(_ERROR_BYTES):
             self._errors = (self._errors + part)[-_ERROR_BYTES:]
 
@@ -176,7 +176,7 @@ class WorldProcess(ExitStack):
         self._process.stdout.close()
         with suppress(TimeoutExpired):
             self._process.wait(min(_ENDS_S, self._timeout_s))
-        with suppress(OSError):  # no process of the group is left
+        with suppress(OSError):  # all processes of the group have exited already
             os.killpg(self._process.pid, signal.SIGKILL)
         self._reader.join(1.0)
 
@@ -187,30 +187,30 @@ def _shown(line: bytes) -> str:
 
 @dataclass(frozen=True)
 class AboutWorld:
-    """The first line of a program: what its environment is."""
+    """The first message of a program, which describes its environment."""
 
-    world: Annotated[str, Field(max_length=200)]  # name and version
-    task: Annotated[str, Field(max_length=200)]  # part of the names of files
+    world: Annotated[str, Field(max_length=200)]  # name and version of the environment
+    task: Annotated[str, Field(max_length=200)]  # name of the task, used in file names
     rate_hz: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]  # control steps per second
     steps: Annotated[int, Field(ge=1, le=1_000_000)]  # control steps that suffice for the task
-    instruction: str = ""  # the task in words
-    expert: bool = False  # whether it has one
+    instruction: str = ""  # language instruction
+    expert: bool = False  # whether the environment has a scripted expert
 
 
 class OtherWorld(WorldProcess):
-    """A third-party environment that runs as a program; `close` ends it. Interface: `rollout.Environment`.
+    """A third-party environment that runs as a program; `close` ends it. It implements `rollout.Environment`.
 
     Args:
-        command: Its program and arguments, as in a shell: PYTHON examples/worlds/robosuite.py Lift.
-        timeout_s: As of `WorldProcess`.
+        command: The program and its arguments in shell syntax, such as PYTHON examples/worlds/robosuite.py Lift.
+        timeout_s: As for `WorldProcess`.
 
     Raises:
-        InputError: It cannot be started, or does not say what it is.
+        InputError: The program cannot be started, or its first message is invalid.
     """
 
     def __init__(self, command: str, timeout_s: float | None = None) -> None:
         super().__init__(command, timeout_s)
-        self._image_shape: tuple[int, ...] | None = None  # of the first observation
+        self._image_shape: tuple[int, ...] | None = None  # image shape of the first observation
         try:
             self.about = record_of(AboutWorld, self.exchange(), where=self.where, needed="what it is", fix=PROTOCOL)
         except BaseException:
@@ -218,19 +218,19 @@ class OtherWorld(WorldProcess):
             raise
 
     def reset(self, *, seed: int, options: Mapping[str, Any]) -> tuple[Observation, dict[str, Any]]:
-        """Start the episode of a seed: always the same one. `options` has the stride.
+        """Start the episode of a seed; the same seed starts the same episode. `options` contains the stride.
 
         Raises:
-            InputError: The program has ended, or answers something else.
+            InputError: The program has exited, or its answer is invalid.
         """
         self._stride = options["stride"]
         return self._ask(do="reset", seed=seed)
 
     def step(self, action: Action | None) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Hold the pose after an action for a model step; None: let the expert act.
+        """Command the pose after an action for one model step; None: let the expert act.
 
         Raises:
-            InputError: As `reset`.
+            InputError: As for `reset`.
         """
         target = None if action is None else target_of(self._state, action)
         words = None if target is None else target.tolist()
@@ -263,50 +263,50 @@ class OtherWorld(WorldProcess):
         return pose
 
 
-def _image(found: dict[str, Any]) -> Image:
-    """Return an image from its height, width, and bytes in base64."""
-    pixels = np.frombuffer(base64.b64decode(found["rgb"]), dtype=np.uint8)
-    if min(found["height"], found["width"]) < 1:
-        raise ValueError(f"an image of {found['height']}x{found['width']} pixels")
-    return pixels.copy().reshape(found["height"], found["width"], 3)
+def _image(encoded: dict[str, Any]) -> Image:
+    """Decode an image from its height, width, and bytes in base64."""
+    pixels = np.frombuffer(base64.b64decode(encoded["rgb"]), dtype=np.uint8)
+    if min(encoded["height"], encoded["width"]) < 1:
+        raise ValueError(f"an image of {encoded['height']}x{encoded['width']} pixels")
+    return pixels.copy().reshape(encoded["height"], encoded["width"], 3)
 
 
-# ---- a model in such an environment ----
+# ---- benchmark in a third-party environment ----
 
 
 def run_world_benchmark(
     subject: Subject, world: OtherWorld, options: BenchmarkOptions, reporter: Reporter = SILENT
 ) -> ClosedLoopBenchmark:
-    """Let a model, zero actions and random actions solve what the expert of an environment solves.
+    """Run a model, zero actions and random actions on problems that the expert of an environment solves.
 
     Args:
-        subject: The model and its planning settings.
-        world: Where they act.
-        options: Number and first seed of the problems, and the sub-goals. Task and domain are the environment's.
+        subject: The model and its planning config.
+        world: The environment.
+        options: Number and first seed of the problems, and the sub-goals. Task and domain are ignored.
         reporter: Shows the progress of each policy.
 
     Raises:
-        InputError: A model that needs what such environments do not measure, no expert, or one that solves fewer than
-            half of the problems.
+        InputError: The model needs inputs that such environments do not measure, the environment has no expert, or the
+            expert solves fewer than half of the problems.
         UnreachableError: PyAV is missing.
     """
     if options.films:
         video_library()
     model = policy_of(subject, None)
     progress = reporter.task(f"{world.about.task}: {Expert.name}")
-    trials, shown = find_trials(world, options, subject.config.data.model_stride, progress)
+    trials, expert_result = find_trials(world, options, subject.config.data.model_stride, progress)
     policies = (model, ZeroActions(), RandomActions(subject.config.planning.limits, options.seed))
     results = try_policies(world, policies, trials, options.films, reporter)
-    return ClosedLoopBenchmark(subject, trials, (*results, shown))
+    return ClosedLoopBenchmark(subject, trials, (*results, expert_result))
 
 
 def find_trials(
     world: OtherWorld, options: BenchmarkOptions, stride: int, progress: Progress = no_progress
 ) -> tuple[Trials, ClosedLoopResult]:
-    """Return as many trials as required that the expert solves, and its results; the others are left out.
+    """Return the required number of trials that the expert solves, and its results; other trials are left out.
 
     Raises:
-        InputError: It solves fewer than half, or there is no expert.
+        InputError: The expert solves fewer than half of the trials, or there is no expert.
     """
     about = world.about
     if not about.expert:
@@ -342,17 +342,21 @@ def find_trials(
     return solved, ClosedLoopResult(solved, Expert.name, tuple(episodes))
 
 
-# ---- recording of its expert, and of play ----
+# ---- recording of the expert, and of random play ----
 
-REST_S = 0.5  # an episode ends so long after success
-OFF_M, OFF_S, EVERY_S = 0.02, 0.3, 1.5  # of a disturbance: its standard deviation on each axis, length, and period
-HELD_S, WIDER_M, GRIPS = (0.3, 1.0), 0.05, 0.3  # of play: how long a target, how much wider the box, share of grips
-LOOK = 4  # control steps between two positions of the expert that the box of play is made from
-DISTURBED, PLAY = 1, 2  # seeds that leave this, divided by three
+REST_S = 0.5  # an episode ends this long after success
+OFF_M, OFF_S, EVERY_S = 0.02, 0.3, 1.5  # standard deviation per axis, duration and period of a disturbance
+HELD_S, WIDER_M, GRIPS = (
+    (0.3, 1.0),
+    0.05,
+    0.3,
+)  # play: duration of a target, margin of the box, share of gripper changes
+LOOK = 4  # control steps between two expert positions from which the box of random play is computed
+DISTURBED, PLAY = 1, 2  # kind of an episode by the remainder of its seed divided by three
 
 
 class _DisturbedExpert(Expert):
-    """Now and then holds a pose a few centimetres off, then lets the expert go on."""
+    """Periodically commands a pose a few centimetres off for a short time; otherwise the expert acts."""
 
     def __init__(self, world: OtherWorld, seed: int, every: int) -> None:
         self._rng, self._steps = np.random.default_rng([seed, 0]), itertools.count(0, every)
@@ -360,22 +364,22 @@ class _DisturbedExpert(Expert):
         self._period, self._length = max(1, round(EVERY_S * rate_hz)), round(OFF_S * rate_hz)
 
     def act(self, observation: Observation) -> Action | None:
-        place = next(self._steps) % self._period
-        if place < self._every:
+        phase = next(self._steps) % self._period
+        if phase < self._every:
             self._target = observation.state.copy()
             self._target[:3] += OFF_M * self._rng.normal(size=3)
-        return None if place >= self._length else _action_to(self._target, observation)
+        return None if phase >= self._length else _action_to(self._target, observation)
 
 
 class _Play(Expert):
-    """Goes to random places in the box in which the expert moves, and now and then opens or closes the gripper."""
+    """Moves to random positions in a box around the expert's positions, and sometimes opens or closes the gripper."""
 
     def __init__(self, world: OtherWorld, seed: int, every: int) -> None:
         self._rng, self._steps = np.random.default_rng([seed, 1]), itertools.count(0, every)
         self._rate_hz, self._until = world.about.rate_hz, 0.0
         expert = steps_of(world, Expert(), Trial(seed, world.about.steps // LOOK, LOOK))
-        places = [step.observation.state[:3] for step in expert]
-        self._low, self._high = np.min(places, axis=0) - [WIDER_M, WIDER_M, 0.0], np.max(places, axis=0) + WIDER_M
+        points = [step.observation.state[:3] for step in expert]
+        self._low, self._high = np.min(points, axis=0) - [WIDER_M, WIDER_M, 0.0], np.max(points, axis=0) + WIDER_M
 
     def act(self, observation: Observation) -> Action | None:
         step = next(self._steps)
@@ -395,28 +399,28 @@ def _action_to(target: State, observation: Observation) -> Action:
 def record_world(
     world: OtherWorld, folder: Path, seeds: Sequence[int], progress: Progress = no_progress, *, every: int = 1
 ) -> tuple[int, int]:
-    """Record the episodes of some seeds; one that was recorded before is not recorded again.
+    """Record the episodes of some seeds; existing files are kept.
 
-    Of three episodes, one is the expert's. In one the hand is now and then held a few centimetres off, so that there is
-    more than one way to do the task, and ways back. One is play: without it a model learns where experts go, not what
-    actions do.
+    One third of the episodes are the expert's. In another third the expert is disturbed, so that the data contain
+    different solutions and recoveries. The last third is random play: without it a model learns the typical motion of
+    experts, not the effect of actions.
 
     Args:
-        world: With an expert.
-        folder: One .npz file an episode (format: data/sources/npz.py).
-        seeds: Of the episodes.
+        world: An environment with an expert.
+        folder: Folder for one .npz file per episode (format: data/sources/npz.py).
+        seeds: Seeds of the episodes.
         progress: Called with (episodes done, episodes in total).
-        every: Control steps from one frame to the next.
+        every: Control steps per frame.
 
     Returns:
-        Number of episodes that the expert solved, and that it acted in; neither counts play.
+        The number of episodes that the expert solved, and the number in which it acted; both without random play.
 
     Raises:
-        InputError: The folder cannot be written, or the program ends or answers something else.
+        InputError: The folder cannot be written, or the program exits or its answer is invalid.
     """
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    solved, name = 0, re.sub(r"[^\w .,()+-]", "-", world.about.task, flags=re.ASCII)  # the name of a file, and no path
+    solved, name = 0, re.sub(r"[^\w .,()+-]", "-", world.about.task, flags=re.ASCII)  # a file name without separators
     for done, seed in enumerate(seeds, start=1):
         file = folder / f"{name}_{seed:06d}.npz"
         if not file.exists():
