@@ -1,1 +1,1 @@
-"""Inspection of data sets: checks, statistics, coverage of actions, duplicates."""
+"""Inspection of data sets: checks, statistics, action coverage, duplicates, and comparison of readings with a model."""

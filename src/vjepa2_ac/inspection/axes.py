@@ -1,7 +1,7 @@
-"""Calibration of axes: the angle about the vertical between the axes of a model and those of the robot.
+"""Calibrate the axes of a model: the angle about the vertical between its axes and those of the robot.
 
-States and actions are turned by angles all around, about the robot's base and about the middle of the motion; taken is
-the angle at which the model predicts the next frame best.
+States and actions are rotated by angles from -180 to 165 degrees, about the robot's base and about the centre of the
+motion. The result is the angle with the lowest prediction error for the next frame.
 """
 
 from __future__ import annotations
@@ -36,26 +36,26 @@ from vjepa2_ac.planning.settings import AXES_FORMAT, require_axes_in
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.storage.structured import utc_now
 
-MOST_YAW_DEGREES = 15.0  # half the width of the interval of an angle that is known
-EPISODES_NEEDED = 2  # for an interval
+MOST_YAW_DEGREES = 15.0  # largest half-width of the angle's interval with which the result is used
+EPISODES_NEEDED = 2  # minimum for an interval
 TRIED_DEGREES = tuple(range(-180, 180, 15))
 _UNTURNED = TRIED_DEGREES.index(0)
 
 
 @dataclass(frozen=True)
 class AxisFit:
-    """The angle about z, counterclockwise from above, at which a model predicts best what the robot does."""
+    """The rotation about z, counterclockwise from above, with which a model predicts the robot's motion best."""
 
     yaw_degrees: Estimate
-    error: Estimate  # squared error of the next frame at the tried angle next to the yaw, over that of no turn
-    by_angle: tuple[float, ...]  # the same at each of `TRIED_DEGREES`
-    pairs: int  # of frames
+    error: Estimate  # squared error of the next frame at the tried angle nearest to the yaw, relative to no rotation
+    by_angle: tuple[float, ...]  # relative squared error at each of `TRIED_DEGREES`
+    pairs: int  # number of pairs of frames
     episodes: int
-    centre_m: tuple[float, float]  # x, y about which states are turned by the yaw
+    centre_m: tuple[float, float]  # x, y of the centre of the rotation
 
     @property
     def problem(self) -> str | None:
-        """Why nothing can be planned by it, as text; None: it can."""
+        """The reason for which the result cannot be used for planning; None if it can be used."""
         yaw, half = self.yaw_degrees, (self.yaw_degrees.high - self.yaw_degrees.low) / 2
         if self.episodes < EPISODES_NEEDED:
             return f"pairs of {self.episodes} episode, and an interval needs {EPISODES_NEEDED}"
@@ -66,7 +66,7 @@ class AxisFit:
         return None
 
     def words(self) -> str:
-        """Return the result as a sentence, and whether it can be planned by."""
+        """Return the result as text, with the reason if it cannot be used for planning."""
         yaw, (x, y) = self.yaw_degrees, self.centre_m
         centre = f"the middle of its motion, x {x:.2f} y {y:.2f} m" if any(self.centre_m) else "its base"
         between = f" (95 % interval {yaw.low:.0f} to {yaw.high:.0f})" if yaw.has_interval else ""
@@ -91,12 +91,12 @@ class AxisFit:
 def fit_axes(
     errors: Float[np.ndarray, "pairs angles"], episode_ids: Sequence[str], centre_m: tuple[float, float] = (0.0, 0.0)
 ) -> AxisFit:
-    """Return the angle of least error, from a parabola through the least of the tried ones and its two neighbours.
+    """Return the angle with the lowest error, from a parabola through the lowest error and its two neighbours.
 
     Args:
         errors: Squared errors of the next frame at each of `TRIED_DEGREES`.
-        episode_ids: Of each pair; whole episodes are resampled for the intervals.
-        centre_m: x, y about which states were turned.
+        episode_ids: The episode of each pair; whole episodes are resampled for the intervals.
+        centre_m: x, y of the centre of the rotation.
     """
     nearby = _least(errors.sum(axis=0))
 
@@ -119,18 +119,18 @@ def _nearest_tried(degrees: float) -> int:
 
 
 def _least(errors: Float[np.ndarray, "*batch angles"]) -> Float[np.ndarray, "*batch"]:
-    place = errors.argmin(axis=-1)[..., None]
+    index = errors.argmin(axis=-1)[..., None]
     before, least, after = (
-        np.take_along_axis(errors, (place + step) % errors.shape[-1], axis=-1)[..., 0] for step in (-1, 0, 1)
+        np.take_along_axis(errors, (index + step) % errors.shape[-1], axis=-1)[..., 0] for step in (-1, 0, 1)
     )
     bend = before - 2 * least + after
     shift = np.divide(before - after, 2 * bend, out=np.zeros_like(bend), where=bend > 0)
     step = TRIED_DEGREES[1] - TRIED_DEGREES[0]
-    return np.asarray(_wrapped(TRIED_DEGREES[0] + step * (place[..., 0] + shift)))
+    return np.asarray(_wrapped(TRIED_DEGREES[0] + step * (index[..., 0] + shift)))
 
 
 def _wrapped(degrees: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-    """Return angles within -180 .. 180: an interval may go across it."""
+    """Wrap angles to -180 .. 180 degrees."""
     return np.asarray(np.remainder(degrees + 180.0, 360.0) - 180.0)
 
 
@@ -138,16 +138,16 @@ def _wrapped(degrees: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"
 def infer_axes(
     model: Predictor, starts: Sequence[RolloutStart], at_once: int, progress: Progress = no_progress
 ) -> AxisFit:
-    """Find the angle by which a model's axes are turned.
+    """Find the angle by which a model's axes are rotated.
 
     Args:
         model: The predictor.
-        starts: Of poses in the robot's base frame; one or more.
+        starts: Starts with poses in the robot's base frame; at least one.
         at_once: Samples per batch.
         progress: Called with the number of finished starts.
     """
-    # A turned mounting turns states about the robot's base. A turned camera turns them about the point that it looks
-    # at, which is near the middle of the motion.
+    # If the robot's mounting is rotated, states are rotated about the base. If the camera is rotated, they are rotated
+    # about the point that it looks at, which is near the centre of the motion.
     x, y = np.mean([start.state[:2].cpu().double().numpy() for start in starts], axis=0)
     centres = ((0.0, 0.0), (float(x), float(y)))
     errors = np.zeros((len(centres), len(starts), len(TRIED_DEGREES)))
@@ -184,13 +184,13 @@ def calibrate_axes(
 ) -> tuple[AxisFit, dict[str, Any]]:
     """Fit the axes of a model to recorded pairs of frames, one model step apart.
 
-    The model predicts as it plans: with trained weights merged, in the base's type, without autocast.
+    The model predicts as in planning: with trained weights merged, in the base model's dtype, without autocast.
 
     Args:
-        config: The data, the device and the precision.
-        model: What `model.base` takes, or the folder of a run.
-        pairs: At most, spread over the episodes.
-        split: Of the data.
+        config: The config with data and device.
+        model: A model in a form that `model.base` accepts, or the folder of a run.
+        pairs: Largest number of pairs, spread over the episodes.
+        split: The split of the data.
         reporter: Shows the progress of indexing, encoding and predicting.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Check a data set as `data check` does: open it, load a few batches as training would, and judge the numbers."""
+"""Checks of `data check`: open a data set, load a few batches as in training, and check the values."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from vjepa2_ac.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.spaces import POSE, POSES, Spaces, rotation_angles
 
-_DARK = 8  # of 255: mean of frames that are nearly black
-_STILL_CM, _FAR_CM = 0.2, 30.0  # medians of |dxyz| per model step that are reported
-_REACH_M = 1.6  # beyond the reach of common arms
-_LONGEST = 300  # characters of a reason
-_OPEN = 0.2  # a gripper that never closes further may be given in metres
-_LARGE = 100.0  # numbers of vectors beyond plausible radians, metres and shares
-_LISTED = 8  # numbers of a vector in a message
+_DARK = 8  # mean (0 to 255) below which frames are nearly black
+_STILL_CM, _FAR_CM = 0.2, 30.0  # medians of |dxyz| per model step outside these bounds give a warning
+_REACH_M = 1.6  # larger distances are beyond the reach of common arms
+_LONGEST = 300  # characters of a reason in a message
+_OPEN = 0.2  # a gripper whose closedness is always below this may be given in metres
+_LARGE = 100.0  # larger values in vectors are implausible for radians, metres and shares
+_LISTED = 8  # indices of numbers in a message
 
 
 def check_data(
     config: DataConfig, *, seed: int = 0, batch_size: int = 2, clips: int = 32, progress: Progress | None = None
 ) -> Iterator[Finding]:
-    """Yield the findings in the order in which training would meet them.
+    """Check a data set and yield the findings, in the order in which training uses the data.
 
     Args:
-        config: The data.
+        config: The data config.
         seed: Seed of the order of clips.
         batch_size: Clips in a batch.
         clips: The approximate number of clips to read.
@@ -68,7 +68,7 @@ def check_data(
 
 
 def _check_selection(dataset: Dataset) -> Iterator[Finding]:
-    """Yield which episodes, splits and groups are used, and which episodes are copies."""
+    """Yield the findings about used episodes, splits, groups and copied episodes."""
     config = dataset.config
     for one in dataset.removed:
         if one.episodes or one.steps or one.windows:
@@ -84,7 +84,9 @@ def _check_selection(dataset: Dataset) -> Iterator[Finding]:
         except InputError as error:
             if split == "train":
                 raise
-            level: Level = "error" if share else "skipped"  # training opens validation, and test if it has a share
+            level: Level = (
+                "error" if share else "skipped"
+            )  # training needs validation, and test if its share is above 0
             yield Finding(level, split, f"{shorten(error.found, _LONGEST, placeholder=' …')}. {error.fix}")
             continue
         short = f"; {counted(len(windows.short), 'episode')} shorter than a clip" if len(windows.short) else ""
@@ -99,7 +101,7 @@ def _check_selection(dataset: Dataset) -> Iterator[Finding]:
 
 
 def _check_test_split(dataset: Dataset) -> Iterator[Finding]:
-    """Warn if the test split is too small to measure whether training helped, and name a share that suffices."""
+    """Yield a warning if the test split is too small for intervals, with a share that suffices."""
     config, is_long_enough = dataset.config, dataset.table.num_steps >= dataset.config.clip_steps
     count = int((dataset.members("test") & is_long_enough).sum())
     if not 0 < count < ENOUGH_EPISODES:
@@ -141,7 +143,7 @@ def _check_clips(dataset: Dataset, *, seed: int, batch_size: int, clips: int) ->
 
 
 def batch_findings(batches: Sequence[Batch], spaces: Spaces = POSES) -> Iterator[Finding]:
-    """Yield the findings of some batches, with or without poses; a pure function, reads nothing."""
+    """Yield the findings about some batches, with poses or vectors as states."""
     first = batches[0]
     name, images = ("latents", first.latents.values) if first.latents else ("frames", first.frames)
     shapes = f"{name} {tuple(images.shape)} {str(images.dtype).removeprefix('torch.')}" if images is not None else name
@@ -162,10 +164,10 @@ def batch_findings(batches: Sequence[Batch], spaces: Spaces = POSES) -> Iterator
 
 
 def _pixel_finding(batches: Sequence[Batch]) -> Finding:
-    """Return whether the frames show something; `check_excerpts` compares each frame with the previous one."""
+    """Return the finding about uniform or dark frames; `check_excerpts` compares consecutive frames."""
     frames = [batch.frames for batch in batches if batch.frames is not None]
-    low, high = min(int(one.min()) for one in frames), max(int(one.max()) for one in frames)
-    mean = float(np.mean([one.float().mean().item() for one in frames]))
+    low, high = min(int(batch.min()) for batch in frames), max(int(batch.max()) for batch in frames)
+    mean = float(np.mean([batch.float().mean().item() for batch in frames]))
     return first_case(
         "pixels",
         f"{low} to {high}, mean {mean:.0f}",
@@ -175,7 +177,7 @@ def _pixel_finding(batches: Sequence[Batch]) -> Finding:
 
 
 def _vector_finding(name: str, values: Float[np.ndarray, "rows width"], fix: str) -> Finding:
-    """Return the finding about numbers of unknown meaning."""
+    """Return the finding about states or actions that are vectors of unknown meaning."""
     low, high = values.min(axis=0), values.max(axis=0)
     is_fixed, is_large = low == high, abs(values).max(axis=0) > _LARGE
     return first_case(
@@ -195,7 +197,7 @@ def _listed(mask: np.ndarray) -> str:
 def _pose_findings(
     states: Float[np.ndarray, "rows 7"], actions: Float[np.ndarray, "pairs 7"], clips: int
 ) -> Iterator[Finding]:
-    """Yield a finding for each kind of number in poses."""
+    """Yield the findings about position, rotation, gripper and actions."""
     positions, angles, closed = states[:, POSE.position], states[:, POSE.rotation], states[:, POSE.gripper]
     low, high = positions.min(axis=0), positions.max(axis=0)
     extent, reach = (high - low).max(), np.linalg.norm(positions, axis=1).max()

@@ -1,4 +1,4 @@
-"""Measure action coverage: has the motion enough directions and sizes to plan with?
+"""Measure action coverage: do the data contain enough directions and magnitudes of motion to plan with?
 
 A planner searches all directions up to its limits and takes the action with the lowest energy. Where the data have no
 such actions, the model extrapolates, and the optimiser exploits its errors. Data have low diversity ("narrow" in the
@@ -28,25 +28,25 @@ from vjepa2_ac.spaces import POSE, StateSpace, states_in_camera_frame
 
 T = TypeVar("T")
 
-PERCENTILE = 99  # of each number's change
+PERCENTILE = 99  # percentile that is reported as the usual size of changes
 PLAY = (
     "Record half an hour of random motion in all directions, with steps as long as the planner's: this helps planning"
     " more than further demonstrations"
 )
 
-ENOUGH_NEAR = 0.5  # a direction is covered by this share of the steps that go near it if all are equally frequent
-_SHORT_CM = 0.5  # a shorter step has no direction, and along an axis no sign
-_NEAR_DEG = 30.0
+ENOUGH_NEAR = 0.5  # a direction is covered from this density on, relative to equally frequent directions
+_SHORT_CM = 0.5  # shorter steps have no reliable direction, and no reliable sign along an axis
+_NEAR_DEG = 30.0  # angle within which a step counts for a direction
 # Measured: random reaching of the simulated arm 0.99 or more, of 100 random steps 0.90; half of all directions 0.61,
 # a plane 0.50 (0.58 if a fifth as thick as wide), an axis 0.14 (0.43), one way 0.07; starts of BridgeData 0.41.
 ENOUGH_DIRECTIONS = 0.7
-_SMALL_CM = 1.0  # an image hardly shows a shorter step
-_FEWEST_STEPS = 100  # that do not overlap
-_ROWS, _COLUMNS, _MOST = 24, 48, 5000
+_SMALL_CM = 1.0  # shorter steps are hardly visible in an image
+_FEWEST_STEPS = 100  # minimum number of steps that do not overlap
+_ROWS, _COLUMNS, _MOST = 24, 48, 5000  # cells of the map of directions, and most steps that are used for it
 _ONE_WAY, _ONE_AXIS, _ONE_PLANE, _LEANING = 0.8, 0.8, 0.1, 0.3
-_GRIPPER = 0.1  # of its way: a change of the gripper
-_HARDLY = 0.01  # numbers of vectors are of the order of 1: a smaller change is hardly one for the model
-_STEP, _OFTEN, _HALF = 0.1, 0.05, 0.5  # shares: of the farthest change, of the steps, of the numbers
+_GRIPPER = 0.1  # smallest change of closedness that counts as motion of the gripper
+_HARDLY = 0.01  # smaller changes of numbers in vectors count as rest, because the numbers are of the order of 1
+_STEP, _OFTEN, _HALF = 0.1, 0.05, 0.5  # thresholds: share of the usual change, of the steps, of the numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +55,11 @@ class ReadEpisode:
 
     index: int  # index into the data set's table
     states: Float[np.ndarray, "steps state_dim"]
-    kept: tuple[tuple[int, int], ...]  # ranges that clips come from
-    extrinsics: Float[np.ndarray, "steps 6"] | None = None  # of the camera that `data.pose_frame` says
+    kept: tuple[tuple[int, int], ...]  # ranges of control steps from which clips are taken
+    extrinsics: Float[np.ndarray, "steps 6"] | None = None  # camera poses, if `data.pose_frame` is camera
 
     def changes(self, stride: int, space: StateSpace) -> Iterator[Float[np.ndarray, "pairs state_dim"]]:
-        """Yield the changes from each step to the one `stride` later, within kept ranges, in the model's frame."""
+        """Yield the changes of the state over `stride` control steps, within kept ranges, in the model's frame."""
         states = self.states if self.extrinsics is None else states_in_camera_frame(self.states, self.extrinsics)
         for start, end in self.kept:
             for first in range(start, min(start + stride, end - stride)):
@@ -67,35 +67,37 @@ class ReadEpisode:
 
 
 def sample_of(dataset: Dataset, count: int) -> list[int]:
-    """Return at most `count` of the used episodes: a random draw that is always the same."""
-    # A latent cache has only the episodes that clips come from.
+    """Return at most `count` of the used episodes, drawn deterministically by the hash of their identities."""
+    # A latent cache contains only episodes from which clips are taken.
     members = dataset.starts.episodes if dataset.config.is_cache else dataset.episodes
     members = members[np.argsort(dataset.table.id_hash[members], kind="stable")]
-    return [int(members[place]) for place in spread(len(members), count)]
+    return [int(members[index]) for index in spread(len(members), count)]
 
 
 def read_each(
     dataset: Dataset, chosen: Sequence[int], read: Callable[[int], T], progress: Progress = no_progress
 ) -> Iterator[tuple[int, T]]:
-    """Yield some episodes with what is read of each; those that cannot be read are treated as `leave_out` says.
+    """Apply a function to some episodes in parallel, and yield each index with its result.
+
+    Episodes that cannot be read are skipped if `data.broken_episodes` allows it.
 
     Raises:
         InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
     """
 
-    def look(index: int) -> T | InputError:
+    def read_or_error(index: int) -> T | InputError:
         try:
             return read(index)
         except InputError as error:
             return error
 
-    found = in_parallel(look, chosen, connections_to(dataset.config))
-    for done, (index, one) in enumerate(zip(chosen, found, strict=True), start=1):
+    results = in_parallel(read_or_error, chosen, connections_to(dataset.config))
+    for done, (index, result) in enumerate(zip(chosen, results, strict=True), start=1):
         progress(done, len(chosen))
-        if isinstance(one, InputError):
-            dataset.leave_out(index, one)
+        if isinstance(result, InputError):
+            dataset.leave_out(index, result)
         else:
-            yield index, one
+            yield index, result
 
 
 def read_sample(
@@ -104,7 +106,7 @@ def read_sample(
     """Read at most `count` episodes, and those in `also`, without frames.
 
     Raises:
-        InputError: As `read_each`.
+        InputError: As for `read_each`.
     """
     chosen = list(dict.fromkeys([*also, *sample_of(dataset, count)]))
     for index, episode in read_each(dataset, chosen, dataset.source.read, progress):
@@ -114,34 +116,38 @@ def read_sample(
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Coverage of actions by the changes of the state, from each control step to the one `stride` later."""
+    """Action coverage, from the changes of the state over `stride` control steps."""
 
-    narrow: str  # why the data are not diverse enough to plan with; empty: they are, or there are too few steps to tell
-    moving_steps: int  # consecutive model steps that move
+    narrow: str  # the reason for which the data are not diverse enough; empty: they are, or there are too few steps
+    moving_steps: int  # number of consecutive model steps that move
     usual: Float[np.ndarray, " dim"]  # the 99th percentile of the size of each number's change
     lines: Mapping[str, str]  # the results as text, by name
-    metrics: Mapping[str, Any]  # the same as plain values
-    density: Float[np.ndarray, "rows columns"] | None = None  # of the directions of poses; see `density_of`
+    metrics: Mapping[str, Any]  # the results as plain values
+    density: Float[np.ndarray, "rows columns"] | None = None  # density of directions, for poses; see `density_of`
 
     @property
     def is_known(self) -> bool:
-        """Whether there are enough steps to tell."""
+        """Whether there are enough moving steps for a verdict."""
         return self.moving_steps >= _FEWEST_STEPS
 
     @property
     def verdict(self) -> str:
-        """Whether the motion is diverse enough to plan with, and if not, why, and what to record."""
+        """A sentence that states whether the motion is diverse enough to plan with, and if not, what to record."""
         if self.narrow:
             return f"motions are not diverse enough to plan with: {self.narrow}. {PLAY}"
         return "motions are diverse enough to plan with" if self.is_known else _needed(self.moving_steps)
 
     def noted(self) -> dict[str, Any]:
-        """Return what a run stores about its data, as plain values."""
+        """Return the values that a run stores about its data, as plain values."""
         return {"percentile": PERCENTILE, "changes": self.usual.tolist(), "narrow": self.narrow}
 
 
 def coverage_findings(coverage: Coverage | None) -> Iterator[Finding]:
-    """Yield whether the motion is diverse enough to plan with, the verdict last; None: no step fits."""
+    """Yield the findings about action coverage, with the verdict last.
+
+    Args:
+        coverage: The coverage; None: no episode is as long as a model step.
+    """
     if coverage is None:
         yield Finding("skipped", "coverage", "needs episodes with more consecutive steps than data.stride, found none")
         return
@@ -152,22 +158,22 @@ def coverage_findings(coverage: Coverage | None) -> Iterator[Finding]:
 
 
 def coverage_in(dataset: Dataset, *, episodes: int = 64) -> Coverage | None:
-    """Return the coverage of actions by a sample of the episodes, read without frames; None: no step fits.
+    """Measure action coverage in a sample of episodes, without frames; None if no episode is as long as a model step.
 
     Raises:
-        InputError: As `read_sample`.
+        InputError: As for `read_sample`.
     """
     return coverage_by(read_sample(dataset, episodes), dataset.spaces.state, dataset.config.model_stride)
 
 
 def coverage_by(sample: Iterable[ReadEpisode], space: StateSpace, stride: int) -> Coverage | None:
-    """Return the coverage of actions by some episodes; None: no step fits into them."""
-    changes = [piece for one in sample for piece in one.changes(stride, space)]
+    """Measure action coverage in some episodes; None if none of them is as long as a model step."""
+    changes = [piece for episode in sample for piece in episode.changes(stride, space)]
     return coverage_of(np.concatenate(changes), space, stride) if changes else None
 
 
 def coverage_of(changes: Float[np.ndarray, "pairs dim"], space: StateSpace, stride: int) -> Coverage:
-    """Return the coverage of actions by one or more changes of states, of which neighbouring ones overlap."""
+    """Measure action coverage from changes of states, which may overlap in time."""
     usual = np.asarray(np.percentile(np.abs(changes), PERCENTILE, axis=0))
     coverage = _of_poses(changes, usual, stride) if space.is_pose else _of_vectors(changes, usual, stride)
     metrics = {"stride": stride, "steps": len(changes), **coverage.metrics, "percentile_99": usual.tolist()}
@@ -180,23 +186,23 @@ def _needed(moving_steps: int) -> str:
 
 
 def _of_poses(changes: Float[np.ndarray, "pairs 7"], usual: Float[np.ndarray, " 7"], stride: int) -> Coverage:
-    ways_cm, lengths_cm = 100 * changes[:, POSE.position], POSE.shown_size(changes)
-    directions = (ways_cm / np.maximum(lengths_cm, 1e-12)[:, None])[lengths_cm >= _SHORT_CM]
+    moves_cm, lengths_cm = 100 * changes[:, POSE.position], POSE.shown_size(changes)
+    directions = (moves_cm / np.maximum(lengths_cm, 1e-12)[:, None])[lengths_cm >= _SHORT_CM]
     moving_steps = len(directions) // stride
     is_known = moving_steps >= _FEWEST_STEPS
     density = density_of(directions)
     covered = float((density >= ENOUGH_NEAR).mean())
     mean = directions.mean(axis=0) if len(directions) else np.zeros(3)
-    one_way = float(np.linalg.norm(mean))  # 0 if the directions balance, 1 if they are one
-    shares, axes = np.linalg.eigh(directions.T @ directions / max(1, len(directions)))  # the least share first
-    usual_cm = [float(one) for one in np.percentile(lengths_cm, [10, 50, 90, 99])]
+    one_way = float(np.linalg.norm(mean))  # 0 if the directions are balanced, 1 if all are the same
+    shares, axes = np.linalg.eigh(directions.T @ directions / max(1, len(directions)))  # in ascending order
+    usual_cm = [float(length) for length in np.percentile(lengths_cm, [10, 50, 90, 99])]
     share = f"{100 * covered:.0f} % of all directions"
     narrow = ""
     if usual_cm[2] < _SMALL_CM:
         narrow = f"90 % of the steps are at most {usual_cm[2]:.1f} cm long, which images hardly show: raise data.stride"
     elif is_known and covered < ENOUGH_DIRECTIONS:
         narrow = f"they cover {share}; {_where(mean, one_way, shares, axes.T)}"
-    back, forth = ((sign * ways_cm >= _SHORT_CM).mean(axis=0) for sign in (-1, 1))
+    back, forth = ((sign * moves_cm >= _SHORT_CM).mean(axis=0) for sign in (-1, 1))
     gripper = float((np.abs(changes[:, POSE.gripper]) >= _GRIPPER).mean())
     along = (
         f"{name} {100 * far:.1f} cm ({100 * one:.0f} % of them towards -{name}, {100 * other:.0f} % towards +{name})"
@@ -223,21 +229,21 @@ def density_of(directions: Float[np.ndarray, "steps 3"]) -> Float[np.ndarray, "r
 
     The cells have equal areas: rows are equally spaced in z (-1 to 1), columns in azimuth (-180 to 180 degrees).
     """
-    some = directions[:: -(-len(directions) // _MOST) or 1].astype(np.float32)
-    if not len(some):
+    sampled = directions[:: -(-len(directions) // _MOST) or 1].astype(np.float32)
+    if not len(sampled):
         return np.zeros((_ROWS, _COLUMNS))
     height = (np.arange(_ROWS, dtype=np.float32)[:, None] + 0.5) / _ROWS * 2 - 1
     azimuth = ((np.arange(_COLUMNS, dtype=np.float32) + 0.5) / _COLUMNS * 2 - 1) * np.pi
     across = np.sqrt(1 - height**2)
     cells = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height + 0 * azimuth], axis=-1)
     near = np.cos(np.deg2rad(_NEAR_DEG))
-    return np.asarray((cells @ some.T > near).mean(axis=-1) / ((1 - near) / 2), np.float64)
+    return np.asarray((cells @ sampled.T > near).mean(axis=-1) / ((1 - near) / 2), np.float64)
 
 
 def _where(
     mean: Float[np.ndarray, " 3"], one_way: float, shares: Float[np.ndarray, " 3"], axes: Float[np.ndarray, "3 3"]
 ) -> str:
-    """Say where directions are, by their mean and principal axes."""
+    """Describe the distribution of directions, by their mean and principal axes."""
     if one_way >= _ONE_WAY:
         return f"nearly all go one way, {_shown(mean / one_way)}"
     if shares[2] >= _ONE_AXIS:
@@ -249,11 +255,11 @@ def _where(
 
 def _shown(direction: Float[np.ndarray, " 3"]) -> str:
     numbers = np.round(direction, 1) + 0.0  # without -0.0
-    return f"({', '.join(f'{name} {one:+.1f}' for name, one in zip('xyz', numbers, strict=True))})"
+    return f"({', '.join(f'{name} {number:+.1f}' for name, number in zip('xyz', numbers, strict=True))})"
 
 
 def _of_vectors(changes: Float[np.ndarray, "pairs dim"], usual: Float[np.ndarray, " dim"], stride: int) -> Coverage:
-    """Return the coverage of each number by itself: how numbers depend on each other is not known."""
+    """Measure the coverage of each number separately, because the dependence between numbers is unknown."""
     back, forth = ((sign * changes > _STEP * usual).mean(axis=0) for sign in (-1, 1))
     both = np.flatnonzero((np.minimum(back, forth) >= _OFTEN) & (usual >= _HARDLY)).tolist()
     still = np.flatnonzero(usual < _HARDLY).tolist()

@@ -1,8 +1,8 @@
-"""Check excerpts of episodes without a model: do frames and states belong together, and are both plausible?
+"""Check excerpts of episodes without a model: do frames and states agree in time, and are both plausible?
 
-The limits follow from measurements on simulated arms, BridgeData and DROID excerpts, unchanged and with faults
-(docs/data_reference.md):
-each limit is well away from all clean sets, so slight errors pass.
+The limits follow from measurements on simulated arms, BridgeData and DROID excerpts, unchanged and with artificial
+faults (docs/data_reference.md). Each limit is far from the values of all unchanged data sets, so slight faults are not
+reported.
 
                                     clean sets                spoiled                              limit
     stale poses, share of steps     0 to 0.01                 0.19 (every 5th), 0.80 (4 of 5)      0.05; error 0.5
@@ -29,30 +29,30 @@ from vjepa2_ac.inspection.coverage import read_each, sample_of
 from vjepa2_ac.inspection.findings import Finding, Level
 from vjepa2_ac.spaces import POSE, StateSpace
 
-EPISODES, _EPISODES_AT_URL = 24, 12  # most episodes that are read; an episode of DROID is about 5 MB
-STEPS = 64
-_ROWS, _COLUMNS = 24, 32  # of a small frame: an arm is still some pixels wide, and a camera's noise is averaged out
-BLANK = 8.0  # of 255: the parts of a black or uniform frame differ by less
-_STILL_FRAME = 0.1  # of an episode's median change: the codec noise of a repeated frame
+EPISODES, _EPISODES_AT_URL = 24, 12  # largest number of episodes to read; an episode of DROID is about 5 MB
+STEPS = 64  # control steps of an excerpt
+_ROWS, _COLUMNS = 24, 32  # size of a small frame; an arm is still some pixels wide, and camera noise is averaged out
+BLANK = 8.0  # contrast (0 to 255) below which a frame counts as black or uniform
+_STILL_FRAME = 0.1  # changes below this share of an episode's median change are codec noise of a repeated frame
 _STALE, _MOSTLY_STALE = 0.05, 0.5
 _COPIED, _MOSTLY_COPIED = 0.2, 0.9
 _FAR_LIKE_NEAR, _FEWEST_STEPS = 0.9, 8
 _INSIDE_M, _DELTA_JUMPS = 0.05, 0.3
 
-# Of the agreement of frames and states:
-_MOST_LAG = 10  # control steps
-_LAG_SHARE = 4  # an excerpt is shifted by a quarter of its length at most
-_SHIFTS = 20  # pairings with other episodes, each covering all episodes
-_FEWEST_EPISODES = 8  # with fewer, chance level is not known well enough
-_SURE = 3.0  # standard errors, or deviations of chance
-_GAIN = 0.25  # of the value above chance, that another shift must add
-_BACKWARDS = 0.25  # by which an episode's frames fit better in opposite order; share of such episodes, at most
-_ABOVE = 0.15  # minimum above chance for matching frames: 0.3 and more was measured
+# Constants for the agreement of frames and states:
+_MOST_LAG = 10  # largest shift in control steps
+_LAG_SHARE = 4  # the largest shift is the length of an excerpt divided by this
+_SHIFTS = 20  # pairings of each episode with frames of other episodes, to estimate the chance level
+_FEWEST_EPISODES = 8  # with fewer episodes the chance level is too uncertain
+_SURE = 3.0  # required standard errors, or standard deviations of the chance level
+_GAIN = 0.25  # required gain of another shift, relative to the value above chance
+_BACKWARDS = 0.25  # required gain of the opposite order in an episode, and largest share of such episodes
+_ABOVE = 0.15  # smallest correlation above chance of matching frames; 0.3 and more was measured
 
 
 @dataclass(frozen=True, eq=False)
 class Excerpt:
-    """Neighbouring control steps of an episode."""
+    """Consecutive control steps of an episode, with small grey frames."""
 
     name: str  # the episode's identity
     states: Float[np.ndarray, "steps state_dim"]
@@ -60,17 +60,17 @@ class Excerpt:
 
     @property
     def frame_change(self) -> Float[np.ndarray, " changes"]:
-        """The difference of each frame from the one before: the mean over its pixels."""
+        """The mean absolute difference of each frame from the previous one, over its pixels."""
         return np.asarray(np.abs(np.diff(self.grey, axis=0)).mean(axis=(1, 2)), np.float64)
 
 
 def excerpts_of(dataset: Dataset, *, episodes: int = EPISODES, steps: int = STEPS) -> Iterator[Excerpt]:
-    """Yield the middle of some used episodes: always the same draw.
+    """Yield the middle of some used episodes, which are drawn deterministically.
 
-    Episodes that cannot be read are skipped, or raise an error, as `data.broken_episodes` says.
+    Episodes that cannot be read are skipped if `data.broken_episodes` allows it.
 
     Raises:
-        InputError: As `Dataset.leave_out`.
+        InputError: As for `Dataset.leave_out`.
     """
 
     def read(index: int) -> Excerpt:
@@ -85,8 +85,8 @@ def excerpts_of(dataset: Dataset, *, episodes: int = EPISODES, steps: int = STEP
 
 
 def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.ndarray, "steps rows columns"]:
-    """Return frames in grey, each pixel the mean of a part; smaller frames are not reduced."""
-    if len(frames) > 1:  # one after the other: the grey frame has more bytes than the frame
+    """Convert frames to small grey frames by averaging; frames that are smaller already keep their size."""
+    if len(frames) > 1:  # one frame at a time, because a float32 grey frame is larger than the colour frame
         return np.concatenate([small_grey(frame[None]) for frame in frames])
     grey = frames.mean(axis=3, dtype=np.float32)
     for axis, wanted in ((1, _ROWS), (2, _COLUMNS)):
@@ -99,12 +99,12 @@ def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.
 
 
 def affordable(dataset: Dataset, episodes: int = EPISODES) -> int:
-    """Return the number of episodes to read: fewer behind a URL."""
+    """Return the number of episodes to read, which is smaller for data behind a URL."""
     return _EPISODES_AT_URL if storage.is_url(dataset.config.path) else episodes
 
 
 def check_excerpts(dataset: Dataset) -> Iterator[Finding]:
-    """Read excerpts of some episodes and yield what is unusual in them.
+    """Read excerpts of some episodes, and yield the findings about faults in them.
 
     Raises:
         InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
@@ -119,7 +119,7 @@ def check_excerpts(dataset: Dataset) -> Iterator[Finding]:
 def excerpt_findings(
     excerpts: Sequence[Excerpt], space: StateSpace, stride: int, control_rate_hz: float
 ) -> Iterator[Finding]:
-    """Yield what is unusual in excerpts, and whether frames and states belong together; reads nothing."""
+    """Yield the findings about faults in excerpts, and the agreement of frames and states."""
     excerpts = [one for one in excerpts if len(one.states) > 1 and np.ptp(one.grey) >= BLANK]
     if not excerpts:
         yield _agreement([], stride, control_rate_hz, is_sound=True)
@@ -134,17 +134,17 @@ def excerpt_findings(
 
 
 def _motion_in(excerpts: Sequence[Excerpt], space: StateSpace) -> list[Float[np.ndarray, " _"]]:
-    """Return the motion of each episode at each step: the sum over its numbers, each in units of its typical change."""
+    """Return the motion of each episode at each step: the sum over its numbers, each relative to its usual change."""
     changes = [space.differences(one.states) for one in excerpts]
     for change in changes if space.rotation is not None else ():
         change[:, space.rotation] = Rotation.from_euler("xyz", change[:, space.rotation]).as_rotvec()
     scale = np.sqrt((np.concatenate(changes) ** 2).mean(axis=0))
-    scale = np.where(scale > 0, scale, np.inf)  # constant numbers do not count
+    scale = np.where(scale > 0, scale, np.inf)  # constant numbers add nothing
     return [np.abs(change / scale).sum(axis=1) for change in changes]
 
 
 def _noise_as_frames(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
-    """Report neighbouring frames that differ as much as those half an excerpt apart."""
+    """Yield an error if consecutive frames differ as much as frames half an excerpt apart."""
     excerpts = [one for one in excerpts if len(one.grey) >= _FEWEST_STEPS]
     near, far = sum(float(one.frame_change.sum()) for one in excerpts), 0.0
     for grey in (one.grey for one in excerpts):
@@ -156,7 +156,7 @@ def _noise_as_frames(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
 
 
 def _repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]]) -> Iterator[Finding]:
-    """Report repetitions: of poses while frames change, of frames while poses change, or of single steps of both."""
+    """Yield findings about repeated poses with changing frames, repeated frames with changing poses, and both."""
     each_held = [(np.diff(one.states, axis=0) == 0).all(axis=1) for one in excerpts]
     each_still = [is_still(one.frame_change) for one in excerpts]
     singly = np.concatenate([_alone(one & other) for one, other in zip(each_held, each_still, strict=True)])
@@ -178,7 +178,7 @@ def _repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, 
 
 
 def is_still(change: Float[np.ndarray, " changes"]) -> Bool[np.ndarray, " changes"]:
-    """Return which changes of frames are no more than the codec noise of a repeated frame."""
+    """Return which changes of frames are so small that the frame is a repetition with codec noise."""
     changing = change[change > 0]
     return np.asarray(change <= (_STILL_FRAME * np.median(changing) if len(changing) else 0.0))
 
@@ -188,13 +188,13 @@ def _share(mask: Bool[np.ndarray, " changes"], among: Bool[np.ndarray, " changes
 
 
 def _alone(mask: Bool[np.ndarray, " changes"]) -> Bool[np.ndarray, " changes"]:
-    """Return which values are true while both neighbours are not."""
+    """Return which values are true while both neighbours are false."""
     padded = np.pad(mask, 1)
     return np.asarray(mask & ~padded[:-2] & ~padded[2:])
 
 
 def _deltas_for_poses(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
-    """Report positions that are impossible for a flange: at the base, as differences of positions are."""
+    """Yield a finding if positions are too close to the robot's base, as differences of positions are."""
     positions = [one.states[:, POSE.position] for one in excerpts]
     median_m = float(np.median(np.linalg.norm(np.concatenate(positions), axis=1)))
     if not 0 < median_m < _INSIDE_M:
@@ -216,18 +216,19 @@ def _agreement(
     *,
     is_sound: bool,
 ) -> Finding:
-    """Compare the change of frames with that of states.
+    """Compare the changes of frames with the motion of states, and return the finding.
 
-    Where a robot moves faster, its frame changes more. The rank correlation of the two within an episode is 0.5 and
-    more on simulated arms at 15 Hz and on BridgeData at 5 Hz; with the frames of another episode, at the
-    best of 21 shifts, it is 0.1 to 0.4. So the shift with the highest correlation shows frames that are late, frames
-    that fit backwards are reversed, and frames that fit no better than another episode's belong to another episode.
+    Frames change more when the robot moves faster. The rank correlation of the two within an episode is 0.5 and more on
+    simulated arms at 15 Hz and on BridgeData at 5 Hz. With the frames of another episode, at the best of 21 shifts, it
+    is 0.1 to 0.4. Therefore the shift with the highest correlation is the delay of the frames; a higher correlation in
+    the opposite order means reversed frames; and frames that correlate no better than those of another episode belong
+    to another episode.
 
     Args:
-        pairs: Of some episodes: how far the state has moved at each step, and the frame has changed, in any unit.
-        stride: Control steps per model step. A camera easily lags by one control step: that is late at stride 1 only.
-        control_rate_hz: For the message.
-        is_sound: Nothing else is wrong that would explain a low correlation.
+        pairs: For each episode the motion of the state and the change of the frame at each step, in any unit.
+        stride: Control steps per model step. Many cameras lag by one control step, which is reported at stride 1 only.
+        control_rate_hz: Control steps per second, for the message.
+        is_sound: Whether no other fault was found that explains a low correlation.
     """
     pairs = [pair for pair in pairs if all(len(values) and np.ptp(values) > 0 for values in pair)]
     usual = float(np.median([len(one) for one, _ in pairs])) if pairs else 0.0
@@ -275,17 +276,17 @@ def _agreement(
 
 
 def _ranks(rows: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, "rows longest"]:
-    """Return the ranks of each row's values, from 0 to 1; NaN after the end of shorter ones."""
+    """Return the ranks of the values in each row, from 0 to 1, padded with NaN to the longest row."""
     ranks = np.full((len(rows), max(map(len, rows))), np.nan)
-    for place, row in enumerate(rows):
-        ranks[place, : len(row)] = rankdata(row) / len(row)
+    for number, row in enumerate(rows):
+        ranks[number, : len(row)] = rankdata(row) / len(row)
     return ranks
 
 
 def _profiles(
     moved: Float[np.ndarray, "episodes longest"], seen: Float[np.ndarray, "episodes longest"], lags: range
 ) -> Float[np.ndarray, "episodes lags"]:
-    """Return each row's correlation with frame changes taken so many steps later than motion."""
+    """Return the correlation of motion and frame change in each row, with frames shifted by each lag."""
     length = moved.shape[1]
     columns = []
     for lag in lags:

@@ -1,4 +1,4 @@
-"""Findings: the lines of `data check`, and their summary; and duplicates, which are found by the index alone."""
+"""Findings (the lines of `data check`) with their summary, and duplicated episodes, which are found from the index."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ Level = Literal["ok", "warning", "error", "skipped"]
 DUPLICATES_FIX = "List copies in data.exclude, or keep related episodes in one split with data.split_by"
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 
-_NEAR = 1e-4  # of means and deviations of copies: rounding to 0.1 mm changes them less
-_MOVING = 1e-2  # of deviations: episodes with smaller ones may agree because the robot stands still
-_MOST_COPIES = 8  # of one recording; of more, not all may be found
+_NEAR = 1e-4  # tolerance of means and spans of copies; rounding to 0.1 mm changes them less
+_MOVING = 1e-2  # episodes with smaller spans are not compared: they may agree because the robot does not move
+_MOST_COPIES = 8  # copies of one recording; if there are more, some may be missed
 
 
 @dataclass(frozen=True)
 class Finding:
     """The result of one check of a data set.
 
-    An error: training would not start, or learn nothing. A warning: something is probably wrong. Skipped: the check did
-    not run, or could not decide; the text says what it needs.
+    With an error training would fail or learn nothing. A warning means that something is probably wrong. A skipped
+    check did not run or could not decide; the text states what it needs.
     """
 
     level: Level
@@ -39,16 +39,22 @@ class Finding:
 
 
 def first_case(about: str, text: str, *cases: tuple[bool, Level, str]) -> Finding:
-    """Return the finding of the first case that holds, with its level and explanation; `ok` if none holds."""
-    level, words = next(((level, words) for holds, level, words in cases if holds), ("ok", ""))
-    return Finding(level, about, f"{text}: {words}" if words else text)
+    """Return the finding of the first case whose condition is true, or else the level `ok`.
+
+    Args:
+        about: Name of the check.
+        text: The measured values.
+        cases: Condition, level and explanation of each case.
+    """
+    level, explanation = next(((level, explanation) for holds, level, explanation in cases if holds), ("ok", ""))
+    return Finding(level, about, f"{text}: {explanation}" if explanation else text)
 
 
 def findings_as_dict(findings: Sequence[Finding]) -> dict[str, Any]:
     """Return the findings as plain values, with the number of errors, warnings and skipped checks."""
-    counts = Counter(one.level for one in findings)
+    counts = Counter(finding.level for finding in findings)
     return {
-        "findings": [{"level": one.level, "name": one.about, "text": one.text} for one in findings],
+        "findings": [{"level": finding.level, "name": finding.about, "text": finding.text} for finding in findings],
         "errors": counts["error"],
         "warnings": counts["warning"],
         "skipped": counts["skipped"],
@@ -57,31 +63,31 @@ def findings_as_dict(findings: Sequence[Finding]) -> dict[str, Any]:
 
 def summary_of(findings: Sequence[Finding]) -> str:
     """Return the last line of `data check`, such as "0 errors, 1 warning, 3 skipped"."""
-    counts = Counter(one.level for one in findings)
+    counts = Counter(finding.level for finding in findings)
     return f"{counted(counts['error'], 'error')}, {counted(counts['warning'], 'warning')}, {counts['skipped']} skipped"
 
 
 @dataclass(frozen=True)
 class Duplicates:
-    """Used episodes that have the same, or nearly the same, states as another one."""
+    """Used episodes whose states are equal or nearly equal to those of another episode."""
 
     is_known: bool  # whether the states were compared
-    episodes: int = 0
-    different: int = 0  # of these, without copies
-    across: int = 0  # of these: with a copy in another split
-    example: tuple[tuple[str, Split], ...] = ()  # two of them with their splits: of different splits, if there are
-    copies: tuple[str, ...] = ()  # identities of all but the first of each: what to exclude
+    episodes: int = 0  # number of episodes with a copy
+    different: int = 0  # number of different recordings among them
+    across: int = 0  # number of them with a copy in another split
+    example: tuple[tuple[str, Split], ...] = ()  # two copies with their splits, if possible in different splits
+    copies: tuple[str, ...] = ()  # identities of all but the first episode of each recording
 
     def __str__(self) -> str:
         if not self.is_known:
             return "need the states of the episodes; the index of this data set has none"
         if not self.episodes:
             return "no two episodes have the same states"
-        (one, its_split), (other, others_split) = self.example
+        (first, first_split), (second, second_split) = self.example
         return (
             f"{self.episodes:,} episodes have the states of another episode, exactly or nearly"
             f" ({self.different:,} different recordings). {self.across:,} of them have a copy in another split, such as"
-            f" {one} ({its_split}) and {other} ({others_split}). {DUPLICATES_FIX}"
+            f" {first} ({first_split}) and {second} ({second_split}). {DUPLICATES_FIX}"
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -90,7 +96,7 @@ class Duplicates:
 
 
 def find_duplicates(dataset: Dataset) -> Duplicates:
-    """Compare the states of all used episodes by their hashes and summaries: fast, reads nothing."""
+    """Find duplicates among all used episodes, from hashes and summaries of their states in the index."""
     table = dataset.table
     if table.state_hash is None:
         return Duplicates(is_known=False)
@@ -121,18 +127,20 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
 def _recordings(
     table: EpisodeTable, members: Int[np.ndarray, " members"], hashes: UInt64[np.ndarray, " members"]
 ) -> Int[np.ndarray, " members"]:
-    """Return a number for each episode: the same for equal and for nearly equal states."""
+    """Return a number for each episode, which is the same for episodes with equal or nearly equal states."""
     motion = table.motion[members]
     numbers = np.unique(hashes, return_inverse=True)[1]
-    moving = np.flatnonzero(motion[:, SPANS].max(axis=1, initial=0.0) > _MOVING)  # not those of unknown motion
+    moving = np.flatnonzero(motion[:, SPANS].max(axis=1, initial=0.0) > _MOVING)  # without unknown motion
     points = np.column_stack([motion[moving, 2:], table.num_steps[members[moving]]])
     _, nearest = KDTree(points).query(points, k=_MOST_COPIES, p=np.inf, distance_upper_bound=_NEAR)
-    numbers[moving] = np.append(numbers[moving], len(members))[nearest].min(axis=1)  # the last one: no such neighbour
+    numbers[moving] = np.append(numbers[moving], len(members))[nearest].min(
+        axis=1
+    )  # the appended number stands for "no neighbour"
     return np.asarray(numbers)
 
 
 def duplicates_finding(dataset: Dataset) -> Finding:
-    """Return whether episodes are copies of others, by the index."""
+    """Return the finding about duplicated episodes."""
     duplicates = find_duplicates(dataset)
     level: Level = "skipped" if not duplicates.is_known else "warning" if duplicates.episodes else "ok"
     return Finding(level, "duplicates", str(duplicates))

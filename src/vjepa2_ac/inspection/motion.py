@@ -1,4 +1,4 @@
-"""Check motion and the ends of episodes: speeds that no arm reaches, padding, lost measurements, rotation formats."""
+"""Check motion and episode ends: impossible speeds, padding, lost measurements, rotation formats, frozen frames."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from vjepa2_ac.spaces import POSE, step_sizes
 
 _EPISODES = 200
 _MIDDLES = 64  # episodes whose middle frame is read
-_MOST_FAST = 200  # episodes that are read to name their steps
+_MOST_FAST = 200  # largest number of too fast episodes that are read to name their steps
 # Measured: with half of the episodes at half the scale the groups are 5.8 (BridgeData) and 9.0 (simulated arm)
 # deviations apart, otherwise at most 4.0.
 _FEWEST_SCALED, _SEPARATION, _SCALE, _SAME_SHAPE = 4, 5.0, 1.4, 0.2
 _END_STEPS = 16  # steps at each end of an episode whose frames are read
 _MIN_FROZEN = 3  # single repeated frames come from a camera with a lower rate
-_MOVED_M = 0.01  # an image shows such a motion
+_MOVED_M = 0.01  # smallest motion that is visible in an image
 FASTEST_M_S, FASTEST_RAD_S = 2.5, 10.0  # speeds between control steps that no arm reaches
-_FARTHER = 1.5  # a step from or to zeros, relative to the 99th percentile of other steps: not a motion
+_FARTHER = 1.5  # a step from or to zeros above this multiple of the 99th percentile of steps is no motion
 _EXCLUDE = "Remove these steps from the data set, or list the episodes in data.exclude"
 
 
 class Stretch(NamedTuple):
-    """Consecutive control steps of an episode that training uses."""
+    """Consecutive control steps of an episode that are used in training."""
 
     name: str  # the episode's identity
     start: int  # the first step
@@ -43,7 +43,7 @@ class Stretch(NamedTuple):
 
 
 def check_motion(dataset: Dataset) -> Iterator[Finding]:
-    """Read the states of some episodes, and the frames at the ends of fewer, and yield what no robot does.
+    """Read the states of some episodes, and frames at the ends of fewer, and yield the findings about their motion.
 
     Raises:
         InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
@@ -64,12 +64,12 @@ def check_motion(dataset: Dataset) -> Iterator[Finding]:
 
 
 def warnings_from_index(dataset: Dataset) -> list[Finding]:
-    """Return the warnings that need no frames: copies, another scale, and steps that no arm makes.
+    """Return the warnings that need no frames: duplicates, another scale, and impossible speeds.
 
-    Only episodes are read that are too fast by the index.
+    Only episodes that are too fast according to the index are read.
 
     Raises:
-        InputError: As `check_motion`.
+        InputError: As for `check_motion`.
     """
     findings = [duplicates_finding(dataset)]
     if dataset.config.states == "pose":
@@ -79,7 +79,7 @@ def warnings_from_index(dataset: Dataset) -> list[Finding]:
 
 
 def scale_finding(dataset: Dataset) -> Finding:
-    """Return whether the positions of some episodes are a multiple of those of the others, as with another unit."""
+    """Return the finding about groups of episodes whose positions differ in scale, as with different units."""
     radii_m, spans_m = (np.linalg.norm(dataset.table.motion[:, part], axis=1) for part in (MEANS, SPANS))
     members = dataset.episodes[(radii_m * spans_m)[dataset.episodes] > 0]  # not those of unknown motion
     if len(members) < 2 * _FEWEST_SCALED:
@@ -100,7 +100,7 @@ def scale_finding(dataset: Dataset) -> Finding:
 
 
 def _fast_episodes(dataset: Dataset) -> list[int]:
-    """Return at most 200 episodes in which, by the index, a step exceeds the speed of any arm; the fastest first."""
+    """Return at most 200 episodes with a step that is faster than any arm according to the index, fastest first."""
     members = dataset.episodes
     excess = (dataset.table.motion[members, :2] / [FASTEST_M_S, FASTEST_RAD_S]).max(axis=1)
     order = np.argsort(-excess)[: int((excess * dataset.control_rate_hz > 1).sum())]
@@ -108,7 +108,7 @@ def _fast_episodes(dataset: Dataset) -> list[int]:
 
 
 def _check_states(dataset: Dataset, sample: Sequence[ReadEpisode]) -> Iterator[Finding]:
-    """Yield the findings about speed and padding; the index knows the speed of episodes that were not read."""
+    """Yield the findings about speed and padding; for episodes that were not read, the index contains the speed."""
     num_indexed = int((dataset.table.motion[dataset.episodes, 0] >= 0).sum())
     checked = f"{len(sample):,} of {counted(len(dataset.episodes), 'episode')} checked"
     by_index = f", {num_indexed:,} by the index" if num_indexed > len(sample) else ""
@@ -123,7 +123,7 @@ def _check_states(dataset: Dataset, sample: Sequence[ReadEpisode]) -> Iterator[F
 
 
 def speed_finding(stretches: Sequence[Stretch], control_rate_hz: float, checked: str) -> Finding:
-    """Return whether poses change faster between consecutive control steps than an arm can move.
+    """Return the finding about poses that change faster between control steps than an arm can move.
 
     Args:
         stretches: Steps of some episodes.
@@ -149,9 +149,9 @@ def speed_finding(stretches: Sequence[Stretch], control_rate_hz: float, checked:
 
 
 def padding_finding(stretches: Sequence[Stretch], checked: str) -> Finding:
-    """Return whether the numbers of poses are exactly zero although the robot is elsewhere before or after them.
+    """Return the finding about poses that are exactly zero although the previous or next pose is far away.
 
-    Poses relative to the first state of an episode begin with zeros, too; but from there the robot moves slowly.
+    Poses relative to the first state of an episode also start with zeros, but then the robot moves away slowly.
     """
     runs: list[tuple[float, str, int, int]] = []  # farthest step from or to the zeros, identity, first step, end
     moves_m = [np.zeros(1)]
@@ -175,7 +175,7 @@ def padding_finding(stretches: Sequence[Stretch], checked: str) -> Finding:
 
 
 def _check_rotation_format(dataset: Dataset, sample: Sequence[ReadEpisode]) -> Iterator[Finding]:
-    """Yield whether the hand turns more smoothly if the rotation numbers are read in another format."""
+    """Yield the finding about rotations that are smoother if they are read in another format."""
     config, source, about = dataset.config, dataset.source, "rotation format"
     if config.is_cache:
         yield Finding("skipped", about, "needs rotation numbers; check the data set that this cache was made from")
@@ -212,7 +212,7 @@ def _check_rotation_format(dataset: Dataset, sample: Sequence[ReadEpisode]) -> I
 
 
 def _check_ends(dataset: Dataset) -> Finding:
-    """Count the black and the frozen frames at the ends of some episodes."""
+    """Return the finding about black and frozen frames at the ends of episodes."""
     is_pose = dataset.spaces.state.position is not None
 
     def read(index: int) -> list[tuple[int, int, str]]:
@@ -239,7 +239,7 @@ def _check_ends(dataset: Dataset) -> Finding:
 
 
 def _check_middles(dataset: Dataset) -> Finding:
-    """Find episodes whose middle frame shows nothing: there a camera failed, or images were lost."""
+    """Return the finding about episodes whose middle frame is blank, because a camera failed or images were lost."""
 
     def is_blank(index: int) -> bool:
         start, end = max(dataset.kept.of(index), key=lambda one: one[1] - one[0])
@@ -254,12 +254,12 @@ def _check_middles(dataset: Dataset) -> Finding:
 def count_at_end(
     grey: Float32[np.ndarray, "steps rows columns"], states: Float[np.ndarray, "steps dim"], *, is_pose: bool
 ) -> tuple[int, int]:
-    """Return the number of black frames at an end of an episode, and of frames with one image while the robot moves.
+    """Return the numbers of black frames, and of identical frames while the robot moves, at an end of an episode.
 
     Args:
         grey: Frames from 0 to 255, the outermost one first.
-        states: Their states.
-        is_pose: Whether the states are poses; else frozen frames are not counted.
+        states: The states of the frames.
+        is_pose: Whether the states are poses; otherwise frozen frames are not counted.
     """
     black = _num_leading(grey.max(axis=(1, 2)) < BLANK)
     same = _num_leading(is_still(np.abs(np.diff(grey, axis=0)).mean(axis=(1, 2), dtype=np.float64))) + 1

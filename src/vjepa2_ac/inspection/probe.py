@@ -1,7 +1,7 @@
-"""Data variants: under which does a trained model predict best: unchanged, mirrored, shifted, ...?
+"""Find out whether a trained model predicts better on mirrored, shifted or otherwise changed data.
 
-The same clips are measured unchanged and with one thing changed at a time, of every episode and nothing on disk; a
-variant that is certainly better is most likely the true reading of the data.
+The same clips are measured unchanged and with one change at a time, which applies to all episodes; no file is changed.
+If a variant is certainly better, the data are most likely recorded or configured wrongly in this respect.
 """
 
 from __future__ import annotations
@@ -39,37 +39,37 @@ from vjepa2_ac.spaces import POSE, euler_from_matrices, matrices_from_euler
 
 SHIFTS = (1, 2, 4, 8)  # control steps
 AS_THEY_ARE = "as they are"
-_CANDIDATES_PER_CLIP = 8  # windows checked per clip, since shifts need room on both sides
-_GAIN = 0.01  # of persistence: smaller gains are irrelevant
+_CANDIDATES_PER_CLIP = 8  # candidate starts per clip, because shifts need further states on both sides
+_GAIN = 0.01  # smaller gains, relative to persistence, are irrelevant
 
 
 @dataclass(frozen=True)
 class VariantProbe:
     """The results of all variants, each compared with the unchanged data."""
 
-    plain: VariantResult  # of these
+    plain: VariantResult  # the result on unchanged data
     results: tuple[VariantResult, ...]
 
     @property
     def better(self) -> VariantResult | None:
-        """The variant that fits best, if it certainly fits better than the unchanged data."""
-        certain = [one for one in self.results if one.is_certainly_better(needed=ENOUGH_EPISODES)]
-        gains = {one: -one.difference.value for one in certain if one.difference and one.ratio.high < 1}
-        better = [one for one, gain in gains.items() if gain > _GAIN]  # with a ratio above 1 it only fails less
-        return max(better, key=lambda one: gains[one], default=None)
+        """The best variant, if it is certainly better than the unchanged data and better than persistence."""
+        certain = [result for result in self.results if result.is_certainly_better(needed=ENOUGH_EPISODES)]
+        gains = {result: -result.difference.value for result in certain if result.difference and result.ratio.high < 1}
+        better = [result for result, gain in gains.items() if gain > _GAIN]
+        return max(better, key=lambda result: gains[result], default=None)
 
     @property
     def is_decided(self) -> bool:
-        """Whether the model can tell variants apart: on enough episodes it predicts better than persistence."""
+        """Whether there is a verdict: a variant is better, or the model beats persistence on enough episodes."""
         return self.better is not None or (self.plain.episodes >= ENOUGH_EPISODES and self.plain.ratio.value < 1)
 
     def verdict(self) -> str:
-        """Return as text whether the unchanged data fit the model best."""
+        """Return a sentence that states whether the unchanged data fit the model best."""
         plain, better = self.plain, self.better
         text = f"one-step error / persistence {plain.ratio} on {counted(plain.clips, 'clip')}"
         text += f" of {counted(plain.episodes, 'episode')}"
-        if better is not None and (found := better.difference) is not None:
-            less = f"{-found.value:.3f} [{-found.high:.3f}, {-found.low:.3f}]"
+        if better is not None and (difference := better.difference) is not None:
+            less = f"{-difference.value:.3f} [{-difference.high:.3f}, {-difference.low:.3f}]"
             return f"{text}, lower by {less} with {better.name}: {better.repair}"
         if plain.episodes < ENOUGH_EPISODES:
             return f"needs at least {ENOUGH_EPISODES} episodes, found {plain.episodes} ({text})"
@@ -81,13 +81,13 @@ class VariantProbe:
 def probe_config(
     config: Config, dataset: Dataset, *, model: str, clips: int = 64, progress: Progress = no_progress
 ) -> VariantProbe:
-    """Probe the data of a config, opened at a fixed stride, with a model.
+    """Compare variants of a data set, opened at a fixed stride, with a model.
 
     Args:
-        config: The device and the precision.
-        dataset: The data.
-        model: What `model.base` takes, or the folder of a run.
-        clips: Number of clips, of the validation episodes; of training episodes if there are no others.
+        config: The config, for device and precision.
+        dataset: The data set.
+        model: A model in a form that `model.base` accepts, or the folder of a run.
+        clips: Number of clips, from validation episodes, or from training episodes if there is no validation split.
         progress: Called with the number of measured clips.
 
     Raises:
@@ -113,15 +113,15 @@ def probe_variants(
 
     Args:
         model: The predictor.
-        encode: Makes the latents.
-        dataset: The source of clips, at a fixed stride.
+        encode: Encodes the frames.
+        dataset: The data set, at a fixed stride.
         sample: The clips.
         progress: Called with (clips done, clips in total).
 
     Raises:
         InputError: The split is empty, or a clip cannot be read.
     """
-    # Of whole clips, as a cache has them.
+    # Starts of clips of the config's length, because a latent cache contains only these.
     candidates = validation_windows(dataset, sample.split, clips=sample.clips * _CANDIDATES_PER_CLIP)
     frames = sample.frames_of(dataset.config)
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": frames}))
@@ -139,27 +139,27 @@ def probe_variants(
 def _with_room(
     dataset: Dataset, candidates: list[tuple[int, int]], clips: int
 ) -> tuple[list[tuple[int, int]], list[int]]:
-    """Return the starts of clips, and the shifts for which each has states before and after it."""
+    """Return the starts of clips, and the shifts for which each clip has enough states before and after it."""
     steps, length = dataset.table.num_steps, dataset.config.clip_steps
     enough = max(1, min(clips, len(candidates) // 4))
     fitting, shifts = candidates, list[int]()
-    for room in SHIFTS:
-        wider = [(episode, start) for episode, start in fitting if room <= start <= steps[episode] - length - room]
+    for shift in SHIFTS:
+        wider = [(episode, start) for episode, start in fitting if shift <= start <= steps[episode] - length - shift]
         if len(wider) < enough:
             break
         fitting = wider
-        shifts.append(room)
-    return [fitting[place] for place in spread(len(fitting), clips)], shifts
+        shifts.append(shift)
+    return [fitting[index] for index in spread(len(fitting), clips)], shifts
 
 
 def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
     """Return the variants that apply to this data.
 
     Args:
-        config: The data.
-        shifts: Control steps by which to shift frames against states.
+        config: The data config.
+        shifts: Control steps by which to shift frames relative to states.
     """
-    found = [
+    variants = [
         _variant(
             f"frames {_steps(shift)} {'late' if shift > 0 else 'early'}",
             f"give each frame the state of {_steps(shift)} {'before' if shift > 0 else 'after'}",
@@ -168,35 +168,35 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
         for size in shifts
         for shift in (size, -size)
     ]
-    if config.actions == "difference":  # a command has no opposite
-        turned = _of_states(lambda states: np.ascontiguousarray(states[::-1]))
-        found.append(_variant("the states backwards", "reverse the order of the frames", turned))
+    if config.actions == "difference":  # recorded commands cannot be reversed
+        backwards = _of_states(lambda states: np.ascontiguousarray(states[::-1]))
+        variants.append(_variant("the states backwards", "reverse the order of the frames", backwards))
     if config.states == "pose":
         for axis, name in enumerate("xy"):
             repair = f"negate {name}, with the rotation (as of a mirror)"
-            found.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
+            variants.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
         inverted = _of_states(lambda states: np.append(states[:, :-1], 1 - states[:, -1:], axis=1))
         section, fields = config.pose_fields
         repair = f"exchange data.{section}.gripper_open and gripper_closed" if fields else "write 1 - gripper"
-        found.append(_variant("the gripper inverted", repair, inverted))
+        variants.append(_variant("the gripper inverted", repair, inverted))
     if not config.is_cache:
         exchanged, flipped = _of_frames(lambda frames: frames[..., ::-1]), _of_frames(lambda frames: frames[:, :, ::-1])
         repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
-        found.append(_variant("red and blue exchanged", repair, exchanged, has_frames=True))
+        variants.append(_variant("red and blue exchanged", repair, exchanged, has_frames=True))
         repair = "flip the frames, left to right, where the data is written"
-        found.append(_variant("frames mirrored", repair, flipped, has_frames=True))
-    return found
+        variants.append(_variant("frames mirrored", repair, flipped, has_frames=True))
+    return variants
 
 
 def _variant(name: str, repair: str, change: Callable[[Episode], Episode], *, has_frames: bool = False) -> Variant:
-    """Return a variant of changed episodes; without frames where they are the same."""
+    """Return a variant that changes each episode; without `has_frames` its frames are not read."""
 
     def no_frames(steps: Sequence[int]) -> np.ndarray:
         return np.zeros((len(steps), 1, 1, 3), np.uint8)
 
     def changed(episode: Episode) -> Episode:
-        found = change(episode)
-        return found if has_frames else replace(found, read_frames=no_frames, read_latents=None)
+        result = change(episode)
+        return result if has_frames else replace(result, read_frames=no_frames, read_latents=None)
 
     def view(dataset: Dataset) -> Dataset:
         return replace(dataset, source=ReadOnce(dataset.source, changed))
@@ -205,7 +205,7 @@ def _variant(name: str, repair: str, change: Callable[[Episode], Episode], *, ha
 
 
 def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarray, "steps 7"]:
-    """Return poses mirrored across the plane of two axes: one coordinate and two rotations negated."""
+    """Mirror poses by negating one coordinate and the rotations about the two other axes."""
     mirror = np.ones(3)
     mirror[axis] = -1
     rotations = matrices_from_euler(states[:, POSE.rotation]) * mirror[:, None] * mirror
@@ -217,7 +217,7 @@ def _steps(shift: int) -> str:
 
 
 def shifted(episode: Episode, *, late: int) -> Episode:
-    """Give each step the state, and the command, of `late` steps before; beyond the ends, the first or the last."""
+    """Give each step the state and the command of `late` steps earlier, repeating the first or last one at the ends."""
     steps = np.clip(np.arange(len(episode.states)) - late, 0, len(episode.states) - 1)
     commands = None if episode.commands is None else episode.commands[steps]
     return replace(episode, states=episode.states[steps], commands=commands)

@@ -1,4 +1,4 @@
-"""The contact sheet of a data set: episodes as film strips and their motion, below plots of the whole set."""
+"""The contact sheet of a data set: plots of the whole data set, and image strips of episodes with their motion."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from vjepa2_ac.inspection.coverage import ENOUGH_NEAR, ReadEpisode
 from vjepa2_ac.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, Inspection, largest_change
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, written_figure
 
-_PLACES = 6000  # points of the map, at most
+_PLACES = 6000  # largest number of points in the map
 _IDLE = "#c9c9c9"
 _OUTCOME = {True: ("success", GREEN), False: ("failure", "#c0392b"), None: ("", "#b5b5b5")}
 _STRIDES = ("#7fb3dd", BLUE, "#0b3558", "#7a4fa3", "#333333")
 
 _WIDTH, _LABEL, _FILM, _TITLE, _ROW, _PANELS = 11.0, 1.6, 9.0, 0.5, 1.6, 2.5  # inches
-_EDGE = 0.2 / _WIDTH  # of the sheet, left and right
-_LEAST, _MOST, _PICTURE = 4, 14, 0.8  # pictures in a row, and the height in inches at which they are counted
+_EDGE = 0.2 / _WIDTH  # left and right margin, relative to the width
+_LEAST, _MOST, _PICTURE = 4, 14, 0.8  # least and most images in a row, and their height in inches
 
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """One episode: some of its frames, and its motion at every control step."""
+    """One row of the sheet: some frames of an episode, and its motion at every control step."""
 
     name: str
     success: bool | None
     frames: UInt8[np.ndarray, "time height width 3"]
-    speed: Float[np.ndarray, " steps"]  # per second, in cm of the flange; of vectors see `plot_contact_sheet`
-    closedness: Float[np.ndarray, " steps"] | None  # None: the states are no poses
-    shaded: tuple[tuple[int, int], ...]  # ranges [start, end) of steps that are left out
-    seen: CropBox  # what the model sees of a picture
+    speed: Float[np.ndarray, " steps"]  # cm/s of the flange; for vectors see `plot_contact_sheet`
+    closedness: Float[np.ndarray, " steps"] | None  # None: the states are not poses
+    shaded: tuple[tuple[int, int], ...]  # ranges [start, end) of steps that are not used
+    seen: CropBox  # part of the image that is the model's input
 
 
 def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress: Progress = no_progress) -> Path:
-    """Write the contact sheet of an inspected data set; decodes only the frames that it shows.
+    """Write the contact sheet of an inspected data set. Only the frames that it shows are decoded.
 
     `progress` is called with (episodes whose frames were read, episodes shown).
 
@@ -93,15 +93,15 @@ def _strip_of(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
 
 
 def pictures_per_row(height: int, width: int) -> int:
-    """Return the number of frames of a size in a row of the sheet."""
+    """Return the number of images of a size in a row of the sheet."""
     return int(min(max(_FILM // (_PICTURE * width / height + 0.06), _LEAST), _MOST))
 
 
 def plot_contact_sheet(inspection: Inspection, strips: Sequence[Strip], path: Path) -> Path:
-    """Write the contact sheet of a data set as PNG; it is written atomically.
+    """Write the contact sheet of a data set as PNG, atomically.
 
-    Its unit of motion is cm of the flange. For vectors it is the change of the number that changes most, as a
-    percentage of its range; these have no positions in space.
+    Motion is shown in cm of the flange for poses. For vectors it is the largest change of a number, as a percentage of
+    its range, and the map of positions is replaced by the ranges of all numbers.
     """
     dataset, heights = inspection.dataset, [_TITLE, _PANELS, *(_ROW for _ in strips)]
     with written_figure(path, _WIDTH, sum(heights), dpi=130, layout="none", facecolor="white") as figure:
@@ -116,7 +116,7 @@ def plot_contact_sheet(inspection: Inspection, strips: Sequence[Strip], path: Pa
 
 
 def _panels(part: Any, inspection: Inspection) -> None:
-    """Draw the small plots of the whole set: lengths, motion per model step, places and directions."""
+    """Draw the plots of the whole data set: lengths, motion per model step, positions and directions."""
     dataset, has_poses = inspection.dataset, inspection.has_poses
     lengths_s = dataset.table.num_steps / dataset.control_rate_hz
     edges = {"left": 0.04, "right": 0.96, "bottom": 0.34, "top": 0.9}
@@ -151,7 +151,7 @@ def _panels(part: Any, inspection: Inspection) -> None:
 
 
 def _directions(part: Any, axes: Any, directions: Float[np.ndarray, "rows columns"]) -> None:
-    """Draw the sphere of directions, each of the same area, as a map: x forward in the middle, z up."""
+    """Draw the density of directions as an equal-area map of the sphere, with x (forward) in the middle and z up."""
     extent = (-180.0, 180.0, -1.0, 1.0)
     shown = axes.imshow(directions, extent=extent, origin="lower", aspect="auto", cmap="Blues", vmin=0, vmax=2)
     axes.set_title(f"Directions: {(directions >= ENOUGH_NEAR).mean():.0%} covered")
@@ -201,7 +201,7 @@ def _strip(part: Any, strip: Strip, control_rate_hz: float, fastest: float) -> N
 
 
 def _paler(frame: UInt8[np.ndarray, "height width 3"], seen: CropBox) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a frame that is pale where the model does not see it."""
+    """Return a frame that is pale outside the part that is the model's input."""
     shown = (frame * 0.3 + 255 * 0.35).astype(np.uint8)
     part = np.s_[seen.top : seen.top + seen.height, seen.left : seen.left + seen.width]
     shown[part] = frame[part]

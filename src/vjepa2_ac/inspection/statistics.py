@@ -36,28 +36,28 @@ class Inspection:
 
     @property
     def has_poses(self) -> bool:
-        """Whether there is a position, of which motion is measured."""
+        """Whether the states contain a position, from which motion is measured."""
         return self.dataset.spaces.state.position is not None
 
     @cached_property
     def ranges(self) -> Float[np.ndarray, "state_dim 2"]:
-        """The least and the greatest value of each number of the sample's states."""
-        states = np.concatenate([one.states for one in self.sample])
+        """Minimum and maximum of each number of the state in the sample."""
+        states = np.concatenate([episode.states for episode in self.sample])
         return np.stack([states.min(axis=0), states.max(axis=0)], axis=1)
 
     @cached_property
     def coverage(self) -> Coverage | None:
-        """The coverage of actions by the sample at the config's stride; None: no step fits."""
+        """Action coverage of the sample at the config's stride; None if no episode is as long as a model step."""
         return coverage_by(self.sample, self.dataset.spaces.state, self.dataset.config.model_stride)
 
     @cached_property
     def steps(self) -> dict[int, dict[str, Float[np.ndarray, " pairs"]]]:
-        """How far the state moves in a model step at each candidate stride: of poses MOVED and TURNED, else CHANGED."""
+        """Size of the motion in a model step for each candidate stride: MOVED and TURNED for poses, else CHANGED."""
         return {stride: self._at_stride(stride) for stride in candidate_strides(self.dataset.control_rate_hz)}
 
     def _at_stride(self, stride: int) -> dict[str, Float[np.ndarray, " pairs"]]:
         space = self.dataset.spaces.state
-        pieces = [piece for one in self.sample for piece in one.changes(stride, space)]
+        pieces = [piece for episode in self.sample for piece in episode.changes(stride, space)]
         changes = np.concatenate([np.zeros((0, len(space))), *pieces])
         if not self.has_poses:
             return {CHANGED: largest_change(changes, self.ranges)}
@@ -105,7 +105,7 @@ class Inspection:
 
     @cached_property
     def summary(self) -> dict[str, str]:
-        """What there is to say, by what it is about."""
+        """The statistics as lines of text, by name."""
         config, values = self.dataset.config, self.values
         hours, success, copies = values["hours"], values["success_share"], self.duplicates.copies
         lasting = f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
@@ -147,8 +147,8 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
     """Compute the statistics of a data set: from the table for all episodes, from the states of a sample for motion.
 
     Args:
-        dataset: Its stride is a number.
-        episodes: At most as many are read, without frames, spread over the used ones.
+        dataset: A data set whose stride is a number.
+        episodes: Number of episodes that are read, without frames.
         progress: Called with (episodes read, total number).
 
     Raises:
@@ -163,20 +163,20 @@ def _percentiles(values: Float[np.ndarray, " pairs"]) -> list[float]:
 
 
 def idle_runs(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[np.ndarray, " steps"]:
-    """Return the steps in runs of idle ones, by measured motion, that are long enough for the idle filter."""
+    """Return which steps are in idle ranges, by measured motion, that are long enough for the idle filter."""
     return long_idle_runs(idle_by_motion(states, config.idle), config.idle)
 
 
 def largest_change(
     changes: Float[np.ndarray, "steps state_dim"], ranges: Float[np.ndarray, "state_dim 2"]
 ) -> Float[np.ndarray, " steps"]:
-    """Return, at each step, the change of the number that changes most, in percent of its range."""
+    """Return the largest change of a number at each step, in percent of the number's range."""
     spans = ranges[:, 1] - ranges[:, 0]
     return np.asarray((abs(changes) / np.where(spans > 0, spans, np.inf)).max(axis=1) * 100)
 
 
 def at_some_stride(dataset: Dataset) -> Dataset:
-    """Return a data set at its stride; if that is auto, at the smallest candidate."""
+    """Return the data set with a fixed stride: its own, or the smallest candidate if it is auto."""
     if dataset.config.stride != "auto":
         return dataset
     return dataset.with_stride(min(candidate_strides(dataset.control_rate_hz)))

@@ -1,9 +1,9 @@
-"""Variants: the same clips of a data set, read in several ways and measured with a model, compared pair by pair.
+"""Compare variants of reading the same clips of a data set, by the prediction error of a model.
 
-A model's one-step error over persistence is lowest where frames, states and actions are those that it knows. So strides
-are calibrated: the step length of the released weights is unknown (see IMPLEMENTATION_NOTES), and robots differ in
-their control rate. At each candidate stride, the same clips begin at the same control steps of the same held-out
-episodes. Other readings of the data are in `inspection.probe`.
+A model's one-step error relative to persistence is lowest if frames, states and actions are as in its training. This is
+used to calibrate the stride: the step length of the released weights is unknown (see IMPLEMENTATION_NOTES), and robots
+differ in their control rate. At each candidate stride, clips start at the same control steps of the same held-out
+episodes. Other variants are in `inspection.probe`.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.storage.structured import plain
 
-Encode = Callable[[Batch], LatentBatch]  # pixels into latents, on the model's device
+Encode = Callable[[Batch], LatentBatch]  # encodes pixels into latents, on the model's device
 
-_MARGIN = 2.0  # half-widths of the 95 % interval: the best of several is easily better by chance
+_MARGIN = 2.0  # required half-widths of the 95 % interval, because the best of several variants is selected
 _EPISODES_NEEDED = 2  # for an interval
 _EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to read a data set."""
+    """One variant of reading a data set."""
 
     name: str
     view: Callable[[Dataset], Dataset]
-    has_frames: bool = True  # False: they are those of the first variant, whose latents are taken
-    repair: str = ""  # the fix, if it fits better
+    has_frames: bool = True  # False: the frames equal those of the first variant, so its latents are used
+    repair: str = ""  # the fix if this variant is better
 
 
 @dataclass(frozen=True)
@@ -59,26 +59,28 @@ class VariantResult:
     """The one-step, teacher-forced error of a model under a variant."""
 
     name: str
-    ratio: Estimate  # of the error to that of copying the frame before
+    ratio: Estimate  # error relative to persistence
     error: float  # mean over clips
     persistence: float
     clips: int
     episodes: int
-    difference: Estimate | None = None  # of the ratio to another variant's on the same clips; below 0: fits better
+    difference: Estimate | None = None  # ratio minus that of another variant on the same clips; below 0: better
     repair: str = ""
 
     def is_certainly_better(self, *, needed: int) -> bool:
-        """Return whether the difference is below 0 by twice its interval: the variant was chosen on these clips.
+        """Return whether the difference is below 0 by more than twice the half-width of its interval.
+
+        The margin is larger than usual, because the variant was selected on the same clips.
 
         Args:
-            needed: Episodes; with fewer, an interval is too narrow.
+            needed: Minimum number of episodes; with fewer, intervals are too narrow.
         """
         if self.difference is None or not self.difference.has_interval or self.episodes < needed:
             return False
         return self.difference.value + _MARGIN * (self.difference.high - self.difference.value) < 0
 
 
-# By clip (episode, first control step): the one-step, teacher-forced L1 error of the model and of persistence.
+# The one-step, teacher-forced L1 errors of the model and of persistence, by clip (episode, first control step).
 VariantErrors = dict[tuple[str, int], Float[np.ndarray, " 2"]]
 
 
@@ -89,8 +91,8 @@ def result_of(
     ids, difference = [episode for episode, _ in errors], None
     if reference is not None:
         common = [clip for clip in errors if clip in reference]
-        one, other = (np.array([kind[clip] for clip in common]).T.copy() for kind in (errors, reference))
-        difference = ratio_difference((one[0], one[1]), (other[0], other[1]), [episode for episode, _ in common])
+        variant, other = (np.array([part[clip] for clip in common]).T.copy() for part in (errors, reference))
+        difference = ratio_difference((variant[0], variant[1]), (other[0], other[1]), [name for name, _ in common])
     of_model, of_persistence = np.array(list(errors.values())).T.copy()
     means, counts = (float(of_model.mean()), float(of_persistence.mean())), (len(ids), len(set(ids)))
     return VariantResult(name, ratio(of_model, of_persistence, ids), *means, *counts, difference, repair)
@@ -102,34 +104,34 @@ class SameClips:
 
     dataset: Dataset
     windows: Sequence[tuple[int, int]]  # episode and first control step of each
-    batch_size: int  # clips that are computed together
+    batch_size: int  # clips per batch
 
 
 def measure_variants(
     model: Predictor, encode: Encode, clips: SameClips, variants: Sequence[Variant], progress: Progress = no_progress
 ) -> list[VariantErrors]:
-    """Measure a model's one-step error on the same clips under each variant; each episode is read once for all.
+    """Measure a model's one-step error on the same clips under each variant; each episode is read only once.
 
     Args:
         model: The predictor.
-        encode: Makes the latents.
-        clips: What to measure on.
-        variants: The first one decides which clips can be read.
-        progress: Called with (clips done, clips in total), of all variants.
+        encode: Encodes the frames.
+        clips: The clips.
+        variants: The variants. The first one determines which clips can be read.
+        progress: Called with (clips done, clips in total), over all variants.
 
     Raises:
-        InputError: A clip cannot be read; or, by `data.broken_episodes`, none of them.
+        InputError: A clip cannot be read, or no clip can be read although `data.broken_episodes` skips broken ones.
     """
     first, done, dataset, windows = variants[0], 0, clips.dataset, clips.windows
     parts: list[VariantErrors] = [{} for _ in variants]
     for batch in batches_of(first.view(dataset), windows, batch_size=clips.batch_size):
         latents, read = encode(batch), replace(dataset, source=ReadOnce(dataset.source))
-        places = [dataset.table.find(name) for name in batch.episode_ids]
-        here = [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
-        for variant, found in zip(variants, parts, strict=True):
-            seen = [latents] if variant is first else _read(variant, read, here, encode, latents)
-            for each in seen:
-                found |= _measured(model, each)
+        indices = [dataset.table.find(name) for name in batch.episode_ids]
+        starts = [(index, start) for index, start in zip(indices, batch.starts, strict=True) if index is not None]
+        for variant, errors in zip(variants, parts, strict=True):
+            batches = [latents] if variant is first else _read(variant, read, starts, encode, latents)
+            for latent_batch in batches:
+                errors |= _measured(model, latent_batch)
             done += len(batch.starts)
             progress(done, len(windows) * len(variants))
     return parts
@@ -138,7 +140,7 @@ def measure_variants(
 def _read(
     variant: Variant, dataset: Dataset, windows: Sequence[tuple[int, int]], encode: Encode, latents: LatentBatch
 ) -> Iterable[LatentBatch]:
-    """Yield a batch of clips under a variant; frames are encoded only if it has some of its own."""
+    """Yield a batch of clips under a variant; frames are encoded only if the variant changes them."""
     for batch in batches_of(variant.view(dataset), windows, batch_size=len(windows)):
         if variant.has_frames:
             yield encode(batch)
@@ -148,19 +150,19 @@ def _read(
 
 
 def _measured(model: Predictor, latents: LatentBatch) -> VariantErrors:
-    found = measured(model, latents, ONE_STEP, (L1,))
-    errors = np.stack([found.of("teacher_forced", L1, way).mean(axis=1) for way, _ in ONE_STEP], axis=1)
+    result = measured(model, latents, ONE_STEP, (L1,))
+    errors = np.stack([result.of("teacher_forced", L1, kind).mean(axis=1) for kind, _ in ONE_STEP], axis=1)
     return dict(zip(zip(latents.episode_ids, latents.starts, strict=True), errors, strict=True))
 
 
 @dataclass(frozen=True)
 class ReadOnce:
-    """A source of which each episode is read once: a remote one, or one in a large record, takes long. It is changed.
+    """A source that changes episodes, and keeps them in memory, because reading remote or large episodes is slow.
 
     Args:
         source: The source.
-        change: What is done to each episode.
-        episodes: Those that were read.
+        change: Changes an episode after reading.
+        episodes: The episodes that were read.
     """
 
     source: EpisodeSource
@@ -172,17 +174,22 @@ class ReadOnce:
         return self.source.infos(progress)
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
-        """Return an episode, changed."""
+        """Return a changed episode; read it at the first call only."""
         if (index, camera) not in self.episodes:
             self.episodes[index, camera] = self.change(self.source.read(index, camera, needed))
         return self.episodes[index, camera]
 
 
 def load_named(config: Config, dataset: Dataset, model: str | None) -> WorldModel:
-    """Return the model of a run's folder, or of what `model.base` takes; None: the config's own. It fits the data.
+    """Load a model and check that it fits the data.
+
+    Args:
+        config: The config with the data.
+        dataset: The data set.
+        model: Folder of a run, or a model in a form that `model.base` accepts; None: the model of the config.
 
     Raises:
-        InputError: There is none, it cannot be read, is randomly initialized, or does not fit the data.
+        InputError: There is no such model, it cannot be read, it is random, or it does not fit the data.
     """
     if model is None and config.model.is_random:
         found, needed = "a model that has learned nothing", "one that can say which stride it was trained at"
@@ -199,31 +206,31 @@ def load_named(config: Config, dataset: Dataset, model: str | None) -> WorldMode
 
 @dataclass(frozen=True)
 class Calibration:
-    """The results at each stride, and the best one."""
+    """The results at each stride, and the best stride."""
 
-    results: Mapping[int, VariantResult]  # that of the best one is compared with the runner-up
-    impossible: Mapping[int, str]  # stride -> why it could not be measured
+    results: Mapping[int, VariantResult]  # by stride; the best one is compared with the second best
+    impossible: Mapping[int, str]  # by stride: the reason for which it could not be measured
     frames: int
     split: Split
     rate_hz: float  # control steps per second
 
     @property
     def stride(self) -> int:
-        """The stride with the lowest ratio of error and persistence."""
+        """The stride with the lowest error relative to persistence."""
         return _by_ratio(self.results)[0]
 
     @property
     def best(self) -> VariantResult:
-        """Its result."""
+        """The result at the best stride."""
         return self.results[self.stride]
 
     @property
     def is_certain(self) -> bool:
-        """Whether the best stride is certainly better than the next, which were both chosen on these clips."""
+        """Whether the best stride is certainly better than the second best."""
         return self.best.is_certainly_better(needed=_EPISODES_TO_BE_SURE)
 
     def verdict(self) -> str:
-        """Return as text the best stride, and how certain it is."""
+        """Return a sentence with the best stride and its certainty."""
         best, difference = self.best, self.best.difference
         seconds = self.stride / self.rate_hz
         words = f"Best: stride {self.stride} ({seconds:.2f} s per model step), error/persistence {best.ratio}"
@@ -252,7 +259,7 @@ class Calibration:
 
 
 def _by_ratio(results: Mapping[int, VariantResult]) -> list[int]:
-    """Return the strides, the best first."""
+    """Return the strides, the best one first."""
     return sorted(results, key=lambda stride: results[stride].ratio.value)
 
 
@@ -261,12 +268,12 @@ def calibrate_config(
 ) -> Calibration:
     """Calibrate the model of a config, or another one, on the config's data.
 
-    A latent cache has the frames of one stride's clips only, so frames are encoded on the fly.
+    A latent cache contains only the frames of clips at one stride, so frames are encoded here.
 
     Args:
-        config: The data, the model, the device and the precision.
+        config: The config with data, model, device and precision.
         sample: The clips at each stride.
-        model: Another model: what `model.base` takes, or the folder of a run.
+        model: Another model in a form that `model.base` accepts, or the folder of a run.
         reporter: Shows the progress of indexing and measuring.
 
     Raises:
@@ -287,10 +294,10 @@ def calibrate_model(
     sample: ClipSample,
     progress: Progress = no_progress,
 ) -> Calibration:
-    """Calibrate a model that is on the accelerator's device, in the run's precision.
+    """Calibrate the stride for a model that is on the accelerator's device, in the run's precision.
 
     Raises:
-        InputError: As `calibrate`; or the data is a latent cache.
+        InputError: As for `calibrate`, or the data are a latent cache.
     """
     if dataset.config.is_cache:
         found = f"latents that were encoded for clips at stride {dataset.config.stride}"
@@ -305,15 +312,15 @@ def calibrate_model(
 def calibrate(
     model: Predictor, encode: Encode, dataset: Dataset, sample: ClipSample, *, progress: Progress = no_progress
 ) -> Calibration:
-    """Measure a model's one-step error over persistence at each stride.
+    """Measure a model's one-step error relative to persistence at each stride.
 
-    A stride is possible if clips of it fit into at least two episodes (one, if no stride fits into two). All possible
-    ones are measured on the starts from which a clip of the widest fits.
+    A stride is possible if its clips fit into at least two episodes (or one, if no stride fits into two). All possible
+    strides are measured at the starts from which a clip of the largest stride fits.
 
     Args:
         model: The predictor.
-        encode: Makes the latents.
-        dataset: The source of clips; its own stride does not matter.
+        encode: Encodes the frames.
+        dataset: The data set; its own stride is ignored.
         sample: The clips at each stride.
         progress: Called with (clips done, clips in total).
 
@@ -329,8 +336,7 @@ def calibrate(
     widest_first = possible[::-1]
     variants = [Variant(str(stride), partial(_at_stride, views[stride])) for stride in widest_first]
     clips = SameClips(dataset, windows, sample.batch_size)
-    found = measure_variants(model, encode, clips, variants, progress)
-    errors = dict(zip(widest_first, found, strict=True))
+    errors = dict(zip(widest_first, measure_variants(model, encode, clips, variants, progress), strict=True))
     names = {stride: f"stride {stride} ({stride / rate:.2f} s)" for stride in possible}
     results = {stride: result_of(errors[stride], name) for stride, name in names.items()}
     if len(results) > 1:
@@ -344,7 +350,7 @@ def _at_stride(view: Dataset, dataset: Dataset) -> Dataset:
 
 
 def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:
-    """Return the strides whose clips fit into enough episodes, and for the others the reason why not."""
+    """Return the strides whose clips fit into enough episodes, and the reasons for all other strides."""
     fitting, reasons = {}, {}
     for stride, dataset in views.items():
         try:
@@ -364,12 +370,12 @@ def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[
 def choose_stride(
     config: Config, dataset: Dataset, accelerator: Accelerator, reporter: Reporter
 ) -> tuple[WorldModel, Calibration]:
-    """Load the base of a run whose `data.stride` is auto, and calibrate it among the candidates whose clips fit.
+    """Load the base model of a run whose `data.stride` is auto, and calibrate the stride.
 
-    The result is the same in all processes.
+    Only candidates whose clips fit into the episodes are measured. The result is the same in all processes.
 
     Raises:
-        InputError: The run has no base that could choose, no candidate fits, or as `calibrate_model`.
+        InputError: The base model is random, no candidate fits, or as for `calibrate_model`.
     """
     world_model = load_named(config, dataset, None).to(accelerator.device)
     reporter.note("data.stride is auto: measuring the model at each candidate stride")
@@ -387,7 +393,7 @@ def choose_stride(
         raise errors[0]
     sample = ClipSample(clips=config.validation.clips, strides=tuple(fitting))
     calibration = calibrate_model(world_model, dataset, config, accelerator, sample)
-    for one in calibration.results.values():
-        reporter.note(f"  {one.name}: error/persistence {one.ratio:.3f}")
+    for result in calibration.results.values():
+        reporter.note(f"  {result.name}: error/persistence {result.ratio:.3f}")
     reporter.note(calibration.verdict())
     return world_model, broadcast_object(accelerator, calibration)
