@@ -89,9 +89,9 @@ def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.
     if len(frames) > 1:  # one frame at a time, because a float32 grey frame is larger than the colour frame
         return np.concatenate([small_grey(frame[None]) for frame in frames])
     grey = frames.mean(axis=3, dtype=np.float32)
-    for axis, wanted in ((1, _ROWS), (2, _COLUMNS)):
+    for axis, target in ((1, _ROWS), (2, _COLUMNS)):
         size = grey.shape[axis]
-        edges = np.linspace(0, size, min(wanted, size) + 1).astype(int)
+        edges = np.linspace(0, size, min(target, size) + 1).astype(int)
         shape = [1, 1, 1]
         shape[axis] = -1
         grey = np.add.reduceat(grey, edges[:-1], axis=axis) / np.diff(edges).reshape(shape).astype(np.float32)

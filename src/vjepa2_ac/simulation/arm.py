@@ -165,7 +165,7 @@ class SimulatedArm:
         self._circles.move(self._data, self._time_s)
 
     def _camera_pose(self, camera: str) -> Float[np.ndarray, "4 4"]:
-        """Return the frame of a camera in the world. The wrist camera is mounted on the hand, beside the fingers."""
+        """Return the frame of a camera in the world. The wrist camera is mounted on the hand, next to the fingers."""
         if camera in _EXTERIOR_TURNS_DEG:
             return self.domain.camera.turned(_EXTERIOR_TURNS_DEG[camera]).pose()
         if camera != "wrist":
