@@ -59,7 +59,8 @@ def named_actions(
     if name == "none":
         return actions
     if name not in _DIRECTIONS:
-        raise InputError(where="actions", found=repr(name), needed=f"one of {', '.join(ACTION_NAMES)}, or a file")
+        needed = f"true (of a recorded clip), {', '.join(ACTION_NAMES)}, or a file"
+        raise InputError(where="actions", found=repr(name), needed=needed)
     axis, sign = _DIRECTIONS[name]
     if axis != GRIPPER:
         size = size_m if limits is None else min(size_m, limits.xyz_m[axis])
