@@ -51,7 +51,7 @@ _BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
 _SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # elements, as in bitsandbytes
 _CHECKPOINTED = ", checkpointed"
 _STANDING = (  # parts that are allocated all the time
-    "encoder weights", "predictor weights", "trained weights", "optimizer state", "prefetched batch", "CUDA allowance",
+    "encoder weights", "predictor weights", "trained weights", "optimizer state", "batch", "CUDA allowance",
 )  # fmt: skip
 _OF_LOSS = {"loss", "rollout_steps"}
 _WITH_EFFECT: Any = {
@@ -343,7 +343,7 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
         "trained weights": trained,
         "gradients": trained,
         "optimizer state": sum(_moments(config, elements) for elements in parameters.trained_tensors),
-        "prefetched batch": batch_bytes(config, sizes),
+        "batch": batch_bytes(config, sizes),
         "latents": _latents(config, sizes, config.training.batch_size),
         "encoder activations": _encoding(config, sizes, config.training.batch_size),  # before the predictor runs
         "validation": _validating(config, sizes, step),
