@@ -325,8 +325,7 @@ def test_a_film_without_pyav_is_a_gif_and_a_note(tmp_path: Path, monkeypatch: py
     monkeypatch.setitem(sys.modules, "av", None)
     for name, value in (("draw_strip", FRAMES[0]), ("film_frames", FRAMES[:2]), ("loop_of", [(1, 0.1), (0, 0.1)])):
         monkeypatch.setattr(imagine, name, lambda *_, value=value, **__: value)
-    for name in "strip_of":
-        monkeypatch.setattr(imagine, name, lambda _: {})
+    monkeypatch.setattr(imagine, "strip_of", lambda _: {})
     written = imagine.write_imagination(None, tmp_path, reporter=SimpleNamespace(note=noted.append))  # type: ignore[arg-type]
     assert imagine.VIDEO not in {path.name for path in written}
     assert all(path.is_file() for path in written)

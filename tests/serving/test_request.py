@@ -131,6 +131,7 @@ WRONG = {
     "goal/rules: \\[{'name': b": {**RULED, "goal/rules": [{"name": b"x"}, {}]},
     "goal/rules: \\[{'at_most': array": {**RULED, "goal/rules": [{"at_most": np.ones(2)}, {}]},
     "goal/rules\\[0\\]: at_most: .*found 1.5": {**RULED, "goal/rules": [{"at_most": 1.5}, {}]},
+    "goal/rules\\[0\\]: at_most: .*10000": {**RULED, "goal/rules": [{"at_most": 2**64 - 1}, {}]},
     "goal/rules\\[0\\]: most: unknown": {**RULED, "goal/rules": [{"most": 1}, {}]},
     "goal/rules\\[1\\]: gripper: .* 'up'": {**RULED, "goal/rules": [{}, {"gripper": "up"}]},
     "at least 0": {**RULED, "goal/rules": [{"at_least": 0}, {}]},

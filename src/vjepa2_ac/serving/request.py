@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, cast, get_args
+from typing import Annotated, Any, cast, get_args
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from pydantic import Field
 
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.goals import GripperMode, SubGoal
@@ -19,6 +20,8 @@ IMAGE_KEYS = ("observation/exterior_image_1_left", "observation/exterior_image_0
 """Keys of the camera image (DROID, RoboArena, generic); the first one that a message contains is used."""
 
 MOST_GOALS = 32  # goal images of one request
+MOST_STEPS = 10_000  # model steps of one goal
+_Steps = Annotated[int, Field(ge=0, le=MOST_STEPS)]
 
 _STATE, _POSE, _GRIPPER = "observation/state", "observation/cartesian_position", "observation/gripper_position"
 _GOAL = "goal/"
@@ -34,8 +37,8 @@ class GoalRule:
     """The rule of one goal image, as in goals.json; all fields are optional."""
 
     name: str = ""
-    at_least: int = 1
-    at_most: int | None = None
+    at_least: _Steps = 1
+    at_most: _Steps | None = None
     share: float | None = None
     gripper: GripperMode | None = None
 

@@ -2,7 +2,7 @@
 
 The predictor's part is measured: it is the peak of one micro-step on fake tensors, executed by the training code. All
 other parts are calculated: weights and optimizer moments from the parameter counts (bitsandbytes' kernels do not
-accept fake tensors), the next batch from its size, and the encoder's activations by formula. On an H100 the total
+accept fake tensors), the batch from its size, and the encoder's activations by formula. On an H100 the total
 differed by 1 % from the peak that PyTorch's allocator reported; the CUDA context was not compared.
 
 The fake tensors are on the CPU, because fake CUDA tensors need a driver. Three operations are replaced, so that they

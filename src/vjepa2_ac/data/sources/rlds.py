@@ -9,9 +9,12 @@ Later reads fetch exactly the images of a clip that are not cached; fixed blocks
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
@@ -28,9 +31,9 @@ from vjepa2_ac.data.sources.tfrecord import NotAnExampleError, Place, Read, Reco
 from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_images
-from vjepa2_ac.storage.block_file import DiskCache
 from vjepa2_ac.storage.remote import read_neighbours
 
+_CHECKED = b"\xc3"  # not all bits equal, so that a damaged file seldom contains false marks
 _GAP_BYTES = 1 << 15  # images at most this far apart are fetched with one request
 _CHUNK_BYTES = 1 << 20  # all of a camera's images are fetched in parallel chunks of this size
 
@@ -68,10 +71,10 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
             images = remote.images(feature, place, info.num_steps, needed, of_images)
             return episode_of(record, config, info, images, where)
         with open_shard(shard) as read:
-            checked, key = places_of_records(config.disk_cache), f"checked {table.texts['index']} {index}"
-            if checked.read(key) is None:
+            checked = cache_folder(config.disk_cache) / "index" / f"{table.texts['index']}.checked"
+            if not _is_marked(checked, index):
                 require_intact(read, span)
-                checked.write(key, b"intact")
+                _mark(checked, index)
             record = Record(read, span)
             images = images_here(shard, record.place_of(feature), info.num_steps, of_images)
             return episode_of(record, config, info, images, where)
@@ -94,9 +97,24 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
         return replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)}), shards
 
 
-def places_of_records(config: DiskCacheConfig) -> DiskCache:
-    """Return the disk cache of facts about records: whether they are intact, and positions of features and images."""
-    return open_cache(cache_folder(config) / "places", None)
+def _is_marked(file: Path, number: int) -> bool:
+    """Return whether a record has been checked; a mark that cannot be read counts as missing."""
+    try:
+        with file.open("rb") as marks:
+            marks.seek(number)
+            return marks.read(1) == _CHECKED
+    except OSError:
+        return False
+
+
+def _mark(file: Path, number: int) -> None:
+    """Mark a record as checked; where that cannot be written, it is checked again next time."""
+    with suppress(OSError):
+        handle = os.open(file, os.O_WRONLY | os.O_CREAT, 0o666)
+        try:
+            os.pwrite(handle, _CHECKED, number)
+        finally:
+            os.close(handle)
 
 
 def images_here(shard: Shard, feature: Place, num_steps: int, where: str) -> FrameReader:
@@ -121,7 +139,7 @@ class RemoteEpisode:
 
     def __init__(self, shard: Shard, span: RecordSpan, config: DiskCacheConfig) -> None:
         self._shard, self._span = shard, span
-        self._places, self._contents = places_of_records(config), fetched_data(config)
+        self._places, self._contents = open_cache(cache_folder(config) / "places", None), fetched_data(config)
         self._key = f"{shard.path} {shard.version} {shard.size} {span.offset}"
 
     def record(self, names: Sequence[str]) -> Record:
