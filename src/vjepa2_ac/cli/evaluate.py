@@ -83,8 +83,9 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     subject = options.subject
     if unused := [word for word in options.overrides if not is_of_moved(word)]:
-        needed = "model.base=PATH, for a run whose base was moved: evaluate does not change other config keys"
-        raise InputError(where="command line", found=" ".join(unused), needed=needed)
+        needed = "one run or model, and model.base=PATH if its base model was moved"
+        fix = "For a second run use --against RUN, or call evaluate again. Other config keys cannot be changed"
+        raise InputError(where="command line", found=" ".join(unused), needed=needed, fix=fix)
     request = cli.evaluation_options(options, probes=cli.record_of_options(ProbeOptions, options))
     cli.require_subject(subject, settle(subject, request), options.words)
     cli.say_places_elsewhere(subject)
