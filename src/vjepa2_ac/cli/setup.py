@@ -319,7 +319,7 @@ def _demo(_options: argparse.Namespace) -> int:
     """Run the whole workflow on a simulated arm, in about 5 minutes.
 
     The command records data, fine-tunes a tiny world model with LoRA, trains a decoder, makes a video of predicted
-    frames and evaluates the run. It needs 4 to 6 minutes on 2 CPU cores and no download. All files are written to the
+    frames and evaluates the run. It needs 4 to 7 minutes on 2 CPU cores and no download. All files are written to the
     folder demo. Run the same command again to resume.
     """
     from vjepa2_ac.simulation.domains import load_mujoco

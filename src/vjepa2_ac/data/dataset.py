@@ -339,23 +339,23 @@ def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "ti
     return view(dataset.source.read(episode, batch.cameras[row]).read_frames(steps), dataset.config.crop)
 
 
-def find_episode(dataset: Dataset, wanted: str) -> int:
+def find_episode(dataset: Dataset, name: str) -> int:
     """Return the index of an episode by its identity, its number from 0, or a unique part of its identity.
 
     Raises:
         InputError: No episode matches, or several match.
     """
     table = dataset.table
-    if (index := table.find(wanted)) is not None:
+    if (index := table.find(name)) is not None:
         return index
-    if wanted.isdecimal() and len(wanted) < 10 and int(wanted) < len(table):
-        return int(wanted)
-    matching = [int(index) for index in dataset.episodes if wanted in table.identity(int(index))]
+    if name.isdecimal() and len(name) < 10 and int(name) < len(table):
+        return int(name)
+    matching = [int(index) for index in dataset.episodes if name in table.identity(int(index))]
     if len(matching) != 1:
         found = f"{counted(len(matching), 'episode')} of this name in {dataset.config.path}"
         example = table.identity((matching or dataset.episodes.tolist())[0])
         needed = f"a name such as {example}, a part that only it has, or a number from 0 to {len(table) - 1}"
-        raise InputError(where=f"--episode {wanted}", found=found, needed=needed)
+        raise InputError(where=f"--episode {name}", found=found, needed=needed)
     return matching[0]
 
 

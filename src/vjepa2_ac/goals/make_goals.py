@@ -70,13 +70,13 @@ class MadeGoals:
 
 
 def make_goals(
-    config: DataConfig, wanted: str, options: KeyFrameOptions, progress: Progress | None = None
+    config: DataConfig, episode_name: str, options: KeyFrameOptions, progress: Progress | None = None
 ) -> MadeGoals:
     """Return the key frames of an episode of a data set as goals.
 
     Args:
         config: The data set and its camera or cameras.
-        wanted: The episode: its name in the data, its number from 0, or a part of its name.
+        episode_name: The episode: its name in the data, its number from 0, or a part of its name.
         options: Options for selecting key frames.
         progress: Called with (done, total) while the data set is indexed for the first time.
 
@@ -86,7 +86,7 @@ def make_goals(
     """
     require_views(config, options.views)
     dataset = open_dataset(config, progress=progress)
-    index = find_episode(dataset, wanted)
+    index = find_episode(dataset, episode_name)
     name, states = dataset.table.identity(index), dataset.source.read(index, config.cameras[0]).states
     if len(states) < 2:
         raise InputError(where=name, found=f"{len(states)} frames", needed="2 at least")
