@@ -56,7 +56,7 @@ test-oldest: $(OLDEST)/installed  ## model, runs, training and planning with the
 # The programs of a folder import one another by their bare names.
 PROGRAM_TYPES := $(BIN)/mypy --follow-imports=silent --no-warn-return-any --allow-untyped-calls --no-warn-unused-ignores
 
-lint: $(INSTALLED)  ## style, types, spelling and notebooks; needs no network
+lint: $(INSTALLED)  ## style, types, spelling, language and notebooks; needs no network
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -65,6 +65,7 @@ lint: $(INSTALLED)  ## style, types, spelling and notebooks; needs no network
 	MYPYPATH=evidence $(PROGRAM_TYPES) evidence
 	git ls-files -z -co --exclude-standard | xargs -0 $(BIN)/codespell
 	$(BIN)/nbstripout --verify examples/*.ipynb
+	$(BIN)/pytest -q tests/test_language.py
 
 format: $(INSTALLED)  ## let ruff and nbstripout rewrite the code
 	$(BIN)/ruff check --fix .

@@ -1,0 +1,122 @@
+"""Plain language: no private words in pages, messages, docstrings, comments and names; no long sentence in a page.
+
+CONTRIBUTING.md explains the rules. An exception is one entry of ALLOWED or ALLOWED_NAMES.
+"""
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from markdown_it import MarkdownIt
+
+from paths import ROOT
+
+WRITE_INSTEAD = {  # a regular expression for whole words, and what to write instead
+    r"knobs?": "option or config key",
+    r"anew": "again",
+    r"foretell|foretells|foretold": "predict, show or print",
+    r"beside": "next to, in addition to or compared with",
+    r"taught": "seen in training",
+    r"nobody|somebody|everybody|strangers?": "no method, all users or third parties",
+    r"told|tellers?": "reported or logged; a model",
+    r"wanted|asked for": "required or requested",
+    r"alike": "the same, or similar",
+    r"(?:lies|stands|lie|stand) (?:in|at|on|under|there)": "is in, or is stored in",
+    r"(?:go|goes|going|went|gone) on": "resume or continue",
+    r"ways? out": "fix",
+    r"held against": "compared with",
+    r"so many|every so-many-th": "n; every n-th",
+    r"postcards?|watchm[ae]n": "HTML export; anomaly monitor",
+    r"doing nothing": "persistence (prediction) or zero action (control)",
+}
+ALLOWED: dict[str, set[str]] = {}  # file: the words as they are written there
+NAMES = "found|one|ones|its|told|tells|asked|asks|kept|there|wanted|others|taken|given|anew|taught|beside|knob|nobody"
+ALLOWED_NAMES: set[str] = set()
+MOST_WORDS = 30  # in a sentence of a page
+
+PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")), *sorted(ROOT.glob("docs/*.md"))]
+MODULES = sorted((ROOT / "src").rglob("*.py"))
+ASSETS = [
+    path
+    for path in sorted((ROOT / "src").rglob("*"))
+    if path.suffix in {".yaml", ".jinja", ".js", ".html"} and "golden" not in path.parts
+]
+
+
+def prose(page: str) -> Iterator[tuple[str, bool]]:
+    """Yield (text, is in a table) of each paragraph, heading, list item and table cell; code becomes the word `code`."""
+    depth = 0
+    for token in MarkdownIt().enable("table").parse(page):
+        depth += {"table_open": 1, "table_close": -1}.get(token.type, 0)
+        for child in token.children or []:
+            if child.type == "code_inline":
+                child.content = "`code`"
+            elif child.type in {"softbreak", "hardbreak"}:
+                child.content = " "
+        if token.type == "inline":
+            yield "".join(child.content for child in token.children or [] if child.type != "html_inline"), depth > 0
+
+
+def texts(module: str) -> Iterator[str]:
+    """Yield the strings, docstrings and comments of a module."""
+    for node in ast.walk(ast.parse(module)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+    for token in tokenize.generate_tokens(io.StringIO(module).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.string
+
+
+def names(module: str) -> Iterator[str]:
+    """Yield the identifiers that a module defines."""
+    for node in ast.walk(ast.parse(module)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.arg):
+            yield node.arg
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node.attr
+
+
+def private_words(path: Path, parts: Iterator[str]) -> list[str]:
+    allowed = ALLOWED.get(str(path.relative_to(ROOT)), set())
+    text = re.sub(r"\s+", " ", "\n".join(parts))
+    return [
+        f"{path.relative_to(ROOT)}: {text[max(match.start() - 40, 0) : match.end() + 40]!r}: write {instead}"
+        for words, instead in WRITE_INSTEAD.items()
+        for match in re.finditer(rf"\b(?:{words})\b", text, flags=re.IGNORECASE)
+        if match[0].lower() not in allowed
+    ]
+
+
+def sentences(text: str) -> list[str]:
+    return re.split(r"(?<=[.!?])[\")]*\s+(?=[A-Z`(\d])", text)
+
+
+def test_pages_use_standard_terms() -> None:
+    wrong = [line for path in PAGES for line in private_words(path, (text for text, _ in prose(path.read_text())))]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_sentences_of_pages_are_short() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)}: {len(sentence.split())} words: {sentence}"
+        for path in PAGES
+        for text, _ in prose(path.read_text())
+        for sentence in sentences(text)
+        if len(sentence.split()) > MOST_WORDS
+    ]
+    assert not wrong, f"at most {MOST_WORDS} words:\n" + "\n".join(wrong)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("Each knob has a default.", "knob"), ("It is told\nto the robot.", "told")]
+)
+def test_a_private_word_is_found(text: str, words: str) -> None:
+    assert words in private_words(ROOT / "README.md", iter([text]))[0]
