@@ -48,7 +48,7 @@ ASSETS = [
 
 
 def prose(page: str) -> Iterator[tuple[str, bool]]:
-    """Yield (text, is in a table) of each paragraph, heading, list item and table cell; code becomes the word `code`."""
+    """Yield (text, is in a table) of each paragraph, heading and table cell; inline code becomes the word `code`."""
     depth = 0
     for token in MarkdownIt().enable("table").parse(page):
         depth += {"table_open": 1, "table_close": -1}.get(token.type, 0)
