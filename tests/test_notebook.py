@@ -74,7 +74,7 @@ def test_it_runs_and_shows_its_figures(tmp_path: Path) -> None:
         "builtin:sim-tiny on cpu",
         "of persistence",
         "Validation at step 4",
-        "than with ",
+        "sensitive to actions",
         "cm apart; not moving at all would be",
     ):
         assert words in printed, words

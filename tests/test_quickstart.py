@@ -41,7 +41,7 @@ def test_from_data_to_a_number_and_a_plan(
     for line in re.findall(r"^  (vjepa2-ac .*?)   #", told, re.M):
         assert line in walked, "init prints the page's commands"
     shown = " ".join(printed["vjepa2-ac evaluate runs/my_robot"].split())
-    assert re.search("error [0-9.]+ % (lower|higher) than with (the base model|persistence)", shown)
+    assert re.search("error [0-9.]+ % (lower|higher) than (the base model's|that of persistence)", shown)
     for made in ("my_robot.yaml", "inspection", "runs/my_robot/report.html", "runs/my_robot/metrics.json", "merged"):
         assert (tmp_path / made).exists(), made
 

@@ -47,7 +47,7 @@ def test_processes_that_share_an_evaluation_find_what_one_finds(make_config, tmp
     words = [BROKEN, "evaluate", run, *PROBES, "--out"]
     run_ranks([*words, str(tmp_path / "alone")], 1)
     said = run_ranks([*words, str(tmp_path / "together")], 3)
-    assert "uses actions" in said[0][0]
+    assert "sensitive to actions" in said[0][0]
     assert [out for out, _ in said[1:]] == ["", ""], "only the first process speaks"
     alone, together = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("alone", "together"))
     assert_same(alone["rows"], together["rows"])

@@ -62,7 +62,7 @@ def test_a_perfect_predictor_scores_zero_in_every_metric(oracle: Evaluation) -> 
                 assert one.value == pytest.approx(0.0, abs=1e-5)
     assert [one.value for one in gain_over(*pair_of(oracle))] == pytest.approx([1.0] * (TIME - 1))
     found = summarize(oracle, rows_of(oracle))
-    assert found.predicts.statement.startswith("error 100 % lower than with the base model")
+    assert found.predicts.statement.startswith("error 100 % lower than the base model's")
     assert found.uses_actions.conclusion == "yes"
 
 

@@ -25,7 +25,17 @@ from vjepa2_ac.evaluation.result import (
     PredictionErrors,
 )
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.evaluation.summary import Summary, closed_loop, not_measured, summarize, with_closed_loop
+from vjepa2_ac.evaluation.summary import (
+    PLANNING,
+    PREDICTION,
+    RANKING,
+    SENSITIVITY,
+    Summary,
+    closed_loop,
+    not_measured,
+    summarize,
+    with_closed_loop,
+)
 from vjepa2_ac.intervals import Estimate, share_of
 from vjepa2_ac.spaces import POSE_CHANGE
 from worlds import about
@@ -80,13 +90,13 @@ def summary_of(*models: ModelResult, episodes: int = 8, **changes: Any) -> Summa
 @pytest.mark.parametrize(
     ("base", "adapter", "noise", "conclusion", "statement"),
     [
-        (1.0, 0.75, 0.02, "yes", "error 25 % lower than with the base model, 1.5 s ahead"),
-        (0.8, 1.2, 0.0, "no", "error 50 % higher than with the base model, 1.5 s ahead"),
-        (1.0, 0.998, 0.0, "no", "error 0.2 % lower than with the base model, 1.5 s ahead"),
-        (1.0, 1.0, 0.0, "no", "error 0.0 % lower than with the base model, 1.5 s ahead"),
-        (1.0, 0.98, 0.3, "inconclusive", "than with the base model"),
-        (1.6, 1.2, 0.0, "no", "error 20 % higher than with persistence, 1.5 s ahead"),
-        (None, 0.5, 0.02, "yes", "error 50 % lower than with persistence, 1.5 s ahead"),
+        (1.0, 0.75, 0.02, "yes", "error 25 % lower than the base model's, 1.5 s ahead"),
+        (0.8, 1.2, 0.0, "no", "error 50 % higher than the base model's, 1.5 s ahead"),
+        (1.0, 0.998, 0.0, "no", "error 0.2 % lower than the base model's, 1.5 s ahead"),
+        (1.0, 1.0, 0.0, "no", "error 0.0 % lower than the base model's, 1.5 s ahead"),
+        (1.0, 0.98, 0.3, "inconclusive", "than the base model's"),
+        (1.6, 1.2, 0.0, "no", "error 20 % higher than that of persistence, 1.5 s ahead"),
+        (None, 0.5, 0.02, "yes", "error 50 % lower than that of persistence, 1.5 s ahead"),
     ],
 )
 def test_better_prediction_needs_a_lower_error_than_the_base_model_and_persistence(
@@ -118,9 +128,9 @@ def ranked(name: str, level: float, rank: float, **changes: Any) -> ModelResult:
 @pytest.mark.parametrize(
     ("base", "rank", "conclusion", "compared_with"),
     [
-        (0.05, 0.02, "yes", "with the base model"),
-        (0.05, 0.05, "no", "with the base model"),
-        (0.05, 0.1, "no", "with the base model"),
+        (0.05, 0.02, "yes", "the base model"),
+        (0.05, 0.05, "no", "the base model"),
+        (0.05, 0.1, "no", "the base model"),
         (0.7, 0.6, "no", "chance"),
         (None, 0.1, "yes", "chance"),
         (None, 0.6, "no", "chance"),
@@ -138,14 +148,14 @@ def test_better_action_ranking_needs_a_lower_error_than_chance_and_the_base_mode
         assert summary.uses_actions.conclusion == "no", "a model that ranks worse than chance is not sensitive to them"
         assert summary.sentence == "Action ranking is worse than chance, so the model cannot be used for planning."
     elif conclusion == "no":
-        assert summary.sentence == "Action ranking is not better than with the base model."
+        assert summary.sentence == "Action ranking is not better than the base model."
     else:
         assert summary.sentence.endswith(f"better action ranking than {compared_with}. Planning was not measured.")
 
 
 def test_the_third_line_is_action_ranking_until_a_closed_loop_was_measured(tmp_path: Path) -> None:
     bare, measured = summary_of(model("model", 0.5)), summary_of(ranked("model", 0.5, 0.02, shuffled=0.9))
-    assert bare.ranks_actions == not_measured("ranks actions", "`vjepa2-ac evaluate --ranking-clips 32`")
+    assert bare.ranks_actions == not_measured(RANKING, "`vjepa2-ac evaluate --ranking-clips 32`")
     shares = {name: share_of(count, 50) for name, count in {"m": 45, "random": 2, "oracle": 50}.items()}
     plans = closed_loop(shares, "m", "oracle", 50, "reach")
     (tmp_path / "closed_loop" / "reach-B").mkdir(parents=True)
@@ -153,13 +163,13 @@ def test_the_third_line_is_action_ranking_until_a_closed_loop_was_measured(tmp_p
     file.write_text(json.dumps({"about": {"checkpoint": "step-8 (the newest)"}, "verdict": asdict(plans)}))
     for summary in (bare, measured):
         planned = with_closed_loop(summary, tmp_path, "step-8 (the newest)")
-        assert [one.name for one in summary.verdicts] == ["predicts", "uses actions", "ranks actions"]
+        assert [one.name for one in summary.verdicts] == [PREDICTION, SENSITIVITY, RANKING]
         assert planned.verdicts == (*summary.verdicts[:2], plans)
         assert with_closed_loop(summary, tmp_path, "step-9 (the newest)") == summary
         assert with_closed_loop(summary, tmp_path / "no", "step-8 (the newest)") == summary
-        assert "plans" not in str(summary)
+        assert PLANNING not in str(summary)
     assert with_closed_loop(measured, tmp_path, "step-8 (the newest)").sentence.endswith(
-        "more problems solved than by the zero action and random actions."
+        "a higher success rate than the zero action and random actions."
     )
 
 
@@ -191,9 +201,10 @@ def test_a_measurement_of_fewer_episodes_than_the_evaluation_has_no_conclusion_a
     assert (summary.ranks_actions.conclusion, summary.ranks_actions.interval) == ("inconclusive", "")
     assert summary.ranks_actions.reference == "(chance 50 %; 2 episodes are too few for a conclusion)"
     assert summary.uses_actions.conclusion == "yes"
-    assert summary.sentence == "Inconclusive: action ranking. Measure more clips, with --ranking-clips."
+    assert summary.sentence == "Inconclusive: better action ranking. Measure more clips, with --ranking-clips."
     unclear = replace(summary, predicts=replace(summary.predicts, conclusion="inconclusive"))
-    assert unclear.sentence == "Inconclusive: prediction, action ranking. Measure more clips, with --ranking-clips."
+    both = "Inconclusive: better prediction, better action ranking. Measure more clips, with --ranking-clips."
+    assert unclear.sentence == both
 
 
 def with_spread(result: ModelResult, spread: float) -> ModelResult:
@@ -272,8 +283,8 @@ def test_predictions_that_are_not_finite_have_no_conclusion() -> None:
 def test_the_sentence_names_a_landscape_that_is_not_better(distance: float) -> None:
     base = mapped(ranked("base", 1.0, 0.05), 13.8, 0.072)
     sentence = summary_of(base, mapped(ranked("adapter", 0.7, 0.02, shuffled=0.9), distance, 0.0086)).sentence
-    assert sentence.startswith("Better prediction than with the base model")
-    denied = "But the energy minimum is not nearer to the true action than with the base model."
+    assert sentence.startswith("Better prediction than the base model")
+    denied = "But the energy minimum is not nearer to the true action than that of the base model."
     assert sentence.endswith(denied) == (distance > 13.8)
     assert len(sentence.split()) <= 40
 
@@ -318,7 +329,7 @@ def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
     assert plans.conclusion == conclusion
     assert plans.needs.startswith(needs)
     assert bool(plans.needs) == bool(needs)
-    assert plans.statement.endswith(f"of {problems} reach problem{'s' * (problems > 1)}")
+    assert plans.statement.endswith(f"on {problems} reach problem{'s' * (problems > 1)}")
 
 
 def test_a_measured_plan_is_not_denied_by_the_use_of_the_actions() -> None:
@@ -346,7 +357,7 @@ def test_every_summary_fits_a_screen_and_has_whole_sentences(
     summary = summarize(measured, rows_of(measured))
     lines = str(summary).splitlines()
     assert len(lines) <= 18, "three of them are the long name and the clips"
-    assert max(map(len, lines)) <= 80
+    assert max(map(len, lines)) <= 90
     assert lines[2] == f"24 clips, {episodes} held-out episode{'s' * (episodes > 1)}"
     assert len(summary.sentence.split()) <= 40
     assert re.fullmatch(r"[A-Z0-9].*\.", summary.sentence)

@@ -19,14 +19,14 @@ from browser import open_page
 from evaluation_results import decoded_strips, evaluation, page_of
 from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.evaluation.summary import Verdict, summarize
+from vjepa2_ac.evaluation.summary import PLANNING, Verdict, summarize
 from vjepa2_ac.reports import write
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.reports.write import LONGEST_S, MOST_BYTES, MOST_CLIPS, bar_of, film_of, report_page
 
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;]]>{}\u202e\x00\ud800é"
 SOLVED = Verdict(
-    "plans", "no", "solves 4.0 % of 50 reach problems", 0.04, 0.01, 0.1, reference="(random 6.0 %)", baseline=0.06
+    PLANNING, "no", "success rate 4.0 % on 50 reach problems", 0.04, 0.01, 0.1, reference="(random 6.0 %)", baseline=0.06
 )
 
 
@@ -93,7 +93,7 @@ def test_the_first_screen_shows_the_summary_of_the_console_and_numbers_that_it_d
 
 def test_a_bar_shows_a_number_its_interval_and_its_baseline_in_their_order() -> None:
     for value, baseline in ((0.3, 0.0), (-0.3, 0.0), (0.3, 0.5), (0.7, 0.5)):
-        verdict = Verdict("plans", "yes", "", value, value - 0.04, value + 0.05, baseline=baseline)
+        verdict = Verdict(PLANNING, "yes", "", value, value - 0.04, value + 0.05, baseline=baseline)
         bar = bar_of(verdict)
         assert 0 < min(bar.values()) < max(bar.values()) < 100
         assert bar["low"] < bar["point"] < bar["high"]

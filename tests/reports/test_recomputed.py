@@ -84,12 +84,12 @@ def recomputed(metrics: dict[str, Any]) -> dict[str, tuple[str, str, str]]:
     nothing = [clip[-1] for clip in by_clip["persistence"]]
     share, interval = gain("l1", last["l1"][base] if base else nothing)
     spread = models[name]["distribution"]["variance"][-1] / models[name]["distribution"]["true_variance"][-1]
-    before, reference = 1.0, "true latents"
+    before, reference, reference_error = 1.0, "true latents", "that of persistence"
     if base:
-        of_base, reference = models[base]["distribution"], "base model"
+        of_base, reference, reference_error = models[base]["distribution"], "base model", "the base model's"
         before = of_base["variance"][-1] / of_base["true_variance"][-1]
     found["predicts"] = (
-        f"error {share} % lower than with {'the base model' if base else 'persistence'}, {ahead}",
+        f"error {share} % lower than {reference_error}, {ahead}",
         interval,
         f"(part of the gain may be blur: spread {spread:.2f}, {reference} {before:.2f})",
     )

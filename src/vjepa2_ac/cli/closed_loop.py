@@ -261,12 +261,12 @@ def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
 
 def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse.Namespace) -> Summary:
     """Return a summary of the closed-loop verdict and, if `evaluate` measured this checkpoint, its other verdicts."""
-    from vjepa2_ac.evaluation.summary import Summary, not_measured
+    from vjepa2_ac.evaluation.summary import PREDICTION, RANKING, SENSITIVITY, Summary, not_measured
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
     subject, trials = benchmark.subject, benchmark.trials
     how = _evaluate_command(options) or "`vjepa2-ac evaluate`"
-    predicts, uses, ranks = (not_measured(name, how) for name in ("predicts", "uses actions", "ranks actions"))
+    predicts, uses, ranks = (not_measured(name, how) for name in (PREDICTION, SENSITIVITY, RANKING))
     measured = f"{trials.task}, {trials.place}, {counted(trials.steps, 'step')} of {trials.seconds_per_step:.2f} s"
     summary = Summary(subject.name, measured, predicts, uses, ranks, verdict)
     if subject.chosen and (Path(subject.name) / METRICS_FILE).is_file():

@@ -1,4 +1,4 @@
-"""The summary of an evaluation: verdicts on prediction, use of the actions, action ranking or planning, and landscape.
+"""The summary of an evaluation: verdicts on prediction, sensitivity to actions, action ranking or planning, landscape.
 
 A verdict is yes, no, inconclusive or not measured. It names what was measured, with one number and its 95 % interval
 over episodes. PyTorch is not imported.
@@ -14,7 +14,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from textwrap import wrap
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, TypeAdapter
 
 from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import L1, Evaluation
@@ -28,17 +30,28 @@ SAME_ERROR = 0.01  # relative; errors this close count as equal, whatever their 
 SAME_RANK = 0.005  # absolute; action-ranking errors this close count as equal, whatever their interval
 SAME_SUCCESS = 0.1  # absolute; a success rate is not better if its upper bound is less than this above a competitor's
 CHANCE = 0.5  # action-ranking error of a model that ignores its actions
-_BASE, _PERSISTENCE, _CHANCE = "with the base model", "with persistence", "chance"  # values of `compared_with`
+_BASE, _PERSISTENCE, _CHANCE = "the base model", "persistence", "chance"  # values of `compared_with`
 _TOO_FEW = "too few for a conclusion"
-_COLUMNS, _NO_BREAK = 80, "\N{NO-BREAK SPACE}"
+_COLUMNS, _NO_BREAK = 90, "\N{NO-BREAK SPACE}"
 _wrap = partial(wrap, break_on_hyphens=False)  # commands and paths have hyphens
+
+
+PREDICTION, SENSITIVITY, RANKING = "better prediction", "sensitive to actions", "better action ranking"
+PLANNING, LANDSCAPE = "plans better", "better landscape"
+_FORMER_NAMES = {  # in files of earlier versions
+    "predicts": PREDICTION,
+    "uses actions": SENSITIVITY,
+    "ranks actions": RANKING,
+    "plans": PLANNING,
+    "landscape": LANDSCAPE,
+}
 
 
 @dataclass(frozen=True)
 class Verdict:
     """One line of the summary."""
 
-    name: str
+    name: Annotated[str, BeforeValidator(lambda name: _FORMER_NAMES.get(name, name))]
     conclusion: Conclusion
     statement: str  # the measurement with one number; a word such as "lower" gives the sign
     value: float | None = None  # this number with its sign; None: not measured
@@ -48,7 +61,8 @@ class Verdict:
     reference: str = ""  # numbers to compare with
     needs: str = ""  # a sentence: why there is no conclusion, and what is needed for one
     baseline: float = 0.0  # value of an untrained model, or of the best competitor
-    compared_with: str = ""  # the reference that decided the conclusion, as in "not better than with the base model"
+    # The reference that decided the conclusion, as in "not better than the base model"; earlier versions wrote "with".
+    compared_with: Annotated[str, BeforeValidator(lambda text: text.removeprefix("with "))] = ""
 
     @property
     def interval(self) -> str:
@@ -81,28 +95,26 @@ class Summary:
     @property
     def sentence(self) -> str:
         """The conclusion from all verdicts in one or two sentences, at most 40 words."""
-        third = "planning" if self.plans else "action ranking"
-        claims = {"prediction": self.predicts, "the use of the actions": self.uses_actions, third: self.verdicts[2]}
-        if needs := next((verdict.needs for verdict in claims.values() if verdict.needs), ""):
+        first_three = self.verdicts[:3]
+        if needs := next((verdict.needs for verdict in first_three if verdict.needs), ""):
             return needs
-        for name, verdict in claims.items():
+        for verdict in first_three:
             if verdict.conclusion == "no":
-                return self._denial(name, verdict)
-        if unclear := [name for name, verdict in claims.items() if verdict.conclusion == "inconclusive"]:
-            more = "problems" if unclear == ["planning"] else "held-out episodes"
+                return self._denial(verdict)
+        if unclear := [verdict.name for verdict in first_three if verdict.conclusion == "inconclusive"]:
+            more = "problems" if unclear == [PLANNING] else "held-out episodes"
             more = "clips, with --ranking-clips" if _TOO_FEW in self.verdicts[2].reference else more
             return f"Inconclusive: {', '.join(unclear)}. Measure more {more}."
-        if missing := [name for name, verdict in claims.items() if verdict.conclusion == "not measured"]:
+        if missing := [verdict.name for verdict in first_three if verdict.conclusion == "not measured"]:
             return f"Not measured: {', '.join(missing)}."
-        better = f"Better prediction than {self.predicts.compared_with}, sensitive to the actions"
+        better = f"Better prediction than {self.predicts.compared_with}, sensitive to actions"
         if self.plans is not None:
-            better += f", and more problems solved than by {self.plans.compared_with}."
+            better += f", and a higher success rate than {self.plans.compared_with}."
         else:
             better += f", better action ranking than {self.ranks_actions.compared_with}. Planning was not measured."
         if self.landscape is None or self.landscape.conclusion != "no":
             return better
-        competitor = self.landscape.compared_with
-        competitor = "a random point" if competitor == _CHANCE else competitor
+        competitor = "a random point" if self.landscape.compared_with == _CHANCE else "that of the base model"
         return f"{better} But the energy minimum is not nearer to the true action than {competitor}."
 
     @property
@@ -110,11 +122,14 @@ class Summary:
         """The consequence for planning as a clause; empty if planning was measured."""
         return ", so the model cannot be used for planning" if self.plans is None else ""
 
-    def _denial(self, claim: str, verdict: Verdict) -> str:
-        """Return the sentence about a claim whose verdict is no."""
-        if verdict.name != "uses actions":
-            check = " Check data, axes and stride first." * (verdict.name == "predicts")
-            return f"{claim.capitalize()} is not better than {verdict.compared_with}.{check}"
+    def _denial(self, verdict: Verdict) -> str:
+        """Return the sentence about a verdict that is no."""
+        if verdict.name == PREDICTION:
+            return f"Prediction is not better than {verdict.compared_with}. Check data, axes and stride first."
+        if verdict.name == RANKING:
+            return f"Action ranking is not better than {verdict.compared_with}."
+        if verdict.name == PLANNING:
+            return f"The success rate in closed loop is not higher than {verdict.compared_with}."
         if verdict.compared_with == _CHANCE:
             return f"Action ranking is worse than chance{self._unusable}."
         if verdict.high is not None and verdict.high < 0:
@@ -125,9 +140,10 @@ class Summary:
         gap = _COLUMNS - len(self.subject) - len(self.measured)
         header = f"{self.subject}{' ' * gap}{self.measured}"
         lines = [header] if gap > 1 else [*_wrap(self.subject, _COLUMNS), self.measured]
+        names = max(len(verdict.name) for verdict in self.verdicts)
         width = max(len(verdict.conclusion) for verdict in self.verdicts)
         for verdict in self.verdicts:
-            label = f"  {verdict.name:<13}  {verdict.conclusion:<{width}}  "
+            label = f"  {verdict.name:<{names}}  {verdict.conclusion:<{width}}  "
             room = _COLUMNS - len(label) - len(verdict.interval) - 1
             text = _with_fixed_units(f"{verdict.statement} {verdict.reference}")
             first = _wrap(text, room)[0]
@@ -208,7 +224,7 @@ def with_closed_loop(summary: Summary, run: Path, checkpoint: str) -> Summary:
         written = json.loads(file.read_bytes())
         measured = written["about"]["checkpoint"] or ""  # name of the checkpoint, and how it was selected
         if measured.partition(" ")[0] == checkpoint.partition(" ")[0] and "verdict" in written:
-            return replace(summary, plans=Verdict(**written["verdict"]))
+            return replace(summary, plans=TypeAdapter(Verdict).validate_python(written["verdict"]))
     return summary
 
 
@@ -279,8 +295,9 @@ def _blur(rows: Mapping[str, Row], base_rows: Mapping[str, Row], horizon: int) -
 
 
 def _verdict_on_gain(gain: Estimate, compared_with: str, ahead: str) -> Verdict:
-    statement = f"error {_amount(gain, 'lower', 'higher')} than {compared_with}, {ahead}"
-    return _verdict("predicts", conclusion_of(gain, SAME_ERROR), statement, gain, compared_with)
+    reference = "the base model's" if compared_with == _BASE else f"that of {compared_with}"
+    statement = f"error {_amount(gain, 'lower', 'higher')} than {reference}, {ahead}"
+    return _verdict(PREDICTION, conclusion_of(gain, SAME_ERROR), statement, gain, compared_with)
 
 
 def _amount(change: Estimate, positive: str, negative: str) -> str:
@@ -291,20 +308,20 @@ def _amount(change: Estimate, positive: str, negative: str) -> str:
 def _uses_actions(rows: Mapping[str, Row], ranks_actions: Verdict) -> Verdict:
     """Conclude from the one-step error with shuffled actions; yes also requires action ranking better than chance."""
     cost, gap = (rows[f"{name}.shuffled"].estimate for name in ("cost_of_actions", "gap_of_actions"))
-    conclusion, reference, compared_with = conclusion_of(gap, SAME_ERROR), "", "with shuffled actions"
+    conclusion, reference, compared_with = conclusion_of(gap, SAME_ERROR), "", "shuffled actions"
     low, high = ranks_actions.low, ranks_actions.high
     if conclusion == "yes" and low is not None and high is not None and high >= CHANCE:
         conclusion, compared_with = "no" if low > CHANCE else "inconclusive", _CHANCE
         reference = f"(but {ranks_actions.statement} {ranks_actions.interval}, chance 50 %)"
     statement = f"one-step error {_amount(cost, 'higher', 'lower')} with shuffled actions"
-    return replace(_verdict("uses actions", conclusion, statement, cost, compared_with), reference=reference)
+    return replace(_verdict(SENSITIVITY, conclusion, statement, cost, compared_with), reference=reference)
 
 
 def _ranks_actions(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict:
     """Conclude from the action-ranking error: yes if it is below the base model's and below chance."""
     key = "ranking.rank"
     if key not in rows:
-        return not_measured("ranks actions", "`vjepa2-ac evaluate --ranking-clips 32`")
+        return not_measured(RANKING, "`vjepa2-ac evaluate --ranking-clips 32`")
     rank = rows[key].estimate
     statement = f"action-ranking error {percent(rank.value)} %"
     conclusion, reference, compared_with = conclusion_of(rank.below(CHANCE), SAME_RANK), "chance 50 %", _CHANCE
@@ -312,7 +329,7 @@ def _ranks_actions(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Ver
         if conclusion == "yes":
             conclusion, compared_with = conclusion_of(difference.estimate.below(0.0), SAME_RANK), _BASE
         reference = f"base model {percent(base_rows[key].value)} %, {reference}"
-    verdict = _verdict("ranks actions", conclusion, statement, rank, compared_with)
+    verdict = _verdict(RANKING, conclusion, statement, rank, compared_with)
     return replace(verdict, reference=f"({reference})", baseline=CHANCE)
 
 
@@ -333,7 +350,7 @@ def _landscape(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict
         references.insert(0, f"base model {_with_unit(base_rows[key].value, unit)}")
         references[-1] += f", base model {base_rows[sharpness].value:#.2g}"
     statement = f"energy minimum {_with_unit(distance.value, unit)} from the true action"
-    verdict = _verdict("landscape", conclusion, statement, distance, compared_with)
+    verdict = _verdict(LANDSCAPE, conclusion, statement, distance, compared_with)
     return replace(verdict, reference=f"({'; '.join(references)})", baseline=chance, unit="cm" if unit else "")
 
 
@@ -367,7 +384,7 @@ def closed_loop(
     elif problems < ENOUGH_EPISODES:
         needs = f"{_are_too_few(problems, 'problem')}; use --episodes 50."
     others = ", ".join(f"{name} {percent(rate.value)} %" for name, rate in shares.items() if name != model)
-    statement = f"solves {percent(share.value)} % of {counted(problems, f'{task} problem')} {conditions}".rstrip()
+    statement = f"success rate {percent(share.value)} % on {counted(problems, f'{task} problem')} {conditions}".rstrip()
     competitors = "the zero action and random actions"
-    verdict = _verdict("plans", "inconclusive" if needs else conclusion, statement, share, competitors)
+    verdict = _verdict(PLANNING, "inconclusive" if needs else conclusion, statement, share, competitors)
     return replace(verdict, reference=f"({others})", needs=needs, baseline=best.value)
