@@ -26,7 +26,14 @@ from vjepa2_ac.reports.write import LONGEST_S, MOST_BYTES, MOST_CLIPS, bar_of, f
 
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;]]>{}\u202e\x00\ud800é"
 SOLVED = Verdict(
-    PLANNING, "no", "success rate 4.0 % on 50 reach problems", 0.04, 0.01, 0.1, reference="(random 6.0 %)", baseline=0.06
+    PLANNING,
+    "no",
+    "success rate 4.0 % on 50 reach problems",
+    0.04,
+    0.01,
+    0.1,
+    reference="(random 6.0 %)",
+    baseline=0.06,
 )
 
 
