@@ -26,7 +26,14 @@ from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state, write_torch
 from vjepa2_ac.runs.subject import Subject, load_subject, run_config_of
-from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, try_writing_at, user_can_write, write_atomically
+from vjepa2_ac.storage import (
+    atomic_writer,
+    check_local_writable,
+    folder_writer,
+    is_empty,
+    translate_write_errors,
+    write_atomically,
+)
 from vjepa2_ac.storage.tensors import require_finite
 
 Form = Literal["merged", "official", "hub"]
@@ -90,7 +97,7 @@ def export_run(
         run.world_model.save_pretrained(destination)
     else:
         destination = destination if destination.suffix == ".pt" else destination / OFFICIAL_NAME
-        with user_can_write(destination), atomic_writer(destination) as file:
+        with translate_write_errors(destination), atomic_writer(destination) as file:
             write_torch(to_official(run.world_model), file)
     return Exported(destination, run.chosen)
 
@@ -100,10 +107,10 @@ def _check_free(destination: Path, form: Form) -> None:
     if destination.suffix == ".pt" and form != "official" and not destination.is_dir():
         found = "the name of a .pt file"
         raise InputError(where=str(destination), found=found, needed=f"a folder, for --to {form}")
-    with user_can_write(destination):
+    with translate_write_errors(destination):
         if destination.exists() and not (destination.is_dir() and is_empty(destination)):
             raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
-        try_writing_at(destination)
+        check_local_writable(destination)
 
 
 def _write_hub(checkpoint: Path, folder: Path, destination: Path, card: str, metrics: Metrics | None) -> None:

@@ -16,7 +16,7 @@ from vjepa2_ac.decoding.decoder import CARD, SIMULATED, WEIGHTS, Decoder, Decode
 from vjepa2_ac.decoding.training import decoder_loss
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.storage.places import SIMULATION_FILE
+from vjepa2_ac.storage.paths import SIMULATION_FILE
 
 
 @pytest.fixture

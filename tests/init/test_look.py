@@ -13,7 +13,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft import Machine, choose_model, make_draft
 from vjepa2_ac.init.found import guesses, pick_camera, plain
 from vjepa2_ac.init.look import look_at, measured
-from vjepa2_ac.storage.places import SIMULATION_FILE
+from vjepa2_ac.storage.paths import SIMULATION_FILE
 
 LAPTOP = Machine(None, 24 * 10**9, has_bf16=False, cores=2, free_bytes=10**11)
 STATES = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]

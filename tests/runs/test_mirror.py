@@ -62,7 +62,7 @@ def place(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "gs":
         request.getfixturevalue("bucket")
     return {
-        "gs": PLACE, "folder": str(tmp_path / "disk/run"), "file": storage.absolute(f"file://{tmp_path}/disk/run"),
+        "gs": PLACE, "folder": str(tmp_path / "disk/run"), "file": storage.canonical_path(f"file://{tmp_path}/disk/run"),
         "memory": f"memory://{tmp_path.name}/run",
     }[request.param]  # fmt: skip
 
@@ -311,7 +311,7 @@ def test_a_bucket_that_is_closed_for_a_while_costs_one_warning(
 def test_a_place_without_room_may_have_some_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
     monkeypatch.setattr(transfer.tempfile, "TemporaryFile", Mock(side_effect=OSError(code, "No room")))
     with pytest.raises(UnreachableError) as caught:
-        storage.try_writing(str(tmp_path))
+        storage.check_writable(str(tmp_path))
     assert not isinstance(caught.value, RefusedError), "training begins without it, with a warning"
 
 

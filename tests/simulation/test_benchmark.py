@@ -13,7 +13,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.media.video import read_header
 from vjepa2_ac.planning.model_setup import load_to_plan
 from vjepa2_ac.simulation.benchmark import FILM, JOINT_FIELDS, BenchmarkOptions, film_frames, run_benchmark
-from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
+from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 
 SMALL = [
     "planning.samples=6",

@@ -26,7 +26,7 @@ from vjepa2_ac.simulation.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.policies import ZeroActions
 from vjepa2_ac.simulation.rollout import Image, Observation, Trial, run_trials
 from vjepa2_ac.simulation.worlds import OtherWorld, WorldProcess, find_trials, record_world, run_world_benchmark
-from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
+from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 
 SMALL = ["planning.samples=6", "planning.iterations=2", "planning.planner.options.elites=3"]
 

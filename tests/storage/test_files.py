@@ -75,9 +75,12 @@ def test_a_full_disk_is_called_one_and_says_of_which_file(tmp_path: Path) -> Non
         storage.atomic_writer(tmp_path / "a.json"),
     ):
         raise full
-    with pytest.raises(InputError, match=r"^a: cannot be written: .*Free some space"), storage.user_can_write("a"):
+    with (
+        pytest.raises(InputError, match=r"^a: cannot be written: .*Free some space"),
+        storage.translate_write_errors("a"),
+    ):
         raise full
-    with pytest.raises(ConnectionResetError), storage.user_can_write("a"):
+    with pytest.raises(ConnectionResetError), storage.translate_write_errors("a"):
         raise ConnectionResetError(errno.ECONNRESET, "not about writing")
 
 
@@ -203,16 +206,16 @@ def test_a_url_is_read_like_a_local_folder(folder: str) -> None:
     assert storage.exists(file)
     assert not storage.exists(storage.join(folder, "c"))
     assert storage.file_size(file) == 10
-    assert storage.read_bytes(file) == storage.read_bounded(file, 10) == b"0123456789"
+    assert storage.read_bytes(file) == storage.read_small_file(file, 10) == b"0123456789"
     with pytest.raises(InputError, match="more than 9 bytes"):
-        storage.read_bounded(file, 9)
+        storage.read_small_file(file, 9)
     assert storage.read_range(file, 3, 4) == b"3456"
     assert storage.read_range(file, 8, 4) == b"89"
     assert [(info.name, info.size) for info in storage.list_files(folder)] == [("a", 0), ("b", 10)]
-    with closing(storage.open_to_read(file)) as opened:
+    with closing(storage.open_for_reading(file)) as opened:
         opened.seek(4)
         assert (opened.read(2), opened.read()) == (b"45", b"6789")
-    for read in (storage.read_bytes, storage.open_to_read, storage.file_size):
+    for read in (storage.read_bytes, storage.open_for_reading, storage.file_size):
         with pytest.raises(FileNotFoundError):
             read(storage.join(folder, "c"))
     assert storage.list_names(storage.join(folder, "none")) == []
@@ -229,8 +232,8 @@ def test_a_file_that_changes_has_another_version(folder: str) -> None:
 def test_a_file_that_may_never_end_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="a pipe"):
-        storage.read_bounded(tmp_path / "pipe", 10)
+        storage.read_small_file(tmp_path / "pipe", 10)
     with (tmp_path / "sparse").open("wb") as file:
         file.truncate(1 << 40)
     with pytest.raises(InputError, match="more than 10 bytes"):
-        storage.read_bounded(tmp_path / "sparse", 10)
+        storage.read_small_file(tmp_path / "sparse", 10)

@@ -15,7 +15,7 @@ from gcs import Failure, Gcs
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError, UnreachableError, pip_install
 from vjepa2_ac.storage import remote, retries
-from vjepa2_ac.storage.retries import RetryPolicy, with_retries
+from vjepa2_ac.storage.retries import RetryPolicy, call_with_retries
 
 DATA = bytes(range(256)) * 400
 FILE = "gs://bucket/folder/file"
@@ -37,9 +37,9 @@ def file(gcs: Gcs) -> str:
         (lambda: [file.size for file in storage.list_files("gs://bucket/folder")], [len(DATA), 5]),
         (lambda: storage.read_bytes(FILE), DATA),
         (lambda: storage.read_ranges(FILE, [(0, 5), (256, 3)]), [DATA[:5], DATA[256:259]]),
-        (lambda: storage.open_to_read(FILE).read(), DATA),
+        (lambda: storage.open_for_reading(FILE).read(), DATA),
     ],
-    ids=["file_size", "exists", "list_names", "list_files", "read_bytes", "read_ranges", "open_to_read"],
+    ids=["file_size", "exists", "list_names", "list_files", "read_bytes", "read_ranges", "open_for_reading"],
 )
 @pytest.mark.usefixtures("file")
 def test_everything_survives_what_passes(
@@ -91,7 +91,7 @@ def test_an_absent_file_is_absent_and_not_asked_for_again(gcs: Gcs, file: str) -
     assert storage.list_names("gs://bucket/none") == []
     assert storage.list_files("gs://bucket/none") == []
     with pytest.raises(FileNotFoundError):
-        storage.open_to_read(f"{file}.none")
+        storage.open_for_reading(f"{file}.none")
 
 
 def test_a_read_past_the_end_gives_what_there_is(gcs: Gcs, file: str) -> None:
@@ -211,7 +211,7 @@ def test_a_mistake_of_ours_is_neither_tried_again_nor_blamed_on_the_network(erro
         raise error
 
     with pytest.raises(type(error), match="ours"):
-        with_retries("gs://a", action, policy=AT_ONCE, access="")
+        call_with_retries("gs://a", action, policy=AT_ONCE, access="")
     assert calls == [AT_ONCE.timeout_s]
 
 
@@ -250,7 +250,7 @@ def test_errors_of_any_library_are_told_apart(error: Exception, attempts: int, w
         raise error
 
     with pytest.raises(UnreachableError, match=words) as caught:
-        with_retries("gs://a", action, policy=AT_ONCE, access="Log in so")
+        call_with_retries("gs://a", action, policy=AT_ONCE, access="Log in so")
     assert len(calls) == attempts
     assert caught.value.__cause__ is error
     assert "\n" not in str(caught.value)
@@ -266,12 +266,12 @@ def test_a_network_that_stays_away_is_spoken_of_once(
         caplog.clear()
         policy = RetryPolicy(attempts=attempts, first_wait_s=0.0, longest_wait_s=0.0)
         with pytest.raises(UnreachableError):
-            with_retries("gs://a/b", action, policy=policy, access="")
+            call_with_retries("gs://a/b", action, policy=policy, access="")
         return sum(record.levelname == "WARNING" for record in caplog.records)
 
     monkeypatch.setattr(retries, "_last_warning_s", [float("-inf")])
     assert spoken(attempts=3) == 0  # two failures are nothing
-    with retries.quietly():
+    with retries.suppress_retry_warnings():
         assert spoken(attempts=6) == 0  # by whoever can do without
     assert spoken(attempts=6) == 1
     assert spoken(attempts=6) == 0  # said already

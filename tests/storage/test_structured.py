@@ -15,7 +15,7 @@ from pydantic import Field
 from gcs import Gcs
 from paths import ROOT
 from vjepa2_ac.errors import InputError, MissingFileError
-from vjepa2_ac.storage.structured import json_object, json_text, parse_yaml, read_json_object, record_of
+from vjepa2_ac.storage.structured import format_json, parse_json_object, parse_record, parse_yaml, read_json_object
 
 # ---- JSON ----
 
@@ -25,15 +25,15 @@ from vjepa2_ac.storage.structured import json_object, json_text, parse_yaml, rea
 )
 def test_what_is_no_json_object_is_refused_with_its_file(text: str | bytes) -> None:
     with pytest.raises(InputError, match=r"^x\.json: .*JSON.*needed: a card\. Copy it again\.") as caught:
-        json_object(text, where="x.json", needed="a card", fix="Copy it again")
+        parse_json_object(text, where="x.json", needed="a card", fix="Copy it again")
     assert len(str(caught.value)) < 400
 
 
 def test_no_more_of_a_file_is_read_than_its_reader_wants_and_a_missing_one_is_named(tmp_path: Path, gcs: Gcs) -> None:
     (tmp_path / "a.json").write_text('{"a": "' + "x" * 100 + '"}')
-    assert read_json_object(tmp_path / "a.json", most_bytes=200)
+    assert read_json_object(tmp_path / "a.json", max_bytes=200)
     with pytest.raises(InputError, match="more than 50 bytes"):
-        read_json_object(tmp_path / "a.json", most_bytes=50)
+        read_json_object(tmp_path / "a.json", max_bytes=50)
     for path in (tmp_path / "none.json", gcs.put("bucket/a.json", b"{}").replace("a.", "none.")):
         with pytest.raises(MissingFileError, match=r"none\.json: cannot be read: No such"):
             read_json_object(path)
@@ -43,10 +43,10 @@ def test_no_more_of_a_file_is_read_than_its_reader_wants_and_a_missing_one_is_na
 
 def test_lists_of_numbers_are_written_on_one_line_and_read_back() -> None:
     value = {"a": [1, 2.5, None], "b": [[1e-5, -2], ["text, 1"]]}
-    assert json_text({"a": [1, 2.5, None]}) == '{\n "a": [1, 2.5, null]\n}\n'
-    assert json.loads(json_text(value)) == value
+    assert format_json({"a": [1, 2.5, None]}) == '{\n "a": [1, 2.5, null]\n}\n'
+    assert json.loads(format_json(value)) == value
     with pytest.raises(ValueError, match="JSON"):
-        json_text(math.nan)
+        format_json(math.nan)
 
 
 # ---- records ----
@@ -63,7 +63,7 @@ class Sample:
 
 def test_a_record_is_made_of_plain_values() -> None:
     values = {"step": 3, "error": 1, "reasons": {"a": "b"}, "names": ["x"]}
-    assert record_of(Sample, values, where="") == Sample(3, "", 1.0, {"a": "b"}, ("x",))
+    assert parse_record(Sample, values, where="") == Sample(3, "", 1.0, {"a": "b"}, ("x",))
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_a_record_is_made_of_plain_values() -> None:
 )
 def test_values_of_other_types_are_refused_by_name(values: dict[str, object], complaint: str) -> None:
     with pytest.raises(InputError) as caught:
-        record_of(Sample, values, where="state.json")
+        parse_record(Sample, values, where="state.json")
     assert complaint in str(caught.value)
     assert len(str(caught.value)) < 500
 

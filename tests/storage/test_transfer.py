@@ -104,7 +104,7 @@ def test_a_bucket_that_does_not_exist_is_named(tmp_path: Path) -> None:
     for action in (
         lambda: storage.upload(source_of(tmp_path, SMALL), "gs://other/run/file"),
         lambda: storage.file_sizes("gs://other/run"),
-        lambda: storage.try_writing("gs://other/run"),
+        lambda: storage.check_writable("gs://other/run"),
     ):
         with pytest.raises(RefusedError, match="there is no bucket other"):
             action()
@@ -136,7 +136,7 @@ def test_every_kind_of_place_is_written_listed_and_removed_from(place: str, tmp_
 
 
 def test_trying_a_place_leaves_nothing(place: str, bucket: Gcs, tmp_path: Path) -> None:
-    storage.try_writing(place)
+    storage.check_writable(place)
     assert storage.file_sizes(place) == {}
     assert not (tmp_path / "at").exists()
     assert bucket.names("bucket") == ["before"]
@@ -146,7 +146,7 @@ def test_a_folder_of_this_machine_that_cannot_be_written_is_refused(tmp_path: Pa
     (tmp_path / "file").write_text("")
     for action in (
         lambda: storage.upload(source_of(tmp_path, SMALL), str(tmp_path / "file/inner/a")),
-        lambda: storage.try_writing("/proc/none"),
+        lambda: storage.check_writable("/proc/none"),
     ):
         with pytest.raises(RefusedError, match="cannot be written"):
             action()
@@ -155,9 +155,11 @@ def test_a_folder_of_this_machine_that_cannot_be_written_is_refused(tmp_path: Pa
 def test_a_place_has_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert (
-        storage.absolute("runs/one/") == storage.absolute(f"file://{tmp_path}/runs/one") == str(tmp_path / "runs/one")
+        storage.canonical_path("runs/one/")
+        == storage.canonical_path(f"file://{tmp_path}/runs/one")
+        == str(tmp_path / "runs/one")
     )
-    assert storage.absolute("gs://bucket/run/") == "gs://bucket/run"
+    assert storage.canonical_path("gs://bucket/run/") == "gs://bucket/run"
 
 
 @pytest.mark.usefixtures("bucket")

@@ -11,7 +11,7 @@ from vjepa2_ac.cli import options as cli
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError, counted, shell_command
 from vjepa2_ac.reporter import INDEXING, SILENT
-from vjepa2_ac.storage.structured import json_text, plain
+from vjepa2_ac.storage.structured import format_json, to_plain
 
 _CLIPS, _PAIRS = 64, 200  # for the calibration of strides and of axes; 200 pairs as in the paper
 
@@ -138,8 +138,8 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
     if probe is not None:
         add(Finding("warning" if probe.better else "ok" if probe.is_decided else "skipped", "probe", probe.verdict()))
     if as_json:
-        values = plain([asdict(variant) for variant in variants])
-        print(json_text({**findings_as_dict(findings), "variants": values}), end="")
+        values = to_plain([asdict(variant) for variant in variants])
+        print(format_json({**findings_as_dict(findings), "variants": values}), end="")
     else:
         cli.show(summary_of(findings))
     return int(any(finding.level == "error" for finding in findings))

@@ -18,7 +18,7 @@ from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.folder import is_run, read_run_config
-from vjepa2_ac.storage.places import BUILTIN
+from vjepa2_ac.storage.paths import BUILTIN
 
 if TYPE_CHECKING:
     from vjepa2_ac.decoding.decoder import TrainedDecoder

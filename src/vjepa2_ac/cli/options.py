@@ -19,8 +19,8 @@ from vjepa2_ac.errors import InputError, did_you_mean, printable, shell_command
 from vjepa2_ac.process import is_first
 from vjepa2_ac.reporter import INDEXING
 from vjepa2_ac.runs.folder import is_run, places_elsewhere, read_run_config
-from vjepa2_ac.storage import places, require_new_folder, try_writing_at, user_can_write, write_atomically
-from vjepa2_ac.storage.structured import json_text
+from vjepa2_ac.storage import check_local_writable, paths, require_new_folder, translate_write_errors, write_atomically
+from vjepa2_ac.storage.structured import format_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -247,7 +247,7 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
 
     config = load_config_of_run(Path(path), overrides) if of_run else load_config(path, overrides)
     data = config.data.path
-    if not places.is_url(data) and not Path(data).exists():
+    if not paths.is_url(data) and not Path(data).exists():
         found = f"no such file or folder, seen from {Path.cwd()}"
         fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
         raise InputError(where=f"data.path: {data}", found=found, needed="a data set", fix=fix)
@@ -306,7 +306,7 @@ def open_data(config: Config, reporter: ConsoleReporter) -> Dataset:
 
 def write_json(path: Path, values: Any) -> Path:
     """Write plain values to a JSON file atomically, and return its path."""
-    write_atomically(path, json_text(values))
+    write_atomically(path, format_json(values))
     return path
 
 
@@ -316,7 +316,7 @@ def make_folder(folder: Path) -> None:
     Raises:
         InputError: The folder cannot be created.
     """
-    with user_can_write(f"--out {folder}"):
+    with translate_write_errors(f"--out {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
 
 
@@ -327,8 +327,8 @@ def require_new_place(folder: Path) -> None:
         InputError: The folder is not empty or cannot be created.
     """
     require_new_folder(folder)
-    with user_can_write(folder):
-        try_writing_at(folder)
+    with translate_write_errors(folder):
+        check_local_writable(folder)
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -364,16 +364,16 @@ def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:
 
 
 def _config_path(text: str) -> str:
-    if places.is_url(text):
+    if paths.is_url(text):
         raise ValueError(f"is a URL. If it holds data, run `{shell_command('init', text)}`, which writes a config")
-    return places.on_this_machine(text)
+    return paths.resolve_local_path(text)
 
 
 as_config = _reader(_config_path)  # a local config file, or builtin:NAME
-as_local = _reader(places.on_this_machine)  # a local path as text; `~` is the user's home folder
-as_path = _reader(lambda text: Path(places.on_this_machine(text)))
-as_place = _reader(places.anywhere)  # a local path or a URL
-as_model = _reader(places.of_a_model)  # a local path, or builtin:NAME
+as_local = _reader(paths.resolve_local_path)  # a local path as text; `~` is the user's home folder
+as_path = _reader(lambda text: Path(paths.resolve_local_path(text)))
+as_place = _reader(paths.resolve_path_or_url)  # a local path or a URL
+as_model = _reader(paths.resolve_model_path)  # a local path, or builtin:NAME
 
 
 def whole_number(least: int, most: int = _MOST) -> Callable[[str], int]:

@@ -12,7 +12,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.errors import counted
 from vjepa2_ac.reporter import INDEXING
-from vjepa2_ac.storage import user_can_write
+from vjepa2_ac.storage import translate_write_errors
 
 if TYPE_CHECKING:
     import numpy as np
@@ -97,7 +97,7 @@ def _plan(options: argparse.Namespace) -> int:
     about = session.as_dict() | {"start": options.start, "goals": names, "mask": options.mask}
     about["decoder"] = None if decoder is None else decoder.as_dict()
     predicted_frames = None if decoder is None else imagine_plan(result, decoder)
-    with user_can_write(options.out):
+    with translate_write_errors(options.out):
         file = write_plan(result, about, options.out / PLAN_FILE)
         image = plot_plan(result, options.out / PLAN_IMAGE, predicted_frames)
     summary = textwrap.fill(summarize(result), _COLUMNS)
@@ -164,6 +164,6 @@ def _goals(options: argparse.Namespace) -> None:
     chosen = cli.record_of_options(KeyFrameOptions, options, stride=stride, views=config.planning.views)
     with cli.reporter() as reporter:
         made = make_goals(config.data, options.episode, chosen, reporter.task(INDEXING))
-    with user_can_write(options.out):
+    with translate_write_errors(options.out):
         written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
     cli.show(goals_table(made), files=written)

@@ -21,8 +21,8 @@ from vjepa2_ac.cli.waiting import Work
 from vjepa2_ac.config.loading import config_as_yaml, config_path, config_schema, load_config, packaged_configs
 from vjepa2_ac.errors import InputError, UserError, counted, shell_command
 from vjepa2_ac.reporter import INDEXING
-from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
-from vjepa2_ac.storage.places import BUILTIN, literal
+from vjepa2_ac.storage import check_local_writable, translate_write_errors, write_atomically
+from vjepa2_ac.storage.paths import BUILTIN, to_config_value
 
 if TYPE_CHECKING:
     from vjepa2_ac.init.draft import Draft
@@ -91,8 +91,8 @@ def _init(options: argparse.Namespace) -> int:
     if out.exists() and not options.overwrite:
         fix = "--out another, or --overwrite"
         raise InputError(where=str(out), found="a file is there", needed="a new one", fix=fix)
-    with user_can_write(f"--out {out}"):
-        try_writing_at(out.parent)
+    with translate_write_errors(f"--out {out}"):
+        check_local_writable(out.parent)
 
     from vjepa2_ac.init.look import look_at, measured, simulated
     from vjepa2_ac.model.model_files import find_base, find_encoder_path
@@ -111,7 +111,7 @@ def _init(options: argparse.Namespace) -> int:
     model, machine = choose_model(options.model or (TINY if path == _SIMULATED else None), is_scratch), this_machine()
     cli.show(f"Data: {'; '.join(data.about)}.\nMachine: {machine.about}.")
     draft = make_draft(data, machine, model, run_dir=f"runs/{name}")
-    with user_can_write(f"--out {out}"):
+    with translate_write_errors(f"--out {out}"):
         write_atomically(out, draft.text(data, machine).encode())
     guessed = [f"  GUESSED  {key} = {value_and_why}" for key, value_and_why in guesses(draft.knobs).items()]
     cli.show(*draft.costs, f"Written: {out}", *guessed)
@@ -204,7 +204,7 @@ def _download(options: argparse.Namespace) -> None:
     cli.show(f"Licence {known.licence}; from {url}; its size is checked")
     with cli.reporter() as reporter:
         download(url, path, known=known, reporter=reporter)
-    cli.show(f"It is in {path}. In a config:  {known.config_key}: {literal(path)}")
+    cli.show(f"It is in {path}. In a config:  {known.config_key}: {to_config_value(path)}")
 
 
 def _doctor(options: argparse.Namespace) -> int:

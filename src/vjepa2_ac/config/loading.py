@@ -24,9 +24,9 @@ from vjepa2_ac.config.section import key_of_data, marks_of
 from vjepa2_ac.config.training import TrainingConfig, usual_warmup
 from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.registry import SOURCES, UNKNOWN_OPTION, import_plugins
-from vjepa2_ac.storage import read_bounded
-from vjepa2_ac.storage.places import BUILTIN, NO_DATA
-from vjepa2_ac.storage.structured import message_of, parse_yaml
+from vjepa2_ac.storage import read_small_file
+from vjepa2_ac.storage.paths import BUILTIN, NO_DATA
+from vjepa2_ac.storage.structured import describe_validation_error, parse_yaml
 
 _MOST_BYTES = 1_000_000  # size limit of a config file: PyYAML needs a minute for 20 MB
 # Cached because a command reads the config of its run several times, 20 ms each. `parse_config` copies the values.
@@ -194,7 +194,7 @@ _Dumper.add_implicit_resolver("!number", re.compile(r"^[-+]?[\d_]*\.?[\d_]*[eE][
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        text = read_bounded(path, _MOST_BYTES).decode()
+        text = read_small_file(path, _MOST_BYTES).decode()
     except FileNotFoundError:
         fix = "`vjepa2-ac init` writes one for your data; `vjepa2-ac config list` shows those of the package"
         raise InputError(where=str(path), found="no such file", needed="a config", fix=fix) from None
@@ -392,7 +392,7 @@ def _explain(key: str, detail: Any) -> str:
     if detail["type"] == UNKNOWN_OPTION:
         return str(detail["msg"])
     if detail["type"] != "extra_forbidden":
-        return message_of(detail)
+        return describe_validation_error(detail)
     key = key_of_data(key)
     section, dot, name = key.rpartition(".")
     if (why := why_removed(key)) is not None:

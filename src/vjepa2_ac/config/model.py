@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from vjepa2_ac.config.section import Affects, PositiveInt, Section, Share
-from vjepa2_ac.storage import places
+from vjepa2_ac.storage import paths
 
 # Limits far above the released model (width 1408, depth 40, 1.3 billion weights), because a file may claim any size.
 Width = Annotated[int, Field(ge=1, le=16_384)]
@@ -189,7 +189,7 @@ class SizesConfig(Section):
 class EncoderConfig(Section):
     """A pre-trained encoder, for a base model without an encoder."""
 
-    path: Annotated[str, AfterValidator(places.of_an_encoder), Affects.PLAN]
+    path: Annotated[str, AfterValidator(paths.resolve_encoder_path), Affects.PLAN]
     """Meta's `.pt` of V-JEPA 2 or 2.1 (`vjepa2-ac download --list`), a transformers folder, `hf://owner/name` or
     `hf://owner/name@revision` for such a folder on the Hub, or the folder of a model of this project. A run can resume
     after the path was changed, because the fingerprint of the weights is compared."""
@@ -211,7 +211,7 @@ class EncoderConfig(Section):
 class ModelConfig(Section):
     """Which world model to start from."""
 
-    base: Annotated[str, AfterValidator(places.of_a_model), Affects.PLAN]
+    base: Annotated[str, AfterValidator(paths.resolve_model_path), Affects.PLAN]
     """The base model: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny model
     of the demo, which is part of the package). A run can resume after the path was changed, because the fingerprint of
     the weights is compared. random: a new predictor with `sizes`, initialised close to persistence, with `encoder` or

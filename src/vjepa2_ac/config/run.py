@@ -13,14 +13,14 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.config.section import Affects, Section
 from vjepa2_ac.config.sources import RldsData  # noqa: F401 - all forms of data
 from vjepa2_ac.config.training import CheckpointConfig, DecoderConfig, TrackingConfig, TrainingConfig, ValidationConfig
-from vjepa2_ac.storage import places
+from vjepa2_ac.storage import paths
 
 
 def _run_folder(path: str) -> str:
     try:
-        return places.on_this_machine(path)
+        return paths.resolve_local_path(path)
     except ValueError as error:
-        if not places.is_url(path):
+        if not paths.is_url(path):
             raise
         raise ValueError(f"{error}; to keep a copy there as the run goes, set checkpoint.remote to it") from None
 

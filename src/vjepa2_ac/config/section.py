@@ -20,7 +20,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import core_schema
 
 from vjepa2_ac.registry import Registry
-from vjepa2_ac.storage import places
+from vjepa2_ac.storage import paths
 
 PositiveInt = Annotated[int, Field(ge=1, le=1_000_000_000)]  # larger values would exceed any memory
 Count = Annotated[int, Field(ge=0)]
@@ -29,9 +29,9 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 ZeroToOne = Annotated[float, Field(ge=0.0, le=1.0)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 OFF = BeforeValidator(lambda value: "off" if value is False else value)  # YAML reads off as a boolean
-Place = Annotated[str, AfterValidator(places.anywhere)]  # a local path (~ is the user's home) or a URL
-Local = Annotated[str, AfterValidator(places.on_this_machine)]  # a local path
-LocalOrBuiltin = Annotated[str, AfterValidator(places.of_a_model)]  # a local path, or builtin:NAME
+Place = Annotated[str, AfterValidator(paths.resolve_path_or_url)]  # a local path (~ is the user's home) or a URL
+Local = Annotated[str, AfterValidator(paths.resolve_local_path)]  # a local path
+LocalOrBuiltin = Annotated[str, AfterValidator(paths.resolve_model_path)]  # a local path, or builtin:NAME
 
 
 class Affects(Flag):

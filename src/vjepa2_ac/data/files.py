@@ -51,7 +51,7 @@ class EpisodeFiles:
         """
         if not storage.is_url(path):
             return path
-        size = self.cache.read_or_make(f"size {path} {version}", lambda: str(storage.file_size(path)).encode())
+        size = self.cache.read_or_create(f"size {path} {version}", lambda: str(storage.file_size(path)).encode())
         return BlockCachedFile(path, version=version, size=int(size), cache=self.cache)
 
     def read(self, path: str, *, version: str) -> bytes:
@@ -60,9 +60,9 @@ class EpisodeFiles:
         Raises:
             InputError: There is no such file. An UnreachableError if the file cannot be read.
         """
-        with storage.user_can_read(path, fix="Copy the episode again"):
+        with storage.translate_read_errors(path, fix="Copy the episode again"):
             if storage.is_url(path):
-                return self.cache.read_or_make(f"{path}@{version}", lambda: storage.read_bytes(path))
+                return self.cache.read_or_create(f"{path}@{version}", lambda: storage.read_bytes(path))
             return storage.read_bytes(path)
 
     def parsed(self, key: str, parse: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
@@ -102,14 +102,14 @@ def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
         OSError: A folder cannot be listed.
         InputError: A name is not UTF-8.
     """
-    folders, visited = [""], {storage.absolute(root)}
+    folders, visited = [""], {storage.canonical_path(root)}
     for _ in range(DEEPEST):
         below: list[str] = []
         listed = in_parallel(lambda folder: list_folder(root, folder), folders, connections)
         for folder, (files, names) in zip(folders, listed, strict=True):
             yield from ((folder, file) for file in files if not file.name.startswith("."))
             below += [storage.join(folder, name) for name in names]
-        paths = {storage.absolute(storage.join(root, folder)): folder for folder in reversed(below)}
+        paths = {storage.canonical_path(storage.join(root, folder)): folder for folder in reversed(below)}
         folders = sorted(folder for path, folder in paths.items() if path not in visited)
         visited |= paths.keys()
 

@@ -15,7 +15,7 @@ from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, StepSelection, fi
 from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import POSE, rotation_angles
-from vjepa2_ac.storage.structured import read_json_object, shown
+from vjepa2_ac.storage.structured import read_json_object, short_repr
 
 logger = logging.getLogger(__name__)
 
@@ -39,8 +39,8 @@ def find_ranges(
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
         make = partial(published_ranges, path, table)
-        with storage.user_can_read(path):
-            parts["list"] = [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
+        with storage.translate_read_errors(path):
+            parts["list"] = [storage.canonical_path(path), storage.file_size(path), storage.file_version(path)]
     return get_or_make(config.disk_cache, key_of(parts), make, StepSelection)
 
 
@@ -71,7 +71,7 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     where = f"data.idle.ranges: {path}"
     needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
     another = "Name the list of this version of the data set, or set data.idle.rule: commands or motion"
-    lists = read_json_object(path, most_bytes=_MOST_BYTES, needed=needed)
+    lists = read_json_object(path, max_bytes=_MOST_BYTES, needed=needed)
     names = [table.identity(index) for index in range(len(table))]
     listed = sum(name in lists for name in names)
     if not listed:
@@ -84,7 +84,7 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
         pairs = _pairs(lists.get(name, []), steps)
         if pairs is None:
             needed = f"pairs [start, end) of steps from 0 to {steps}, its length, that do not overlap"
-            raise InputError(where=f"{where}: {name}", found=shown(lists[name]), needed=needed, fix=another)
+            raise InputError(where=f"{where}: {name}", found=short_repr(lists[name]), needed=needed, fix=another)
         ranges.append(pairs)
     logger.log(
         logging.INFO if listed == len(table) else logging.WARNING,

@@ -25,7 +25,7 @@ from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.episode import STATE_DIM, EpisodeInfo, StepRanges
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.spaces import step_sizes
-from vjepa2_ac.storage import places
+from vjepa2_ac.storage import paths
 
 logger = logging.getLogger(__name__)
 
@@ -347,7 +347,7 @@ def cache_folder(config: DiskCacheConfig) -> Path:
         return Path(config.dir)
     if configured := os.environ.get(_CACHE):
         try:
-            return Path(places.on_this_machine(configured))
+            return Path(paths.resolve_local_path(configured))
         except ValueError as error:
             raise InputError(where=_CACHE, found=f"{configured!r} {error}", needed="a folder of this machine") from None
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
@@ -383,7 +383,7 @@ def get_or_build(config: DiskCacheConfig, key: str, place: str, build: Callable[
 
     If the data set was moved, paths in cached problems are rewritten from the old folder to `place`.
     """
-    folder = storage.absolute(place)
+    folder = storage.canonical_path(place)
 
     def build_with_key() -> EpisodeTable:
         table = build()
@@ -406,7 +406,7 @@ def get_or_make(config: DiskCacheConfig, key: str, make: Callable[[], T], kind: 
     """
     path = cache_folder(config) / "index" / f"{key}.index"
     try:
-        with storage.user_can_read(path):
+        with storage.translate_read_errors(path):
             data = path.read_bytes()
         if not data.endswith(key.encode()):
             raise NotATableError("it is damaged, from an older version, or of other data")  # noqa: TRY301

@@ -31,8 +31,8 @@ from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.model.model_files import ASSETS
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import folder_writer
-from vjepa2_ac.storage.places import BUILTIN, NO_DATA, SIMULATION_FILE
-from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.paths import BUILTIN, NO_DATA, SIMULATION_FILE
+from vjepa2_ac.storage.structured import parse_record, read_json_object
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 
 logger = logging.getLogger(__name__)
@@ -327,4 +327,4 @@ def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
         fix = "Train one with `vjepa2-ac decoder CONFIG`; one that is unfinished goes on with the same command"
         found = f"no {CARD} there"
         raise InputError(where=f"{where} {folder}", found=found, needed=_NEEDED, fix=fix) from None
-    return record_of(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)
+    return parse_record(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)

@@ -32,7 +32,7 @@ from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import checkpoint_name
 from vjepa2_ac.runs.folder import IMAGINED
 from vjepa2_ac.spaces import StateSpace, counterfactual_states, feasible_actions
-from vjepa2_ac.storage import user_can_write, write_atomically
+from vjepa2_ac.storage import translate_write_errors, write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -204,7 +204,7 @@ def write_imagination(imagination: Imagination, folder: Path, *, reporter: Repor
         InputError: The folder cannot be written.
     """
     strip = strip_of(imagination)
-    with user_can_write(folder):
+    with translate_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / STRIP, encode_png(draw_strip(strip)))
         images, loop = list(film_frames(strip)), loop_of(strip)

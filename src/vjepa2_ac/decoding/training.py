@@ -57,7 +57,7 @@ from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import read_torch, write_torch
 from vjepa2_ac.runs.folder import RunLock
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.storage import atomic_writer, try_writing_at, user_can_write, write_atomically
+from vjepa2_ac.storage import atomic_writer, check_local_writable, translate_write_errors, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
 KEY, PAIRS, STATE = "key.json", "pairs", "training.pt"
@@ -99,7 +99,7 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
             return folder
         if not is_done:
             lock.take()
-            with user_can_write(folder):
+            with translate_write_errors(folder):
                 write_atomically(folder / KEY, json.dumps({"key": dict(ready.key.parts)}, indent=1) + "\n")
             _try_one_step(ready)
             _make(ready, reporter)
@@ -170,8 +170,8 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
     require_frames(config.data, to="learn from")
     require_stride(config.data, to="know which frames clips use")
     device = computing_device(config.training)
-    with user_can_write(folder):
-        try_writing_at(folder)
+    with translate_write_errors(folder):
+        check_local_writable(folder)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     wanted: dict[Split, list[FramesToEncode]] = {
         "train": wanted_frames(dataset, "train", frames=decoder.frames),
@@ -260,7 +260,7 @@ def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Repor
             if step % _LOG_EVERY == 0 or is_last:
                 log.write("train", step, metrics)
             if step % every == 0 or is_last or stop.reason is not None:
-                with log.before_a_checkpoint(), user_can_write(saved), atomic_writer(saved) as file:
+                with log.before_a_checkpoint(), translate_write_errors(saved), atomic_writer(saved) as file:
                     parts = {"decoder": steps.decoder.state_dict(), "optimizer": steps.optimizer.state_dict()}
                     write_torch({"step": step, "average": steps.average, **parts}, file)
             if stop.reason is not None and not is_last:

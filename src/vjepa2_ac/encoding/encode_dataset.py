@@ -136,7 +136,7 @@ def begin_encoding(cache: LatentCache, left: Sequence[FramesToEncode], reporter:
         free = f", with {free_bytes(cache.folder) / 1e9:.4g} GB free on its disk"
     else:
         free = ""
-        storage.try_writing(cache.folder)
+        storage.check_writable(cache.folder)
     reporter.note(f"The latents go into {cache.folder}{free}")
     cache.require_space(left)
     cache.begin()

@@ -106,7 +106,7 @@ class LatentCache:
         key = key_of_cache(config, fingerprint_of(dataset.table), encoding)
         parent = config.cache_dir or cache_folder(config.disk_cache) / "latents"
         path = storage.join(parent, key.digest) if folder is None else str(folder)
-        return cls(dataset, encoding, key, storage.folder_at(path))
+        return cls(dataset, encoding, key, storage.parse_folder(path))
 
     @property
     def files(self) -> LatentFiles:

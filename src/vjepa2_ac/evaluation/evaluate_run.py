@@ -35,8 +35,8 @@ from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.metrics_log import warnings_of
 from vjepa2_ac.runs.subject import Subject, load_subject
-from vjepa2_ac.storage import try_writing_at, user_can_write
-from vjepa2_ac.storage.places import BUILTIN
+from vjepa2_ac.storage import check_local_writable, translate_write_errors
+from vjepa2_ac.storage.paths import BUILTIN
 from vjepa2_ac.storage.structured import utc_now
 
 BASE = "base"
@@ -185,9 +185,9 @@ def _require_places(subject: str, asked: EvaluationOptions) -> None:
     folder = asked.out or Path(subject)
     if is_run(subject):
         select_checkpoint(Path(subject), asked.checkpoint)
-    with user_can_write(folder):
+    with translate_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        try_writing_at(folder)
+        check_local_writable(folder)
 
 
 def _clips(

@@ -22,7 +22,7 @@ from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import L1, Evaluation
 from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.intervals import ENOUGH_EPISODES, Estimate
-from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
+from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 
 Conclusion = Literal["yes", "no", "inconclusive", "not measured"]
 

@@ -26,7 +26,7 @@ from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.planning.energy import mean_difference
 from vjepa2_ac.planning.planner import Cancelled
 from vjepa2_ac.spaces import Space
-from vjepa2_ac.storage.structured import plain, record_of
+from vjepa2_ac.storage.structured import parse_record, to_plain
 
 _QUICK = {"samples": 64, "iterations": 4}  # size of a search on a CPU; docs/planning.md rates its plans
 _MOST_FRAMES = 16  # frames of an image strip
@@ -318,7 +318,7 @@ def read_request(text: str | bytes) -> PageRequest:
         values = json.loads(text)
     except (ValueError, RecursionError):
         raise InputError(where="request", found="no JSON", needed="what explore's own page sends") from None
-    return record_of(PageRequest, values, where="request", needed="what explore's own page sends")
+    return parse_record(PageRequest, values, where="request", needed="what explore's own page sends")
 
 
 @dataclass(frozen=True)
@@ -343,7 +343,7 @@ def packed(kind: str, seq: int | None, values: dict[str, Any], images: Sequence[
     about = [
         {"name": image.name, "bytes": len(data), "alt": image.alt} for image, data in zip(images, jpegs, strict=True)
     ]
-    text = json.dumps(plain({"kind": kind, "seq": seq, "images": about, **values}), allow_nan=False).encode()
+    text = json.dumps(to_plain({"kind": kind, "seq": seq, "images": about, **values}), allow_nan=False).encode()
     return b"".join([len(text).to_bytes(4, "big"), text, *jpegs])
 
 

@@ -22,7 +22,7 @@ from vjepa2_ac.data.sources.tfrecord import HEADER_BYTES, Kind, span_at
 from vjepa2_ac.errors import InputError, MissingFileError, UserError, counted
 from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
 from vjepa2_ac.init.poses import Column, Samples, find_pose, measured_columns, vector_state
-from vjepa2_ac.storage.places import SIMULATION_FILE
+from vjepa2_ac.storage.paths import SIMULATION_FILE
 from vjepa2_ac.storage.structured import read_json_object
 
 DROID = "gs://gresearch/robotics/droid/1.0.1"

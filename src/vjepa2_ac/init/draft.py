@@ -18,7 +18,7 @@ from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.model.checkpoints import base_sizes
 from vjepa2_ac.model.model_files import OFFICIAL, PUBLISHED
-from vjepa2_ac.storage.places import BUILTIN
+from vjepa2_ac.storage.paths import BUILTIN
 from vjepa2_ac.training.cost import GIGABYTE, USUAL_GPU, estimate_memory
 
 RELEASED = "checkpoints/vjepa2-ac-vitg.pt"

@@ -25,7 +25,7 @@ from vjepa2_ac.episode import STATE_DIM, Progress
 from vjepa2_ac.errors import InputError, UserError, counted, shell_command
 from vjepa2_ac.init.described import droid, like_droid, look_at_lerobot, look_at_rlds
 from vjepa2_ac.init.found import FoundData, Knob, idle_rule, pick_camera, plain
-from vjepa2_ac.storage.places import BUILTIN
+from vjepa2_ac.storage.paths import BUILTIN
 
 _CONNECTIONS = 16  # number of parallel reads
 _CONVERTERS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "convert"
@@ -142,7 +142,7 @@ def look_at(path: str) -> FoundData:
     if not storage.is_url(path) and not Path(path).is_dir():
         fix = f"For a data set of the Hugging Face Hub: hf://datasets/{path}" if _HUB_NAME.fullmatch(path) else ""
         raise InputError(where=path, found="no such folder", needed="a folder, or a URL", fix=fix)
-    with storage.user_can_read(path):
+    with storage.translate_read_errors(path):
         if data := _look_with_plugins(path):
             return data
         described = _find_described_sets(path)
@@ -193,7 +193,7 @@ def _find_described_sets(path: str) -> list[tuple[str, str]]:
             names = {entry.name for entry in entries}
             marked = [form for form, mark in _MARKS.items() if mark.partition("/")[0] in names]
             if form := next((form for form in marked if storage.exists(storage.join(folder, _MARKS[form]))), None):
-                described.setdefault(storage.absolute(folder), (form, folder))
+                described.setdefault(storage.canonical_path(folder), (form, folder))
                 continue
             inner = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
             if depth == _DEEPEST:

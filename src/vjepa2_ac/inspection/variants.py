@@ -35,7 +35,7 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.subject import load_subject
-from vjepa2_ac.storage.structured import plain
+from vjepa2_ac.storage.structured import to_plain
 
 Encode = Callable[[Batch], LatentBatch]  # encodes pixels into latents, on the model's device
 
@@ -253,7 +253,7 @@ class Calibration:
             "verdict": self.verdict(),
             "split": self.split,
             "frames": self.frames,
-            "strides": [plain(asdict(one)) | {"stride": stride} for stride, one in self.results.items()],
+            "strides": [to_plain(asdict(one)) | {"stride": stride} for stride, one in self.results.items()],
             "impossible": {str(stride): why for stride, why in self.impossible.items()},
         }
 

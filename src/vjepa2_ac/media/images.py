@@ -20,7 +20,7 @@ from PIL.PngImagePlugin import PngImageFile
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import StateSpace, rotation_angles
-from vjepa2_ac.storage import read_bounded, user_can_read
+from vjepa2_ac.storage import read_small_file, translate_read_errors
 
 MOST_PIXELS = 100_000_000  # ten times a robot's camera; the header of a 600-byte file may claim forty times as many
 _MOST_BYTES = 1 << 32  # limit for images that are decoded together
@@ -148,8 +148,8 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
     Raises:
         InputError: The file is missing, too large, a pipe or a device, or neither PNG nor JPEG.
     """
-    with user_can_read(path, needed="an image: PNG or JPEG"):
-        data = read_bounded(path, _MOST_FILE_BYTES)
+    with translate_read_errors(path, needed="an image: PNG or JPEG"):
+        data = read_small_file(path, _MOST_FILE_BYTES)
     return decode_image(data, str(path))
 
 

@@ -155,8 +155,8 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
     """Open a video for decoding in one thread, because the loader's workers already run in parallel."""
     av = video_library(where)
     if isinstance(file, (str, Path)):
-        with storage.user_can_read(where, needed="a whole, undamaged MP4", fix=_FIX):
-            opened = storage.open_to_read(file)
+        with storage.translate_read_errors(where, needed="a whole, undamaged MP4", fix=_FIX):
+            opened = storage.open_for_reading(file)
         with closing(opened), _opened(opened, where) as video:
             yield video
         return

@@ -30,7 +30,7 @@ from vjepa2_ac.model.lora import (
     wrap,
 )
 from vjepa2_ac.model.world_model import WorldModel, fit_heads
-from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.structured import parse_record, read_json_object
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 
 with quiet_imports():
@@ -141,7 +141,7 @@ def read_card(folder: Path, model: WorldModel) -> Card:
         InputError: The folder contains no trained weights or is damaged, or they belong to another base model.
     """
     path, needed = folder / CARD, "the card of an adapter, as save_trained writes it"
-    card = record_of(Card, read_json_object(path, needed=needed), where=str(path), needed=needed)
+    card = parse_record(Card, read_json_object(path, needed=needed), where=str(path), needed=needed)
     own = model.adaptation.base if model.adaptation else model.predictor_fingerprint()
     encoder = model.adaptation.encoder if model.adaptation else model.encoder_fingerprint()
     for part, found, needed, trained_on, this in (

@@ -41,10 +41,10 @@ from vjepa2_ac.model.model_files import (
     read_sizes,
 )
 from vjepa2_ac.model.world_model import ENCODER, WorldModel, widths_as_text, widths_of_model
-from vjepa2_ac.storage.places import BUILTIN
-from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.paths import BUILTIN
+from vjepa2_ac.storage.structured import parse_record, read_json_object
 from vjepa2_ac.storage.tensors import check_tensors, open_safetensors, require_finite, require_floats
-from vjepa2_ac.storage.transfer import from_hub
+from vjepa2_ac.storage.transfer import download_from_hub
 
 logger = logging.getLogger(__name__)
 
@@ -240,7 +240,7 @@ def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: FoundEncode
         },
     }
     fix = "Set image size and heads in model.sizes: the tensors cannot tell"
-    found = record_of(ModelSizes, fields, where=str(file.path), needed="sizes that go with model.sizes", fix=fix)
+    found = parse_record(ModelSizes, fields, where=str(file.path), needed="sizes that go with model.sizes", fix=fix)
     check_sizes(found, given, where=str(file.path))
     return found
 
@@ -292,7 +292,7 @@ def find_encoder(config: EncoderConfig) -> FoundEncoder:
     if path is not None and not path.is_dir():
         found = encoder_in_file(MetaFile.open(path), config.key, config.frame, config.heads)
     else:
-        folder = path or from_hub(config.path, _ON_THE_HUB, where=f"model.encoder.path: {config.path}")
+        folder = path or download_from_hub(config.path, _ON_THE_HUB, where=f"model.encoder.path: {config.path}")
         name = config.path if path is None else path.name
         found = _in_folder(folder, config, name=name)
     if config.heads not in {None, found.sizes.heads}:
@@ -308,7 +308,7 @@ def sizes_with(found: FoundEncoder, given: ModelSizes) -> ModelSizes:
         InputError: The given sizes contradict those of the file, or do not fit its patches, frame path or heads.
     """
     own = {"encoder": found.sizes.model_dump(), "patch_size": found.patch_size}
-    sizes = record_of(ModelSizes, given.model_dump() | own, where=found.where, needed=ENCODER_NEEDED)
+    sizes = parse_record(ModelSizes, given.model_dump() | own, where=found.where, needed=ENCODER_NEEDED)
     check_sizes(sizes, given, where=found.where)
     if found.image_size not in {None, given.image_size}:
         logger.warning(
@@ -329,7 +329,7 @@ def expected_sizes(config: EncoderConfig, given: ModelSizes) -> ModelSizes:
         return sizes_with(find_encoder(config), given)
     encoder = known.encoder.sizes(known.family, config.frame).model_dump()
     encoder["depth"] = min(encoder["depth"], config.layer or encoder["depth"])
-    return record_of(ModelSizes, given.model_dump() | {"encoder": encoder}, where=f"model.encoder: {config.path}")
+    return parse_record(ModelSizes, given.model_dump() | {"encoder": encoder}, where=f"model.encoder: {config.path}")
 
 
 def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: int | None) -> FoundEncoder:
@@ -421,7 +421,7 @@ def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> FoundEncode
 
 def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, name: str) -> FoundEncoder:
     """Return the encoder of a plain or a classification model of transformers, without masked predictor and head."""
-    fields = record_of(_TransformersConfig, card, where=str(folder / CONFIG), needed=ENCODER_NEEDED, fix=FIX)
+    fields = parse_record(_TransformersConfig, card, where=str(folder / CONFIG), needed=ENCODER_NEEDED, fix=FIX)
     tensors = _mapped(sorted(folder.glob("*.safetensors")))
     prefix = next((one for one in _PREFIXES_ON_THE_HUB if any(tensor.startswith(one) for tensor in tensors)), None)
     if prefix is None:
@@ -471,11 +471,11 @@ class MetaFile:
             InputError: There is no such file, or it has another format, is truncated, a git-lfs pointer or a pipe.
             UnreachableError: The file cannot be read.
         """
-        with storage.user_can_read(path, needed=_NEEDED, fix=FIX):
+        with storage.translate_read_errors(path, needed=_NEEDED, fix=FIX):
             try:
                 whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
             except Exception as error:  # a damaged pickle raises errors of any type
-                if storage.is_refusal(error):
+                if storage.is_os_read_error(error):
                     raise
                 found, fix = _problem_of(path, error)
                 raise InputError(where=str(path), found=found, needed=_NEEDED, fix=fix) from None

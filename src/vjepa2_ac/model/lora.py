@@ -23,7 +23,7 @@ from vjepa2_ac.errors import InputError, quiet_imports
 from vjepa2_ac.model.low_rank import LowRankLayer, low_rank_linear
 from vjepa2_ac.model.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.world_model import Adaptation, WorldModel, base_weights, require_trained
-from vjepa2_ac.storage.structured import record_of, shown
+from vjepa2_ac.storage.structured import parse_record, short_repr
 
 with quiet_imports():
     from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict
@@ -287,10 +287,10 @@ def knobs_of(values: Mapping[str, Any], *, where: str) -> AdapterConfig:
         unread = {"peft_type": values.get("peft_type")}
     unread |= {peft: None for peft in ("r", "lora_alpha", "target_modules") if values.get(peft) is None}
     if unread:
-        listed = ", ".join(f"{shown(name)} {shown(value)}" for name, value in unread.items())
+        listed = ", ".join(f"{short_repr(name)} {short_repr(value)}" for name, value in unread.items())
         found = f"an adapter with {listed}, which is not read here"
         raise InputError(where=where, found=found, needed=NEEDED, fix=FIX)
-    return record_of(AdapterConfig, {**given, "peft": options}, where=where, needed=NEEDED, fix=FIX)
+    return parse_record(AdapterConfig, {**given, "peft": options}, where=where, needed=NEEDED, fix=FIX)
 
 
 def _is_off(value: object, default: object) -> bool:

@@ -21,9 +21,9 @@ from vjepa2_ac.config.loading import flat
 from vjepa2_ac.config.model import Family, FramePath
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError, shell_command
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.storage.places import BUILTIN, HUB
-from vjepa2_ac.storage.retries import RetryPolicy, with_retries
-from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.paths import BUILTIN, HUB
+from vjepa2_ac.storage.retries import RetryPolicy, call_with_retries
+from vjepa2_ac.storage.structured import parse_record, read_json_object
 
 ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets"
 FORMAT = "vjepa2-ac world model 1"
@@ -109,7 +109,7 @@ def read_sizes(folder: Path) -> ModelSizes:
     where, card = str(folder / CONFIG), read_json_object(folder / CONFIG, needed=NEEDED_MODEL, fix=_FIX)
     if card.get("format") != FORMAT:
         raise InputError(where=where, found="not the config of a world model", needed=NEEDED_MODEL, fix=_FIX)
-    return record_of(ModelSizes, card.get("sizes"), where=f"{where}: sizes", needed=NEEDED_MODEL, fix=_FIX)
+    return parse_record(ModelSizes, card.get("sizes"), where=f"{where}: sizes", needed=NEEDED_MODEL, fix=_FIX)
 
 
 def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
@@ -135,7 +135,7 @@ def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
     """
     origin = read_json_object(folder / CONFIG, needed=NEEDED_MODEL).get("encoder_origin")
     where, needed = f"{folder / CONFIG}: encoder_origin", "file, key and licence of an encoder"
-    return None if origin is None else record_of(EncoderOrigin, origin, where=where, needed=needed)
+    return None if origin is None else parse_record(EncoderOrigin, origin, where=where, needed=needed)
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,7 @@ def download(
         UnreachableError: The server refuses, or cannot be reached.
     """
     path = Path(path)
-    with storage.user_can_write(path):
+    with storage.translate_write_errors(path):
         if path.is_dir():
             raise InputError(where=str(path), found="a folder", needed="the name of a file", fix="Name a file in it")
         if path.exists():
@@ -308,7 +308,7 @@ def download(
         path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{known.name}.part" if known else f"{path.name}.part")
     try:
-        with_retries(
+        call_with_retries(
             url,
             lambda timeout_s: _fetch(url, part, known, reporter, timeout_s),
             policy=policy,
@@ -353,7 +353,7 @@ def _fetch(url: str, part: Path, known: Published | None, reporter: Reporter, ti
             fix = "Free some space, or name a file on a larger disk with --to"
             raise InputError(where=str(part), found=f"{free / 1e9:.4g} GB free on its disk", needed=needed, fix=fix)
         show = reporter.task(f"{part.name.removesuffix('.part')} (MB)")
-        with storage.user_can_write(part), part.open("ab" if start else "wb") as file:
+        with storage.translate_write_errors(part), part.open("ab" if start else "wb") as file:
             while block := answer.read(CHUNK_BYTES):
                 file.write(block)
                 show(file.tell() // 10**6, whole // 10**6)

@@ -21,7 +21,7 @@ from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.storage.structured import json_text, plain
+from vjepa2_ac.storage.structured import format_json, to_plain
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +171,7 @@ def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path
         "slices": slices,
         "seconds": {**answer.seconds, "search": 0.0 if plan is None else plan.seconds},
     }
-    write_atomically(path, json_text({name: plain(value) for name, value in content.items()}))
+    write_atomically(path, format_json({name: to_plain(value) for name, value in content.items()}))
     return path
 
 

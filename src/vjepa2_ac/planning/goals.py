@@ -18,7 +18,7 @@ from pydantic import ConfigDict, Field
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import encode_png, read_image, require_contrast, require_image
 from vjepa2_ac.storage.files import folder_writer
-from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
+from vjepa2_ac.storage.structured import format_json, parse_record, read_json_object
 
 GOALS_FILE = "goals.json"
 REACHED = 1e-6  # the energy of an image equal to the goal image, up to rounding
@@ -166,7 +166,7 @@ def read_goal_folder(folder: Path) -> tuple[SubGoal, ...]:
             be read, or differs in size from the first image.
     """
     path, needed = folder / GOALS_FILE, f"the {GOALS_FILE} that `vjepa2-ac goals` writes"
-    content = record_of(_GoalsFile, read_json_object(path, needed=needed), where=str(path), needed=needed)
+    content = parse_record(_GoalsFile, read_json_object(path, needed=needed), where=str(path), needed=needed)
     goals: list[SubGoal] = []
     for number, entry in enumerate(content.goals, start=1):
         image_path = _path_of(entry, folder, where=f"{path}: goal {number}")
@@ -225,5 +225,5 @@ def write_goals(
             bounds = (goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper)
             entries.append(GoalEntry(name, *bounds, frame))
         content = _GoalsFile(1, entries, origin=dict(origin or {}))
-        (filling / GOALS_FILE).write_text(json_text(asdict(content)))
+        (filling / GOALS_FILE).write_text(format_json(asdict(content)))
     return folder / GOALS_FILE

@@ -19,7 +19,7 @@ from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import CHANGES, MOVABLE, is_of_moved, is_run, read_run_config
 from vjepa2_ac.spaces import POSE, REACH_M, vector_states
-from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.structured import parse_record, read_json_object
 
 logger = logging.getLogger(__name__)
 
@@ -91,7 +91,7 @@ def read_axes(path: str | Path) -> AxesFile:
     """
     where, needed = f"planning.axes: {path}", f"calibrated axes of format {AXES_FORMAT}"
     values = read_json_object(path, needed=needed, fix=_FIX)
-    axes = record_of(AxesFile, values, where=where, needed=needed, fix=_FIX)
+    axes = parse_record(AxesFile, values, where=where, needed=needed, fix=_FIX)
     if axes.problem is not None:
         fix = "Record varied moves and fit to more pairs (--limit); or the model does not see the actions: adapt it"
         raise InputError(where=where, found=f"axes that are {axes.problem}", fix=fix)
@@ -171,7 +171,7 @@ def taught_in(folder: Path, *, poses: bool) -> Taught | None:
     if not path.is_file():
         return None
     values = {name: value for name, value in read_json_object(path).items() if name in {"changes", "narrow"}}
-    taught = record_of(Taught, values, where=str(path), needed="a number of 0 or more for each of the state's")
+    taught = parse_record(Taught, values, where=str(path), needed="a number of 0 or more for each of the state's")
     if poses and (len(taught.changes) != len(POSE) or max(taught.changes[:3]) > REACH_M):
         needed = f"{len(POSE)} numbers: {', '.join(POSE.change_names)}, positions in metres"
         raise InputError(where=str(path), found=str(taught.changes), needed=needed)

@@ -44,7 +44,7 @@ from vjepa2_ac.planning.solvers import PlanStart
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces
 from vjepa2_ac.storage import folder_writer
-from vjepa2_ac.storage.structured import read_json_object, record_of, utc_now
+from vjepa2_ac.storage.structured import parse_record, read_json_object, utc_now
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 
 CARD, WEIGHTS = "prior.json", "prior.safetensors"
@@ -192,7 +192,7 @@ def load_prior(folder: str | Path, *, where: str) -> tuple[PriorCard, ActionPrio
     """
     path = Path(folder)
     values = read_json_object(path / CARD, needed=_NEEDED, fix=_FIX)
-    card = record_of(PriorCard, values, where=f"{where}: {path / CARD}", needed=_NEEDED, fix=_FIX)
+    card = parse_record(PriorCard, values, where=f"{where}: {path / CARD}", needed=_NEEDED, fix=_FIX)
     prior = ActionPrior(card.sizes).eval().requires_grad_(False)
     prior.load_state_dict(read_tensors(path / WEIGHTS, prior.state_dict(), needed=_NEEDED, fix=_FIX))
     return card, prior

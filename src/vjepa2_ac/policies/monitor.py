@@ -23,7 +23,7 @@ from vjepa2_ac.model.world_model import Fingerprints, WorldModel
 from vjepa2_ac.planning.cameras import Cameras
 from vjepa2_ac.planning.controller import Compare, Surprise
 from vjepa2_ac.planning.energy import mean_difference
-from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.structured import parse_record, read_json_object
 
 MONITOR = "monitor.json"
 _FIX = "Make it with `vjepa2-ac monitor RUN`"
@@ -73,7 +73,7 @@ class Monitor:
         """
         file = Path(path) / MONITOR if Path(path).is_dir() else Path(path)
         values = read_json_object(file, needed="a monitor.json", fix=_FIX)
-        monitor = record_of(cls, values, where=f"{where}: {file}", needed="a monitor.json", fix=_FIX)
+        monitor = parse_record(cls, values, where=f"{where}: {file}", needed="a monitor.json", fix=_FIX)
         is_same_model = (monitor.encoder, monitor.predictor) == (known.encoder, known.predictor)
         if not is_same_model or len(monitor.expected) != tokens:
             raise InputError(where=f"{where}: {file}", found="the threshold of another model", fix=_FIX)

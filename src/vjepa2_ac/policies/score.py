@@ -26,7 +26,7 @@ from vjepa2_ac.runs.checkpoint import step_of
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.spaces import POSE, StateSpace, apply_actions, states_along
-from vjepa2_ac.storage.structured import plain
+from vjepa2_ac.storage.structured import to_plain
 
 CHANCE = 0.5  # share of other actions with a lower energy than the true ones, if a model ignores the actions
 _OTHERS = 16  # number of actions from other evaluation points that the true actions are compared with
@@ -74,7 +74,7 @@ class PolicyScores:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
-        values: dict[str, Any] = plain(asdict(self) | {"is_blind": self.is_blind})
+        values: dict[str, Any] = to_plain(asdict(self) | {"is_blind": self.is_blind})
         return values
 
 

@@ -21,8 +21,8 @@ from vjepa2_ac.errors import InputError, MissingFileError, shell_command
 from vjepa2_ac.evaluation.result import L1, About, Evaluation, Way
 from vjepa2_ac.evaluation.rows import Row, rows_of
 from vjepa2_ac.evaluation.summary import Summary, summarize
-from vjepa2_ac.storage import user_can_read, write_atomically
-from vjepa2_ac.storage.structured import json_text, message_of
+from vjepa2_ac.storage import translate_read_errors, write_atomically
+from vjepa2_ac.storage.structured import describe_validation_error, format_json
 
 METRICS_FILE = "metrics.json"
 FORMAT = 6  # incremented when a reader of the file would have to change
@@ -95,7 +95,7 @@ def not_measured(one: Evaluation) -> dict[str, str]:
 
 def write_metrics(evaluation: Evaluation, path: Path, summary: Summary | None = None) -> Path:
     """Write all metrics of an evaluation, and its summary (None: without a closed loop), atomically."""
-    write_atomically(path, json_text(metrics_as_dict(evaluation, summary)))
+    write_atomically(path, format_json(metrics_as_dict(evaluation, summary)))
     return path
 
 
@@ -108,12 +108,12 @@ def read_metrics(folder: Path) -> Metrics:
     """
     path, fix = folder / METRICS_FILE, f"Write it with `{shell_command('evaluate', folder)}`"
     try:
-        with user_can_read(path):
+        with translate_read_errors(path):
             return TypeAdapter(Metrics).validate_json(path.read_bytes())
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
-        found = f"metrics that cannot be used ({place}: {message_of(first)})"
+        found = f"metrics that cannot be used ({place}: {describe_validation_error(first)})"
         raise InputError(where=str(path), found=found, needed=f"format {FORMAT}", fix=fix) from None
     except MissingFileError:
         found = f"no {METRICS_FILE}" if folder.is_dir() else "no such folder"

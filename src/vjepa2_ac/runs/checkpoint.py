@@ -24,8 +24,8 @@ from pydantic import Field
 
 from vjepa2_ac.config.section import PositiveInt
 from vjepa2_ac.errors import InputError, MissingFileError, counted, shell_command
-from vjepa2_ac.storage import is_refusal, read_bounded, sha256_of_file, sync, user_can_read
-from vjepa2_ac.storage.structured import MOST_BYTES, json_object, read_json_object, record_of, shown
+from vjepa2_ac.storage import is_os_read_error, read_small_file, sha256_of_file, sync, translate_read_errors
+from vjepa2_ac.storage.structured import MAX_BYTES, parse_json_object, parse_record, read_json_object, short_repr
 
 logger = logging.getLogger(__name__)
 
@@ -203,12 +203,12 @@ def find_damage(checkpoint: Path) -> str | None:
     """
     name = MANIFEST
     try:
-        with user_can_read(checkpoint / MANIFEST):
-            files = named_files(read_bounded(checkpoint / MANIFEST, MOST_BYTES))
+        with translate_read_errors(checkpoint / MANIFEST):
+            files = named_files(read_small_file(checkpoint / MANIFEST, MAX_BYTES))
         if STATE not in files:
             return f"{MANIFEST} does not name {STATE}"
         for name, digest in files.items():
-            with user_can_read(checkpoint / name):
+            with translate_read_errors(checkpoint / name):
                 if sha256_of_file(checkpoint / name) != digest:
                     return f"{name} is damaged (its SHA-256 is not the manifest's)"
     except MissingFileError:
@@ -234,7 +234,7 @@ def written_state(checkpoint: Path) -> RunState:
     """
     path = checkpoint / STATE
     values = read_json_object(path, needed=_NEEDED, fix=_FIX)  # a loss scale may be infinite
-    return record_of(RunState, values, where=str(path), needed=_NEEDED, fix=_FIX)
+    return parse_record(RunState, values, where=str(path), needed=_NEEDED, fix=_FIX)
 
 
 def _remove(checkpoint: Path) -> None:
@@ -272,9 +272,11 @@ def named_files(manifest: bytes) -> dict[str, str]:
     Raises:
         InputError: It is no manifest, or names a file outside its folder.
     """
-    files = json_object(manifest, where=MANIFEST).get("files")
+    files = parse_json_object(manifest, where=MANIFEST).get("files")
     if not isinstance(files, dict) or not all(isinstance(digest, str) for digest in files.values()):
-        raise InputError(where=MANIFEST, found=f"files {shown(files)}", needed="the SHA-256 of each file, by its name")
+        raise InputError(
+            where=MANIFEST, found=f"files {short_repr(files)}", needed="the SHA-256 of each file, by its name"
+        )
     for name in files:
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts or not path.parts or str(path) != name:
@@ -308,12 +310,12 @@ def read_torch(path: Path) -> Any:
     import torch
 
     needed = "a file that this program wrote"
-    with user_can_read(path, needed=needed):
+    with translate_read_errors(path, needed=needed):
         try:
             _require_as_written(path)
             return torch.load(path, weights_only=True, map_location="cpu")
         except Exception as error:  # torch raises errors of any type for a damaged file
-            if is_refusal(error):
+            if is_os_read_error(error):
                 raise
             found = f"cannot be read ({error})"
             if isinstance(error, pickle.UnpicklingError):

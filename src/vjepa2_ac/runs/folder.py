@@ -39,9 +39,15 @@ from vjepa2_ac.config.model import RANDOM
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
-from vjepa2_ac.storage import read_bounded, try_writing_at, user_can_read, user_can_write, write_atomically
-from vjepa2_ac.storage.places import BUILTIN, is_url, literal
-from vjepa2_ac.storage.structured import MOST_BYTES, shown, utc_now
+from vjepa2_ac.storage import (
+    check_local_writable,
+    read_small_file,
+    translate_read_errors,
+    translate_write_errors,
+    write_atomically,
+)
+from vjepa2_ac.storage.paths import BUILTIN, is_url, to_config_value
+from vjepa2_ac.storage.structured import MAX_BYTES, short_repr, utc_now
 
 logger = logging.getLogger(__name__)
 
@@ -90,8 +96,8 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
         found = "a folder with other things in it, and no config.yaml"
         needed = "an empty or new folder, or one of a run"
         raise InputError(where=str(folder), found=found, needed=needed, fix="Set another run_dir")
-    with user_can_write(folder):
-        try_writing_at(folder)
+    with translate_write_errors(folder):
+        check_local_writable(folder)
 
 
 def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool = False) -> Path:
@@ -128,9 +134,9 @@ def run_id(folder: Path) -> str:
     path = folder / RUN_ID
     if not path.is_file():
         return secrets.token_hex(8)
-    name = read_bounded(path, _MOST_BYTES_OF_ID).decode(errors="replace").strip()
+    name = read_small_file(path, _MOST_BYTES_OF_ID).decode(errors="replace").strip()
     if not _ID.fullmatch(name):
-        raise InputError(where=str(path), found=shown(name), needed="the name of a run, letters and digits")
+        raise InputError(where=str(path), found=short_repr(name), needed="the name of a run, letters and digits")
     return name
 
 
@@ -188,7 +194,7 @@ def read_run_config(folder: Path, overrides: Iterable[str] = ()) -> Config:
         found = "no config.yaml" if folder.is_dir() else "no such folder"
         needed = "the folder of a run, which `vjepa2-ac train CONFIG` makes"
         raise InputError(where=str(folder), found=found, needed=needed)
-    overrides = [*overrides, f"run_dir={json.dumps(literal(folder))}"]
+    overrides = [*overrides, f"run_dir={json.dumps(to_config_value(folder))}"]
     config = load_config_of_run(folder / CONFIG, overrides)
     moved = [f"{key}={json.dumps(path)}" for key, path in _seen_from_start(config, folder)]
     return load_config_of_run(folder / CONFIG, [*overrides, *moved]) if moved else config
@@ -242,8 +248,8 @@ def _is_without_config(path: Path) -> bool:
 
 def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
     try:
-        with user_can_read(path):
-            starts = json.loads(read_bounded(path, MOST_BYTES))
+        with translate_read_errors(path):
+            starts = json.loads(read_small_file(path, MAX_BYTES))
     except (InputError, ValueError, RecursionError):  # the file is missing or damaged
         return []
     return [start for start in starts if isinstance(start, dict)] if isinstance(starts, list) else []
@@ -292,7 +298,7 @@ class RunLock:
         """
         if self._lock.is_locked:
             return
-        with user_can_write(self._folder / LOCK):
+        with translate_write_errors(self._folder / LOCK):
             self._folder.mkdir(parents=True, exist_ok=True)
             try:
                 self._lock.acquire(blocking=False)

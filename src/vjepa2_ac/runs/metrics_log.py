@@ -31,8 +31,8 @@ from vjepa2_ac.config.loading import config_as_flat_dict
 from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.registry import TRACKERS
 from vjepa2_ac.runs.folder import METRICS, TENSORBOARD
-from vjepa2_ac.storage import read_bounded, user_can_write, write_atomically
-from vjepa2_ac.storage.structured import finite_or_none, json_object
+from vjepa2_ac.storage import read_small_file, translate_write_errors, write_atomically
+from vjepa2_ac.storage.structured import finite_or_none, parse_json_object
 
 logger = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class MetricsLog:
     def __init__(self, run_dir: Path, *, first_step: int, trackers: Trackers | None = None) -> None:
         self.path = run_dir / METRICS
         kept = [row for row in read_metrics_log(self.path) if row["step"] <= first_step] if first_step > 0 else []
-        with user_can_write(self.path):
+        with translate_write_errors(self.path):
             write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in kept).encode())
             self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
         self._waiting = b""  # rows that could not be written yet; the first may be partly written
@@ -134,9 +134,9 @@ def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
     """
     if not path.exists():
         return
-    for line in read_bounded(path, _MOST_BYTES).decode(errors="replace").splitlines():
+    for line in read_small_file(path, _MOST_BYTES).decode(errors="replace").splitlines():
         try:
-            row = json_object(line, where=str(path))
+            row = parse_json_object(line, where=str(path))
         except InputError:
             row = {}
         if type(row.get("step")) is int and isinstance(row.get("kind"), str):

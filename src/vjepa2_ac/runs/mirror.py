@@ -32,8 +32,8 @@ from vjepa2_ac.runs.checkpoint import (
     written_state,
 )
 from vjepa2_ac.runs.folder import ENVIRONMENT, HELD, SMALL_FILES, last_start
-from vjepa2_ac.storage.retries import quietly
-from vjepa2_ac.storage.structured import MOST_BYTES, read_json_object
+from vjepa2_ac.storage.retries import suppress_retry_warnings
+from vjepa2_ac.storage.structured import MAX_BYTES, read_json_object
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class RemoteCheckpoints:
     """The checkpoints in a remote folder; every method raises UnreachableError if it cannot be reached.
 
     Attributes:
-        place: The URL or path of the remote folder, from `storage.absolute`.
+        place: The URL or path of the remote folder, from `storage.canonical_path`.
     """
 
     place: str
@@ -117,7 +117,7 @@ class RemoteCheckpoints:
         """
         name, manifest = checkpoint.name, (checkpoint / MANIFEST).read_bytes()
         claim = next((claim for claim in (MANIFEST, SENDING) if claim in files), None)
-        if files and (claim is None or storage.read_bounded(self._path(name, claim), MOST_BYTES) != manifest):
+        if files and (claim is None or storage.read_small_file(self._path(name, claim), MAX_BYTES) != manifest):
             self.remove(name)  # a different checkpoint with the same name
             files = {}
         sizes = {path: (checkpoint / path).stat().st_size for path in named_files(manifest)}
@@ -145,8 +145,8 @@ class RemoteCheckpoints:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         try:
-            with storage.user_can_read(source := self._path(name, MANIFEST)):
-                manifest = storage.read_bounded(source, MOST_BYTES)
+            with storage.translate_read_errors(source := self._path(name, MANIFEST)):
+                manifest = storage.read_small_file(source, MAX_BYTES)
             for path in named_files(manifest):
                 storage.download(self._path(name, path), folder / path)
         except FileNotFoundError as error:
@@ -174,7 +174,7 @@ class Mirror:
     """
 
     def __init__(self, place: str, config: Config, run_id: str) -> None:
-        self._remote, self._run_id = RemoteCheckpoints(storage.absolute(place)), run_id
+        self._remote, self._run_id = RemoteCheckpoints(storage.canonical_path(place)), run_id
         self._folder, self._config = Path(config.run_dir), config.checkpoint
         self._thread: threading.Thread | None = None
         self._begun_s = -float("inf")
@@ -240,7 +240,7 @@ class Mirror:
 
     def _send(self) -> None:
         try:
-            with quietly():
+            with suppress_retry_warnings():
                 self._bring_up_to_date()
             self._outage_reported = False
         except _CancelledError:
@@ -279,7 +279,7 @@ class Mirror:
         remote.owner(listing, self._run_id)
         path = storage.join(remote.place, ENVIRONMENT)
         with suppress(FileNotFoundError):  # two uploaders would overwrite each other's files
-            if self._starts is not None and storage.read_bounded(path, MOST_BYTES) != self._starts:
+            if self._starts is not None and storage.read_small_file(path, MAX_BYTES) != self._starts:
                 found = f"{remote.place} is used by a later start of this run, {last_start(path)}"
                 fix = "This one continues without it; stop one of the two"
                 raise LostPlaceError(where=REMOTE_KEY, found=found, fix=fix)
@@ -323,7 +323,7 @@ class Mirror:
         source, held = self._folder / CHECKPOINTS / name, self._folder / HELD / name
         shutil.rmtree(held, ignore_errors=True)
         try:
-            for file in (MANIFEST, *named_files(storage.read_bounded(source / MANIFEST, MOST_BYTES))):
+            for file in (MANIFEST, *named_files(storage.read_small_file(source / MANIFEST, MAX_BYTES))):
                 (held / file).parent.mkdir(parents=True, exist_ok=True)
                 try:
                     os.link(source / file, held / file)

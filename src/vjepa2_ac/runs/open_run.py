@@ -27,7 +27,7 @@ from vjepa2_ac.runs.checkpoint import (
 )
 from vjepa2_ac.runs.folder import CONFIG, SMALL_FILES, RunLock, check_run_folder, open_run_folder, with_settled_values
 from vjepa2_ac.runs.mirror import REMOTE_KEY, Mirror, RemoteCheckpoints, complete, reason_of, step_number
-from vjepa2_ac.storage.retries import quietly
+from vjepa2_ac.storage.retries import suppress_retry_warnings
 
 logger = logging.getLogger(__name__)
 
@@ -126,7 +126,7 @@ def open_remote(
     """
     if config.checkpoint.remote is None:
         return config
-    place, run_dir = storage.absolute(config.checkpoint.remote), Path(config.run_dir).resolve()
+    place, run_dir = storage.canonical_path(config.checkpoint.remote), Path(config.run_dir).resolve()
     if not storage.is_url(place) and Path(place).is_relative_to(run_dir):
         found, needed = f"{place}, and run_dir is {run_dir}", "a place outside the run's folder"
         fix = "Set checkpoint.remote to a folder on another disk, or a URL such as gs://bucket/run"
@@ -138,8 +138,8 @@ def open_remote(
     remote, newer = RemoteCheckpoints(place), list[str]()
     owner: str | None = None
     try:
-        with quietly():
-            storage.try_writing(place)
+        with suppress_retry_warnings():
+            storage.check_writable(place)
             listing = remote.listing()
             owner = remote.owner(listing, None if state is None else state.run_id)
         minutes = config.checkpoint.remote_every_minutes

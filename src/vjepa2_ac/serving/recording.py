@@ -13,8 +13,8 @@ import numpy as np
 
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.storage import require_new_folder, user_can_write, write_atomically
-from vjepa2_ac.storage.structured import json_text, plain, utc_now
+from vjepa2_ac.storage import require_new_folder, translate_write_errors, write_atomically
+from vjepa2_ac.storage.structured import format_json, to_plain, utc_now
 
 logger = logging.getLogger(__name__)
 
@@ -43,9 +43,9 @@ class Recorder:
         self._episode = 0
         self._is_on = True
         require_new_folder(folder)
-        with user_can_write(folder):
+        with translate_write_errors(folder):
             (folder / IMAGES).mkdir(parents=True, exist_ok=True)
-            write_atomically(folder / ABOUT, json_text({"format": FORMAT, **about}))
+            write_atomically(folder / ABOUT, format_json({"format": FORMAT, **about}))
 
     def goal(self, goals: Sequence[SubGoal], mask: np.ndarray | None) -> None:
         """Set the goals of the next decisions, and start a new episode of the recording."""
@@ -63,8 +63,8 @@ class Recorder:
         if not self._is_on:
             return
         try:
-            line = {"time": utc_now(), "episode": self._episode, "frame": self._image(frame), "state": plain(state)}
-            line |= {"goals": [self._image(image) for image in self._goals], "answer": plain(answer)}
+            line = {"time": utc_now(), "episode": self._episode, "frame": self._image(frame), "state": to_plain(state)}
+            line |= {"goals": [self._image(image) for image in self._goals], "answer": to_plain(answer)}
             text = json.dumps(line, allow_nan=False) + "\n"
             self._count(len(text.encode()))
             with (self.folder / DECISIONS).open("a") as file:

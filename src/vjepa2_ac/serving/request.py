@@ -14,7 +14,7 @@ from pydantic import Field
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.goals import GripperMode, SubGoal
 from vjepa2_ac.policies.score import ChunkForm
-from vjepa2_ac.storage.structured import record_of
+from vjepa2_ac.storage.structured import parse_record
 
 IMAGE_KEYS = ("observation/exterior_image_1_left", "observation/exterior_image_0_left", "observation/image")
 """Keys of the camera image (DROID, RoboArena, generic); the first one that a message contains is used."""
@@ -189,7 +189,7 @@ def _in_order(images: Sequence[np.ndarray], rules: Any) -> tuple[SubGoal, ...]:
         raise _wrong("goal/rules", rules, needed)
     goals = []
     for index, (image, values) in enumerate(zip(images, rules, strict=True)):
-        rule = record_of(GoalRule, values, where=f"goal/rules[{index}]", needed=needed)
+        rule = parse_record(GoalRule, values, where=f"goal/rules[{index}]", needed=needed)
         name = rule.name or str(index)
         goals.append(SubGoal(image, name, rule.at_least, rule.at_most, rule.share, rule.gripper))
     return tuple(goals)

@@ -30,7 +30,7 @@ from vjepa2_ac.serving.recording import Recorder
 from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, Request, read_request
 from vjepa2_ac.serving.wire import WireError, pack, unpack
 from vjepa2_ac.spaces import StateSpace, apply_action, euler_from_matrices, matrices_from_euler
-from vjepa2_ac.storage.structured import plain
+from vjepa2_ac.storage.structured import to_plain
 
 logger = logging.getLogger(__name__)
 
@@ -249,7 +249,7 @@ class Session:
             if plan is not None and not self.options.dry_run:
                 changes = plan.actions.double().numpy()
         reply |= {"dry_run": True, "planned": planned} if self.options.dry_run else {"target": planned}
-        return {"actions": self._actions(state, changes), **plain(reply)}
+        return {"actions": self._actions(state, changes), **to_plain(reply)}
 
     def _actions(self, state: np.ndarray, changes: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "rows dim"]:
         """Convert the changes of the plan into the format of the reply.

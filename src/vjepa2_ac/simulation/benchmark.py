@@ -53,7 +53,7 @@ from vjepa2_ac.simulation.rollout import (
 )
 from vjepa2_ac.simulation.tasks import STEPS, SUCCESS_M, TaskName, arm_for, make_problem
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.storage.places import CLOSED_LOOP_FILE
+from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 from vjepa2_ac.storage.structured import utc_now
 
 JOINT_FIELDS = ("steps/observation/joint_position", "steps/observation/gripper_position")

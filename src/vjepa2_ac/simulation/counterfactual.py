@@ -23,7 +23,7 @@ from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
 from vjepa2_ac.simulation.arm import SimulatedArm
 from vjepa2_ac.simulation.record import JPEG_QUALITY, RecordingSpec, arm_of, carry_out, read_simulation
 from vjepa2_ac.simulation.rollout import send_action
-from vjepa2_ac.storage.places import SIMULATION_FILE
+from vjepa2_ac.storage.paths import SIMULATION_FILE
 
 RECORDED_CAMERAS = {"exterior_1_left": "exterior_1", "exterior_2_left": "exterior_2", "wrist_left": "wrist"}
 """Camera of a data set, as in `data.fields.cameras` -> camera of the simulated arm."""

@@ -30,8 +30,8 @@ from vjepa2_ac.simulation.droid_writer import CAMERAS, DroidEpisode, write_droid
 from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
 from vjepa2_ac.simulation.policies import play
 from vjepa2_ac.simulation.tasks import arm_for
-from vjepa2_ac.storage.places import SIMULATION_FILE
-from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
+from vjepa2_ac.storage.paths import SIMULATION_FILE
+from vjepa2_ac.storage.structured import format_json, parse_record, read_json_object
 
 RecordedTask = Literal["push", "pick", "place"]
 
@@ -174,7 +174,7 @@ def record_dataset(
                 yield episode
                 progress(done, episodes)
 
-    notes = {SIMULATION_FILE: json_text(RecordedSimulation.of(spec, episodes).as_dict())}
+    notes = {SIMULATION_FILE: format_json(RecordedSimulation.of(spec, episodes).as_dict())}
     return write_droid_rlds(folder, watched(), shards=shards or -(-episodes // 32), notes=notes)
 
 
@@ -291,4 +291,4 @@ def read_simulation(folder: str | Path) -> RecordedSimulation:
     worlds = [one for key in ("domain", "ranges") if (one := values.pop(key, None)) is not None]
     if len(worlds) != 1:
         raise InputError(where=where, found="not one of the keys domain and ranges", needed=_NEEDED, fix=_AGAIN)
-    return record_of(RecordedSimulation, values | {"domain": worlds[0]}, where=where, needed=_NEEDED, fix=_AGAIN)
+    return parse_record(RecordedSimulation, values | {"domain": worlds[0]}, where=where, needed=_NEEDED, fix=_AGAIN)

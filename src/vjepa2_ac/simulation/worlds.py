@@ -56,8 +56,8 @@ from vjepa2_ac.simulation.rollout import (
     target_of,
 )
 from vjepa2_ac.spaces import POSE, actions_from_states
-from vjepa2_ac.storage import atomic_writer, user_can_write
-from vjepa2_ac.storage.structured import record_of
+from vjepa2_ac.storage import atomic_writer, translate_write_errors
+from vjepa2_ac.storage.structured import parse_record
 
 _ANSWER_S = 120.0  # default timeout of an answer
 LOADING = 5  # factor of the timeout for the first answer
@@ -212,7 +212,7 @@ class OtherWorld(WorldProcess):
         super().__init__(command, timeout_s)
         self._image_shape: tuple[int, ...] | None = None  # image shape of the first observation
         try:
-            self.about = record_of(AboutWorld, self.exchange(), where=self.where, needed="what it is", fix=PROTOCOL)
+            self.about = parse_record(AboutWorld, self.exchange(), where=self.where, needed="what it is", fix=PROTOCOL)
         except BaseException:
             self.close()
             raise
@@ -418,7 +418,7 @@ def record_world(
     Raises:
         InputError: The folder cannot be written, or the program exits or its answer is invalid.
     """
-    with user_can_write(folder):
+    with translate_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     solved, name = 0, re.sub(r"[^\w .,()+-]", "-", world.about.task, flags=re.ASCII)  # a file name without separators
     for done, seed in enumerate(seeds, start=1):
@@ -441,7 +441,7 @@ def _record(world: OtherWorld, file: Path, seed: int, every: int) -> None:
         rested = rested + every if step.info["success"] else 0
         if kind != PLAY and rested >= REST_S * about.rate_hz:
             break
-    with user_can_write(file), atomic_writer(file) as stream:
+    with translate_write_errors(file), atomic_writer(file) as stream:
         np.savez(
             stream,
             states=np.stack([step.observation.state for step in steps[:-1]]),

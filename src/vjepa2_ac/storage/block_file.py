@@ -156,7 +156,7 @@ class DiskCache:
         except OSError as error:
             self._note_refusal(path, error)
 
-    def read_or_make(self, key: str, make: Callable[[], bytes]) -> bytes:
+    def read_or_create(self, key: str, make: Callable[[], bytes]) -> bytes:
         """Return the entry of a key; if it is absent, create it with `make` and store it."""
         data = self.read(key)
         if data is None:
@@ -285,7 +285,7 @@ def cached_ranges(url: str, ranges: Sequence[tuple[int, int]], *, key: str, cach
     """
     pieces = {span: cache.read(f"{key} {span}") or b"" for span in ranges}
     missing = sorted(span for span, data in pieces.items() if len(data) != span[1])
-    for span, data in zip(missing, remote.read_neighbours(url, missing), strict=True):
+    for span, data in zip(missing, remote.read_adjacent_ranges(url, missing), strict=True):
         pieces[span] = data
         cache.write(f"{key} {span}", data)
     return [pieces[span] for span in ranges]

@@ -2,7 +2,7 @@
 
 A path is local, or a URL such as `gs://bucket/folder` (see `remote`). A missing or truncated file raises an
 `InputError`, which the handlers of broken episodes catch. Network failures are retried and finally raise an
-`UnreachableError`, as do errors of the operating system (see `unreadable`): neither says that the file is broken.
+`UnreachableError`, as do errors of the operating system (see `read_error`): neither says that the file is broken.
 
 A file is written under a temporary name, `.NAME.RANDOM.partial` in the target folder, and renamed when it is complete
 and on the disk. Partial files of killed writers are removed by a later writer once they are unchanged for a day.
@@ -29,7 +29,7 @@ from typing import BinaryIO
 from vjepa2_ac.errors import InputError, MissingFileError, RefusedError, UnreachableError, UserError, refusal_of
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.block_file import RangedFile, open_remote
-from vjepa2_ac.storage.places import is_url
+from vjepa2_ac.storage.paths import is_url
 from vjepa2_ac.storage.remote import FileInfo, ShortReadError
 
 _ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG})
@@ -55,7 +55,7 @@ def join(folder: str | Path, name: str) -> str:
     return f"{str(folder).rstrip('/')}/{name}" if is_url(folder) else str(Path(folder) / name)
 
 
-def absolute(path: str | Path) -> str:
+def canonical_path(path: str | Path) -> str:
     """Return the canonical form of a path or URL: local paths (also `file://`) absolute with links resolved.
 
     The result does not depend on the working directory and has no trailing slash.
@@ -119,7 +119,7 @@ def list_names(folder: str | Path) -> list[str]:
     return [entry.name for entry in list_folder(folder)]
 
 
-def require_content(path: str | Path, size: int | None = None) -> None:
+def require_regular_file(path: str | Path, size: int | None = None) -> None:
     """Refuse a git-lfs pointer, a pipe or a device in place of a file; only the beginning of a small file is read.
 
     Args:
@@ -142,7 +142,7 @@ def require_content(path: str | Path, size: int | None = None) -> None:
             remote.refuse_pointer(str(path), read_range(path, 0, size))
 
 
-def open_to_read(path: str | Path) -> ByteReader:
+def open_for_reading(path: str | Path) -> ByteReader:
     """Open a file for reading and seeking; the caller closes it.
 
     Behind a URL only the blocks that are read are fetched, so the result suits readers of videos and tables.
@@ -151,11 +151,11 @@ def open_to_read(path: str | Path) -> ByteReader:
         InputError: The file is a git-lfs pointer, a pipe or a device.
         OSError: There is no such file, or it cannot be read.
     """
-    require_content(path)
+    require_regular_file(path)
     return open_remote(str(path)) if is_url(path) else Path(path).open("rb")
 
 
-def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -> UserError:
+def read_error(where: str, error: OSError, *, needed: str = "", fix: str = "") -> UserError:
     """Return the error of a file that is missing, truncated, or refused by the operating system.
 
     A missing file is a MissingFileError, a truncated one an InputError. A refusal (no permission, too many open files,
@@ -179,24 +179,24 @@ def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -
     return kind(where=where, found=f"cannot be read: {refusal}", needed=needed, fix=fix)
 
 
-def is_refusal(error: BaseException) -> bool:
+def is_os_read_error(error: BaseException) -> bool:
     """Return whether the operating system refused to read, as opposed to a library that found a damaged file."""
     # EINVAL comes from a seek before the start, which the offsets of a damaged file cause.
     return isinstance(error, OSError) and error.errno != errno.EINVAL
 
 
 @contextmanager
-def user_can_read(path: str | Path, *, needed: str = "", fix: str = "") -> Iterator[None]:
+def translate_read_errors(path: str | Path, *, needed: str = "", fix: str = "") -> Iterator[None]:
     """Raise an error for the user if a file cannot be read, or is a git-lfs pointer, a pipe or a device.
 
     Raises:
-        UserError: Instead of any OSError; see `unreadable` and `require_content`.
+        UserError: Instead of any OSError; see `read_error` and `require_regular_file`.
     """
     try:
-        require_content(path)
+        require_regular_file(path)
         yield
     except OSError as error:
-        raise unreadable(str(path), error, needed=needed, fix=fix) from None
+        raise read_error(str(path), error, needed=needed, fix=fix) from None
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -210,18 +210,18 @@ def read_bytes(path: str | Path) -> bytes:
     return Path(path).read_bytes()
 
 
-def read_bounded(path: str | Path, most_bytes: int) -> bytes:
-    """Return the content of a small untrusted file, reading at most `most_bytes` (and one byte to detect more).
+def read_small_file(path: str | Path, max_bytes: int) -> bytes:
+    """Return the content of a small untrusted file, reading at most `max_bytes` (and one byte to detect more).
 
     Raises:
         InputError: The file is larger, a git-lfs pointer, or may never end, such as a pipe.
         OSError: There is no such file, or it cannot be read.
     """
-    require_content(path)
-    length = min(file_size(path), most_bytes + 1) if is_url(path) else most_bytes + 1
+    require_regular_file(path)
+    length = min(file_size(path), max_bytes + 1) if is_url(path) else max_bytes + 1
     data = read_range(path, 0, length)
-    if len(data) > most_bytes:
-        raise InputError(where=str(path), found=f"more than {most_bytes:,} bytes", needed="a file that small")
+    if len(data) > max_bytes:
+        raise InputError(where=str(path), found=f"more than {max_bytes:,} bytes", needed="a file that small")
     return data
 
 
@@ -314,16 +314,16 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
         InputError: The folder cannot be created or written, or the disk is full.
     """
     target = Path(folder).resolve()
-    with user_can_write(folder):
+    with translate_write_errors(folder):
         is_folder = target.is_dir()
         if target.exists() and not is_folder:
             raise NotADirectoryError(errno.ENOTDIR, "it is a file")
         temporary = _new_partial(target if is_folder else target.parent, target.name)
         temporary.mkdir()
     try:
-        with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's
+        with translate_write_errors(folder, errors=_FULL):  # any other error of the block is the caller's
             yield temporary
-        with user_can_write(folder):
+        with translate_write_errors(folder):
             if is_folder:
                 _move_into(target, temporary, manifest)
             else:
@@ -353,7 +353,7 @@ def sync(path: str | Path) -> None:
 
 
 @contextmanager
-def user_can_write(path: str | Path, errors: frozenset[int] = _UNWRITABLE) -> Iterator[None]:
+def translate_write_errors(path: str | Path, errors: frozenset[int] = _UNWRITABLE) -> Iterator[None]:
     """Raise an error for the user if a local path cannot be written, or the disk is full.
 
     Raises:
@@ -380,14 +380,14 @@ def require_new_folder(folder: Path) -> None:
     Raises:
         InputError: The folder is not empty, or cannot be listed.
     """
-    with user_can_write(folder):
+    with translate_write_errors(folder):
         in_use = folder.is_dir() and not is_empty(folder)
     if in_use:
         found, fix = "already there and not empty", "Delete it, or name another folder"
         raise InputError(where=str(folder), found=found, fix=fix)
 
 
-def try_writing_at(path: Path) -> None:
+def check_local_writable(path: Path) -> None:
     """Test whether a folder, or its nearest existing parent, can be written, with a temporary file.
 
     Raises:

@@ -77,7 +77,7 @@ def file_size(url: str) -> int:
         FileNotFoundError: There is no such file.
         UnreachableError: The URL cannot be reached.
     """
-    return _persist(url, lambda timeout_s: _size_once(url, timeout_s))
+    return _retry(url, lambda timeout_s: _size_once(url, timeout_s))
 
 
 def file_version(url: str) -> str:
@@ -87,7 +87,7 @@ def file_version(url: str) -> str:
         FileNotFoundError: There is no such file or folder.
         UnreachableError: The URL cannot be reached.
     """
-    return _version_of(_persist(url, lambda timeout_s: _ask(url, "info", timeout_s)))
+    return _version_of(_retry(url, lambda timeout_s: _call_method(url, "info", timeout_s)))
 
 
 def list_folder(url: str) -> list[FileInfo]:
@@ -99,7 +99,7 @@ def list_folder(url: str) -> list[FileInfo]:
         UnreachableError: The URL cannot be reached.
     """
     try:
-        listed = _persist(url, lambda timeout_s: _ask(url, "ls", timeout_s, detail=True, refresh=True))
+        listed = _retry(url, lambda timeout_s: _call_method(url, "ls", timeout_s, detail=True, refresh=True))
     except FileNotFoundError:
         return []
     entries = {str(entry["name"]).rstrip("/").rsplit("/", 1)[-1]: entry for entry in listed}
@@ -109,7 +109,7 @@ def list_folder(url: str) -> list[FileInfo]:
     ]
 
 
-def files_below(url: str) -> dict[str, FileInfo]:
+def list_files_below(url: str) -> dict[str, FileInfo]:
     """Return all files below a folder by their relative paths, with one uncached listing (one request per page).
 
     Raises:
@@ -121,13 +121,13 @@ def files_below(url: str) -> dict[str, FileInfo]:
 
     def find(timeout_s: float) -> Any:
         filesystem.invalidate_cache()
-        return _once(filesystem, "find", timeout_s, root, detail=True)
+        return _call_filesystem(filesystem, "find", timeout_s, root, detail=True)
 
-    entries = {name.removeprefix(root): entry for name, entry in _persist(url, find).items() if name != root}
+    entries = {name.removeprefix(root): entry for name, entry in _retry(url, find).items() if name != root}
     return {name: FileInfo(name, int(entry.get("size") or 0), _version_of(entry)) for name, entry in entries.items()}
 
 
-def send(source: Path, url: str) -> None:
+def upload(source: Path, url: str) -> None:
     """Write a local file to a URL; folders are created on file systems that have folders.
 
     Raises:
@@ -139,7 +139,12 @@ def send(source: Path, url: str) -> None:
     # Small pieces, because fsspec's event loop is blocked while a piece is read from the disk.
     pieces = {"chunksize": _PIECE_BYTES} if _protocol(url) == "gs" else {}
     allowed_s = retries.DEFAULT.timeout_s + source.stat().st_size / _SLOWEST_BYTES_PER_S
-    _persist(url, lambda timeout_s: _once(filesystem, "put_file", timeout_s, *names, **pieces), "written", allowed_s)
+    _retry(
+        url,
+        lambda timeout_s: _call_filesystem(filesystem, "put_file", timeout_s, *names, **pieces),
+        "written",
+        allowed_s,
+    )
 
 
 def remove(url: str) -> None:
@@ -149,7 +154,7 @@ def remove(url: str) -> None:
         FileNotFoundError: There is no such file.
         UnreachableError: The file cannot be removed; a RefusedError if that is permanent.
     """
-    _persist(url, lambda timeout_s: _ask(url, "rm_file", timeout_s, writing=True), "written")
+    _retry(url, lambda timeout_s: _call_method(url, "rm_file", timeout_s, writing=True), "written")
 
 
 def read_range(url: str, start: int, length: int) -> bytes:
@@ -163,7 +168,7 @@ def read_range(url: str, start: int, length: int) -> bytes:
     if length > _PIECE_BYTES:
         cuts = range(start, start + length, _PIECE_BYTES)
         return b"".join(_concurrently(url, [(cut, min(_PIECE_BYTES, start + length - cut)) for cut in cuts]))
-    data = _persist(url, lambda timeout_s: _read_once(url, start, length, timeout_s)) if length > 0 else b""
+    data = _retry(url, lambda timeout_s: _read_once(url, start, length, timeout_s)) if length > 0 else b""
     if start == 0:
         refuse_pointer(url, data)
     return data
@@ -183,7 +188,7 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
     return pieces
 
 
-def read_neighbours(url: str, ranges: Sequence[tuple[int, int]], gap_bytes: int = 0) -> list[bytes]:
+def read_adjacent_ranges(url: str, ranges: Sequence[tuple[int, int]], gap_bytes: int = 0) -> list[bytes]:
     """Return several (start, length) pieces like `read_ranges`, fetching neighbouring pieces in one request.
 
     Args:
@@ -229,9 +234,9 @@ def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
     """Read a range with one request; accept a short response only at the end of the file."""
     bare: Any = {} if _filesystem(url).async_impl else {"cache_type": "none"}  # the default prefetches megabytes
     try:
-        data: bytes = _ask(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
+        data: bytes = _call_method(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
     except Exception as error:
-        if retries.status_of(error) != 416:
+        if retries.http_status(error) != 416:
             raise
         data = b""  # HTTP 416: the file ends before `start`
     with _counting:
@@ -247,27 +252,27 @@ def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
 def _size_once(url: str, timeout_s: float) -> int:
     """Return the size of a file with one request; on Google Cloud Storage skip the check whether it is a folder."""
     method = "get_object" if hasattr(_filesystem(url), "_get_object") else "info"
-    return int(_ask(url, method, timeout_s)["size"])
+    return int(_call_method(url, method, timeout_s)["size"])
 
 
-def _persist(url: str, action: Callable[[float], _T], doing: str = "read", timeout_s: float | None = None) -> _T:
+def _retry(url: str, action: Callable[[float], _T], operation: str = "read", timeout_s: float | None = None) -> _T:
     policy = replace(retries.DEFAULT, timeout_s=timeout_s or retries.DEFAULT.timeout_s)
     try:
-        return retries.with_retries(url, action, policy=policy, access=login_hint(url), doing=doing)
+        return retries.call_with_retries(url, action, policy=policy, access=login_hint(url), operation=operation)
     except NotImplementedError:
-        raise RefusedError(where=url, found=f"{_protocol(url)}:// cannot be {doing}", needed=_KNOWN) from None
+        raise RefusedError(where=url, found=f"{_protocol(url)}:// cannot be {operation}", needed=_KNOWN) from None
 
 
 # ---- fsspec's file systems, and their credentials ----
 
 
-def _ask(url: str, method: str, timeout_s: float, *, writing: bool = False, **arguments: Any) -> Any:
+def _call_method(url: str, method: str, timeout_s: float, *, writing: bool = False, **arguments: Any) -> Any:
     """Call a method of the URL's file system with the URL's path, without retries; async ones have a time-out."""
     filesystem = _filesystem(url, writing=writing)
-    return _once(filesystem, method, timeout_s, filesystem._strip_protocol(url), **arguments)
+    return _call_filesystem(filesystem, method, timeout_s, filesystem._strip_protocol(url), **arguments)
 
 
-def _once(filesystem: Any, method: str, timeout_s: float, *arguments: Any, **options: Any) -> Any:
+def _call_filesystem(filesystem: Any, method: str, timeout_s: float, *arguments: Any, **options: Any) -> Any:
     if not filesystem.async_impl:
         return getattr(filesystem, method)(*arguments, **options)
     from fsspec.asyn import sync
@@ -351,7 +356,7 @@ def _kind(url: str, protocol: str) -> Any:
 
 
 def _google(kind: Any, options: dict[str, Any]) -> Any:
-    """Open gcsfs without its own retries, which would add six attempts (up to 30 s) to each of `with_retries`."""
+    """Open gcsfs without its own retries, which would add six attempts (up to 30 s) to each of `call_with_retries`."""
     once = getattr(kind._request, "__wrapped__", kind._request)
     open_as = partial(type(kind.__name__, (kind,), {"_request": once}), use_listings_cache=False, **options)
     login = google_token()

@@ -51,13 +51,13 @@ class RetryPolicy:
 DEFAULT = RetryPolicy()  # gives up within 1 minute if errors are immediate, within 5 if the server never responds
 
 
-def with_retries(
+def call_with_retries(
     where: str,
     action: Callable[[float], _T],
     *,
     policy: RetryPolicy,
     access: str,
-    doing: str = "read",
+    operation: str = "read",
     progress: Callable[[], int] = lambda: 0,
 ) -> _T:
     """Call an action, retry it after temporary failures, and return its result.
@@ -67,7 +67,7 @@ def with_retries(
         action: Called with its time limit in seconds.
         policy: Number of attempts, waits and time limits.
         access: The fix for missing permission, as a sentence.
-        doing: "read" or "written", for messages.
+        operation: "read" or "written", for messages.
         progress: Returns the progress of an action that can resume. Attempts and time are counted from zero again
             after each attempt that made progress.
 
@@ -87,8 +87,8 @@ def with_retries(
             if type(error).__module__ == "builtins" and not isinstance(error, OSError | ValueError | EOFError):
                 raise  # a programming error such as a TypeError
             if not _is_temporary(error):
-                is_denied = status_of(error) in _NO_ACCESS or _is_login_error(error)
-                found = f"{'no permission' if is_denied else f'cannot be {doing}'} ({_summary(error)})"
+                is_denied = http_status(error) in _NO_ACCESS or _is_login_error(error)
+                found = f"{'no permission' if is_denied else f'cannot be {operation}'} ({_summary(error)})"
                 fix = access if is_denied else "Check the address"
                 raise RefusedError(where=where, found=found, fix=fix) from error
             if progress() > before:
@@ -104,7 +104,7 @@ def with_retries(
 
 
 @contextmanager
-def quietly() -> Iterator[None]:
+def suppress_retry_warnings() -> Iterator[None]:
     """Log retried failures at level INFO in this thread, for callers that do not depend on the result."""
     token = _quiet.set(True)
     try:
@@ -127,7 +127,7 @@ def _log_failure(failures: int, text: str, *arguments: object) -> None:
     logger.log(logging.WARNING if is_warning else logging.INFO, text, *arguments)
 
 
-def status_of(error: BaseException) -> int | None:
+def http_status(error: BaseException) -> int | None:
     """Return the HTTP status of an error from any client library, or None."""
     for holder in (error, getattr(error, "response", None)):
         for name in ("code", "status", "status_code"):
@@ -140,7 +140,7 @@ def status_of(error: BaseException) -> int | None:
 
 
 def _is_temporary(error: Exception) -> bool:
-    status = status_of(error)
+    status = http_status(error)
     if status is not None:
         return status in _PASSING_STATUS
     if _is_login_error(error):
@@ -155,7 +155,7 @@ def _is_login_error(error: Exception) -> bool:
 
 def _summary(error: Exception) -> str:
     """Return the message of a library's error on one line."""
-    status = status_of(error)
+    status = http_status(error)
     text = " ".join(str(getattr(error, "message", "") or error).split())
     text = text if len(text) <= _LONGEST_SUMMARY else f"{text[:_LONGEST_SUMMARY]}…"
     name = "time-out" if isinstance(error, TimeoutError) else type(error).__name__

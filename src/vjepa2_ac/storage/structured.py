@@ -21,11 +21,11 @@ from pydantic import TypeAdapter, ValidationError
 from yaml.nodes import MappingNode, Node, ScalarNode
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import read_bounded, user_can_read
+from vjepa2_ac.storage import read_small_file, translate_read_errors
 
 T = TypeVar("T")
 
-MOST_BYTES = 16 << 20
+MAX_BYTES = 16 << 20
 _MOST_SHOWN = 120  # characters of a value in messages
 _MOST_PROBLEMS = 5  # problems of one file in a message
 _PLAIN_LIST = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null|true|false),?\s+)+)\]")
@@ -43,7 +43,7 @@ _PYDANTIC_TERMS = {  # pydantic uses the terms of JSON; the file may be YAML
 # ---- JSON ----
 
 
-def json_object(data: bytes | str, *, where: str, needed: str = "a JSON object", fix: str = "") -> dict[str, Any]:
+def parse_json_object(data: bytes | str, *, where: str, needed: str = "a JSON object", fix: str = "") -> dict[str, Any]:
     """Parse a JSON object; numbers may be NaN and infinite, as Python writes them.
 
     Args:
@@ -65,20 +65,21 @@ def json_object(data: bytes | str, *, where: str, needed: str = "a JSON object",
 
 
 def read_json_object(
-    path: str | Path, *, most_bytes: int = MOST_BYTES, needed: str = "a JSON object", fix: str = ""
+    path: str | Path, *, max_bytes: int = MAX_BYTES, needed: str = "a JSON object", fix: str = ""
 ) -> dict[str, Any]:
     """Read a JSON object from a local file or a URL.
 
     Raises:
-        InputError: As `json_object`; or the file is larger than `most_bytes`. A MissingFileError if there is no file.
+        InputError: As `parse_json_object`; or the file is larger than `max_bytes`.
+        MissingFileError: There is no such file.
         UnreachableError: The file cannot be read now.
     """
-    with user_can_read(path, needed=needed, fix=fix):
-        data = read_bounded(path, most_bytes)
-    return json_object(data, where=str(path), needed=needed, fix=fix)
+    with translate_read_errors(path, needed=needed, fix=fix):
+        data = read_small_file(path, max_bytes)
+    return parse_json_object(data, where=str(path), needed=needed, fix=fix)
 
 
-def json_text(value: Any) -> str:
+def format_json(value: Any) -> str:
     """Return plain values as indented JSON, with each list of numbers on one line.
 
     Raises:
@@ -93,14 +94,14 @@ def finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """Convert arrays and tensors in nested values to lists, and numbers that are not finite to None."""
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return to_plain(value.tolist())
     if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: to_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_plain(item) for item in value]
     return finite_or_none(value) if isinstance(value, float) else value
 
 
@@ -114,7 +115,7 @@ def utc_now() -> str:
 _adapter: Callable[[Any], Any] = cache(TypeAdapter)
 
 
-def record_of(kind: type[T], values: Any, *, where: str, needed: str = "", fix: str = "") -> T:
+def parse_record(kind: type[T], values: Any, *, where: str, needed: str = "", fix: str = "") -> T:
     """Create a dataclass or pydantic model from values of JSON, without converting any value to another type.
 
     Args:
@@ -134,7 +135,8 @@ def record_of(kind: type[T], values: Any, *, where: str, needed: str = "", fix: 
         record: T = _adapter(kind).validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
         problems += [
-            ".".join(map(str, item["loc"])) + ": " * bool(item["loc"]) + message_of(item) for item in error.errors()
+            ".".join(map(str, item["loc"])) + ": " * bool(item["loc"]) + describe_validation_error(item)
+            for item in error.errors()
         ]
     if problems:
         more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
@@ -142,7 +144,7 @@ def record_of(kind: type[T], values: Any, *, where: str, needed: str = "", fix: 
     return record
 
 
-def message_of(detail: Any) -> str:
+def describe_validation_error(detail: Any) -> str:
     """Return pydantic's message for one value in this program's terms, followed by the value.
 
     Args:
@@ -153,10 +155,10 @@ def message_of(detail: Any) -> str:
         return "missing"
     for term, replacement in _PYDANTIC_TERMS.items():
         message = message.replace(term, replacement)
-    return message if isinstance(value, dict) else f"{message} (found {shown(value)})"
+    return message if isinstance(value, dict) else f"{message} (found {short_repr(value)})"
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """Return the `repr` of a value, truncated if it is long."""
     text = repr(value)
     return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}…"

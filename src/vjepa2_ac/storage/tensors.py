@@ -75,13 +75,13 @@ def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
         UnreachableError: The file cannot be read.
     """
     again = "Copy or write the folder again"
-    with storage.user_can_read(path, needed=needed, fix=again):
+    with storage.translate_read_errors(path, needed=needed, fix=again):
         path.open("rb").close()  # safetensors reports a file without read permission as missing
         try:
             with safe_open(path, framework="pt") as file:
                 yield file
         except (SafetensorError, OSError, TypeError) as error:  # TypeError: a dtype that torch does not have
-            if storage.is_refusal(error):
+            if storage.is_os_read_error(error):
                 raise
             found = f"not a whole safetensors file ({error})"
             raise InputError(where=str(path), found=found, needed=needed, fix=again) from None

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.storage import remote
-from vjepa2_ac.storage.files import atomic_writer, join, try_writing_at, user_can_write, write_atomically
-from vjepa2_ac.storage.places import HUB, is_url
+from vjepa2_ac.storage.files import atomic_writer, check_local_writable, join, translate_write_errors, write_atomically
+from vjepa2_ac.storage.paths import HUB, is_url
 from vjepa2_ac.storage.remote import FileInfo
 
 _TEMPORARY_ERRORS = frozenset({
@@ -39,7 +39,7 @@ def upload(source: Path, target: str) -> None:
             shutil.copyfileobj(file, copy)
         return
     try:
-        remote.send(source, target)
+        remote.upload(source, target)
     except FileNotFoundError:
         if not source.is_file():
             raise
@@ -54,10 +54,10 @@ def write(path: str, data: bytes | str) -> None:
         UnreachableError: The URL cannot be written; a RefusedError if that is permanent.
     """
     if not is_url(path):
-        with user_can_write(path):
+        with translate_write_errors(path):
             write_atomically(path, data)
         return
-    with user_can_write(tempfile.gettempdir()), tempfile.NamedTemporaryFile() as source:
+    with translate_write_errors(tempfile.gettempdir()), tempfile.NamedTemporaryFile() as source:
         source.write(data.encode() if isinstance(data, str) else data)
         source.flush()
         upload(Path(source.name), path)
@@ -123,24 +123,24 @@ def file_sizes(folder: str) -> dict[str, int]:
                     if path.is_file():
                         sizes[path.relative_to(folder).as_posix()] = path.stat().st_size
             return sizes
-    return {name: file.size for name, file in files_below(folder).items()}
+    return {name: file.size for name, file in list_files_below(folder).items()}
 
 
-def files_below(url: str) -> dict[str, FileInfo]:
+def list_files_below(url: str) -> dict[str, FileInfo]:
     """Return all files below a folder behind a URL by their relative paths; empty if there is no such folder.
 
     Raises:
         UnreachableError: The folder cannot be listed; a RefusedError if that is permanent.
     """
     try:
-        return remote.files_below(url)
+        return remote.list_files_below(url)
     except FileNotFoundError:
         if url.startswith(("gs://", "gcs://")):  # has no folders, so only buckets can be missing
             raise _no_bucket(url) from None
         return {}
 
 
-def try_writing(folder: str) -> None:
+def check_writable(folder: str) -> None:
     """Test whether files can be written to and removed from a folder or URL, with a temporary file.
 
     Raises:
@@ -148,7 +148,7 @@ def try_writing(folder: str) -> None:
     """
     if not is_url(folder):
         with _write_errors_as_user_errors(folder):
-            try_writing_at(Path(folder))
+            check_local_writable(Path(folder))
         return
     trial = join(folder, f".write-check-{secrets.token_hex(8)}")
     write(trial, "This file of vjepa2-ac may be removed.\n")
@@ -170,7 +170,7 @@ def _no_bucket(url: str) -> RefusedError:
     return RefusedError(where=url, found=f"there is no bucket {bucket}", fix="Make it, or check its name")
 
 
-def from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
+def download_from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
     """Download the missing files of a model on the Hub, resuming partial downloads; return its folder in the cache.
 
     Args:

@@ -185,7 +185,7 @@ def test_what_cannot_be_reached_arrives_from_every_seam(
 ) -> None:
     """Whatever fails, and wherever: the error arrives as what it is, and no episode is called broken."""
     gcs.upload(forms / form, f"robots/{form}")
-    usual, seams, failing = retries.with_retries, dict.fromkeys(()), [None]
+    usual, seams, failing = retries.call_with_retries, dict.fromkeys(()), [None]
 
     def asked(where: str, *given: Any, **named: Any) -> Any:
         here = seam()
@@ -194,7 +194,7 @@ def test_what_cannot_be_reached_arrives_from_every_seam(
         seams.setdefault(here)
         return usual(where, *given, **named)
 
-    monkeypatch.setattr(retries, "with_retries", asked)
+    monkeypatch.setattr(retries, "call_with_retries", asked)
     knobs = {"idle": MOTION, "broken_episodes": "skip"}
     monkeypatch.setattr(files, "CONNECTIONS", 2)
 

@@ -69,7 +69,7 @@ def test_of_a_plain_file_only_the_asked_frames_are_read(tmp_path: Path, monkeypa
             read.append(count := super().readinto(buffer) or 0)
             return count
 
-    monkeypatch.setattr(storage, "open_to_read", lambda path: io.BufferedReader(CountedFile(path)))
+    monkeypatch.setattr(storage, "open_for_reading", lambda path: io.BufferedReader(CountedFile(path)))
     episode.read_frames([5, 6])
     assert sum(read) < FRAMES[:2].nbytes + 4 * io.DEFAULT_BUFFER_SIZE < FRAMES.nbytes / 2
 

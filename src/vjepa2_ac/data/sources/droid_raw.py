@@ -26,7 +26,7 @@ from vjepa2_ac.errors import InputError, counted, require_library
 from vjepa2_ac.media.video import frame_times, read_frames, read_header
 from vjepa2_ac.spaces import POSE, require_finite
 from vjepa2_ac.storage import FileInfo
-from vjepa2_ac.storage.structured import json_object
+from vjepa2_ac.storage.structured import parse_json_object
 
 TRAJECTORY = "trajectory.h5"
 VIDEOS = "recordings/MP4"
@@ -75,7 +75,10 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             OSError: Data behind a URL cannot be read.
         """
         table = self.infos()
-        info, place = table[index], _Place(**json_object(table.locators["place"][index].decode(), where="the index"))
+        info, place = (
+            table[index],
+            _Place(**parse_json_object(table.locators["place"][index].decode(), where="the index")),
+        )
         serial = _serial(place.serials, camera or self._config.cameras[0], info.id)
         numbers = self._numbers(place, (serial,))
         states = _states_of(numbers)
@@ -132,7 +135,9 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             found = f"episode {identity} has no {'metadata_*.json' if has_trajectory else TRAJECTORY}"
             raise InputError(where=self._path(folder, ""), found=found, needed="one", fix=_FIX)
         version, path = key_of({"files": listed}), self._path(folder, listed.metadata)
-        metadata = json_object(self._files.read(path, version=version), where=path, needed="the metadata of an episode")
+        metadata = parse_json_object(
+            self._files.read(path, version=version), where=path, needed="the metadata of an episode"
+        )
         named = {camera: _named(metadata, camera) for camera in RAW_CAMERAS}
         known = {camera: serial for camera, serial in named.items() if serial}
         serials, counts = tuple(_serial(known, camera, path) for camera in self._config.cameras), {}

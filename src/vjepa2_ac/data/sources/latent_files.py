@@ -43,7 +43,7 @@ from vjepa2_ac.episode import Episode, StoredLatents
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_images, encode_jpeg
 from vjepa2_ac.storage.block_file import DiskCache, cached_ranges
-from vjepa2_ac.storage.structured import MOST_BYTES, json_object
+from vjepa2_ac.storage.structured import MAX_BYTES, parse_json_object
 
 CacheType = Literal["bf16", "fp32", "int8"]
 
@@ -220,7 +220,7 @@ class LatentFiles:
 
     @cached_property
     def _listed(self) -> Mapping[str, storage.FileInfo]:
-        return storage.files_below(str(self.folder))
+        return storage.list_files_below(str(self.folder))
 
     def _found(self, name: str) -> storage.FileInfo | None:
         if storage.is_url(self.folder):
@@ -258,14 +258,14 @@ class EpisodeFile:
         with self._reading():
             self._head = self._pieces([(0, min(size, _HEAD_BYTES))])[0]
             begin = _LENGTH_BYTES + int.from_bytes(self._head[:_LENGTH_BYTES], "little")
-            if not _LENGTH_BYTES < begin <= min(size, MOST_BYTES):
+            if not _LENGTH_BYTES < begin <= min(size, MAX_BYTES):
                 raise ValueError("no header")
-            header = json_object(self._pieces([(_LENGTH_BYTES, begin - _LENGTH_BYTES)])[0], where=path)
+            header = parse_json_object(self._pieces([(_LENGTH_BYTES, begin - _LENGTH_BYTES)])[0], where=path)
             about = header.pop("__metadata__", {})
             self._tensors = {name: _Tensor.of(entry, begin) for name, entry in header.items()}
             if (end := max([begin, *(one.end for one in self._tensors.values())])) != size:
                 raise ValueError(f"{size:,} bytes of {end:,}")
-            self.metadata = {name: str(text) for name, text in json_object(about["metadata"], where=path).items()}
+            self.metadata = {name: str(text) for name, text in parse_json_object(about["metadata"], where=path).items()}
         self.names = self._tensors.keys()
         if about.get("key") != key:
             raise self._damaged("a file of another cache", "a file that was made with this one's cache.json")
@@ -341,7 +341,7 @@ class EpisodeFile:
     def _reading(self) -> Iterator[None]:
         """Raise an error for the user if the file is missing, truncated, not safetensors, or lacks a tensor."""
         try:
-            with storage.user_can_read(self.path, needed="latents of an episode", fix=FIX):
+            with storage.translate_read_errors(self.path, needed="latents of an episode", fix=FIX):
                 yield
         except (AttributeError, KeyError, IndexError, RuntimeError, ValueError, TypeError) as error:
             raise self._damaged(f"not a whole file of latents ({error})") from None

@@ -171,8 +171,8 @@ def read_table(path: str, kind: type[T]) -> T:
         UnreachableError: The file cannot be read.
     """
     try:
-        with storage.user_can_read(path, fix=_ENCODE):
-            return kind.from_bytes(storage.read_bounded(path, _MOST_BYTES))
+        with storage.translate_read_errors(path, fix=_ENCODE):
+            return kind.from_bytes(storage.read_small_file(path, _MOST_BYTES))
     except NotATableError as error:
         raise InputError(where=path, found=f"damaged ({error})", fix=_ENCODE) from None
 
@@ -264,7 +264,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         return self._config.model_copy(update={"camera": self.cameras})
 
     def _look(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - opening a cache is fast
-        folder = storage.folder_at(self._config.path)
+        folder = storage.parse_folder(self._config.path)
         key = read_key(folder)
         parts = clip_parts(self._config)
         differing = key.differences(parts, parts)

@@ -22,7 +22,7 @@ from vjepa2_ac.media.video import VideoHeader, is_deep_grey
 from vjepa2_ac.spaces import zero_steps
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.block_file import BlockCachedFile
-from vjepa2_ac.storage.structured import json_object, read_json_object
+from vjepa2_ac.storage.structured import parse_json_object, read_json_object
 
 INFO = "meta/info.json"
 VERSIONS = ("v2.1", "v3.0")
@@ -248,7 +248,7 @@ def list_by_template(root: str, template: str, key: str = "", *, connections: in
     files = [(folder, file) for folder, inside in zip(found, listings, strict=True) for file in inside]
     fitting = dict(sorted((f"{folder}{file.name}", file) for folder, file in files if fnmatchcase(file.name, name)))
     for path, file in fitting.items():
-        storage.require_content(storage.join(root, path), file.size)
+        storage.require_regular_file(storage.join(root, path), file.size)
     return fitting
 
 
@@ -334,10 +334,10 @@ def read_episodes(
 
 def _lines(path: str) -> Iterator[dict[str, Any]]:
     """Yield the object on each line of meta/episodes.jsonl."""
-    for number, line in enumerate(storage.read_bounded(path, _MOST_BYTES).splitlines(), start=1):
+    for number, line in enumerate(storage.read_small_file(path, _MOST_BYTES).splitlines(), start=1):
         if line.strip():
             where = f"{path}: line {number}"
-            yield json_object(line, where=where, needed="an episode", fix=_FIX_TABLES)
+            yield parse_json_object(line, where=where, needed="an episode", fix=_FIX_TABLES)
 
 
 def _row_of(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], outcome: object) -> EpisodeRow:

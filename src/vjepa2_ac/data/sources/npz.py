@@ -167,8 +167,8 @@ def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
         InputError: The file is missing, or not an .npz file. An UnreachableError if it cannot be read.
     """
     with (
-        storage.user_can_read(path, fix="Put it back, or leave the episode out"),
-        closing(storage.open_to_read(opened) if isinstance(opened, str) else opened) as file,
+        storage.translate_read_errors(path, fix="Put it back, or leave the episode out"),
+        closing(storage.open_for_reading(opened) if isinstance(opened, str) else opened) as file,
     ):
         yield NpzFile(file, path)
 
@@ -327,7 +327,7 @@ class NpzFile:
         except UserError:
             raise
         except Exception as error:  # zipfile, zlib and numpy raise many types of errors for damaged files
-            if storage.is_refusal(error):
+            if storage.is_os_read_error(error):
                 raise
             place = f"{self._where}: {name}" if name else self._where
             found = f"cannot be read ({str(error)[:200] or type(error).__name__})"

@@ -170,7 +170,7 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
         if isinstance(opened, BlockCachedFile) and opened.failure is not None:
             raise opened.failure from None
         if isinstance(error, OSError) and error.errno is not None:  # an error of the operating system
-            raise storage.unreadable(path, error, fix=_FIX) from None
+            raise storage.read_error(path, error, fix=_FIX) from None
         found = f"damaged: {' '.join(str(error).strip().splitlines()[:1])[:200]}"
         raise InputError(where=path, found=found, needed="a whole Parquet file", fix=_FIX) from None
 
@@ -217,7 +217,7 @@ def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile
 
 
 def _parts_of(
-    file: parquet.ParquetFile, path: str, columns: list[str], most_bytes: int, **which: list[int]
+    file: parquet.ParquetFile, path: str, columns: list[str], max_bytes: int, **which: list[int]
 ) -> Iterator[dict[str, list[Any]]]:
     """Yield some columns as Python values, a few rows at a time, up to a limit of their total size.
 
@@ -227,8 +227,8 @@ def _parts_of(
     for part in file.iter_batches(_ROWS_AT_ONCE, columns=columns, use_threads=False, **which):
         values = part.to_pydict()
         total += _bytes_in(values)
-        if total > most_bytes:
-            found = f"more than {most_bytes:,} bytes of {', '.join(columns)[:200]}"
+        if total > max_bytes:
+            found = f"more than {max_bytes:,} bytes of {', '.join(columns)[:200]}"
             raise InputError(where=path, found=found, needed="a table that fits into memory", fix=_FIX)
         yield values
 

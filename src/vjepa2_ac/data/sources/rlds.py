@@ -31,7 +31,7 @@ from vjepa2_ac.data.sources.tfrecord import NotAnExampleError, Place, Read, Reco
 from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_images
-from vjepa2_ac.storage.remote import read_neighbours
+from vjepa2_ac.storage.remote import read_adjacent_ranges
 
 _CHECKED = b"\xc3"  # not all bits equal, so that a damaged file seldom contains false marks
 _GAP_BYTES = 1 << 15  # images at most this far apart are fetched with one request
@@ -152,8 +152,8 @@ class RemoteEpisode:
         located = self._located()
         places = [located[name] for name in names if name in located]
         key = f"{self._key} {' '.join(names)}"
-        with storage.user_can_read(self._shard.path, needed=NEEDED):
-            data = self._contents.read_or_make(key, lambda: b"".join(storage.read_ranges(self._shard.path, places)))
+        with storage.translate_read_errors(self._shard.path, needed=NEEDED):
+            data = self._contents.read_or_create(key, lambda: b"".join(storage.read_ranges(self._shard.path, places)))
         ends = np.cumsum([length for _, length in places]).tolist()
         pieces = {place: data[end - place[1] : end] for place, end in zip(places, ends, strict=True)}
         return Record(lambda *place: pieces[place], self._span, located)
@@ -171,7 +171,7 @@ class RemoteEpisode:
         key = f"{self._key} {name}"
 
         def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-            with storage.user_can_read(self._shard.path, needed=NEEDED):
+            with storage.translate_read_errors(self._shard.path, needed=NEEDED):
                 stored = self._places.read(key)
                 if stored is None:
                     images = self._fetch_all(key, feature, num_steps, needed, where)
@@ -187,7 +187,7 @@ class RemoteEpisode:
             with open_shard(self._shard) as read:
                 return json.dumps(Record(read, self._span).located).encode()
 
-        located = json.loads(self._places.read_or_make(self._key, locate))
+        located = json.loads(self._places.read_or_create(self._key, locate))
         return {name: tuple(place) for name, place in located.items()}
 
     def _fetch_all(
@@ -212,7 +212,7 @@ class RemoteEpisode:
         """Return images whose positions are known, from the cache or fetched, neighbouring images with one request."""
         images = dict(zip(steps, self._contents.read_parts(key, len(places), steps) or [b""] * len(steps), strict=True))
         lacking = sorted(step for step, image in images.items() if not image)
-        fetched = read_neighbours(self._shard.path, [places[step] for step in lacking], _GAP_BYTES)
+        fetched = read_adjacent_ranges(self._shard.path, [places[step] for step in lacking], _GAP_BYTES)
         return images | dict(zip(lacking, fetched, strict=True))
 
 

@@ -128,7 +128,7 @@ def open_shard(shard: Shard) -> Iterator[Read]:
         InputError: The file cannot be read, or a local one has changed since the data set was opened.
         UnreachableError: The network fails.
     """
-    with storage.user_can_read(shard.path, needed=NEEDED):
+    with storage.translate_read_errors(shard.path, needed=NEEDED):
         if storage.is_url(shard.path):
             yield _RemoteWindows(shard)
             return

@@ -27,13 +27,13 @@ def is_url(path: str | Path) -> bool:
     return "://" in str(path)
 
 
-def folder_at(place: str) -> Path | str:
+def parse_folder(place: str) -> Path | str:
     """Return a local folder (also `file://`) as a Path, or a remote folder as its URL."""
     local = place.removeprefix("file://")
     return local if is_url(local) else Path(local)
 
 
-def anywhere(path: str) -> str:
+def resolve_path_or_url(path: str) -> str:
     """Resolve a path from the user that may be local or a URL: expand `~` and remove a trailing slash.
 
     Raises:
@@ -43,10 +43,10 @@ def anywhere(path: str) -> str:
         return path.rstrip("/")
     if _SCHEME.match(path):
         raise ValueError("looks like a URL, which has two slashes behind the colon")
-    return on_this_machine(path)
+    return resolve_local_path(path)
 
 
-def on_this_machine(path: str) -> str:
+def resolve_local_path(path: str) -> str:
     """Resolve a path from the user that must be local: expand `~` and remove a trailing slash.
 
     Raises:
@@ -62,28 +62,28 @@ def on_this_machine(path: str) -> str:
     return expanded.rstrip("/") or "/"
 
 
-def of_a_model(name: str) -> str:
-    """Resolve the name of a model: keep a built-in name, resolve any other as `on_this_machine` does.
+def resolve_model_path(name: str) -> str:
+    """Resolve the name of a model: keep a built-in name, resolve any other as `resolve_local_path` does.
 
     Raises:
-        ValueError: As `on_this_machine`.
+        ValueError: As `resolve_local_path`.
     """
-    return name if name.startswith(BUILTIN) else on_this_machine(name)
+    return name if name.startswith(BUILTIN) else resolve_local_path(name)
 
 
-def of_an_encoder(name: str) -> str:
-    """Resolve the name of an encoder: keep a Hub repository, resolve any other as `of_a_model` does.
+def resolve_encoder_path(name: str) -> str:
+    """Resolve the name of an encoder: keep a Hub repository, resolve any other as `resolve_model_path` does.
 
     Raises:
-        ValueError: As `on_this_machine`; or the Hub repository has no owner or no name.
+        ValueError: As `resolve_local_path`; or the Hub repository has no owner or no name.
     """
     if not name.startswith(HUB):
-        return of_a_model(name)
+        return resolve_model_path(name)
     if not _REPOSITORY.fullmatch(name):
         raise ValueError(f"needs {HUB}owner/name, and @revision if it is not the newest")
     return name
 
 
-def literal(path: Path) -> str:
+def to_config_value(path: Path) -> str:
     """Return a path as a config value that resolves to the same path, also for a folder whose name starts with `~`."""
     return f"./{path}" if str(path).startswith("~") else str(path)
