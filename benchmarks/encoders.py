@@ -27,7 +27,7 @@ from timing import about, add_basics, add_repeats, introduction, prepare, settle
 from vjepa2_ac.config import Config, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.sources.latent_files import bytes_per_frame
-from vjepa2_ac.distributed import matmul_speed
+from vjepa2_ac.distributed import measure_matmul_speed
 from vjepa2_ac.encoding.latent_cache import picture_bytes
 from vjepa2_ac.model.model_files import PUBLISHED
 from vjepa2_ac.model.world_model import WorldModel
@@ -90,7 +90,7 @@ def main(given: Sequence[str] | None = None) -> None:
 def print_speeds(options: argparse.Namespace, given: list[str]) -> None:
     """Print and add the frames a second of each encoder, of random weights, at the first image size."""
     prepare(options)
-    ceiling = matmul_speed(torch.device(options.device), torch.bfloat16)
+    ceiling = measure_matmul_speed(torch.device(options.device), torch.bfloat16)
     print(f"{introduction(options)}; bfloat16, {options.frames} frames at once, ceiling {ceiling / 1e12:.3g} TFLOP/s")
     print(f"{'':12} {'frames/s':>9} {'MFU':>6} {'peak GB':>8}")
     rows = Rows(options.json, **about(options, given))

@@ -54,7 +54,7 @@ from timing import (
     settle,
 )
 
-from vjepa2_ac.distributed import matmul_speed
+from vjepa2_ac.distributed import measure_matmul_speed
 
 QUICK = {
     "layers": 1, "width": 128, "latent_dim": 128, "image_size": 32, "samples": 6, "iterations": 2, "at_once": [4, 2],
@@ -100,7 +100,7 @@ def measure_time(options: argparse.Namespace, dtype: str, rows: Rows) -> dict[in
     rows.about["expandable_segments"] = is_expandable(options.device)
     ways = {horizon: same_ways(bench, horizon, rows) for horizon in options.horizon}  # before ours takes its own type
     if options.time:
-        ceiling = matmul_speed(bench.device, bench.dtype)
+        ceiling = measure_matmul_speed(bench.device, bench.dtype)
         print(f"{dtype}: ceiling {ceiling / 1e12:.3g} TFLOP/s")
         titles = ("s/decision", "min", "samples/s", "MFU", "retries", "of plain", "of official")
         print(_NAMES + "".join(f"{title:>12}" for title in titles))

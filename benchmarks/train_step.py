@@ -44,7 +44,7 @@ from step_memory import MEMORY_TITLES, NAMES, asked, found, memory_line, memory_
 from timing import Turns, about, add_options, introduction, prepare, profiled, ratio, rounds, settle
 from train_step_variants import OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, Started, has_checkout, our_ways
 
-from vjepa2_ac.distributed import matmul_speed
+from vjepa2_ac.distributed import measure_matmul_speed
 from vjepa2_ac.model.lora import trainable_report
 
 QUICK = {
@@ -88,7 +88,7 @@ def measure_time(options: argparse.Namespace, dtype: str, settings: Sequence[Set
     ways = choose_ways(bench, options, rows)
     rows.about["expandable_segments"] = is_expandable(options.device)
     if options.time:
-        ceiling = matmul_speed(bench.device, bench.dtype)
+        ceiling = measure_matmul_speed(bench.device, bench.dtype)
         print(f"{dtype}: ceiling {ceiling / 1e12:.3g} TFLOP/s")
         titles = f"{'ms':>9}{'min':>9}{'clips/s':>9}{'MFU':>8}{'retries':>8}{f'of {ways[0]}':>15}"
         print(f"{NAMES}{titles}{'loss':>10}{'gradients':>10}")

@@ -20,7 +20,7 @@ from vjepa2_ac.data.sources.latent_files import LatentFiles
 from vjepa2_ac.data.sources.latents import EPISODES, read_table
 from vjepa2_ac.decoding.decoder import load_decoder
 from vjepa2_ac.episode import EpisodeInfo
-from vjepa2_ac.errors import InputError, RefusedError, in_words
+from vjepa2_ac.errors import InputError, RefusedError, describe_error
 from vjepa2_ac.export import export_run
 from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.checkpoints import load_base, load_official, to_official
@@ -171,7 +171,7 @@ def test_an_error_of_the_system_at_the_command_line_names_mode_and_owner(tmp_pat
     with without_permission(tmp_path / "closed"), pytest.raises(PermissionError) as caught:
         list((tmp_path / "closed").iterdir())
     with without_permission(tmp_path / "closed"):
-        assert re.search(r"/closed: Permission denied \(mode 0000, owner uid \d+; this", in_words(caught.value))
+        assert re.search(r"/closed: Permission denied \(mode 0000, owner uid \d+; this", describe_error(caught.value))
 
 
 def test_a_finished_run_whose_checkpoints_cannot_be_read_is_not_started_again(

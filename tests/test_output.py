@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from run_fixtures import Popen
-from vjepa2_ac.process import own_streams
+from vjepa2_ac.process import guard_output
 
 BEGINNING = """
 import sys, os
@@ -149,7 +149,7 @@ def test_a_pipe_that_others_made_unblocking_is_waited_for(start: Start) -> None:
 
 def test_streams_of_a_test_or_a_notebook_stay_theirs(capsys: pytest.CaptureFixture[str]) -> None:
     before = sys.stdout
-    with own_streams() as lost:
+    with guard_output() as lost:
         assert sys.stdout is before
         assert lost() == ""
         sys.stdout.write("seen\n")

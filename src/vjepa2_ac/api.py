@@ -22,7 +22,7 @@ from vjepa2_ac.data import dataset as datasets
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.transforms import Crop
-from vjepa2_ac.distributed import has_bf16, no_cuda, require_type_of_weights
+from vjepa2_ac.distributed import has_bf16, no_cuda_error, require_weight_dtype
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
@@ -185,7 +185,7 @@ def load_model(
         "encoder": encoder.model_dump() if isinstance(encoder, EncoderConfig) else encoder and {"path": str(encoder)},
     }
     config = config_of_model(str(name), where="load_model", **model_values).model
-    require_type_of_weights(config, place)
+    require_weight_dtype(config, place)
     model = load_base(config, seed=0)
     if adapter is not None:
         load_trained(model, adapter, trainable=False)
@@ -342,7 +342,7 @@ def _device(device: Device) -> torch.device:
     except (RuntimeError, TypeError):
         raise InputError(where="device", found=repr(device), needed="auto, cpu, cuda, or one such as cuda:1") from None
     if found.type == "cuda" and not has_cuda:
-        raise no_cuda(where="device", asked=str(device), instead="Take device='cpu'")
+        raise no_cuda_error(where="device", asked=str(device), instead="Take device='cpu'")
     if found.type == "cuda" and (found.index or 0) >= (count := torch.cuda.device_count()):
         needed = f"one of the {count} CUDA devices of this machine, cuda:0 to cuda:{count - 1}"
         raise InputError(where="device", found=str(device), needed=needed)

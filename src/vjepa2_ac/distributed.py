@@ -4,8 +4,8 @@ Started by torchrun, by `accelerate launch`, or by anything else that sets RANK,
 MASTER_PORT. Gradients are summed once per optimizer step, after the last micro-batch, and not by a wrapper around the
 model: a process may have no clip in a micro-batch (`data.broken_episodes: skip`), and would leave a wrapper waiting.
 
-What only some processes do may take hours (an index, a checkpoint on a slow disk) or fail: `first_only`,
-`first_of_machine` and `agreed` let the others wait for it without a time-out, and raise its error in all.
+What only some processes do may take hours (an index, a checkpoint on a slow disk) or fail: `run_on_first`,
+`run_first_per_machine` and `run_on_all` let the others wait for it without a time-out, and raise its error in all.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from torch.distributed.rendezvous import rendezvous
 
 from vjepa2_ac.config import Config, ModelConfig, TrainingConfig
-from vjepa2_ac.errors import InputError, UnreachableError, UserError, in_words
+from vjepa2_ac.errors import InputError, UnreachableError, UserError, describe_error
 from vjepa2_ac.process import StoppedError
 
 _log = logging.getLogger(__name__)
@@ -67,17 +67,17 @@ def is_on_cpu(training: TrainingConfig) -> bool:
     """
     has_cuda = torch.cuda.is_available()
     if training.device == "cuda" and not has_cuda:
-        raise no_cuda(where="training.device", asked="cuda", instead="Set training.device=cpu")
+        raise no_cuda_error(where="training.device", asked="cuda", instead="Set training.device=cpu")
     return training.device == "cpu" or not has_cuda
 
 
-def no_cuda(*, where: str, asked: str, instead: str) -> InputError:
+def no_cuda_error(*, where: str, asked: str, instead: str) -> InputError:
     """Return the error of a CUDA device where there is none."""
     fix = f"{instead}, or install a CUDA build of PyTorch and a driver"
     return InputError(where=where, found=f"{asked}, but this PyTorch sees no CUDA device", fix=fix)
 
 
-def computing_device(training: TrainingConfig) -> torch.device:
+def select_device(training: TrainingConfig) -> torch.device:
     """Return the device of this process, after checking that it supports the config.
 
     On a CPU without instructions for bfloat16 a config that asks for it is warned of.
@@ -100,7 +100,7 @@ def computing_device(training: TrainingConfig) -> torch.device:
     return device
 
 
-def require_type_of_weights(model: ModelConfig, device: torch.device) -> None:
+def require_weight_dtype(model: ModelConfig, device: torch.device) -> None:
     """Refuse a weight type that the device does not support: planning computes in it, without autocast.
 
     On a CPU without instructions for bfloat16 it is warned of.
@@ -112,20 +112,20 @@ def require_type_of_weights(model: ModelConfig, device: torch.device) -> None:
         _require_bf16(device, where="model.dtype", found="bfloat16", fix="Set model.dtype=float32")
 
 
-def slow_bf16() -> str | None:
+def bf16_slowdown() -> str | None:
     """Return what a product of matrices costs in bfloat16 on this CPU, if that is much slower than in float32.
 
     Measured here: which instructions a CPU has, and which of them PyTorch uses, no list of names tells.
     """
     cpu = torch.device("cpu")
-    bf16, fp32 = (2e3 * _CPU_MATRIX**3 / matmul_speed(cpu, dtype) for dtype in (torch.bfloat16, torch.float32))
+    bf16, fp32 = (2e3 * _CPU_MATRIX**3 / measure_matmul_speed(cpu, dtype) for dtype in (torch.bfloat16, torch.float32))
     if bf16 < _SLOW * fp32:
         return None
     return f"a product of matrices takes {bf16:.3g} ms on this CPU, {fp32:.3g} ms in float32 ({bf16 / fp32:.0f} times)"
 
 
 @lru_cache(maxsize=8)
-def matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
+def measure_matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
     """Return the FLOPs per second of a large matrix product, the best within a fraction of a second.
 
     Measured once per device and type in a program: load by other programs affects it.
@@ -174,7 +174,7 @@ def _require_bf16(device: torch.device, *, where: str, found: str, fix: str) -> 
 
 @cache  # once
 def _warn(found: str, fix: str) -> None:
-    if slow := slow_bf16():
+    if slow := bf16_slowdown():
         _log.warning("%s: %s. %s", found, slow, fix)
 
 
@@ -198,7 +198,7 @@ def make_accelerator(config: Config) -> Accelerator:
         found = "--max-restarts, and one store for all starts: a next one would wait for processes that have ended"
         fix = f"Set {_SHARED_STORE}=1 in the environment of torchrun, which needs --rdzv-backend=c10d"
         raise InputError(where="torchrun", found=found, needed="a store for each start", fix=fix)
-    training, on_cpu = config.training, computing_device(config.training).type == "cpu"
+    training, on_cpu = config.training, select_device(config.training).type == "cpu"
     _patient_group.cache_clear()
     _meet("gloo" if on_cpu else "nccl")
     AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
@@ -244,16 +244,16 @@ def _rendezvous(meeting: Future[Any]) -> None:
         meeting.set_exception(error)
 
 
-def first_only(accelerator: Accelerator, work: Callable[[], _T]) -> _T | None:
+def run_on_first(accelerator: Accelerator, work: Callable[[], _T]) -> _T | None:
     """Let the first process do something that may fail, and take any time; return its result there, None elsewhere.
 
     Raises:
         Exception: What it raised; in all processes.
     """
-    return agreed(accelerator, work if accelerator.is_main_process else lambda: None)
+    return run_on_all(accelerator, work if accelerator.is_main_process else lambda: None)
 
 
-def first_of_machine(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
+def run_first_per_machine(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
     """Let all processes do the same, first one of each machine: the others find the files that it has written.
 
     Raises:
@@ -261,11 +261,11 @@ def first_of_machine(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
     """
     done: list[_T] = []
     if accelerator.num_processes > 1:
-        agreed(accelerator, lambda: done.append(work()) if accelerator.is_local_main_process else None)
-    return agreed(accelerator, lambda: done[0] if done else work())
+        run_on_all(accelerator, lambda: done.append(work()) if accelerator.is_local_main_process else None)
+    return run_on_all(accelerator, lambda: done[0] if done else work())
 
 
-def agreed(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
+def run_on_all(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
     """Do something in this process, and wait until all have done their part; return the result.
 
     Raises:
@@ -278,11 +278,11 @@ def agreed(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
         result = work()
     except Exception as own:
         error = own
-    raise_first(accelerator, error)
+    raise_first_error(accelerator, error)
     return result  # type: ignore[return-value]  # without an error it is set
 
 
-def raise_first(accelerator: Accelerator, error: Exception | None) -> None:
+def raise_first_error(accelerator: Accelerator, error: Exception | None) -> None:
     """Raise, in all processes, the error of the first of them that has one. All have to call."""
     told = error if error is None or isinstance(error, UserError) else _ToldError(f"{type(error).__name__}: {error}")
     _raise_first_of(all_gather_object(accelerator, told), accelerator.process_index, error)
@@ -298,7 +298,7 @@ def _raise_first_of(values: Iterable[object], own: int, error: Exception | None 
             if error is not None and rank == own:
                 raise error
             if isinstance(first, UserError):
-                first.is_told = True
+                first.is_reported = True
             raise first
 
 
@@ -376,8 +376,8 @@ _sharing: Accelerator | None = None
 
 
 @contextlib.contextmanager
-def sharing(accelerator: Accelerator) -> Iterator[None]:
-    """Let the processes share the work of `own_part` and `shared` within the context; they do the same otherwise.
+def share_work(accelerator: Accelerator) -> Iterator[None]:
+    """Let the processes share the work of `own_share` and `map_shared` within the context; they do the same otherwise.
 
     Raises:
         Exception: What the first process that failed raised; in all of them.
@@ -395,7 +395,7 @@ def sharing(accelerator: Accelerator) -> Iterator[None]:
         error = own
     finally:
         _sharing = None
-    raise_first(accelerator, error)
+    raise_first_error(accelerator, error)
 
 
 class _OthersError(Exception):
@@ -406,7 +406,7 @@ class _OthersError(Exception):
         super().__init__(str(error))
 
 
-def own_part(count: int, at_once: int = 1) -> range:
+def own_share(count: int, at_once: int = 1) -> range:
     """Return which of so many things this process does: neighbours, in whole batches of `at_once`."""
     rank, processes = (_sharing.process_index, _sharing.num_processes) if _sharing else (0, 1)
     batches = math.ceil(count / at_once)
@@ -414,7 +414,7 @@ def own_part(count: int, at_once: int = 1) -> range:
     return range(first, min(count, last))
 
 
-def gathered(values: Sequence[_T]) -> list[_T]:
+def gather_shared(values: Sequence[_T]) -> list[_T]:
     """Return the values of all processes that share work, those of the first process first."""
     if _sharing is None:
         return list(values)
@@ -426,7 +426,9 @@ def gathered(values: Sequence[_T]) -> list[_T]:
     return [value for part in parts for value in part]
 
 
-def shared(items: Sequence[_T], work: Callable[[_T], _Result], progress: Callable[[int, int], None]) -> list[_Result]:
+def map_shared(
+    items: Sequence[_T], work: Callable[[_T], _Result], progress: Callable[[int, int], None]
+) -> list[_Result]:
     """Return the result of some work on each item, in their order; processes that share it have a part of them each.
 
     Args:
@@ -434,18 +436,18 @@ def shared(items: Sequence[_T], work: Callable[[_T], _Result], progress: Callabl
         work: What is done with one.
         progress: Called with (done, total) in those of this process.
     """
-    own, found = own_part(len(items)), list[_Result]()
+    own, found = own_share(len(items)), list[_Result]()
     for number in own:
         found.append(work(items[number]))
         progress(len(found), len(own))
-    return gathered(found)
+    return gather_shared(found)
 
 
 # ---- a whole run ----
 
 
 @contextlib.contextmanager
-def joined(config: Config) -> Iterator[Accelerator]:
+def join_processes(config: Config) -> Iterator[Accelerator]:
     """Join the processes of a run, as `make_accelerator`.
 
     The launcher (torchrun, `accelerate launch`, or srun with `--kill-on-bad-exit=1`) ends all processes when one fails.
@@ -463,7 +465,7 @@ def joined(config: Config) -> Iterator[Accelerator]:
         if accelerator.num_processes == 1 or not _is_lost_connection(error):
             raise
         fix = "Look at the output of the other processes. The same command resumes from the newest checkpoint"
-        raise UnreachableError(where="another process of this run", found=in_words(error), fix=fix) from error
+        raise UnreachableError(where="another process of this run", found=describe_error(error), fix=fix) from error
 
 
 def leave_processes() -> None:

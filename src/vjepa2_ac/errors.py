@@ -48,7 +48,7 @@ class UserError(Exception):
         fix: How to fix it, as a sentence.
     """
 
-    is_told = False  # by another process of the run, which met it
+    is_reported = False  # by another process of the run, which met it
 
     def __init__(self, *, where: str, found: str, needed: str = "", fix: str = "") -> None:
         self.where, self.found, self.needed, self.fix = where, found, needed, fix
@@ -114,10 +114,10 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"Did you mean {close[0]}? " if close else ""
 
 
-def in_words(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Return the message of an error; for a lack of permission, files or memory, with a fix."""
     if isinstance(error, OSError) and (error.errno in _NO_MORE_FILES or (error.filename and error.errno in _CLOSED)):
-        found, fix = refusal_of(error)
+        found, fix = describe_refusal(error)
         return str(InputError(where=str(error.filename or "ulimit -n"), found=found, fix=fix))
     if not is_out_of_memory(error):
         return str(error)
@@ -127,7 +127,7 @@ def in_words(error: BaseException) -> str:
     return f"this machine's memory is not enough ({said})"
 
 
-def refusal_of(error: OSError) -> tuple[str, str]:
+def describe_refusal(error: OSError) -> tuple[str, str]:
     """Return what the operating system refused, with mode and owner for a lack of permission, and how to fix it."""
     said = error.strerror or str(error)
     if error.errno in _NO_MORE_FILES:
@@ -226,7 +226,7 @@ def _pip() -> str:
     return "pip" if is_ours else f"{shlex.quote(sys.executable)} -m pip"
 
 
-def extra_of(library: str) -> str:
+def extra_for_library(library: str) -> str:
     """Return the extra of this package that brings a library, the first of several; "" if every installation has it."""
     try:
         lines = distribution(_PACKAGE).requires or []

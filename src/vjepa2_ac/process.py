@@ -37,7 +37,7 @@ _NAMES = ("stdout", "stderr")
 _SAFE_PATH = "PYTHONSAFEPATH"
 
 
-def is_first() -> bool:
+def is_first_process() -> bool:
     """Return whether this is the only process, or the first of several: the one that speaks and writes."""
     return os.environ.get("RANK", "0") == "0"
 
@@ -66,7 +66,7 @@ class _Stream(io.FileIO):
 
 
 @contextlib.contextmanager
-def own_streams() -> Iterator[Callable[[], str]]:
+def guard_output() -> Iterator[Callable[[], str]]:
     """Send all output of this process through streams that never raise, within the context.
 
     Streams that are not the process's own, such as those of a test or a notebook, are not changed. Yields a function
@@ -99,8 +99,8 @@ def own_streams() -> Iterator[Callable[[], str]]:
             setattr(sys, name, before[name])
 
 
-def silent_s() -> float:
-    """Return the seconds since this process printed something; 0 outside of `own_streams`."""
+def seconds_since_output() -> float:
+    """Return the seconds since this process printed something; 0 outside of `guard_output`."""
     raw = getattr(sys.stderr, "buffer", None)
     return time.monotonic() - _Stream.last_write if isinstance(raw, _Stream) else 0.0
 
@@ -140,7 +140,7 @@ class StoppedError(Exception):
         super().__init__(f"{reason}: stopped after step {step:,}; the same command goes on from there")
 
 
-class EndedError(BaseException):
+class SignalExit(BaseException):
     """Ends the current work, as KeyboardInterrupt does, so that temporary files are removed.
 
     Args:
@@ -174,7 +174,7 @@ class StopRequest:
         if not self.number:
             self.number, self._came_at = number, time.monotonic()
         elif number != HANG_UP and time.monotonic() - self._came_at >= SAME_WITHIN_S:
-            end_by(number)
+            exit_by_signal(number)
 
 
 @contextlib.contextmanager
@@ -203,7 +203,7 @@ def stop_request() -> StopRequest:
 
 
 @contextlib.contextmanager
-def tidy_end() -> Iterator[None]:
+def exit_on_signals() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block cleanly, and then the process; a second one ends it at once.
 
     Outside the main thread, and for signals that already have a handler, nothing is changed.
@@ -211,19 +211,19 @@ def tidy_end() -> Iterator[None]:
     first = StopRequest()
 
     def end(number: int, frame: FrameType | None) -> None:
-        is_first = not first.number
+        is_first_process = not first.number
         first.take(number, frame)
-        if is_first:
-            raise EndedError(number)
+        if is_first_process:
+            raise SignalExit(number)
 
     try:
         with _handled([one for one in (signal.SIGTERM, HANG_UP) if signal.getsignal(one) is signal.SIG_DFL], end):
             yield
-    except EndedError as ended:
-        end_by(ended.number)
+    except SignalExit as ended:
+        exit_by_signal(ended.number)
 
 
-def end_by(number: int) -> None:
+def exit_by_signal(number: int) -> None:
     """Give a signal its default effect, and this process the signal."""
     signal.signal(number, signal.SIG_DFL)
     os.kill(os.getpid(), number)

@@ -147,7 +147,7 @@ class Registry:
         return found(**options) if isinstance(found, type) else found
 
     @property
-    def things_in_schema(self) -> Any:
+    def options_schema(self) -> Any:
         """The options of things by their names: for a knob that holds several of them."""
 
         def add(schema: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from vjepa2_ac import distributed
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.distributed import computing_device
+from vjepa2_ac.distributed import select_device
 
 DOORS = {
     "train": ["train", "CONFIG"],
@@ -83,7 +83,7 @@ def test_bfloat16_that_is_only_emulated_is_refused(
     "training", [{"precision": "fp16"}, {"precision": "fp32", "dtype": "float32"}, {"device": "cpu"}], ids=str
 )
 def test_what_an_old_gpu_computes_is_not_refused(training: dict[str, str]) -> None:
-    assert computing_device(parsed(**training).training).type == training.get("device", "cuda")
+    assert select_device(parsed(**training).training).type == training.get("device", "cuda")
 
 
 def test_slow_bfloat16_on_a_cpu_causes_a_warning_with_a_fix(

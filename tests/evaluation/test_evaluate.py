@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from vjepa2_ac import distributed
-from vjepa2_ac.distributed import own_part
+from vjepa2_ac.distributed import own_share
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.evaluate import Contender, clips_of, evaluate
 from vjepa2_ac.evaluation.measure import VALIDATED, actions_before, measured, prediction_errors, with_other_actions
@@ -274,7 +274,7 @@ def test_processes_that_share_clips_give_each_the_same_actions_whatever_clips_ar
         for process in range(processes):
             accelerator = SimpleNamespace(process_index=process, num_processes=processes)
             monkeypatch.setattr(distributed, "_sharing", accelerator)
-            own = own_part(7, 2)
+            own = own_share(7, 2)
             before = actions_before(own, range(7), read)
             found += [others for _, others in with_other_actions(read(own), before)]
         alone = rows(batch, readable).actions

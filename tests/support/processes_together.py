@@ -16,10 +16,10 @@ from vjepa2_ac.distributed import (
     all_gather_object,
     all_reduce,
     broadcast_object,
-    first_of_machine,
-    first_only,
     make_accelerator,
     require_same,
+    run_first_per_machine,
+    run_on_first,
 )
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
@@ -54,8 +54,8 @@ def main() -> None:
         require_same(accelerator, rank, what="it", fix="none")
 
     index = Path(config.run_dir).parent / "index"
-    assert first_of_machine(accelerator, lambda: index.exists() or bool(index.write_text("made"))) or rank == 0
-    assert first_only(accelerator, lambda: "done") == (None if rank else "done")
+    assert run_first_per_machine(accelerator, lambda: index.exists() or bool(index.write_text("made"))) or rank == 0
+    assert run_on_first(accelerator, lambda: "done") == (None if rank else "done")
 
     run = set_up(config, SILENT, accelerator=accelerator)
     first = run.world_model.predictor.state_dict()

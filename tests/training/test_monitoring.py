@@ -12,7 +12,7 @@ import torch
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.distributed import matmul_speed
+from vjepa2_ac.distributed import measure_matmul_speed
 from vjepa2_ac.runs.metrics_log import open_trackers, read_metrics_log
 from vjepa2_ac.training.flops import clip_flops
 from vjepa2_ac.training.loop import train
@@ -32,7 +32,7 @@ def test_update_to_weight_is_of_all_tensors_together() -> None:
 
 def test_throughput_counts_clips_tokens_and_flops_per_second() -> None:
     config = parse_config({"run_dir": "r", "data": {"path": "d", "frames": 8}, "model": {"base": "b"}}, where="test")
-    sizes, speed = ModelSizes(), matmul_speed(CPU, torch.bfloat16)
+    sizes, speed = ModelSizes(), measure_matmul_speed(CPU, torch.bfloat16)
     throughput = Throughput.of(config, sizes, SimpleNamespace(device=CPU, num_processes=2))
     metrics = throughput.metrics(clips=12.0, seconds=4.0, waited_s=1.0)
     assert metrics["samples_per_second"] == 3.0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.config.model import RANDOM
 from vjepa2_ac.errors import InputError, UserError, shell_command
-from vjepa2_ac.process import is_first
+from vjepa2_ac.process import is_first_process
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.folder import is_of_moved, is_run
 
@@ -97,11 +97,11 @@ def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.reports.write import write_evaluation
 
     with cli.reporter() as reporter:
-        evaluation = evaluate_subject(subject, request, reporter=reporter if is_first() else SILENT)
-        if is_first():  # the other processes only share the computation
+        evaluation = evaluate_subject(subject, request, reporter=reporter if is_first_process() else SILENT)
+        if is_first_process():  # the other processes only share the computation
             reporter.task("writing report and figures")
             measured = write_evaluation(evaluation, request.out or Path(subject))
-    if is_first():
+    if is_first_process():
         if options.all:
             checkpoint, notes = evaluation.about.checkpoint, evaluation.notes
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject

@@ -15,8 +15,16 @@ from vjepa2_ac import __version__, process
 from vjepa2_ac.cli import closed_loop, data, evaluate, explore, plan, policies, setup, train
 from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parsed
 from vjepa2_ac.cli.waiting import watch_silence
-from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
-from vjepa2_ac.process import EXIT_STATUS, StoppedError, is_first, tidy_end
+from vjepa2_ac.errors import (
+    InputError,
+    UserError,
+    describe_error,
+    extra_for_library,
+    is_out_of_memory,
+    pip_install,
+    printable,
+)
+from vjepa2_ac.process import EXIT_STATUS, StoppedError, exit_on_signals, is_first_process
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # were ten times slower (commit 0d046757).
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     atexit.register(gc.freeze)  # skips the garbage collection of PyTorch's 500,000 objects when the program exits
-    with process.own_streams() as lost, _print_package_warnings(), tidy_end():
+    with process.guard_output() as lost, _print_package_warnings(), exit_on_signals():
         status = _run(arguments)
         if problem := lost():
             _complain(f"standard output: cannot be written ({problem}): some output is missing")
@@ -56,16 +64,16 @@ def _run(arguments: Sequence[str] | None) -> int:
         library = (error.name or "vjepa2_ac").partition(".")[0]
         if library == "vjepa2_ac":
             raise
-        _complain(f"{library}: it is not installed. Run {pip_install(extra_of(library))}")
+        _complain(f"{library}: it is not installed. Run {pip_install(extra_for_library(library))}")
         return 2
     except (UserError, OSError, MemoryError, RuntimeError) as error:  # OSError: for example a full disk
         if isinstance(error, RuntimeError) and not is_out_of_memory(error):
             raise
-        if not getattr(error, "is_told", False):
-            _complain(in_words(error))
+        if not getattr(error, "is_reported", False):
+            _complain(describe_error(error))
         return 2
     except StoppedError as stopped:
-        if is_first():
+        if is_first_process():
             print(printable(str(stopped)), file=sys.stderr)
         return EXIT_STATUS
     except KeyboardInterrupt:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError, counted, shell_command
-from vjepa2_ac.process import is_first
+from vjepa2_ac.process import is_first_process
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.folder import is_run, read_run_config
 
@@ -77,7 +77,7 @@ def _train(options: argparse.Namespace) -> None:
 
     with TrainingConsole() as reporter:
         folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
-    if is_first() and not options.check:
+    if is_first_process() and not options.check:
         from vjepa2_ac.runs.subject import describe_selection
 
         cli.show(f"The run is in {folder}; see how good it is: {shell_command('evaluate', folder)}")
@@ -100,7 +100,7 @@ def _encode(options: argparse.Namespace) -> None:
             from vjepa2_ac.encoding.ray_engine import ray_engine
 
             engine = closing.enter_context(ray_engine(options.engine))
-        reporter = closing.enter_context(cli.reporter()) if is_first() else SILENT
+        reporter = closing.enter_context(cli.reporter()) if is_first_process() else SILENT
         encoded = encode_config(config, reporter, out=options.out, engine=engine)
         if config.replay is not None and options.out is None and not config.replay.data.is_cache:
             encode_config(config.for_replay(), reporter, engine=engine)

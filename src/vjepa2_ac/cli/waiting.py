@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 
 from vjepa2_ac.errors import printable
-from vjepa2_ac.process import is_first, silent_s
+from vjepa2_ac.process import is_first_process, seconds_since_output
 
 _SILENT_S = (5.0, 15.0, 60.0)  # seconds without output before the first, second and each further line of a task
 _CHECK_S = 0.25
@@ -37,7 +37,7 @@ def watch_silence() -> Iterator[None]:
     """Print the current task whenever the command printed nothing for some seconds, within the context."""
     Work.begin("loading libraries and model")
     ended = threading.Event()
-    if is_first():
+    if is_first_process():
         threading.Thread(target=_watch, args=(ended,), daemon=True).start()
     try:
         yield
@@ -48,6 +48,6 @@ def watch_silence() -> Iterator[None]:
 def _watch(ended: threading.Event) -> None:
     while not ended.wait(_CHECK_S):
         elapsed_s = time.monotonic() - Work.began
-        if Work.title and min(silent_s(), elapsed_s) >= _SILENT_S[min(Work.lines, len(_SILENT_S) - 1)]:
+        if Work.title and min(seconds_since_output(), elapsed_s) >= _SILENT_S[min(Work.lines, len(_SILENT_S) - 1)]:
             Work.lines += 1
             print(printable(f"{Work.title}: {elapsed_s:.0f} s so far"), file=sys.stderr)

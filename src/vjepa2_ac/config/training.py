@@ -148,7 +148,7 @@ class TrackingConfig(Section):
     """Weights & Biases (extra wandb). offline: files in RUN/wandb, which `wandb sync` uploads later."""
     trackio: bool = False
     """trackio (extra trackio): stored in trackio's folder (TRACKIO_DIR), shown by `trackio show`."""
-    others: Annotated[dict[str, dict[str, Any]], TRACKERS.things_in_schema] = {}
+    others: Annotated[dict[str, dict[str, Any]], TRACKERS.options_schema] = {}
     """Your trackers (docs/extending.md): name -> options, {} for none."""
 
     @model_validator(mode="after")

@@ -39,7 +39,7 @@ from vjepa2_ac.decoding.decoder import (
     save_decoder,
 )
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
-from vjepa2_ac.distributed import autocast, computing_device
+from vjepa2_ac.distributed import autocast, select_device
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.latent_cache import (
     EncoderOnDevice,
@@ -169,7 +169,7 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
     folder = Path(config.run_dir).parent / "decoder" if decoder.folder is None else Path(decoder.folder)
     require_frames(config.data, to="learn from")
     require_stride(config.data, to="know which frames clips use")
-    device = computing_device(config.training)
+    device = select_device(config.training)
     with translate_write_errors(folder):
         check_local_writable(folder)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))

@@ -21,7 +21,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare
 from vjepa2_ac.data.windows import require_stride
-from vjepa2_ac.distributed import agreed, computing_device, first_only
+from vjepa2_ac.distributed import run_on_all, run_on_first, select_device
 from vjepa2_ac.encoding.batch import encoding_of, require_same_encoder
 from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, LatentCache, encode_files, frames_in
 from vjepa2_ac.errors import InputError, counted
@@ -66,7 +66,7 @@ def encode_config(
         InputError: Some input cannot be used, or the disk space is too small.
     """
     require_encodable(config)
-    device = computing_device(config.training) if engine is None else torch.device("cpu")
+    device = select_device(config.training) if engine is None else torch.device("cpu")
     cache, model = open_cache(config, out, reporter)
     left = cache.missing(retry=True)
     if left and engine is not None:
@@ -228,16 +228,16 @@ def _encode_together(
     """Encode the missing frames, split between the processes of a run; an error in one process stops all."""
     share = ProcessShare(accelerator.process_index, accelerator.num_processes)
     if share.processes > 1:
-        first_only(accelerator, cache.begin)
-        agreed(accelerator, lambda: require_shared(cache, lambda: cache.is_begun))
+        run_on_first(accelerator, cache.begin)
+        run_on_all(accelerator, lambda: require_shared(cache, lambda: cache.is_begun))
 
     def encode() -> None:
         if left := cache.missing():
             encode_share(cache, left, make_encoder(), share, reporter)
 
-    agreed(accelerator, encode)
+    run_on_all(accelerator, encode)
     if share.processes > 1:
-        agreed(accelerator, lambda: require_shared(cache, lambda: not cache.missing()))
+        run_on_all(accelerator, lambda: require_shared(cache, lambda: not cache.missing()))
 
 
 def require_shared(cache: LatentCache, is_visible: Callable[[], bool]) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
-from vjepa2_ac.distributed import computing_device
+from vjepa2_ac.distributed import select_device
 from vjepa2_ac.encoding.encode_dataset import Engine, begin_encoding, open_cache, require_shared
 from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, LatentCache, encode_files, frames_in
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
@@ -128,7 +128,7 @@ class _Actor:
         config = parse_config(self._config, where="the config")
         cache, model = open_cache(config, self._folder)
         require_shared(cache, lambda: cache.is_begun)
-        return cache, EncoderOnDevice.of(config, model, computing_device(config.training))
+        return cache, EncoderOnDevice.of(config, model, select_device(config.training))
 
     def __call__(self, row: Mapping[str, Any]) -> dict[str, _Result]:
         requests = row["wanted"].wanted

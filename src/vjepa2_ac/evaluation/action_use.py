@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vjepa2_ac.distributed import gathered, shared
+from vjepa2_ac.distributed import gather_shared, map_shared
 from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
@@ -78,7 +78,7 @@ def start_of(
 
 def gathered_starts(starts: Sequence[RolloutStart], device: torch.device) -> list[RolloutStart]:
     """Return the starts of all processes that share the work, on the device of this process."""
-    return [_on(device, start) for start in gathered([_on("cpu", start) for start in starts])]
+    return [_on(device, start) for start in gather_shared([_on("cpu", start) for start in starts])]
 
 
 def _on(device: torch.device | str, start: RolloutStart) -> RolloutStart:
@@ -220,7 +220,7 @@ def rank_actions(
         box, shell = np.where(is_same, 0.5, is_closer).mean(axis=1)
         return box, shell, np.mean(changes[: probes.samples]), energies[0].std(), move.persistence
 
-    in_box, on_shell, change, spread, now = np.array(shared(moves, ranked, progress)).T
+    in_box, on_shell, change, spread, now = np.array(map_shared(moves, ranked, progress)).T
     ranks = (in_box + on_shell) / 2
     return ActionRanking(
         samples=probes.samples,
@@ -260,7 +260,7 @@ def measure_landscapes(
         true = start.true[_AXES]
         return _landscape(model, start, grid_axes(true, half, nodes), true, space.shown_factor, probes.at_once)
 
-    maps = shared(starts, landscape, progress)
+    maps = map_shared(starts, landscape, progress)
     chance = np.mean([np.linalg.norm(_nodes_of(each.axes) - each.true, axis=1).mean() for each in maps])
     return Landscapes(
         axis_names=space.names[_AXES],

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vjepa2_ac.decoding.decoder import TrainedDecoder, as_images, as_pixels
-from vjepa2_ac.distributed import gathered
+from vjepa2_ac.distributed import gather_shared
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.distribution import frechet_distance
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips
@@ -84,8 +84,8 @@ def measure_decoded(
             if clip in example_of:
                 strips[clip] = images.strip(row, example_of[clip], shown)
         progress(len(ids), len(clips.names))
-    arrays, by_source = (_joined(gathered([parts] if ids else [])) for parts in (values, features))
-    ids, strips = gathered(ids), dict(gathered(list(strips.items())))
+    arrays, by_source = (_joined(gather_shared([parts] if ids else [])) for parts in (values, features))
+    ids, strips = gather_shared(ids), dict(gather_shared(list(strips.items())))
     left_out = {}
     for (source, name), array in arrays.items():
         count = int((~np.isfinite(array[:, -1])).sum())

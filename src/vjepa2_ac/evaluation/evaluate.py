@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vjepa2_ac.data.windows import spread
-from vjepa2_ac.distributed import gathered
+from vjepa2_ac.distributed import gather_shared
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_use import (
     RolloutStart,
@@ -160,7 +160,9 @@ def _collect(
 ) -> _Collected:
     batches = with_other_actions((batch for batch, _ in clips.read(None)), clips.before)
     first = list(itertools.islice(batches, 1))
-    if not (origins := gathered([batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first])):
+    if not (
+        origins := gather_shared([batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first])
+    ):
         raise no_clips()
     predicted = {one.name: LatentSums(origins[0]) for one in contenders}
     errors: dict[str, list[PredictionErrors]] = {one.name: [] for one in contenders}
@@ -188,13 +190,13 @@ def _collect(
                 moves += moves_of(batch, row, clips.space, probes.reach_cm / 100)
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
         progress(len(names), len(clips.names))
-    names = gathered(names)
+    names = gather_shared(names)
     return _Collected(
-        errors={name: gathered(parts) for name, parts in errors.items()},
-        predicted={name: LatentSums.joined(gathered([sums])) for name, sums in predicted.items()},
-        true=LatentSums.joined(gathered([true])),
-        copies=LatentSums.joined(gathered([copies])),
-        actions=np.concatenate(gathered(actions)),
+        errors={name: gather_shared(parts) for name, parts in errors.items()},
+        predicted={name: LatentSums.joined(gather_shared([sums])) for name, sums in predicted.items()},
+        true=LatentSums.joined(gather_shared([true])),
+        copies=LatentSums.joined(gather_shared([copies])),
+        actions=np.concatenate(gather_shared(actions)),
         names=names,
         starts=gathered_starts(starts, clips.device),
         moves=gathered_starts(moves, clips.device),

@@ -18,7 +18,7 @@ from vjepa2_ac.data.dataset import Dataset, frames_of, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.transforms import frames_as_seen, pixels_to_input
 from vjepa2_ac.decoding.decoder import TrainedDecoder, as_pixels, load_decoder
-from vjepa2_ac.distributed import first_of_machine, first_only, joined, own_part, sharing
+from vjepa2_ac.distributed import join_processes, own_share, run_first_per_machine, run_on_first, share_work
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
@@ -143,11 +143,11 @@ def evaluate_subject(subject: str, asked: EvaluationOptions, *, reporter: Report
             or the output folder cannot be written.
     """
     config = settle(subject, asked)
-    with joined(config) as accelerator:
-        first_only(accelerator, partial(_require_places, subject, asked))
+    with join_processes(config) as accelerator:
+        run_on_first(accelerator, partial(_require_places, subject, asked))
         decoder = None if asked.decoder is None else load_decoder(asked.decoder)
         progress = reporter.task("looking through the data")
-        dataset = first_of_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
+        dataset = run_first_per_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
         chosen = validation_windows(dataset, asked.split, clips=asked.clips)
         reporter.task(LOADING)
         loaded = load_models(subject, config, asked, dataset, decoder)
@@ -156,7 +156,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions, *, reporter: Report
         if through_cache.config.is_cache and decoder is None:
             world_model.set_encoder_aside()
         loaded.put_on(device)
-        with accelerator.autocast(), sharing(accelerator):
+        with accelerator.autocast(), share_work(accelerator):
             clips = _clips(through_cache, chosen, config, world_model, device)
             about = _about(loaded.subject, config, dataset, asked)
             evaluation = evaluate(loaded.contenders, clips, about, probes=asked.probes, reporter=reporter)
@@ -200,7 +200,7 @@ def _clips(
     """Return the clips at these windows, with the frames that the encoder receives (small ones for cached latents)."""
     batch_size = config.validation.batch_size
     encode = partial(encode_batch, world_model, device=device)
-    part = own_part(len(windows), batch_size)
+    part = own_share(len(windows), batch_size)
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
     read_batches = partial(batches_of, dataset, may_be_none=True)
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.distributed import gathered
+from vjepa2_ac.distributed import gather_shared
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import L1, MODES, Metric, Mode, PredictionErrors, Way
@@ -124,7 +124,7 @@ def prediction_errors(
     If several processes share the work, each passes its batches, and `before` as for `with_other_actions`.
     """
     pairs = with_other_actions(batches, before)
-    return joined(gathered([measured(model, batch, VALIDATED, metrics, others) for batch, others in pairs]))
+    return joined(gather_shared([measured(model, batch, VALIDATED, metrics, others) for batch, others in pairs]))
 
 
 def actions_before(

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_type_of_weights
+from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_weight_dtype
 from vjepa2_ac.model.compilation import require_compiler
 from vjepa2_ac.model.lora import merge_adapter, unadapted_copy
 from vjepa2_ac.model.world_model import WorldModel
@@ -42,7 +42,7 @@ def load_to_plan(
     dtype = "bfloat16" if torch.cuda.is_available() and has_bf16() else "float32"
     settings = planning_settings(subject, config=config, overrides=overrides, dtype=dtype)
     device = torch.device("cpu" if is_on_cpu(settings.training) else "cuda")
-    require_type_of_weights(settings.model, device)  # without autocast
+    require_weight_dtype(settings.model, device)  # without autocast
     loaded = load_subject(subject, checkpoint, config=settings)
     warnings = loaded.warnings
     if loaded.checkpoint is not None:

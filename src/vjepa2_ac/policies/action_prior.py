@@ -28,7 +28,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader, validation_batches
 from vjepa2_ac.data.windows import require_stride
-from vjepa2_ac.distributed import computing_device
+from vjepa2_ac.distributed import select_device
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch
@@ -257,7 +257,7 @@ def train_prior(
     """
     options = options or PriorOptions()
     require_stride(config.data, to="know how long a model step is")
-    device = computing_device(config.training)
+    device = select_device(config.training)
     data, frames = config.data, open_dataset(config.data, progress=reporter.task(INDEXING))
     reporter.task(LOADING)
     model, spaces = load_base(config.model, seed=config.seed).to(device), frames.spaces  # only the encoder is used

@@ -16,7 +16,7 @@ from vjepa2_ac.model.adapter_folder import CARD, load_trained
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.model_files import require_base_of_run
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.process import is_first
+from vjepa2_ac.process import is_first_process
 from vjepa2_ac.runs.checkpoint import ADAPTER, BEST, NEWEST, SELECTED, SelectedCheckpoint, select_checkpoint, step_of
 from vjepa2_ac.runs.folder import MOVABLE, is_of_moved, is_run, read_run_config
 from vjepa2_ac.storage.structured import read_json_object, utc_now
@@ -90,7 +90,7 @@ def load_subject(
     world_model = load_base(config.model, seed=config.seed)
     load_trained(world_model, selected.path / ADAPTER, trainable=False)
     note = note_about(config, selected)
-    if note and is_first():
+    if note and is_first_process():
         logger.warning(note)
     is_base = bool(note) and untrained_model(config, selected.path) == BASE_MODEL
     warnings = (note,) if note else ()

@@ -19,7 +19,7 @@ from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
 
-from vjepa2_ac.errors import refusal_of
+from vjepa2_ac.errors import describe_refusal
 from vjepa2_ac.storage import remote
 
 logger = logging.getLogger(__name__)
@@ -192,7 +192,7 @@ class DiskCache:
             return
         if not self._refused:
             text = "%s: cannot be used (%s); its data are fetched again"
-            logger.warning(text, error.filename or self._folder, refusal_of(error)[0])
+            logger.warning(text, error.filename or self._folder, describe_refusal(error)[0])
         self._refused.add(path)
 
     def _path(self, key: str) -> Path:

@@ -26,7 +26,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from vjepa2_ac.errors import InputError, MissingFileError, RefusedError, UnreachableError, UserError, refusal_of
+from vjepa2_ac.errors import InputError, MissingFileError, RefusedError, UnreachableError, UserError, describe_refusal
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.block_file import RangedFile, open_remote
 from vjepa2_ac.storage.paths import is_url
@@ -174,7 +174,7 @@ def read_error(where: str, error: OSError, *, needed: str = "", fix: str = "") -
     found = f"cannot be read: {error.strerror or error}"
     if isinstance(error, ShortReadError | IsADirectoryError) or error.errno in _ABSENT:
         return InputError(where=where, found=found, needed=needed, fix=fix)
-    refusal, fix = refusal_of(error)
+    refusal, fix = describe_refusal(error)
     kind = RefusedError if isinstance(error, PermissionError) else UnreachableError
     return kind(where=where, found=f"cannot be read: {refusal}", needed=needed, fix=fix)
 

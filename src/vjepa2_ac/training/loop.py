@@ -14,7 +14,7 @@ from pathlib import Path
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
-from vjepa2_ac.distributed import joined, leave_processes, require_same
+from vjepa2_ac.distributed import join_processes, leave_processes, require_same
 from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.training.monitoring import Throughput, TimedBatches
@@ -45,7 +45,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
         StoppedError: A signal asked the run to stop between its first and last step; see `process`.
     """
     changes = {"check_only": check_only, "allow_config_change": allow_config_change}
-    with contextlib.ExitStack() as exit_stack, joined(config) as accelerator:
+    with contextlib.ExitStack() as exit_stack, join_processes(config) as accelerator:
         require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
         require_optimizer(config.training)
         reporter = reporter if accelerator.is_main_process else SILENT

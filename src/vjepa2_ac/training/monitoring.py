@@ -29,7 +29,7 @@ import torch
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.distributed import PRECISIONS, matmul_speed
+from vjepa2_ac.distributed import PRECISIONS, measure_matmul_speed
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, Trackers, read_metrics_log
@@ -190,7 +190,7 @@ class Throughput:
         The FLOPs include the encoder unless latents are cached.
         """
         device = accelerator.device
-        ceiling = accelerator.num_processes * matmul_speed(device, PRECISIONS[config.training.precision])
+        ceiling = accelerator.num_processes * measure_matmul_speed(device, PRECISIONS[config.training.precision])
         flops = clip_flops(config, sizes)
         return cls(flops.predictor if config.data.takes_latents else flops.total, ceiling, device)
 

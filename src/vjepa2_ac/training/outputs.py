@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.distributed import agreed, all_reduce, broadcast_object, first_only
+from vjepa2_ac.distributed import all_reduce, broadcast_object, run_on_all, run_on_first
 from vjepa2_ac.errors import counted
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.registry import TRAINING_HOOKS
@@ -72,9 +72,9 @@ class RunOutputs:
             opened = open_run(config, reporter, check_only=check_only, allow_config_change=allow_config_change)
             return closing.enter_context(opened)
 
-        self._opened = first_only(accelerator, open_folder)  # None in other processes
+        self._opened = run_on_first(accelerator, open_folder)  # None in other processes
         self.config = broadcast_object(accelerator, self._opened.config if self._opened else config)
-        has_ended = first_only(accelerator, lambda: not check_only and self._finish_ended())
+        has_ended = run_on_first(accelerator, lambda: not check_only and self._finish_ended())
         self.has_ended = bool(broadcast_object(accelerator, has_ended))
 
     def _finish_ended(self) -> bool:
@@ -103,7 +103,7 @@ class RunOutputs:
     def begin(self, run: Run) -> None:
         """Open the metrics log, the trackers and the mirror, and install the signal handlers."""
         self._run, self._saved_step, self._saved_s = run, run.state.step, time.monotonic()
-        agreed(run.accelerator, self._begin)
+        run_on_all(run.accelerator, self._begin)
         self._stop = self._closing.enter_context(stop_on_signals())
 
     def _begin(self) -> None:
@@ -162,7 +162,7 @@ class RunOutputs:
             with self.metrics_log.before_a_checkpoint() if self.metrics_log else contextlib.nullcontext():
                 save_checkpoint(self._run, self._run.folder)
 
-        agreed(self._run.accelerator, write)
+        run_on_all(self._run.accelerator, write)
         self._saved_s, self._saved_step = time.monotonic(), self._run.state.step
 
     def stops_without_data(self) -> bool:
@@ -189,7 +189,7 @@ class RunOutputs:
             if self._mirror is not None:
                 self._mirror.finish(lambda: not has_ended or bool(self._stop.number))
 
-        agreed(run.accelerator, finish_mirror)  # all processes wait, because the launcher ends all when one exits
+        run_on_all(run.accelerator, finish_mirror)  # all processes wait, because the launcher ends all when one exits
         if not has_ended:
             raise StoppedError(run.folder, run.state.step, signal.Signals(self._stopped_by).name)
 

@@ -17,7 +17,7 @@ from vjepa2_ac.config.section import Affects, values_that_affect
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import validation_windows
-from vjepa2_ac.distributed import broadcast_object, first_only, require_same
+from vjepa2_ac.distributed import broadcast_object, require_same, run_on_first
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.reporter import Reporter
@@ -93,7 +93,7 @@ def _state_of_all(run: Run, reporter: Reporter) -> RunState:
     accelerator, world_model = run.accelerator, run.world_model
     encoder = world_model.adaptation.encoder if world_model.adaptation else ""
     require_same(accelerator, encoder, what="model.base", fix="Give every machine the same checkpoint")
-    newest = first_only(accelerator, lambda: _read_newest(run, reporter))
+    newest = run_on_first(accelerator, lambda: _read_newest(run, reporter))
     state, moments = broadcast_object(accelerator, newest or (RunState(step=0), None))
     broadcast(list(world_model.predictor.state_dict().values()))  # in place
     if moments is not None and not accelerator.is_main_process:

@@ -19,7 +19,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import require_shared_memory, validation_batches
 from vjepa2_ac.data.selection import describe_splits, named
-from vjepa2_ac.distributed import agreed, all_gather_object, first_of_machine, first_only, make_accelerator
+from vjepa2_ac.distributed import all_gather_object, make_accelerator, run_first_per_machine, run_on_all, run_on_first
 from vjepa2_ac.encoding.batch import extrinsics_for
 from vjepa2_ac.encoding.encode_dataset import with_latents
 from vjepa2_ac.episode import Batch
@@ -70,7 +70,7 @@ def set_up(
     strip = TRAINING_HOOKS.find("validation.decoder")(config) if config.validation.decoder is not None else None
 
     # The other processes of a machine wait for the first process, and then read the index that the first one wrote.
-    dataset, *replay_datasets = first_of_machine(accelerator, lambda: open_data_sets(config, reporter))
+    dataset, *replay_datasets = run_first_per_machine(accelerator, lambda: open_data_sets(config, reporter))
     for warning in TRAINING_HOOKS.find("motion")(dataset):
         reporter.note(f"Warning: {warning.text}.")
     _check_heads(config, dataset)
@@ -82,11 +82,11 @@ def set_up(
     clip, *_ = [first_clip(dataset, split) for split in splits]  # fails early: an empty split, a broken clip
     require_fitting_clips(dataset, replay_datasets)
     if not allow_config_change:
-        first_only(accelerator, lambda: require_same_data(config, (dataset, *replay_datasets)))
+        run_on_first(accelerator, lambda: require_same_data(config, (dataset, *replay_datasets)))
 
     reporter.task(LOADING)
     base = world_model or load_base(config.model, seed=config.seed)
-    first_only(accelerator, lambda: require_same_base(config, base))
+    run_on_first(accelerator, lambda: require_same_base(config, base))
     extrinsics_for(base, clip)
     if strip is not None:
         strip.require_fit(base, config)
@@ -120,7 +120,7 @@ def _require_shared_memory(config: Config, clip: Batch, sizes: ModelSizes, accel
     is_encoded_later = config.data.takes_latents and clip.latents is None
     size = batch_bytes(config, sizes) if is_encoded_later else clip.nbytes * config.training.batch_size
     nodes = all_gather_object(accelerator, platform.node())
-    agreed(accelerator, lambda: require_shared_memory(config.data, size, nodes.count(platform.node())))
+    run_on_all(accelerator, lambda: require_shared_memory(config.data, size, nodes.count(platform.node())))
 
 
 def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:

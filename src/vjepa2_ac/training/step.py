@@ -19,7 +19,7 @@ from vjepa2_ac.config import Config, TrainingConfig
 from vjepa2_ac.config.section import Positive, Section
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader
-from vjepa2_ac.distributed import PRECISIONS, all_gather_object, all_reduce, all_reduce_gradients, raise_first
+from vjepa2_ac.distributed import PRECISIONS, all_gather_object, all_reduce, all_reduce_gradients, raise_first_error
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError, UserError
@@ -172,7 +172,7 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
     sums = [*totals.tolist(), len(names), error is not None]  # `tolist` synchronizes with the device
     *losses, clips, failed = all_reduce(run.accelerator, sums, "sum")
     if failed:
-        raise_first(run.accelerator, error)
+        raise_first_error(run.accelerator, error)
     expected = run.clips_per_step
     if clips < expected:
         _share_broken_episodes(run)

@@ -10,7 +10,7 @@ from typing import Any
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.windows import spread
-from vjepa2_ac.distributed import broadcast_object, gathered, own_part, sharing
+from vjepa2_ac.distributed import broadcast_object, gather_shared, own_share, share_work
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart, gathered_starts, moves_of, rank_actions
@@ -108,7 +108,7 @@ def validate(run: Run, reporter: Reporter) -> Validation:
     could otherwise make processes stop at different steps.
     """
     run.world_model.eval()
-    with run.accelerator.autocast(), sharing(run.accelerator):
+    with run.accelerator.autocast(), share_work(run.accelerator):
         validation = _measure(run)
     validation = broadcast_object(run.accelerator, validation)
     reporter.validated(run.state.step, validation)
@@ -117,14 +117,14 @@ def validate(run: Run, reporter: Reporter) -> Validation:
 
 def _measure(run: Run) -> Validation:
     windows = validation_windows(run.dataset, "validation", clips=run.config.validation.clips)
-    windows_range = own_part(len(windows), run.config.validation.batch_size)
+    windows_range = own_share(len(windows), run.config.validation.batch_size)
     read = partial(batches_of, run.dataset, batch_size=run.config.validation.batch_size, may_be_none=True)
     batches, moves = read(windows[windows_range.start : windows_range.stop]), list[RolloutStart]()
     names = [(run.dataset.table.identity(episode), start) for episode, start in windows]
     chosen = {names[index] for index in spread(len(names), run.config.validation.ranking_clips or 0)}
     encoded = _encoded(run, batches, chosen, moves)
     errors = prediction_errors(run.world_model, encoded, before=actions_before(windows_range, windows, read))
-    for name, reason in gathered(list(run.dataset.broken.reasons.items())):
+    for name, reason in gather_shared(list(run.dataset.broken.reasons.items())):
         run.dataset.broken.met(name, reason)
     config, space = run.config.validation, run.dataset.spaces.action
     moves = gathered_starts(moves, run.accelerator.device)
