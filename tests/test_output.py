@@ -15,7 +15,7 @@ from vjepa2_ac.process import guard_output
 BEGINNING = """
 import sys, os
 from vjepa2_ac import process
-with process.own_streams() as lost:
+with process.guard_output() as lost:
 """
 Start = Callable[..., subprocess.Popen]
 

@@ -16,7 +16,7 @@ class Clock:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_s, self.printed_s, self.lines = 100.0, 100.0, list[str]()
         monkeypatch.setattr(waiting, "_CHECK_S", 0.001)
-        monkeypatch.setattr(waiting, "silent_s", lambda: self.now_s - self.printed_s)
+        monkeypatch.setattr(waiting, "seconds_since_output", lambda: self.now_s - self.printed_s)
         monkeypatch.setattr(time, "monotonic", lambda: self.now_s)
         monkeypatch.setattr(sys, "stderr", self)
 
@@ -62,4 +62,4 @@ def test_each_work_is_named_after_five_seconds_of_silence_and_then_more_rarely(m
 
 
 def test_output_of_other_streams_than_the_own_ones_is_not_watched() -> None:
-    assert waiting.silent_s() == 0.0
+    assert waiting.seconds_since_output() == 0.0

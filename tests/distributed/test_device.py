@@ -90,7 +90,7 @@ def test_slow_bfloat16_on_a_cpu_causes_a_warning_with_a_fix(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(distributed, "matmul_speed", lambda _, dtype: 1e9 if dtype == torch.bfloat16 else 6e10)
+    monkeypatch.setattr(distributed, "measure_matmul_speed", lambda _, dtype: 1e9 if dtype == torch.bfloat16 else 6e10)
     distributed._warn.cache_clear()
     through("train", monkeypatch, tmp_path)
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]

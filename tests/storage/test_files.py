@@ -21,9 +21,9 @@ WRITING = """
 import sys, time
 from pathlib import Path
 from vjepa2_ac import storage
-from vjepa2_ac.process import tidy_end
+from vjepa2_ac.process import exit_on_signals
 target = Path(sys.argv[1])
-with tidy_end():
+with exit_on_signals():
     if sys.argv[2] == "file":
         with storage.atomic_writer(target) as file:
             file.write(b"x" * 1000)
