@@ -128,15 +128,15 @@ def _undrawn() -> Iterator[Callable[[pytest.MonkeyPatch], None]]:
 
     from vjepa2_ac.media import figure
 
-    draw, columns = Figure.draw, figure._MOST_COLUMNS
+    draw, columns = Figure.draw, figure._MAX_COLUMNS
 
     def draw_all(patch: pytest.MonkeyPatch) -> None:
         patch.setattr(Figure, "draw", draw)
-        patch.setattr(figure, "_MOST_COLUMNS", columns)
+        patch.setattr(figure, "_MAX_COLUMNS", columns)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "draw", lambda *_: None)
-        patch.setattr(figure, "_MOST_COLUMNS", 1)
+        patch.setattr(figure, "_MAX_COLUMNS", 1)
         yield draw_all
 
 

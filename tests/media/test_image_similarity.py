@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.media.image_similarity import mean_where, moving_region, ms_ssim, psnr, ssim, ssim_map
+from vjepa2_ac.media.image_similarity import masked_mean, moving_region, ms_ssim, psnr, ssim, ssim_map
 
 # size, case, PSNR, SSIM, MS-SSIM by scales: torchmetrics 1.9.0 on torch 2.13.0, data_range 1, `betas` the first scales'
 # default weights divided by their sum; images of `pair`.
@@ -90,7 +90,7 @@ def test_within_a_region_only_its_pixels_count() -> None:
     torch.testing.assert_close(psnr(predicted, true, where), cut)
     elsewhere = predicted.clone()
     elsewhere[:, 75:] = 0
-    similar = [mean_where(ssim_map(image, true), where) for image in (predicted, elsewhere)]
+    similar = [masked_mean(ssim_map(image, true), where) for image in (predicted, elsewhere)]
     torch.testing.assert_close(*similar)
     assert torch.isnan(psnr(predicted, true, torch.zeros_like(where)))
 

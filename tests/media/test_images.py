@@ -109,7 +109,7 @@ def test_every_form_of_data_refuses_images_beyond_the_bound(
     source.infos()
     read = source.read(0).read_frames
     assert read([0, 2]).shape == (2, 32, 64, 3)
-    for bound, most, message in (("MOST_PIXELS", 2_000, "32 x 64"), ("_MOST_BYTES", 10_000, "2 images of 32 x 64")):
+    for bound, most, message in (("MAX_PIXELS", 2_000, "32 x 64"), ("_MAX_BYTES", 10_000, "2 images of 32 x 64")):
         monkeypatch.setattr(jpeg, bound, most)
         with pytest.raises(InputError, match=message):
             read([0, 2])
@@ -156,7 +156,7 @@ def test_an_image_that_may_never_end_or_is_too_large_is_refused(
     for path in (tmp_path / "goal.png", "/dev/zero"):
         with pytest.raises(InputError, match="a pipe or a device"):
             read_image(path)
-    monkeypatch.setattr(jpeg, "_MOST_FILE_BYTES", 1000)
+    monkeypatch.setattr(jpeg, "_MAX_FILE_BYTES", 1000)
     (tmp_path / "large.png").write_bytes(png(Image.fromarray(PIXELS)))
     with pytest.raises(InputError, match=r"large\.png: more than 1,000 bytes"):
         read_image(tmp_path / "large.png")

@@ -17,7 +17,7 @@ from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.decoding import imagine
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media import video as video_reader
-from vjepa2_ac.media.video import Clock, frame_times, read_frames, read_header, write_video
+from vjepa2_ac.media.video import Clock, read_frame_times, read_frames, read_header, write_video
 
 STEPS = 40
 FRAMES = [draw_frame(state, size=(36, 64)) for state in synthetic_states(STEPS)]
@@ -91,7 +91,7 @@ def test_a_step_has_the_frame_nearest_in_time_whatever_else_is_read(
     times: list[int], gop: int, b_frames: int, tmp_path: Path
 ) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=gop, b_frames=b_frames, times=times)
-    frames, shown = every_frame(path), frame_times(path, where="a")
+    frames, shown = every_frame(path), read_frame_times(path, where="a")
     assert np.diff(shown).tolist() == np.diff(times).tolist()
     clock = Clock(0.105, 10.0)
     targets = [round(15360 * (0.105 + step / 10)) for step in range(int(shown[-1] / 1536))]
@@ -323,7 +323,11 @@ def test_nothing_is_left_of_a_video_that_cannot_be(tmp_path: Path) -> None:
 def test_a_film_without_pyav_is_a_gif_and_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noted: list[str] = []
     monkeypatch.setitem(sys.modules, "av", None)
-    for name, value in (("draw_strip", FRAMES[0]), ("film_frames", FRAMES[:2]), ("loop_of", [(1, 0.1), (0, 0.1)])):
+    for name, value in (
+        ("draw_strip", FRAMES[0]),
+        ("render_frames", FRAMES[:2]),
+        ("schedule_loop", [(1, 0.1), (0, 0.1)]),
+    ):
         monkeypatch.setattr(imagine, name, lambda *_, value=value, **__: value)
     monkeypatch.setattr(imagine, "strip_of", lambda _: {})
     written = imagine.write_imagination(None, tmp_path, reporter=SimpleNamespace(note=noted.append))  # type: ignore[arg-type]

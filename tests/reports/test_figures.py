@@ -17,7 +17,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.decoding.decoder import load_decoder
 from vjepa2_ac.evaluation.imagined import imagine_plan
 from vjepa2_ac.intervals import Estimate
-from vjepa2_ac.media.figure import side_by_side
+from vjepa2_ac.media.figure import stack_horizontally
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reports.comparison import Comparison
 from vjepa2_ac.reports.evaluation_figures import plot_comparison, plot_evaluation
@@ -83,11 +83,11 @@ def test_what_was_imagined_is_a_row_of_its_own_also_of_a_decision_without_a_plan
 
 def test_images_stand_side_by_side_below_their_words() -> None:
     images = [np.full((20, 60, 3), shade, dtype=np.uint8) for shade in (50, 120)]
-    frame = side_by_side(images, ["a", "b"], "both")
+    frame = stack_horizontally(images, ["a", "b"], "both")
     body = frame[-40:]
     assert (body[:, :120] == 50).all()
     assert (body[:, -120:] == 120).all()
     head = frame[:-40]
     assert head.min() < 80 < head.max() == 255  # ink on white
-    assert (side_by_side(images, ["a", "$x_{"], "both") != frame).any()  # dollars begin no formula
-    assert (side_by_side(images, ["a", "b"], "other") != frame).any()
+    assert (stack_horizontally(images, ["a", "$x_{"], "both") != frame).any()  # dollars begin no formula
+    assert (stack_horizontally(images, ["a", "b"], "other") != frame).any()

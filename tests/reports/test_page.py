@@ -69,7 +69,7 @@ def usual(_undrawn: Callable[[pytest.MonkeyPatch], None]) -> Usual:
 
 def leave_figures_empty(patch: pytest.MonkeyPatch) -> None:
     """Give a page all of its images without content: text and tables are the same."""
-    patch.setattr(write, "svg_of", lambda *_: "data:image/svg+xml;base64,")
+    patch.setattr(write, "figure_to_svg", lambda *_: "data:image/svg+xml;base64,")
     patch.setattr(write, "draw_strip", lambda _: np.zeros((8, 8, 3), np.uint8))
 
 
@@ -169,7 +169,7 @@ def test_the_page_refers_to_nothing_but_itself_and_is_the_same_each_time(usual: 
 @pytest.mark.usefixtures("drawn")
 def test_the_page_stays_small_whatever_was_measured(usual: Usual, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(usual[1]) < 2_000_000, "with all figures"
-    monkeypatch.setattr(write, "svg_of", lambda *_: "")
+    monkeypatch.setattr(write, "figure_to_svg", lambda *_: "")
     rng = np.random.default_rng(0)
     one = evaluation(frames=16, size=256)
     noise = rng.integers(0, 256, size=one.examples[0].frames.shape, dtype=np.uint8)

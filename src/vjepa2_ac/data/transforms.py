@@ -23,7 +23,7 @@ from torch import Tensor
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.images import require_bounded
+from vjepa2_ac.media.images import require_decodable_size
 from vjepa2_ac.registry import TRANSFORMS
 
 Crop = Literal["released", "square", "letterbox"]
@@ -97,7 +97,7 @@ def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.nda
     if height == width:
         return frames
     side = max(height, width)
-    require_bounded(side, side, "data.crop: letterbox", count=len(frames))
+    require_decodable_size(side, side, "data.crop: letterbox", count=len(frames))
     rows, columns = side - height, side - width  # numbers of rows and columns to add
     return np.pad(frames, ((0, 0), (rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0)))
 

@@ -23,7 +23,7 @@ from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, TrainedDecoder, as_pixels, load_decoder
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.media.figure import FilmStrip, StripRow, draw_strip, film_frames, loop_of
+from vjepa2_ac.media.figure import RolloutStrip, StripRow, draw_strip, render_frames, schedule_loop
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.model.lora import base_only
@@ -42,7 +42,7 @@ Film = UInt8[np.ndarray, "steps size size 3"]
 
 STRIP, VIDEO, GIF = "imagined.png", "imagined.mp4", "imagined.gif"
 AS_RECORDED = "as recorded"
-_HAPPENS, _TITLE = "what really happens", "One frame is given, the rest is imagined"
+_GROUND_TRUTH, _TITLE = "ground truth", "Frames predicted from one input frame and the actions"
 _MUCH_WORSE_DB = 5.0
 _RATE_HZ = 15.0  # frame rate of the video
 _LONGEST_NAME = 44  # characters
@@ -142,7 +142,7 @@ def shown(
     return np.concatenate([images[number::views] for number in range(views)], axis=2)
 
 
-def strip_of(imagination: Imagination) -> FilmStrip:
+def strip_of(imagination: Imagination) -> RolloutStrip:
     """Return the image strip of an imagination: for each action sequence the true frames, then those of each model.
 
     The recorded action sequence comes first.
@@ -152,20 +152,23 @@ def strip_of(imagination: Imagination) -> FilmStrip:
     ordered = sorted(told.rollouts, key=lambda one: one.name != AS_RECORDED)
     for name, rollouts in groupby(ordered, key=lambda one: one.name):
         for number, one in enumerate(rollouts):
-            story, recorded = _story(one), name == AS_RECORDED
+            sequence, recorded = _story(one), name == AS_RECORDED
             if not number and (truth := told.truth if recorded else one.truth) is not None:
                 captions = ("", *map(_short_action, one.actions)) if recorded else ()
                 frames = np.concatenate([first, truth])
-                rows.append(StripRow(_HAPPENS, "recorded" if recorded else "simulated", frames, captions, story))
+                rows.append(
+                    StripRow(_GROUND_TRUTH, "recorded" if recorded else "simulated", frames, captions, sequence)
+                )
             if not number and recorded and told.decoded_truth is not None:
                 frames = np.concatenate([decoded_first, told.decoded_truth])
-                rows.append(StripRow("the same,\ndecoded", "decoded", frames, story=story))
+                rows.append(StripRow("ground truth,\ndecoded", "decoded", frames, sequence=sequence))
             frames = np.concatenate([decoded_first, one.frames])
-            rows.append(StripRow(f"{one.model} imagines", "imagined", frames, story=story, outlines=one.outlines))
+            rows.append(
+                StripRow(f"prediction of\n{one.model}", "predicted", frames, sequence=sequence, outlines=one.outlines)
+            )
     clip = f"{_short(told.episode_id)} from control step {told.start}" if told.episode_id else "from an image"
     seconds = tuple(time * told.seconds_per_step for time in range(len(rows[0].frames) if rows else 0))
-    title = "What if? " * any(one.name != AS_RECORDED for one in told.rollouts) + _TITLE
-    return FilmStrip(title, tuple(rows), seconds, source=f"{told.subject}, {clip}")
+    return RolloutStrip(_TITLE, tuple(rows), seconds, source=f"{told.subject}, {clip}")
 
 
 def _story(one: Imagined) -> str:
@@ -173,7 +176,7 @@ def _story(one: Imagined) -> str:
     if one.name == AS_RECORDED:
         return AS_RECORDED
     length = 100 * float(np.linalg.norm(one.actions[0, :3])) if one.actions.shape[1] == _POSE else 0.0
-    name = "still" if one.name == "none" else one.name
+    name = "zero action" if one.name == "none" else one.name
     return name + (f", {length:.3g} cm a step" if length >= _LEAST_CM else "")
 
 
@@ -207,7 +210,7 @@ def write_imagination(imagination: Imagination, folder: Path, *, reporter: Repor
     with translate_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / STRIP, encode_png(draw_strip(strip)))
-        images, loop = list(film_frames(strip)), loop_of(strip)
+        images, loop = list(render_frames(strip)), schedule_loop(strip)
         frames, seconds = [images[place] for place, _ in loop], [shown_s for _, shown_s in loop]
         times = [max(1, round(shown_s * _RATE_HZ)) for shown_s in seconds]  # that a video repeats each frame
         written = [folder / STRIP, write_gif(folder / GIF, frames, seconds=seconds)]

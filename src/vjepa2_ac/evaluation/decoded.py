@@ -30,7 +30,7 @@ from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, Repe
 from vjepa2_ac.evaluation.measure import prediction
 from vjepa2_ac.evaluation.result import DecodedRollouts, DecodedStrip, Example
 from vjepa2_ac.intervals import Estimate, ratios
-from vjepa2_ac.media.image_similarity import mean_where, moving_region, psnr, ssim_map
+from vjepa2_ac.media.image_similarity import masked_mean, moving_region, psnr, ssim_map
 from vjepa2_ac.reporter import SILENT, Reporter
 
 DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE = "decoded_truth", "decoded_persistence", "raw_persistence"
@@ -157,7 +157,7 @@ def _measured(images: _Images) -> dict[tuple[str, str], Float[Tensor, "batch hor
             similarity = ssim_map(decoded, true)
             for region, mask in regions.items():
                 metrics[source, f"psnr_db.{region}.{reference}"] = psnr(decoded, true, mask)
-                metrics[source, f"ssim.{region}.{reference}"] = mean_where(similarity, mask)
+                metrics[source, f"ssim.{region}.{reference}"] = masked_mean(similarity, mask)
     return metrics
 
 

@@ -21,7 +21,7 @@ from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.episode import Progress, short_names
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.explore.explorer import MOST_STEPS, Explorer, Moment, Pixels, Place, Search, relative_spread
-from vjepa2_ac.media.figure import error_colours
+from vjepa2_ac.media.figure import colour_errors
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.planning.energy import mean_difference
 from vjepa2_ac.planning.planner import Cancelled
@@ -239,7 +239,7 @@ class Views:
     def _error_map(self, errors: Float[Tensor, " tokens"]) -> Pixels:
         size = self.explorer.world_model.image_size
         grid = size // self.explorer.world_model.sizes.patch_size
-        return error_colours(errors.float().reshape(grid, grid).cpu().numpy(), (size, size)).astype(np.uint8)
+        return colour_errors(errors.float().reshape(grid, grid).cpu().numpy(), (size, size)).astype(np.uint8)
 
     def _searched(self, request: PageRequest, place: Place, progress: Progress, cancelled: Cancelled) -> bytes:
         names = [contender.name for contender in self.explorer.contenders]

@@ -18,7 +18,7 @@ from vjepa2_ac.episode import Progress, no_progress, short_names
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.inspection.coverage import ENOUGH_NEAR, ReadEpisode
 from vjepa2_ac.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, Inspection, largest_change
-from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, written_figure
+from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, save_figure
 
 _PLACES = 6000  # largest number of points in the map
 _IDLE = "#c9c9c9"
@@ -104,7 +104,7 @@ def plot_contact_sheet(inspection: Inspection, strips: Sequence[Strip], path: Pa
     its range, and the map of positions is replaced by the ranges of all numbers.
     """
     dataset, heights = inspection.dataset, [_TITLE, _PANELS, *(_ROW for _ in strips)]
-    with written_figure(path, _WIDTH, sum(heights), dpi=130, layout="none", facecolor="white") as figure:
+    with save_figure(path, _WIDTH, sum(heights), dpi=130, layout="none", facecolor="white") as figure:
         title, panels, *rows = figure.subfigures(len(heights), 1, height_ratios=heights)
         title.text(_EDGE, 0.5, dataset.config.path, size=13, weight="bold", va="center")
         _panels(panels, inspection)

@@ -43,14 +43,14 @@ _STYLE = {
 }
 
 
-def headline(figure: Any, words: str) -> None:
+def add_title(figure: Any, title: str) -> None:
     """Write a title of one line above a figure, truncated to the width of the figure."""
-    line = textwrap.shorten(words, int(12 * figure.get_figwidth()), placeholder=" …")  # 12 letters per inch
+    line = textwrap.shorten(title, int(12 * figure.get_figwidth()), placeholder=" …")  # 12 letters per inch
     figure.suptitle(line, fontsize=10.5, x=0.01, ha="left")
 
 
 @contextmanager
-def written_figure(
+def save_figure(
     path: Path, width: float, height: float, *, dpi: int = 100, size: float = 8, **options: Any
 ) -> Iterator[Any]:
     """Yield a figure to draw on, and write it atomically as a PNG file when the block ends.
@@ -63,19 +63,19 @@ def written_figure(
         size: Font size in points.
         options: Further arguments of matplotlib's `Figure`.
     """
-    with in_our_style({"font.size": size}):
+    with figure_style({"font.size": size}):
         figure = new_figure(width, height, **{"layout": "constrained", **options})
         yield figure
         with atomic_writer(path) as file:
             figure.savefig(file, format="png", dpi=dpi)
 
 
-def in_our_style(changes: dict[str, Any]) -> AbstractContextManager[None]:
+def figure_style(changes: dict[str, Any]) -> AbstractContextManager[None]:
     """Return a context in which matplotlib draws in the style of this package, with some rc parameters changed."""
     return mpl.rc_context(_STYLE | changes)
 
 
-def pixels_of(figure: Any) -> UInt8[np.ndarray, "height width 3"]:
+def figure_to_pixels(figure: Any) -> UInt8[np.ndarray, "height width 3"]:
     """Draw a figure and return its RGB pixels."""
     figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
@@ -88,19 +88,19 @@ def new_figure(width: float, height: float, **options: Any) -> Figure:
     return figure
 
 
-def svg_of(draw: Callable[..., None], width: float, height: float, *given: Any) -> str:
+def figure_to_svg(draw: Callable[..., None], width: float, height: float, *arguments: Any) -> str:
     """Call `draw(figure, *given)` on a figure (size in inches) and return it as an SVG data: URL, reproducibly."""
     style = {"font.size": 9, "legend.fontsize": 8, "svg.fonttype": "none", "svg.hashsalt": "vjepa2-ac"}
     text = io.StringIO()
-    with in_our_style(style), warnings.catch_warnings():
+    with figure_style(style), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # browsers have the glyph
         figure = new_figure(width, height, layout="constrained")
-        draw(figure, *given)
+        draw(figure, *arguments)
         FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None})  # `savefig` would compute the layout twice
     return f"data:image/svg+xml;base64,{base64.b64encode(text.getvalue().encode()).decode()}"
 
 
-def visible(text: str) -> str:
+def replace_hidden_characters(text: str) -> str:
     """Return a text with invalid and misleading characters replaced by U+FFFD."""
     return _HIDDEN.sub("\N{REPLACEMENT CHARACTER}", text)
 
@@ -108,20 +108,20 @@ def visible(text: str) -> str:
 # ---- image strips and videos of rollouts ----
 
 Pixels = UInt8[np.ndarray, "_ _ 3"]
-Kind = Literal["recorded", "simulated", "decoded", "imagined", "error"]
+FrameKind = Literal["recorded", "simulated", "decoded", "predicted", "error"]
 
-MEANING: dict[Kind, tuple[str, str]] = {
-    "recorded": (GREY, "recorded"),
-    "simulated": (GREEN, "what really happens, simulated"),
+FRAME_KINDS: dict[FrameKind, tuple[str, str]] = {
+    "recorded": (GREY, "ground truth, recorded"),
+    "simulated": (GREEN, "ground truth, simulated"),
     "decoded": (BLUE, "decoded from the true frame's latents"),
-    "imagined": (ORANGE, "imagined from the first frame alone"),
-    "error": (RED, "error of each patch: brighter is worse"),
+    "predicted": (ORANGE, "predicted from the input frame and the actions"),
+    "error": (RED, "error of each patch (brighter: larger error)"),
 }
-"""Colour and meaning of each kind."""
+"""The colour and the legend text of each kind of frame."""
 
 _DOTS = 100  # pixels per inch
-_LABEL, _STORY, _HEAD, _GAP, _LINE, _LEGEND = 160, 90, 90, 14, 17, 270  # pixels
-_MOST_COLUMNS = 6  # more are too small to read on a page that is 800 pixels wide
+_LABEL, _SEQUENCE, _HEAD, _GAP, _LINE, _LEGEND = 160, 90, 90, 14, 17, 270  # pixels
+_MAX_COLUMNS = 6  # more are too small to read on a page that is 800 pixels wide
 _PREVIEW_S, _START_S, _END_S, _LOOP_S = 1.2, 0.8, 0.8, 6.0  # durations of parts of a loop, and its maximal duration
 _SLOWER = 2.0  # a loop plays at half the real speed
 
@@ -131,15 +131,15 @@ class StripRow:
     """One row of a strip: the frames of one rollout by one model, from the start frame on."""
 
     label: str  # the source of the frames: the model, or the simulator
-    kind: Kind  # kind of all frames; the first frame of a predicted row is the decoded start frame
+    kind: FrameKind  # kind of all frames; the first frame of a predicted row is the decoded start frame
     frames: UInt8[np.ndarray, "time height width 3"]
     captions: tuple[str, ...] = ()  # one per frame, in small letters; empty: no captions
-    story: str = ""  # name of the action sequence, if the strip has several
+    sequence: str = ""  # name of the action sequence, if the strip has several
     outlines: Bool[np.ndarray, "time height width"] | None = None  # mask of the true arm; None: unknown
 
 
 @dataclass(frozen=True, eq=False)
-class FilmStrip:
+class RolloutStrip:
     """Rollouts of equal length, to be drawn as an image strip or a video."""
 
     title: str
@@ -148,65 +148,66 @@ class FilmStrip:
     source: str = ""  # model and clip, in small letters
 
     @property
-    def about_outlines(self) -> str:
+    def outline_legend(self) -> str:
         """The legend of the outlines; empty if no row has outlines."""
-        return "; white line: where the arm really is" * any(row.outlines is not None for row in self.rows)
+        return "; white outline: the true arm" * any(row.outlines is not None for row in self.rows)
 
 
-def draw_strip(film: FilmStrip, *, side: int = 116) -> Pixels:
+def draw_strip(strip: RolloutStrip, *, side: int = 116) -> Pixels:
     """Draw all rows below each other, with up to six evenly spread times from left to right; return the pixels.
 
     Args:
-        film: The rollouts.
+        strip: The rollouts.
         side: Approximate height and width of an image, in pixels.
     """
-    columns = min(len(film.seconds), _MOST_COLUMNS)
-    captioned = sum(bool(row.captions) for row in film.rows)
-    size = _LABEL + columns * (side + _GAP), _HEAD + len(film.rows) * (side + _GAP) + _LINE * captioned
-    kinds = {row.kind for row in film.rows} | {"decoded" for row in film.rows if row.kind == "imagined"}
-    patches = [Patch(color=colour, label=meaning) for kind, (colour, meaning) in MEANING.items() if kind in kinds]
-    with _figure(film, size) as figure:
+    columns = min(len(strip.seconds), _MAX_COLUMNS)
+    captioned = sum(bool(row.captions) for row in strip.rows)
+    size = _LABEL + columns * (side + _GAP), _HEAD + len(strip.rows) * (side + _GAP) + _LINE * captioned
+    kinds = {row.kind for row in strip.rows} | {"decoded" for row in strip.rows if row.kind == "predicted"}
+    patches = [Patch(color=colour, label=text) for kind, (colour, text) in FRAME_KINDS.items() if kind in kinds]
+    with _figure(strip, size) as figure:
         legend = {"ncols": max(1, size[0] // _LEGEND), "fontsize": 8, "handlelength": 1, "alignment": "left"}
         figure.legend(
             handles=patches,
             loc="outside lower left",
-            title=film.source + film.about_outlines or None,
+            title=strip.source + strip.outline_legend or None,
             title_fontsize=7,
             **legend,
         )
-        draw_rows(figure, film)
-        return pixels_of(figure)
+        draw_rows(figure, strip)
+        return figure_to_pixels(figure)
 
 
-def draw_rows(figure: Any, film: FilmStrip) -> None:
+def draw_rows(figure: Any, strip: RolloutStrip) -> None:
     """Draw the rows of a strip on a figure or subfigure."""
-    indices = np.unique(np.linspace(0, len(film.seconds) - 1, _MOST_COLUMNS).round().astype(int)).tolist()
-    grid = figure.subplots(len(film.rows), len(indices), squeeze=False)
-    for row, row_axes in zip(film.rows, grid, strict=True):
+    indices = np.unique(np.linspace(0, len(strip.seconds) - 1, _MAX_COLUMNS).round().astype(int)).tolist()
+    grid = figure.subplots(len(strip.rows), len(indices), squeeze=False)
+    for row, row_axes in zip(strip.rows, grid, strict=True):
         for index, axes in zip(indices, row_axes, strict=True):
             _show(axes, row, index)
-        label = f"{row.label}:\n{row.story}" if row.story else row.label
-        row_axes[0].set_ylabel(label, color=MEANING[row.kind][0], rotation=0, ha="right", va="center")
+        label = f"{row.label}:\n{row.sequence}" if row.sequence else row.label
+        row_axes[0].set_ylabel(label, color=FRAME_KINDS[row.kind][0], rotation=0, ha="right", va="center")
     for index, axes in zip(indices, grid[0], strict=True):
-        text = f"{film.seconds[index]:.2f} s" if index else "start, given"
+        text = f"{strip.seconds[index]:.2f} s" if index else "input frame"
         axes.set_title(text, fontsize=8, color=GREY, loc="left")
 
 
-def film_frames(film: FilmStrip, *, side: int = 172) -> Iterator[Pixels]:
+def render_frames(strip: RolloutStrip, *, side: int = 172) -> Iterator[Pixels]:
     """Yield a video frame for each time: a grid of models and action sequences, whose longer side is horizontal.
 
     Args:
-        film: The rollouts.
+        strip: The rollouts.
         side: Approximate height and width of an image, in pixels.
     """
-    stories, labels = dict.fromkeys(row.story for row in film.rows), dict.fromkeys(row.label for row in film.rows)
-    row_names, column_names = sorted((list(stories), list(labels)), key=len)
-    cells = {names: row for row in film.rows for names in ((row.story, row.label), (row.label, row.story))}
-    for index, seconds in enumerate(film.seconds):
-        caption = f"{seconds:.2f} s after the only frame that is given" if index else "the start: all that is given"
-        size = _STORY + len(column_names) * (side + _GAP), _HEAD + len(row_names) * (side + _GAP)
-        with _figure(film, size) as figure:
-            figure.supxlabel(caption + film.about_outlines, fontsize=9, x=0.01, ha="left")
+    sequences = dict.fromkeys(row.sequence for row in strip.rows)
+    labels = dict.fromkeys(row.label for row in strip.rows)
+    row_names, column_names = sorted((list(sequences), list(labels)), key=len)
+    cells = {names: row for row in strip.rows for names in ((row.sequence, row.label), (row.label, row.sequence))}
+    for index, seconds in enumerate(strip.seconds):
+        caption = f"{seconds:.2f} s after the input frame" if index else "input frame"
+        size = _SEQUENCE + len(column_names) * (side + _GAP), _HEAD + len(row_names) * (side + _GAP)
+        with _figure(strip, size) as figure:
+            figure.supxlabel(caption + strip.outline_legend, fontsize=9, x=0.01, ha="left")
             grid = figure.subplots(len(row_names), len(column_names), squeeze=False)
             for row_name, row_axes in zip(row_names, grid, strict=True):
                 for column_name, axes in zip(column_names, row_axes, strict=True):
@@ -217,39 +218,39 @@ def film_frames(film: FilmStrip, *, side: int = 172) -> Iterator[Pixels]:
                 row_axes[0].set_ylabel(row_name.replace(", ", ",\n"), rotation=0, ha="right", va="center")
             for column_name, axes in zip(column_names, grid[0], strict=True):
                 axes.set_title(column_name, fontsize=9.5)
-            yield pixels_of(figure)
+            yield figure_to_pixels(figure)
 
 
-def loop_of(film: FilmStrip) -> list[tuple[int, float]]:
+def schedule_loop(strip: RolloutStrip) -> list[tuple[int, float]]:
     """Return (frame index, duration in seconds) of each frame of an endless loop.
 
     The last frame comes first, because previews show the first frame of a loop. Then all frames follow from the start,
     at half the real speed, or faster where the loop would be longer than 6 s.
     """
-    last = len(film.seconds) - 1
+    last = len(strip.seconds) - 1
     longest_s = (_LOOP_S - _PREVIEW_S - _START_S - _END_S) / max(last - 1, 1)
-    steps = [min(_SLOWER * step, longest_s) for step in np.diff(film.seconds).tolist()]
+    steps = [min(_SLOWER * step, longest_s) for step in np.diff(strip.seconds).tolist()]
     return [(last, _PREVIEW_S), (0, _START_S), *zip(range(1, last), steps, strict=False), (last, _END_S)]
 
 
 @contextmanager
-def _figure(film: FilmStrip, size: tuple[int, int]) -> Iterator[Any]:
+def _figure(strip: RolloutStrip, size: tuple[int, int]) -> Iterator[Any]:
     """Yield a figure of (width, height) in pixels with the title of the rollouts."""
-    with in_our_style({"font.size": 9}):
+    with figure_style({"font.size": 9}):
         figure = new_figure(*(pixels / _DOTS for pixels in size), dpi=_DOTS, layout="compressed", facecolor="white")
-        figure.suptitle(film.title, fontsize=11, weight="bold", x=0.01, ha="left")
+        figure.suptitle(strip.title, fontsize=11, weight="bold", x=0.01, ha="left")
         yield figure
 
 
-def show_framed(axes: Any, image: UInt8[np.ndarray, "height width 3"], kind: Kind) -> None:
+def show_with_border(axes: Any, image: UInt8[np.ndarray, "height width 3"], kind: FrameKind) -> None:
     """Show an image with a border in the colour of its kind."""
     axes.imshow(image)
     axes.set(xticks=[], yticks=[])
-    axes.spines[:].set(visible=True, color=MEANING[kind][0], linewidth=3)
+    axes.spines[:].set(visible=True, color=FRAME_KINDS[kind][0], linewidth=3)
 
 
 def _show(axes: Any, row: StripRow, index: int) -> None:
-    show_framed(axes, row.frames[index], "decoded" if row.kind == "imagined" and index == 0 else row.kind)
+    show_with_border(axes, row.frames[index], "decoded" if row.kind == "predicted" and index == 0 else row.kind)
     if row.outlines is not None and row.outlines[index].any():
         for colour, width in (("black", 2.2), ("white", 1.2)):
             axes.contour(row.outlines[index], [0.5], colors=colour, linewidths=width)
@@ -257,7 +258,7 @@ def _show(axes: Any, row: StripRow, index: int) -> None:
         axes.set_xlabel(row.captions[index] or " ", fontsize=7, color=GREY)
 
 
-def error_colours(
+def colour_errors(
     errors: Float[np.ndarray, "grid grid"], size: tuple[int, int], worst: float = 1.0
 ) -> Float[np.ndarray, "height width 3"]:
     """Return patch errors as RGB colours from 0 to 255, from black (no error) to bright yellow (`worst` or more)."""
@@ -270,7 +271,9 @@ _CAPTION = 30  # pixels
 _BETWEEN = 6
 
 
-def side_by_side(images: Sequence[Pixels], captions: Sequence[str], title: str = "", *, enlarged: int = 2) -> Pixels:
+def stack_horizontally(
+    images: Sequence[Pixels], captions: Sequence[str], title: str = "", *, enlarged: int = 2
+) -> Pixels:
     """Join images of one size horizontally, with a caption above each and a title above all.
 
     Args:
@@ -288,7 +291,7 @@ def side_by_side(images: Sequence[Pixels], captions: Sequence[str], title: str =
     return np.concatenate([_text_image(title, row.shape[1], points=11.0), row]) if title else row
 
 
-def below_each_other(images: Sequence[Pixels]) -> Pixels:
+def stack_vertically(images: Sequence[Pixels]) -> Pixels:
     """Join images vertically; narrower images are padded with white on the right."""
     width = max(image.shape[1] for image in images)
     padding = [np.full((image.shape[0], width - image.shape[1], 3), 255, np.uint8) for image in images]
@@ -300,4 +303,4 @@ def _text_image(text: str, width: int, *, points: float = 9.0) -> UInt8[np.ndarr
     """Return an image of one line of text on white; callers must not modify it, because it is cached."""
     figure = new_figure(width / _DOTS, _CAPTION / _DOTS, dpi=_DOTS, facecolor="white")
     figure.text(8 / width, 0.5, text, fontsize=points, va="center", ha="left", parse_math=False)
-    return pixels_of(figure)
+    return figure_to_pixels(figure)

@@ -17,19 +17,19 @@ from torch import Tensor
 
 Images = Float[Tensor, "*batch 3 height width"]
 Pixels = Float[Tensor, "*batch height width"]  # one number per pixel
-Where = Bool[Tensor, "*batch height width"]
-OfEach = Float[Tensor, "*batch"]  # one number per image
+Mask = Bool[Tensor, "*batch height width"]
+PerImage = Float[Tensor, "*batch"]  # one number per image
 Channels = Float[Tensor, "*batch channel height width"]
 
-MOVES_BY = 8 / 255  # a pixel moves if any channel changes by more than this
-DILATED_BY = 8  # pixels on each side
+MOVING_THRESHOLD = 8 / 255  # a pixel moves if any channel changes by more than this
+DILATION_PX = 8  # pixels on each side
 _SIGMA, _RADIUS = 1.5, 5  # of the Gaussian window, 11 x 11
 _C1, _C2 = 0.01**2, 0.03**2  # the constants of luminance and contrast for a data range of 1
 _SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 _ROUNDING = 1e-5  # excludes a difference of exactly 8 levels of 255 despite rounding to float32
 
 
-def psnr(predicted: Images, true: Images, where: Where | None = None) -> OfEach:
+def psnr(predicted: Images, true: Images, mask: Mask | None = None) -> PerImage:
     """Return the peak signal-to-noise ratio of each image in dB: 10 log10(1 / mean squared error).
 
     Identical images have infinite PSNR: exclude them from a mean and report their number.
@@ -37,13 +37,13 @@ def psnr(predicted: Images, true: Images, where: Where | None = None) -> OfEach:
     Args:
         predicted: Images in 0 .. 1.
         true: Images in 0 .. 1.
-        where: Mask of the pixels to average over; None: all. The result is NaN for an image without such pixels.
+        mask: Mask of the pixels to average over; None: all. The result is NaN for an image without such pixels.
     """
     squared = (predicted.float() - true.float()).square().mean(dim=-3)
-    return -10 * torch.log10(mean_where(squared, where))
+    return -10 * torch.log10(masked_mean(squared, mask))
 
 
-def ssim(predicted: Images, true: Images) -> OfEach:
+def ssim(predicted: Images, true: Images) -> PerImage:
     """Return the structural similarity of each image: the mean of `ssim_map`; 1 is identical."""
     return ssim_map(predicted, true).mean(dim=(-2, -1))
 
@@ -51,7 +51,7 @@ def ssim(predicted: Images, true: Images) -> OfEach:
 def ssim_map(predicted: Images, true: Images) -> Pixels:
     """Return the structural similarity at each pixel, as the mean over R, G and B.
 
-    Average it over a region with `mean_where`.
+    Average it over a region with `masked_mean`.
 
     Raises:
         ValueError: A side of the images has fewer than 6 pixels, too few to reflect them at the borders.
@@ -62,7 +62,7 @@ def ssim_map(predicted: Images, true: Images) -> Pixels:
     return _terms(predicted, true)[0].mean(dim=-3)
 
 
-def ms_ssim(predicted: Images, true: Images, scales: int) -> OfEach:
+def ms_ssim(predicted: Images, true: Images, scales: int) -> PerImage:
     """Return the multi-scale structural similarity of each image, for a loss.
 
     The result is a product over scales of the mean contrast (at the coarsest scale: the mean similarity), clamped to at
@@ -93,17 +93,17 @@ def moving_region(true: Float[Tensor, "*batch time 3 height width"]) -> Bool[Ten
     The mask is dilated by 8 pixels in all directions. It depends on the true frames alone.
     """
     later, first = true[..., 1:, :, :, :].float(), true[..., :1, :, :, :].float()
-    moved = ((later - first).abs() > MOVES_BY + _ROUNDING).any(dim=-3)
+    moved = ((later - first).abs() > MOVING_THRESHOLD + _ROUNDING).any(dim=-3)
     flat = moved.reshape(-1, 1, *moved.shape[-2:]).float()
-    dilated = torch.nn.functional.max_pool2d(flat, 2 * DILATED_BY + 1, stride=1, padding=DILATED_BY)
+    dilated = torch.nn.functional.max_pool2d(flat, 2 * DILATION_PX + 1, stride=1, padding=DILATION_PX)
     return (dilated > 0).reshape(moved.shape)
 
 
-def mean_where(values: Pixels, where: Where | None) -> OfEach:
-    """Return the mean over the pixels of a mask, or over all pixels if `where` is None; NaN for an empty mask."""
-    if where is None:
+def masked_mean(values: Pixels, mask: Mask | None) -> PerImage:
+    """Return the mean over the pixels of a mask, or over all pixels if `mask` is None; NaN for an empty mask."""
+    if mask is None:
         return values.mean(dim=(-2, -1))
-    return torch.where(where, values, 0).sum(dim=(-2, -1)) / where.sum(dim=(-2, -1))
+    return torch.where(mask, values, 0).sum(dim=(-2, -1)) / mask.sum(dim=(-2, -1))
 
 
 def _terms(predicted: Channels, true: Channels) -> tuple[Channels, Channels]:
@@ -146,7 +146,7 @@ def _halved(images: Channels) -> Float[Tensor, "*batch channel rows columns"]:
     return halved.reshape(*images.shape[:-2], *halved.shape[-2:])
 
 
-def _power(factor: OfEach, weight: float) -> OfEach:
+def _power(factor: PerImage, weight: float) -> PerImage:
     """Return `factor ** weight` for positive factors and 0 for others, with finite gradients; NaN stays NaN."""
     positive = ~(factor <= 0)
     return torch.where(positive, torch.where(positive, factor, 1) ** weight, 0)

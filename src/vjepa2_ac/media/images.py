@@ -22,13 +22,13 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import StateSpace, rotation_angles
 from vjepa2_ac.storage import read_small_file, translate_read_errors
 
-MOST_PIXELS = 100_000_000  # ten times a robot's camera; the header of a 600-byte file may claim forty times as many
-_MOST_BYTES = 1 << 32  # limit for images that are decoded together
-_MOST_FILE_BYTES = 1 << 28  # an uncompressed PNG of the largest allowed image has 300 MB
-_LEAST_SIDE = 16  # least height and width of an image of a robot's scene, in pixels
+MAX_PIXELS = 100_000_000  # ten times a robot's camera; the header of a 600-byte file may claim forty times as many
+_MAX_BYTES = 1 << 32  # limit for images that are decoded together
+_MAX_FILE_BYTES = 1 << 28  # an uncompressed PNG of the largest allowed image has 300 MB
+_MIN_SIDE = 16  # least height and width of an image of a robot's scene, in pixels
 
 
-def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> None:
+def require_decodable_size(height: int, width: int, where: str, *, count: int = 1) -> None:
     """Refuse images that are too large, or too many of that size to be decoded together, before memory is allocated.
 
     Args:
@@ -40,9 +40,9 @@ def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> N
     Raises:
         InputError: The images are too large.
     """
-    if not 0 < height * width <= MOST_PIXELS or count * height * width * 3 > _MOST_BYTES:
+    if not 0 < height * width <= MAX_PIXELS or count * height * width * 3 > _MAX_BYTES:
         found = f"{count} images of {height} x {width} pixels at once"
-        needed = f"at most {MOST_PIXELS // 10**6} megapixels each, and {_MOST_BYTES // 10**9} GB together"
+        needed = f"at most {MAX_PIXELS // 10**6} megapixels each, and {_MAX_BYTES // 10**9} GB together"
         fix = "Make the images smaller, leave the episode out, or set data.frames lower"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
 
@@ -59,8 +59,8 @@ def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = No
         InputError: The array has another shape or type.
     """
     found = f"an array of shape {image.shape} and type {image.dtype}"
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < _LEAST_SIDE:
-        needed = f"an RGB image: height x width x 3, uint8, {_LEAST_SIDE} pixels or more"
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < _MIN_SIDE:
+        needed = f"an RGB image: height x width x 3, uint8, {_MIN_SIDE} pixels or more"
         raise InputError(where=where, found=found, needed=needed)
     if like is not None and image.shape != like.shape:
         found = f"{image.shape[1]} x {image.shape[0]} pixels (width x height)"
@@ -122,7 +122,7 @@ def stack_frames(
     stacked: list[UInt8[np.ndarray, "height width 3"]] = []
     for frame, step in zip(frames, steps, strict=True):
         at = f"{where}: step {step}"
-        require_bounded(frame.shape[0], frame.shape[1], at, count=len(steps))
+        require_decodable_size(frame.shape[0], frame.shape[1], at, count=len(steps))
         if stacked and frame.shape != stacked[0].shape:
             found, needed = (f"an image of {image.shape[0]}x{image.shape[1]}" for image in (frame, stacked[0]))
             raise InputError(where=at, found=found, needed=f"{needed}, as at step {steps[0]}")
@@ -149,7 +149,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
         InputError: The file is missing, too large, a pipe or a device, or neither PNG nor JPEG.
     """
     with translate_read_errors(path, needed="an image: PNG or JPEG"):
-        data = read_small_file(path, _MOST_FILE_BYTES)
+        data = read_small_file(path, _MAX_FILE_BYTES)
     return decode_image(data, str(path))
 
 
@@ -169,7 +169,7 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
             with JpegImageFile(io.BytesIO(data)) as image:  # reads the header only
                 return _upright(pixels, image)
         with PngImageFile(io.BytesIO(data)) as image:  # reads the header only
-            require_bounded(image.height, image.width, where)
+            require_decodable_size(image.height, image.width, where)
             return _upright(_as_rgb(image), image)
     except (OSError, ValueError, SyntaxError, struct.error, zlib.error, EOFError, IndexError) as error:
         found = f"{len(data)} bytes that are no image, starting with {data[:4]!r} ({error})"
@@ -179,7 +179,7 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
 
 def _decode_jpeg(data: bytes, where: str, *, is_fast: bool = False) -> UInt8[np.ndarray, "height width 3"]:
     height, width, _, _ = simplejpeg.decode_jpeg_header(data)
-    require_bounded(height, width, where)
+    require_decodable_size(height, width, where)
     return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB", fastdct=is_fast))
 
 
@@ -226,7 +226,7 @@ def encode_webp(
 # ---- checks of a camera ----
 
 _BLOCKS = 16  # blocks along each side of an image; averaging over a block removes sensor noise but not the scene
-_LEAST_CONTRAST = 1.0  # of 255: below for a covered lens with noise of 10, above for a scene at 5 % of its light
+_MIN_CONTRAST = 1.0  # of 255: below for a covered lens with noise of 10, above for a scene at 5 % of its light
 _STILL_M, _STILL_RAD = 0.005, math.radians(3.0)  # larger than the noise of the measured states of a still arm
 _STILL_SHARE = 0.5  # the same threshold for vectors, as a share of the largest change in a model step
 
@@ -274,7 +274,7 @@ def is_uniform(image: UInt8[np.ndarray, "height width 3"]) -> bool:
     The criterion: the standard deviation of the means of 16 x 16 blocks is below 1 of 255 in each colour.
     """
     blocks = Image.fromarray(np.ascontiguousarray(image)).resize((_BLOCKS, _BLOCKS), Image.Resampling.BOX)
-    return bool(np.asarray(blocks, dtype=float).std(axis=(0, 1)).max() < _LEAST_CONTRAST)
+    return bool(np.asarray(blocks, dtype=float).std(axis=(0, 1)).max() < _MIN_CONTRAST)
 
 
 def require_contrast(views: Iterable[np.ndarray], *, where: str) -> None:

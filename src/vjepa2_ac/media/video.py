@@ -21,7 +21,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError, require_library
-from vjepa2_ac.media.images import MOST_PIXELS, require_bounded
+from vjepa2_ac.media.images import MAX_PIXELS, require_decodable_size
 from vjepa2_ac.storage import ByteReader, atomic_writer
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _STRICT = {
     "err_detect": "crccheck+bitstream+buffer+explode",  # raises an error instead of concealing damage
-    "max_pixels": str(MOST_PIXELS),
+    "max_pixels": str(MAX_PIXELS),
 }
 _START = -(1 << 40)  # a time before all frames
 _SAME_RATE = 0.98  # least ratio of the video's rate to the steps' rate; times in ms round 30 Hz to 30.3 Hz
@@ -80,7 +80,7 @@ def read_frames(
         steps: Positions in display order, from 0; with a clock, the episode's steps. Positions may repeat.
         where: The file and its episode, for messages.
         clock: The times of the steps, if positions do not identify the frames.
-        times: The result of `frame_times` for the file, which is slow for videos with B-frames (it reads every
+        times: The result of `read_frame_times` for the file, which is slow for videos with B-frames (it reads every
             packet); None: it is computed.
 
     Raises:
@@ -90,32 +90,32 @@ def read_frames(
     """
     if not steps or min(steps) < 0:
         raise ValueError(f"{where}: steps {list(steps)}")
-    with _opened(file, where) as video:
+    with _open_video(file, where) as video:
         if clock is not None:
-            shown = _shown_by(video, clock, steps)
+            shown = _frame_times_by_clock(video, clock, steps)
         else:
-            shown = _shown_at(steps, video.times() if times is None else times, where)
+            shown = _frame_times_by_position(steps, video.times() if times is None else times, where)
         frames = video.decode(sorted(set(shown)))
         if len(sizes := {frame.shape for frame in frames.values()}) > 1:
             found = f"frames of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
-            raise _unusable(where, found, "frames of one size")
+            raise _video_error(where, found, "frames of one size")
         return np.stack([frames[time] for time in shown])
 
 
-def _shown_at(steps: Sequence[int], times: Sequence[int], where: str) -> list[int]:
+def _frame_times_by_position(steps: Sequence[int], times: Sequence[int], where: str) -> list[int]:
     if max(steps) >= len(times):
-        raise _unusable(where, f"{len(times)} frames", f"at least {max(steps) + 1}")
+        raise _video_error(where, f"{len(times)} frames", f"at least {max(steps) + 1}")
     if len(set(times)) < len(times):
-        raise _unusable(where, "frames shown at the same time", "a time for each")
+        raise _video_error(where, "frames shown at the same time", "a time for each")
     return [times[step] for step in steps]
 
 
-def _shown_by(video: _Video, clock: Clock, steps: Sequence[int]) -> list[int]:
+def _frame_times_by_clock(video: _Video, clock: Clock, steps: Sequence[int]) -> list[int]:
     """Return the presentation time of the frame nearest to the time of each step."""
     targets = [round((clock.start_s + step / clock.rate_hz) / video.unit_s) for step in steps]
     if len(set(targets)) < len(set(steps)):
         found = f"times in units of {video.unit_s:g} s for {clock.rate_hz:g} frames a second"
-        raise _unusable(video.where, found, "a time for each")
+        raise _video_error(video.where, found, "a time for each")
     nearest = video.nearest_times(sorted(set(targets)), max(0, int(0.49 / clock.rate_hz / video.unit_s)))
     if not (missing := set(targets) - nearest.keys()):
         return [nearest[target] for target in targets]
@@ -125,7 +125,7 @@ def _shown_by(video: _Video, clock: Clock, steps: Sequence[int]) -> list[int]:
         fix = "Change the rate of the video or that of the steps, or leave the episode out"
         raise InputError(where=video.where, found=found, needed="a frame for each step", fix=fix)
     needed = f"one for each of {len(targets)} times from {min(targets) * video.unit_s:.3f} s on"
-    raise _unusable(video.where, found, needed)
+    raise _video_error(video.where, found, needed)
 
 
 def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
@@ -135,32 +135,32 @@ def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
         InputError: The file is not a video, or damaged.
         OSError: A file behind a URL cannot be read.
     """
-    with _opened(file, where) as video:
+    with _open_video(file, where) as video:
         return video.header()
 
 
-def frame_times(file: str | Path | ByteReader, *, where: str) -> list[int]:
+def read_frame_times(file: str | Path | ByteReader, *, where: str) -> list[int]:
     """Return the presentation time of each frame of a video, in the video's units; errors as `read_header`."""
-    with _opened(file, where) as video:
+    with _open_video(file, where) as video:
         return video.times()
 
 
-def is_deep_grey(pixel_format: str) -> bool:
+def is_depth_format(pixel_format: str) -> bool:
     """Return whether a pixel format is that of a depth map: one channel of more than 8 bits, such as gray12le."""
     return re.match(r"gray(9|1\d|f)", pixel_format) is not None
 
 
 @contextmanager
-def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
+def _open_video(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
     """Open a video for decoding in one thread, because the loader's workers already run in parallel."""
-    av = video_library(where)
+    av = import_pyav(where)
     if isinstance(file, (str, Path)):
         with storage.translate_read_errors(where, needed="a whole, undamaged MP4", fix=_FIX):
             opened = storage.open_for_reading(file)
-        with closing(opened), _opened(opened, where) as video:
+        with closing(opened), _open_video(opened, where) as video:
             yield video
         return
-    source = _QuietFile(file)
+    source = _ErrorStoringFile(file)
     try:
         # The demuxer is fixed, because libav would otherwise follow playlists to other files.
         with av.open(source, format="mp4", metadata_errors="replace") as container:
@@ -170,7 +170,7 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
             raise source.error from None
         if isinstance(error, InputError):
             raise
-        raise _unusable(where, f"cannot be read as a video: {error.strerror}", "a whole, undamaged MP4") from None
+        raise _video_error(where, f"cannot be read as a video: {error.strerror}", "a whole, undamaged MP4") from None
     if source.error is not None:
         raise source.error
 
@@ -178,11 +178,11 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
 def _stream_of(container: Any, where: str) -> VideoStream:
     stream = container.streams.best("video")
     if stream is None:
-        raise _unusable(where, "no video in the file", "an MP4 with frames")
+        raise _video_error(where, "no video in the file", "an MP4 with frames")
     if stream.codec_context is None:
         found, fix = "a codec that this build of PyAV cannot decode", "Install PyAV from PyPI, or convert the video"
         raise InputError(where=where, found=found, needed="H.264, H.265 or AV1", fix=fix)
-    if is_deep_grey(str(stream.pix_fmt)):
+    if is_depth_format(str(stream.pix_fmt)):
         found = f"frames of {stream.pix_fmt}: one channel of more than 8 bits, as depth is stored"
         raise InputError(where=where, found=found, needed="what a camera saw", fix="Name another camera")
     stream.codec_context.thread_count = 1
@@ -190,7 +190,7 @@ def _stream_of(container: Any, where: str) -> VideoStream:
     return cast("VideoStream", stream)
 
 
-class _QuietFile:
+class _ErrorStoringFile:
     """A file for libav that returns end of file on a read error and stores the error.
 
     PyAV would print such an error and treat the file as damaged.
@@ -276,12 +276,12 @@ class _Video:
 
     def decode(self, times: list[int]) -> dict[int, Frame]:
         """Return the frames with these ascending presentation times."""
-        require_bounded(self.stream.height or 1, self.stream.width or 1, self.where, count=len(times))
+        require_decodable_size(self.stream.height or 1, self.stream.width or 1, self.where, count=len(times))
         frames: dict[int, Frame] = {}
         while missing := [time for time in times if time not in frames]:
             self._decode_run(missing, frames)
             if missing[0] not in frames:
-                raise _unusable(self.where, f"no frame at {missing[0] * self.unit_s:.3f} s", "a whole MP4")
+                raise _video_error(self.where, f"no frame at {missing[0] * self.unit_s:.3f} s", "a whole MP4")
         return frames
 
     def _decode_run(self, times: list[int], frames: dict[int, Frame]) -> None:
@@ -325,8 +325,8 @@ class _Video:
             if time is None or time in frames or time not in times:
                 continue
             if frame.is_corrupt:
-                raise _unusable(self.where, f"a damaged frame at {time * self.unit_s:.3f} s", "a whole MP4")
-            require_bounded(frame.height, frame.width, self.where, count=len(times))
+                raise _video_error(self.where, f"a damaged frame at {time * self.unit_s:.3f} s", "a whole MP4")
+            require_decodable_size(frame.height, frame.width, self.where, count=len(times))
             image = np.asarray(self.converter.reformat(frame, format="rgb24", threads=1).to_ndarray())
             frames[time] = _upright(image, frame, self.where)
 
@@ -351,11 +351,11 @@ def _upright(image: Frame, frame: VideoFrame, where: str) -> UInt8[np.ndarray, "
     return image[:: int(np.sign(matrix[1, 1])), :: int(np.sign(matrix[0, 0]))]
 
 
-def _unusable(where: str, found: str, needed: str) -> InputError:
+def _video_error(where: str, found: str, needed: str) -> InputError:
     return InputError(where=where, found=found, needed=needed, fix=_FIX)
 
 
-def video_library(where: str = "video") -> Any:
+def import_pyav(where: str = "video") -> Any:
     """Import and return PyAV.
 
     Raises:
@@ -381,7 +381,7 @@ def write_video(
         UnreachableError: PyAV is not installed.
         ValueError: There are no frames, or they differ in size.
     """
-    av = video_library()
+    av = import_pyav()
     size: tuple[int, int] | None = None
     with atomic_writer(path) as file, av.open(file, "w", format="mp4", options={"movflags": "faststart"}) as container:
         options = {"crf": str(crf), "preset": "medium"} | ({"g": str(key_frame_every)} if key_frame_every else {})

@@ -28,14 +28,14 @@ from vjepa2_ac.media.figure import (
     GREY,
     ORANGE,
     RED,
-    FilmStrip,
-    Kind,
+    FrameKind,
+    RolloutStrip,
     StripRow,
+    add_title,
+    colour_errors,
     draw_rows,
-    error_colours,
-    headline,
-    visible,
-    written_figure,
+    replace_hidden_characters,
+    save_figure,
 )
 from vjepa2_ac.reports.comparison import Comparison
 
@@ -48,8 +48,8 @@ _GREY_PX = 224  # side of the grey image that is shown if a cache has no frames
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
     """Write the plot of an evaluation as a PNG file, atomically."""
-    with written_figure(path, 9.2, 4.9, dpi=150) as figure:
-        headline(figure, visible(evaluation.title)[-80:])
+    with save_figure(path, 9.2, 4.9, dpi=150) as figure:
+        add_title(figure, replace_hidden_characters(evaluation.title)[-80:])
         left, right = figure.subfigures(1, 2, width_ratios=[4, 5], wspace=0.02)
         upper, lower = left.subfigures(2, 1, height_ratios=[3, 2])
         draw_errors(upper, evaluation)
@@ -64,12 +64,12 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
 def plot_comparison(comparison: Comparison, path: Path) -> Path:
     """Write the curves of several runs as a PNG file, atomically."""
     styles = itertools.cycle({"linestyle": dashes, "color": colour} for dashes in _DASHES for colour in _RUNS)
-    with written_figure(path, 9.2, 4.7, dpi=130) as figure:
+    with save_figure(path, 9.2, 4.7, dpi=130) as figure:
         axes = figure.subplots()
         drawn = _curves(axes, comparison.seconds, zip(comparison.curves.values(), styles, strict=False))
         axes.set(title=f"{comparison.title} (band: 95 % over episodes)", ylabel="latent error / persistence")
         axes.set_ylim(0, None)
-        names = [PERSISTENCE, *(textwrap.fill(visible(name), 34) for name in comparison.curves)]
+        names = [PERSISTENCE, *(textwrap.fill(replace_hidden_characters(name), 34) for name in comparison.curves)]
         figure.legend(drawn, names, loc="outside right upper")
     return path
 
@@ -150,33 +150,35 @@ def _plane(axes: Any, landscapes: Landscapes, place: int, first: int, second: in
     axes.set(xlabel=landscapes.axis_names[first] + unit, ylabel=landscapes.axis_names[second] + unit)
 
 
-def example_strip(evaluation: Evaluation, example: Example) -> FilmStrip:
+def example_strip(evaluation: Evaluation, example: Example) -> RolloutStrip:
     """Return the image strip of an example clip: frames, and errors by patch over them (over grey without frames)."""
     steps = 1 + len(example.errors[PERSISTENCE])
     frames = np.full((steps, _GREY_PX, _GREY_PX, 3), 128, np.uint8) if example.frames is None else example.frames
     worst = max(float(errors.max()) for errors in example.errors.values())
-    rows = [] if example.frames is None else [StripRow("true frames", "recorded", frames)]
+    rows = [] if example.frames is None else [StripRow("ground truth", "recorded", frames)]
     for name, errors in example.errors.items():
         shown = [_overlay(frame, of_frame, worst) for frame, of_frame in zip(frames, (None, *errors), strict=True)]
         captions = ("", *(f"mean {of_frame.mean():.3f}" for of_frame in errors))
         rows.append(StripRow(f"error of {_short(name)}", "error", np.stack(shown), captions))
     seconds = tuple(time * evaluation.about.seconds_per_step for time in range(len(frames)))
-    return FilmStrip(f"{visible(example.why)[:80]}: from control step {example.start}", tuple(rows), seconds)
+    return RolloutStrip(
+        f"{replace_hidden_characters(example.why)[:80]}: from control step {example.start}", tuple(rows), seconds
+    )
 
 
-def decoded_strip(evaluation: Evaluation, strip: DecodedStrip) -> FilmStrip:
+def decoded_strip(evaluation: Evaluation, strip: DecodedStrip) -> RolloutStrip:
     """Return the image strip of an example clip with decoded images."""
-    labels: dict[str, tuple[str, Kind]] = {
-        "truth": ("what happened", "recorded"),
-        "decoded_truth": ("the same,\ndecoded", "decoded"),
+    labels: dict[str, tuple[str, FrameKind]] = {
+        "truth": ("ground truth", "recorded"),
+        "decoded_truth": ("ground truth,\ndecoded", "decoded"),
     }
     rows = [
-        StripRow(*labels.get(name, (f"{_short(name)}\nimagines", "imagined")), np.ascontiguousarray(frames))
+        StripRow(*labels.get(name, (f"prediction of\n{_short(name)}", "predicted")), np.ascontiguousarray(frames))
         for name, frames in strip.rows.items()
     ]
     times = range(len(rows[0].frames))
-    title = f"{visible(strip.why)[:80]}: control step {strip.start}"
-    return FilmStrip(title, tuple(rows), tuple(time * evaluation.about.seconds_per_step for time in times))
+    title = f"{replace_hidden_characters(strip.why)[:80]}: control step {strip.start}"
+    return RolloutStrip(title, tuple(rows), tuple(time * evaluation.about.seconds_per_step for time in times))
 
 
 def _overlay(
@@ -186,7 +188,7 @@ def _overlay(
     grey = np.repeat(frame.mean(axis=-1, keepdims=True), 3, axis=-1)
     if errors is None:
         return grey.astype(np.uint8)
-    return np.asarray(0.35 * grey + 0.65 * error_colours(errors, frame.shape[:2], worst)).astype(np.uint8)
+    return np.asarray(0.35 * grey + 0.65 * colour_errors(errors, frame.shape[:2], worst)).astype(np.uint8)
 
 
 def _curves(axes: Any, seconds: np.ndarray, curves: Iterable[tuple[Curve, dict[str, str]]]) -> list[Any]:
@@ -208,4 +210,4 @@ def _colours(names: Iterable[str]) -> dict[str, str]:
 
 def _short(name: str) -> str:
     """Return the last 48 characters of a name, wrapped for a legend."""
-    return textwrap.fill(visible(name)[-48:], 24)
+    return textwrap.fill(replace_hidden_characters(name)[-48:], 24)

@@ -13,7 +13,17 @@ from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.transforms import crop_box
 from vjepa2_ac.errors import counted
-from vjepa2_ac.media.figure import BLUE, GREY, MEANING, ORANGE, RED, Kind, headline, show_framed, written_figure
+from vjepa2_ac.media.figure import (
+    BLUE,
+    FRAME_KINDS,
+    GREY,
+    ORANGE,
+    RED,
+    FrameKind,
+    add_title,
+    save_figure,
+    show_with_border,
+)
 from vjepa2_ac.planning.decision import PlanResult, summarize
 from vjepa2_ac.spaces import POSE
 
@@ -48,8 +58,8 @@ def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = No
         if answer.slices:
             rows.append((_ROW, _slices))
     heights = [height for height, _ in rows]
-    with written_figure(path, _WIDTH, 0.5 + sum(heights), dpi=130) as figure:
-        headline(
+    with save_figure(path, _WIDTH, 0.5 + sum(heights), dpi=130) as figure:
+        add_title(
             figure, summarize(answer).partition(". ")[0]
         )  # the motion only; the search is described on the console
         parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
@@ -77,14 +87,14 @@ def _pictures(part: Any, answer: PlanResult) -> None:
 
 def _imagined(part: Any, answer: PlanResult, imagined: ImaginedPlan) -> None:
     """Draw the start, the predicted frames and the goal from left to right, framed in the colours of image strips."""
-    panels: list[tuple[str, Kind, np.ndarray]] = [("start, decoded", "decoded", imagined.start)]
+    panels: list[tuple[str, FrameKind, np.ndarray]] = [("start, decoded", "decoded", imagined.start)]
     for step, image in imagined.steps.items():
         is_last = step == answer.space.steps
-        panels.append((f"imagined end\n(step {step})" if is_last else f"imagined,\nstep {step}", "imagined", image))
+        panels.append((f"imagined end\n(step {step})" if is_last else f"imagined,\nstep {step}", "predicted", image))
     panels += [("goal, decoded", "decoded", imagined.decoded_goal), ("goal", "recorded", imagined.goal)]
     for axes, (title, kind, image) in zip(part.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        show_framed(axes, image, kind)
-        axes.set_title(title, color=MEANING[kind][0], fontsize=8)
+        show_with_border(axes, image, kind)
+        axes.set_title(title, color=FRAME_KINDS[kind][0], fontsize=8)
     note = "Imagined from the start and the plan's actions alone: what the model predicts, no evidence that it happens."
     part.supxlabel(note, fontsize=8, color=GREY, x=0.01, ha="left")
 
@@ -185,8 +195,8 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
     options = made.options
     how = f"one every {options.every} frames" if options.by == "every" else "where the gripper changes or the arm stops"
     count = counted(len(made.goals), "goal")
-    with written_figure(path, _WIDTH, 0.5 + sum(heights), dpi=130) as figure:
-        headline(figure, f"{count}, {how} ({options.stride} frames per model step)")
+    with save_figure(path, _WIDTH, 0.5 + sum(heights), dpi=130) as figure:
+        add_title(figure, f"{count}, {how} ({options.stride} frames per model step)")
         sheet, *parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
         for place, axes in enumerate(sheet.subplots(rows, _ACROSS, squeeze=False).flat):
             axes.set_axis_off()

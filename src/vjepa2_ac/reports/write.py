@@ -26,7 +26,7 @@ from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import L1, Curve, DecodedStrip, Evaluation, Example, over_persistence
 from vjepa2_ac.evaluation.rows import Row, RowTable, rows_of, sections
 from vjepa2_ac.evaluation.summary import Summary, Verdict, interval_of, percent, summarize, with_closed_loop
-from vjepa2_ac.media.figure import draw_strip, svg_of, visible
+from vjepa2_ac.media.figure import draw_strip, figure_to_svg, replace_hidden_characters
 from vjepa2_ac.media.images import encode_webp
 from vjepa2_ac.reports.evaluation_figures import decoded_strip, drawings, example_strip, plot_evaluation
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, not_measured, write_csv, write_metrics
@@ -84,11 +84,15 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         loader=PackageLoader("vjepa2_ac", "assets"),
         autoescape=True,
         undefined=StrictUndefined,
-        finalize=lambda value: visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value,
+        finalize=lambda value: (
+            replace_hidden_characters(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+        ),
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(visible, name.split("/")))
+    environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(
+        map(replace_hidden_characters, name.split("/"))
+    )
     environment.filters |= {"quote": shlex.quote, "bar": bar_of, "percent": percent, "interval": interval_of}
     environment.filters |= {"coded": coded, "count": counted}
     environment.filters["figure"] = lambda row: f"{percent(row.value)} %" if row.better else f"{row.value:.2f}"
@@ -109,7 +113,7 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
 
 def coded(text: str) -> Markup:
     """Return a text as HTML; text between backticks becomes code."""
-    parts = [escape(visible(part)) for part in text.split("`")]
+    parts = [escape(replace_hidden_characters(part)) for part in text.split("`")]
     if len(parts) % 2 == 0:  # an unpaired backtick
         return Markup("`").join(parts)
     return Markup("").join(Markup("<code>{}</code>").format(part) if n % 2 else part for n, part in enumerate(parts))
@@ -133,7 +137,7 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
         of_part[next(name for name, (_, keys) in _PARTS.items() if re.match(keys, row.key))].append(row)
     images: dict[str, list[PageImage]] = {name: [] for name in _PARTS} | _clips(evaluation)
     for part, described, (width, height), draw in drawings(evaluation):
-        images[part].append(PageImage(svg_of(draw, width, height, evaluation), described))
+        images[part].append(PageImage(figure_to_svg(draw, width, height, evaluation), described))
     notes = {"decoded": () if evaluation.decoded is None else evaluation.decoded.notes}
     return [
         PagePart(name, title, sections(of_part[name]), images[name], notes.get(name, ()))

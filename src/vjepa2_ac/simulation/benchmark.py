@@ -26,8 +26,8 @@ from vjepa2_ac.goals.key_frames import (
     sub_goals_of,
     with_frames_between,
 )
-from vjepa2_ac.media.figure import below_each_other, side_by_side
-from vjepa2_ac.media.video import video_library, write_video
+from vjepa2_ac.media.figure import stack_horizontally, stack_vertically
+from vjepa2_ac.media.video import import_pyav, write_video
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.reporter import SILENT, Reporter
@@ -239,7 +239,7 @@ def run_benchmark(subject: Subject, options: BenchmarkOptions, reporter: Reporte
         UnreachableError: MuJoCo or PyAV is missing.
     """
     if options.films:
-        video_library()
+        import_pyav()
     planning = subject.config.planning
     arm = arm_for(options.task, options.world, views=planning.views)
     model = policy_of(subject, arm)
@@ -371,6 +371,6 @@ def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]
             outcome = f"   {'reached' if episode.success else 'missed'}" if step == steps else ""
             caption = f"{result.policy}:   {100 * distance_m:.1f} cm from the goal{outcome}"
             scale = max(1, FRAME_SIZE[1] // int(frame.shape[1]))  # enlarges small frames, so that captions fit
-            large = side_by_side([frame], [caption], f"{about}    step {step} of {steps}", enlarged=2 * scale)
-            image = below_each_other([large, side_by_side([episode.goal_image], ["goal"], enlarged=scale)])
+            large = stack_horizontally([frame], [caption], f"{about}    step {step} of {steps}", enlarged=2 * scale)
+            image = stack_vertically([large, stack_horizontally([episode.goal_image], ["goal"], enlarged=scale)])
             yield from itertools.repeat(image, _HOLD if step in {0, steps} else 1)

@@ -30,7 +30,7 @@ from pydantic import Field
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.goals.key_frames import OF_MODEL_STEPS, every_key_frame, gripper_key_frames
-from vjepa2_ac.media.video import video_library
+from vjepa2_ac.media.video import import_pyav
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.simulation.arm import State
@@ -291,7 +291,7 @@ def run_world_benchmark(
         UnreachableError: PyAV is missing.
     """
     if options.films:
-        video_library()
+        import_pyav()
     model = policy_of(subject, None)
     progress = reporter.task(f"{world.about.task}: {Expert.name}")
     trials, expert_result = find_trials(world, options, subject.config.data.model_stride, progress)

@@ -23,7 +23,7 @@ from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key, key_of, 
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Scanned, frames_by_step, require_as_indexed
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted, require_library
-from vjepa2_ac.media.video import frame_times, read_frames, read_header
+from vjepa2_ac.media.video import read_frame_times, read_frames, read_header
 from vjepa2_ac.spaces import POSE, require_finite
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import parse_json_object
@@ -100,7 +100,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         self, video: str, version: str, frames: Sequence[int], steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
         opened = partial(self._files.open, video, version=version)
-        walk = lambda: {"times": np.array(frame_times(opened(), where=video), np.int64)}  # noqa: E731
+        walk = lambda: {"times": np.array(read_frame_times(opened(), where=video), np.int64)}  # noqa: E731
         times = self._files.parsed(f"times {video} {version}", walk)["times"].tolist()
         return read_frames(opened(), [frames[step] for step in steps], where=video, times=times)
 

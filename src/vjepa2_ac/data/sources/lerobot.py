@@ -36,7 +36,7 @@ from vjepa2_ac.data.sources.parquet import EPISODE, Columns, ParquetRows
 from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_image, stack_frames
-from vjepa2_ac.media.video import Clock, read_frames, read_header, video_library
+from vjepa2_ac.media.video import Clock, import_pyav, read_frames, read_header
 from vjepa2_ac.spaces import require_finite
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
@@ -101,7 +101,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         info.require_mapping(config)
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
-            video_library(info.where)
+            import_pyav(info.where)
         listed = partial(list_by_template, info.root, connections=connections_to(config))
         tables, files = listed(TABLES[info.version]), listed(info.data_path)
         num_bytes = sum(file.size for file in files.values())

@@ -18,7 +18,7 @@ from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.poses import require_selection
 from vjepa2_ac.data.sources.parquet import read_table
 from vjepa2_ac.errors import InputError, MissingFileError, counted, did_you_mean
-from vjepa2_ac.media.video import VideoHeader, is_deep_grey
+from vjepa2_ac.media.video import VideoHeader, is_depth_format
 from vjepa2_ac.spaces import zero_steps
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.block_file import BlockCachedFile
@@ -212,7 +212,7 @@ def _feature(content: Mapping[str, Any]) -> Feature:
         names = next(iter(names.values()))
     marks = [one for one in (content.get("info"), content.get("video_info")) if isinstance(one, Mapping)]
     is_depth = any(
-        one.get("is_depth_map") or one.get("video.is_depth_map") or is_deep_grey(str(one.get("video.pix_fmt")))
+        one.get("is_depth_map") or one.get("video.is_depth_map") or is_depth_format(str(one.get("video.pix_fmt")))
         for one in marks
     )
     return Feature(dtype, shape, tuple(map(str, names)) if isinstance(names, list) else (), is_depth)

@@ -49,7 +49,7 @@ from vjepa2_ac.data.sources.indexed_source import (
 )
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, UserError
-from vjepa2_ac.media.images import require_bounded
+from vjepa2_ac.media.images import require_decodable_size
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
 FORMAT_HELP = "docs/data.md says what an episode holds"
@@ -294,7 +294,7 @@ class NpzFile:
         """Refuse an array that cannot be the frames of a camera, by its header; `count` frames are read together."""
         self._require(camera, (steps, None, None, 3), "u", "frames (steps, height, width, 3)")
         header = self.header(camera)
-        require_bounded(header.shape[1], header.shape[2], f"{self._where}: {camera}", count=count)
+        require_decodable_size(header.shape[1], header.shape[2], f"{self._where}: {camera}", count=count)
         if header.dtype != np.uint8:
             raise self.refused(camera, f"frames of {header.dtype}", "uint8, 0 to 255")
         if header.by_columns:
