@@ -24,7 +24,7 @@ from paths import GOLDEN, ROOT
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac import open_dataset
 from vjepa2_ac.cli import main
-from vjepa2_ac.init.look import look_at
+from vjepa2_ac.init.recognize import read_properties
 from vjepa2_ac.media.video import write_video
 
 STEPS, RATE_HZ = 20, 10.0
@@ -48,7 +48,7 @@ def run(script: str, *words: object) -> None:
         sys.argv = before
 
 
-def test_the_command_prints_it_whole_and_lists_it(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_data_converter_prints_the_script_and_lists_all_scripts(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["data", "converter", name]) == 0
     assert capsys.readouterr().out == (ROOT / f"examples/convert/{name}.py").read_text()
     assert main(["data", "converter"]) == 0
@@ -164,7 +164,7 @@ def damage_video(folder: Path) -> None:
     ],
     ids=["lengths", "column", "no table", "damaged video", "another clock", "short table", "half as many rows"],
 )
-def test_a_recording_that_does_not_fit_says_why(
+def test_inconsistent_recording_raises_with_the_reason(
     changes: dict[str, Any], spoil: Callable[[Path], None] | None, found: str, tmp_path: Path
 ) -> None:
     folder = write_recording(tmp_path / "own", **changes)
@@ -199,7 +199,7 @@ def require_steps(made: Any, expected: np.ndarray) -> None:
 UNEVEN = np.r_[0, np.cumsum(np.random.default_rng(0).choice([0.03, 0.1, 0.2, 0.6], STEPS - 1))]
 
 
-def test_uneven_frame_times_are_refused_with_the_option_that_resamples(tmp_path: Path) -> None:
+def test_uneven_frame_times_raise_and_name_the_resampling_option(tmp_path: Path) -> None:
     with pytest.raises(
         SystemExit, match=r"first.mp4: frames are 0\.030 to 0\.600 s apart.*up to 1\.65 no step repeats"
     ):
@@ -207,7 +207,7 @@ def test_uneven_frame_times_are_refused_with_the_option_that_resamples(tmp_path:
 
 
 @pytest.mark.parametrize("has_times", [False, True], ids=["rows by number", "rows by time"])
-def test_fps_takes_the_nearest_frame_with_its_own_pose(has_times: bool, tmp_path: Path) -> None:
+def test_fps_selects_the_nearest_frame_and_its_pose(has_times: bool, tmp_path: Path) -> None:
     made = converted(tmp_path, UNEVEN, "--fps", 1.65, row_times=UNEVEN if has_times else None)
     grid = np.arange(0, UNEVEN[-1], 1 / 1.65)
     expected = np.abs(UNEVEN - grid[:, None]).argmin(axis=1)
@@ -238,7 +238,7 @@ def display_matrix(entries: Sequence[float]) -> bytes:
 
 
 @pytest.mark.parametrize("turn", TURNS)
-def test_frames_are_turned_as_players_show_them(turn: str, tmp_path: Path) -> None:
+def test_frames_are_rotated_by_the_display_matrix(turn: str, tmp_path: Path) -> None:
     entries, displayed = TURNS[turn]
     folder = write_recording(tmp_path / "own")
     run("mp4_and_csv", folder, tmp_path / "stored", "--height", 64)
@@ -269,7 +269,7 @@ PLAIN = table_of(EULER_HEADER)
     ],
     ids=["plain", "BOM", "CRLF", "decimal commas", "semicolons", "tabs", "names", "empty column", "empty rows", "text"],
 )
-def test_tables_are_read_as_people_have_them(text: str | bytes, tmp_path: Path) -> None:
+def test_common_csv_dialects_are_read(text: str | bytes, tmp_path: Path) -> None:
     assert np.abs(read_table(tmp_path / "a.csv", text) - STATES).max() < 1e-12
 
 
@@ -295,7 +295,7 @@ ONE = "0.1,0.2,0.3,0.4,0.5,0.6,0.7"
         (f"{EULER_HEADER}\n{ONE.replace('0.7', '85')}", "line 2: 85. Expected .*0 to 1. Set --gripper-open"),
     ],
 )
-def test_a_table_that_cannot_be_read_is_refused_in_one_sentence(rows: str | bytes, found: str, tmp_path: Path) -> None:
+def test_invalid_table_raises_with_line_and_column(rows: str | bytes, found: str, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match=rf"a\.csv: {found}"):
         read_table(tmp_path / "a.csv", rows)
 
@@ -316,7 +316,7 @@ XYZW, WXYZ, VECTOR = ROTATIONS.as_quat(), ROTATIONS.as_quat(scalar_first=True), 
         ("roll,pitch,yaw", "euler_xyz_degrees", np.degrees(STATES[:, 3:6])),
     ],
 )
-def test_rotations_are_read_by_name_or_as_requested(
+def test_rotation_format_follows_from_names_or_option(
     columns: str, rotation: str | None, numbers: np.ndarray, tmp_path: Path
 ) -> None:
     table = table_of(f"x,y,z,{columns},gripper", with_rotation(numbers))
@@ -391,7 +391,7 @@ CHOSEN = ("--pose", "/pose", "--gripper", "/fingers:position", "--gripper-open",
 
 
 @pytest.mark.parametrize(("storage", "encoding"), [(StoragePlugin.SQLITE3, "jpeg"), (StoragePlugin.MCAP, "bgr8")])
-def test_a_bag_becomes_an_episode(storage: StoragePlugin, encoding: str, tmp_path: Path) -> None:
+def test_bag_is_converted_to_one_episode(storage: StoragePlugin, encoding: str, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bags/first", storage, encoding=encoding)
     bags = bag.parent if encoding == "jpeg" else next(file for file in bag.iterdir() if file.suffix != ".yaml")
     out = tmp_path / "npz"
@@ -432,7 +432,7 @@ def test_a_bag_becomes_an_episode(storage: StoragePlugin, encoding: str, tmp_pat
     ],
     ids=lambda value: "" if not isinstance(value, str) else value[:20],
 )
-def test_a_bag_that_does_not_fit_says_why(
+def test_inconsistent_bag_raises_with_the_reason(
     changes: dict[str, Any], words: tuple[object, ...], found: str, tmp_path: Path
 ) -> None:
     bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, **changes)
@@ -455,7 +455,7 @@ def apart(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, *map(str, words)], text=True, capture_output=True, check=False)
 
 
-def test_tables_become_the_files_they_were_made_of(tmp_path: Path) -> None:
+def test_lance_tables_are_converted_to_the_original_files(tmp_path: Path) -> None:
     """By the original writer: the tests' own data set, and what lerobot-lancedb made of it."""
     original, out = GOLDEN / "lerobot_lance/original", tmp_path / "files"
     done = apart(ROOT / "examples/convert/lance_to_files.py", GOLDEN / "lerobot_lance/tables", out)
@@ -469,10 +469,10 @@ def test_tables_become_the_files_they_were_made_of(tmp_path: Path) -> None:
         ours, theirs = (parquet.read_table(root / path) for root in (out, original))
         assert ours.column_names == theirs.column_names
         assert ours.to_pylist() == theirs.to_pylist()
-    assert look_at(str(out)).source == "lerobot"
+    assert read_properties(str(out)).source == "lerobot"
 
 
-def test_a_name_of_meta_stays_in_the_folder(tmp_path: Path) -> None:
+def test_file_names_in_lance_metadata_cannot_leave_the_folder(tmp_path: Path) -> None:
     assert apart("-c", HOSTILE, tmp_path / "in/meta.lance").returncode == 0
     done = apart(ROOT / "examples/convert/lance_to_files.py", tmp_path / "in", tmp_path / "deep/out")
     assert done.returncode == 1

@@ -1,4 +1,4 @@
-"""States of other robots: the right numbers in the right format, or a guess that names what is left out."""
+"""States of other robots: `init` selects the pose and its format, or makes a guess that lists unused numbers."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from synthetic import synthetic_states
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.poses import poses_from
-from vjepa2_ac.init.found import Knob, guesses, plain
-from vjepa2_ac.init.poses import Column, find_pose, gripper_knobs
+from vjepa2_ac.init.draft_values import DraftValue, list_guesses, plain_values
+from vjepa2_ac.init.poses import Column, find_pose, guess_gripper_values
 
 STATE = "observation.state"
 EPISODES = [synthetic_states(80, seed=seed) for seed in range(8)]
@@ -20,7 +20,7 @@ EPISODES = [synthetic_states(80, seed=seed) for seed in range(8)]
 Numbers = Float[np.ndarray, "steps _"]
 
 
-def written(states: Numbers, rotation: str) -> Numbers:
+def convert_states(states: Numbers, rotation: str) -> Numbers:
     """Return states with the rotation in another format."""
     turned = Rotation.from_euler("xyz", states[:, 3:6])
     numbers = {
@@ -33,16 +33,16 @@ def written(states: Numbers, rotation: str) -> Numbers:
     return np.concatenate([states[:, :3], numbers, states[:, 6:]], axis=1)
 
 
-def proposed(names: str, numbers: list[Numbers] | None) -> dict[str, Knob]:
+def propose_pose(names: str, numbers: list[Numbers] | None) -> dict[str, DraftValue]:
     columns = {STATE: Column(len(names.split()), tuple(names.split()))}
     pose = find_pose(columns, None if numbers is None else {STATE: numbers})
     assert pose is not None
     return pose
 
 
-def degrees_off(pose: dict[str, Knob], numbers: Numbers, states: Numbers) -> float:
+def max_rotation_error_deg(pose: dict[str, DraftValue], numbers: Numbers, states: Numbers) -> float:
     """Return the largest angle between the rotations that a proposal reads and the true ones."""
-    values = {"run_dir": "none", "data": {"source": "lerobot", "path": "none", "lerobot": plain(pose)}}
+    values = {"run_dir": "none", "data": {"source": "lerobot", "path": "none", "lerobot": plain_values(pose)}}
     config = parse_config({**values, "model": {"base": "builtin:sim-tiny"}}, where="init").data
     assert isinstance(config, LeRobotData)
     fields = config.lerobot
@@ -75,10 +75,10 @@ def degrees_off(pose: dict[str, Knob], numbers: Numbers, states: Numbers) -> flo
         ("x y z rot_x rot_y rot_z gripper", "rotation_vector", True),
     ],
 )
-def test_rotation_is_read_as_it_is_written(names: str, rotation: str, is_guess: bool) -> None:
-    numbers = [written(states, rotation) for states in EPISODES]
-    pose = proposed(names, numbers)
-    assert degrees_off(pose, numbers[0], EPISODES[0]) < 0.1
+def test_rotation_format_is_recognised(names: str, rotation: str, is_guess: bool) -> None:
+    numbers = [convert_states(states, rotation) for states in EPISODES]
+    pose = propose_pose(names, numbers)
+    assert max_rotation_error_deg(pose, numbers[0], EPISODES[0]) < 0.1
     assert pose["rotation"].is_guess == is_guess
     assert not pose["state"].is_guess
 
@@ -90,25 +90,25 @@ def test_rotation_is_read_as_it_is_written(names: str, rotation: str, is_guess: 
         ("x y z wx wy wz gripper", "euler_xyz", "euler_xyz"),
     ],
 )
-def test_numbers_that_contradict_their_names_win_and_are_a_guess(names: str, rotation: str, other: str) -> None:
-    numbers = [written(states, rotation) for states in EPISODES]
-    pose = proposed(names, numbers)
+def test_values_that_contradict_column_names_decide_as_a_guess(names: str, rotation: str, other: str) -> None:
+    numbers = [convert_states(states, rotation) for states in EPISODES]
+    pose = propose_pose(names, numbers)
     assert (pose["rotation"].value, pose["rotation"].is_guess) == (other, True)
-    assert "which the names say" in pose["rotation"].why
+    assert "which the names suggest" in pose["rotation"].reason
 
 
-def test_names_of_a_quaternion_over_a_rotation_vector_and_two_fingers_are_a_guess() -> None:
+def test_quaternion_names_on_rotation_vector_and_two_fingers_give_a_guess() -> None:
     fingers = [np.stack([0.04 * (1 - one[:, 6]), -0.04 * (1 - one[:, 6])], axis=1) for one in EPISODES]
     parts = zip(EPISODES, fingers, strict=True)
-    numbers = [np.concatenate([written(one, "rotation_vector")[:, :6], two], 1) for one, two in parts]
-    pose = proposed("x y z rx ry rz rw gripper", numbers)
+    numbers = [np.concatenate([convert_states(one, "rotation_vector")[:, :6], two], 1) for one, two in parts]
+    pose = propose_pose("x y z rx ry rz rw gripper", numbers)
     assert (pose["rotation"].value, pose["select"].value) == ("rotation_vector", [0, 1, 2, 3, 4, 5, 6])
     assert pose["state"].is_guess
-    knobs = plain({"gripper": gripper_knobs("gripper", (0.0, 0.04))})["gripper"]
-    assert knobs == {"gripper_open": 0.04, "gripper_closed": 0.0}
+    values = plain_values({"gripper": guess_gripper_values("gripper", (0.0, 0.04))})["gripper"]
+    assert values == {"gripper_open": 0.04, "gripper_closed": 0.0}
 
 
-def test_a_named_pose_with_a_gripper_column_is_no_guess() -> None:
+def test_named_pose_with_gripper_column_is_not_a_guess() -> None:
     columns = {STATE: Column(6, tuple(ONE_ARM)), "observation.gripper_open": Column(1)}
     pose = find_pose(columns)
     assert pose is not None
@@ -116,20 +116,20 @@ def test_a_named_pose_with_a_gripper_column_is_no_guess() -> None:
     assert not pose["state"].is_guess
 
 
-def test_degrees_and_millimetres_are_recognised_by_their_size() -> None:
-    numbers = [written(one, "euler_xyz_degrees") * [1000, 1000, 1000, 1, 1, 1, 1] for one in EPISODES]
-    pose = proposed("x y z roll pitch yaw gripper", numbers)
+def test_degrees_and_millimetres_are_recognised_by_magnitude() -> None:
+    numbers = [convert_states(one, "euler_xyz_degrees") * [1000, 1000, 1000, 1, 1, 1, 1] for one in EPISODES]
+    pose = propose_pose("x y z roll pitch yaw gripper", numbers)
     assert (pose["rotation"].value, pose["position_unit"].value) == ("euler_xyz_degrees", "mm")
-    assert "position_unit" in guesses(pose)
-    assert "too much for radians" in pose["rotation"].why
-    assert degrees_off(pose, numbers[0], EPISODES[0]) < 0.1
+    assert "position_unit" in list_guesses(pose)
+    assert "too large for radians" in pose["rotation"].reason
+    assert max_rotation_error_deg(pose, numbers[0], EPISODES[0]) < 0.1
 
 
-def test_without_numbers_the_guess_says_so() -> None:
-    rotation = proposed("x y z rot_x rot_y rot_z gripper", None)["rotation"]
+def test_guess_without_sampled_values_says_that_values_were_not_read() -> None:
+    rotation = propose_pose("x y z rot_x rot_y rot_z gripper", None)["rotation"]
     assert rotation.is_guess
-    assert "rotation_vector" in rotation.why
-    assert "not read" in rotation.why
+    assert "rotation_vector" in rotation.reason
+    assert "not read" in rotation.reason
 
 
 ONE_ARM = ["x", "y", "z", "roll", "pitch", "yaw"]
@@ -151,16 +151,16 @@ ONE_ARM = ["x", "y", "z", "roll", "pitch", "yaw"]
         ([*ONE_ARM, "gripper", *ONE_ARM, "gripper"], "", "x"),
     ],
 )
-def test_of_two_arms_one_is_taken_as_a_guess_that_says_what_is_left_out(
+def test_first_of_two_arms_is_guessed_and_unused_numbers_are_listed(
     names: list[str], chosen: str, left_out: str
 ) -> None:
-    pose = proposed(" ".join(names), None)
-    taken = [names[index] for index in pose["select"].value]
-    parts = [name.removeprefix(chosen).strip("._") for name in taken]
-    assert parts == [*ONE_ARM, "gripper"], taken
+    pose = propose_pose(" ".join(names), None)
+    selected_names = [names[index] for index in pose["select"].value]
+    parts = [name.removeprefix(chosen).strip("._") for name in selected_names]
+    assert parts == [*ONE_ARM, "gripper"], selected_names
     assert pose["state"].is_guess
-    assert left_out in pose["state"].why.split("left out:")[1]
-    assert "states: vector" in pose["state"].why
+    assert left_out in pose["state"].reason.split("left out:")[1]
+    assert "states: vector" in pose["state"].reason
 
 
 def test_columns_of_two_arms_are_not_mixed() -> None:
@@ -171,19 +171,19 @@ def test_columns_of_two_arms_are_not_mixed() -> None:
     pose = find_pose({name: Column(width) for name, width in columns.items()})
     assert pose is not None
     assert pose["state"].value == ["observation.left_ee_pose", "observation.left_gripper"]
-    assert "observation.right_ee_pose" in pose["state"].why
+    assert "observation.right_ee_pose" in pose["state"].reason
 
 
 @pytest.mark.parametrize(
     ("rotation", "found"), [("quaternion_xyzw", "quaternion_xyzw"), ("rotation_vector", "rotation_vector")]
 )
-def test_eight_numbers_without_names_are_told_apart_by_their_length(rotation: str, found: str) -> None:
-    numbers = [written(one, rotation) for one in EPISODES]
+def test_eight_unnamed_numbers_are_split_by_quaternion_norm(rotation: str, found: str) -> None:
+    numbers = [convert_states(one, rotation) for one in EPISODES]
     numbers = [one if one.shape[1] == 8 else np.concatenate([one, -one[:, 6:]], axis=1) for one in numbers]
     pose = find_pose({STATE: Column(8)}, {STATE: numbers})
     assert pose is not None
     assert (pose["rotation"].value, pose["state"].is_guess) == (found, True)
-    assert plain(pose).get("select") == (None if rotation.startswith("quaternion") else [0, 1, 2, 3, 4, 5, 6])
+    assert plain_values(pose).get("select") == (None if rotation.startswith("quaternion") else [0, 1, 2, 3, 4, 5, 6])
 
 
 @pytest.mark.parametrize(
@@ -202,21 +202,21 @@ def test_eight_numbers_without_names_are_told_apart_by_their_length(rotation: st
         ("gripper_closed", (0.0, 0.1), (0.0, 0.1), True),
     ],
 )
-def test_open_and_closed_follow_from_range_and_name(
+def test_gripper_values_follow_from_range_and_name(
     name: str, ranges: tuple[float, float] | None, expected: tuple[float, float], is_guess: bool
 ) -> None:
-    knobs = gripper_knobs(name, ranges)
-    assert tuple(plain(knobs).values()) == expected
-    assert bool(guesses(knobs)) == is_guess
+    values = guess_gripper_values(name, ranges)
+    assert tuple(plain_values(values).values()) == expected
+    assert bool(list_guesses(values)) == is_guess
 
 
 def chosen_names(names: str) -> list[str]:
-    """Return the names of the numbers that are proposed; empty: no pose."""
+    """Return the names of the numbers that are propose_pose; empty: no pose."""
     named = tuple(names.split())
     pose = find_pose({STATE: Column(len(named), named)})
     if pose is None:
         return []
-    return [named[place] for place in (pose["select"].value if "select" in pose else range(len(named)))]
+    return [named[index] for index in (pose["select"].value if "select" in pose else range(len(named)))]
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def chosen_names(names: str) -> list[str]:
         ("j0 j1 x y z qx qy qz qw finger_joint", "x y z qx qy qz qw finger_joint"),
     ],
 )
-def test_numbers_of_other_quantities_are_not_taken_for_the_pose(names: str, expected: str) -> None:
+def test_other_quantities_are_not_taken_for_the_pose(names: str, expected: str) -> None:
     assert chosen_names(names) == expected.split()
 
 
@@ -255,21 +255,21 @@ def test_numbers_of_other_quantities_are_not_taken_for_the_pose(names: str, expe
         (["observation.ee_pose_in_camera", "observation.ee_pose_in_base"], 1, True),
     ],
 )
-def test_the_measured_pose_of_the_hand_is_preferred(columns: list[str], chosen: int, is_guess: bool) -> None:
+def test_measured_end_effector_pose_is_preferred(columns: list[str], chosen: int, is_guess: bool) -> None:
     pose = find_pose({**{name: Column(6) for name in columns}, "observation.gripper_position": Column(1)})
     assert pose is not None
     assert (pose["state"].value[0], pose["state"].is_guess) == (columns[chosen], is_guess)
 
 
 @pytest.mark.parametrize("name", ["object_pose", "camera_pose", "head_pose", "cube_pose"])
-def test_the_pose_of_another_thing_is_not_the_robot(name: str) -> None:
+def test_pose_of_an_object_is_not_taken_for_the_robot(name: str) -> None:
     assert find_pose({f"observation.{name}": Column(6), "observation.gripper": Column(1)}) is None
 
 
-def test_columns_of_robosuite_are_read() -> None:
+def test_robosuite_columns_are_recognised() -> None:
     samples = {
         "observation.robot0_eef_pos": [one[:, :3] for one in EPISODES],
-        "observation.robot0_eef_quat": [written(one, "quaternion_xyzw")[:, 3:7] for one in EPISODES],
+        "observation.robot0_eef_quat": [convert_states(one, "quaternion_xyzw")[:, 3:7] for one in EPISODES],
         "observation.robot0_gripper_qpos": [np.stack([0.04 * (1 - one[:, 6])] * 2, axis=1) for one in EPISODES],
         "observation.robot0_joint_pos": list(EPISODES),
         "observation.robot0_gripper_qvel": [one[:, :2] for one in EPISODES],

@@ -79,12 +79,12 @@ def _converter(options: argparse.Namespace) -> None:
 
     Without NAME the scripts are listed.
     """
-    from vjepa2_ac.init.look import converter_text, converters
+    from vjepa2_ac.init.recognize import list_converters, read_converter
 
     if options.name is not None:
-        print(converter_text(options.name), end="")
+        print(read_converter(options.name), end="")
         return
-    for name, about in converters().items():
+    for name, about in list_converters().items():
         cli.show(f"{name:<16}{about}")
 
 

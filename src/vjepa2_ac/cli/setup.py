@@ -94,35 +94,39 @@ def _init(options: argparse.Namespace) -> int:
     with translate_write_errors(f"--out {out}"):
         check_local_writable(out.parent)
 
-    from vjepa2_ac.init.look import look_at, measured, simulated
+    from vjepa2_ac.init.recognize import add_episode_lengths, make_simulated_properties, read_properties
     from vjepa2_ac.model.model_files import find_base, find_encoder_path
 
     if options.model is not None:
         (find_encoder_path if is_scratch else find_base)(options.model)
     Work.begin("looking at the data")
     is_missing = path == _SIMULATED and not Path(path).exists()
-    data = simulated(path) if is_missing else look_at(path)
+    data = make_simulated_properties(path) if is_missing else read_properties(path)
 
-    from vjepa2_ac.init.draft import TINY, choose_model, make_draft, this_machine
-    from vjepa2_ac.init.found import guesses
+    from vjepa2_ac.init.draft import TINY, choose_model, detect_machine, make_draft
+    from vjepa2_ac.init.draft_values import list_guesses
 
     with cli.reporter() as reporter:
-        data = data if is_missing else measured(data, reporter.task(INDEXING))
-    model, machine = choose_model(options.model or (TINY if path == _SIMULATED else None), is_scratch), this_machine()
-    cli.show(f"Data: {'; '.join(data.about)}.\nMachine: {machine.about}.")
+        data = data if is_missing else add_episode_lengths(data, reporter.task(INDEXING))
+    model, machine = choose_model(options.model or (TINY if path == _SIMULATED else None), is_scratch), detect_machine()
+    cli.show(f"Data: {'; '.join(data.descriptions)}.\nMachine: {machine.description}.")
     draft = make_draft(data, machine, model, run_dir=f"runs/{name}")
     with translate_write_errors(f"--out {out}"):
-        write_atomically(out, draft.text(data, machine).encode())
-    guessed = [f"  GUESSED  {key} = {value_and_why}" for key, value_and_why in guesses(draft.knobs).items()]
+        write_atomically(out, draft.to_yaml(data, machine).encode())
+    guessed = [
+        f"  GUESSED  {key} = {value_and_reason}" for key, value_and_reason in list_guesses(draft.config_values).items()
+    ]
     cli.show(*draft.costs, f"Written: {out}", *guessed)
     status = 0 if is_missing else _check(draft, out)
     if status:
-        cli.show(f"\nFix these errors first, then: {shell_command('data', 'check', out)}")
+        check, train = shell_command("data", "check", out), shell_command("train", out, "--check")
+        cli.show(f"\nFix these errors and run `{check}` again. If it finds no errors, continue with\n`{train}`.")
+        return status
     first = [(f"vjepa2-ac {_RECORD.format(path=path)}", "the data; half a minute on a core of its own")] * is_missing
     if not Path(model.path).exists() and (fetch := model.download):
         first.append((fetch[0], f"the model, once: {fetch[1]}"))
     cli.show("\nNext:", *(f"  {line}   # {about}" for line, about in [*first, *_next(draft, out, name)]))
-    return status
+    return 0
 
 
 def _name_of(path: str) -> str:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from vjepa2_ac.data.poses import FORMATS, rotation_speeds, smoother_format
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.init.found import Knob
+from vjepa2_ac.init.draft_values import DraftValue
 from vjepa2_ac.inspection.motion import FASTEST_RAD_S
 from vjepa2_ac.spaces import ANGLE_RAD, REACH_M
 
@@ -82,7 +82,7 @@ class _Number:
 
 def find_pose(
     columns: Mapping[str, Column], samples: Samples | None = None, *, control_rate_hz: float = 10.0
-) -> dict[str, Knob] | None:
+) -> dict[str, DraftValue] | None:
     """Return the keys of a config section that select the measured pose; None if no pose is recognised.
 
     Args:
@@ -90,20 +90,20 @@ def find_pose(
         samples: Values of some episodes, with which the interpretation of the names is checked; None: not read.
         control_rate_hz: Control steps per second.
     """
-    measured, samples = measured_columns(columns), samples or {}
+    measured, samples = select_measured_columns(columns), samples or {}
     numbers = [number for name, one in measured.items() for number in _numbers_of(name, one, samples.get(name, ()))]
     chosen = min(_candidates(numbers), key=_rank, default=None)
     if chosen is None:
         return None
-    keys = _keys_of(chosen, _left_out(chosen, numbers), measured, samples, control_rate_hz)
+    keys = _make_pose_values(chosen, _left_out(chosen, numbers), measured, samples, control_rate_hz)
     column, index = chosen[-1].column, chosen[-1].index
     names = measured[column].names
     name = names[index] if index < len(names) else _last_part(column)
     values = np.concatenate(_values(chosen[-1:], samples) or [np.zeros((0, 1))])
-    return {**keys, **gripper_knobs(name, (float(values.min()), float(values.max())) if len(values) else None)}
+    return {**keys, **guess_gripper_values(name, (float(values.min()), float(values.max())) if len(values) else None)}
 
 
-def vector_state(columns: Mapping[str, Column], where: str) -> dict[str, Knob]:
+def select_vector_state(columns: Mapping[str, Column], where: str) -> dict[str, DraftValue]:
     """Return the key that selects a state vector if no pose is recognised: the column named `state`, or the widest one.
 
     Raises:
@@ -111,14 +111,18 @@ def vector_state(columns: Mapping[str, Column], where: str) -> dict[str, Knob]:
     """
     measured = [name for name in columns if re.search(r"observation|\bstate", name)]
     if not measured:
-        found = f"no measured numbers among {', '.join(columns) or 'no columns'}"
-        raise InputError(where=where, found=found, needed="observations of the robot as float, int or bool")
+        found = f"no column with measured numbers ({', '.join(columns) or 'no columns'})"
+        raise InputError(
+            where=where,
+            found=found,
+            needed="columns of the robot's state, named observation… or state, of type float, int or bool",
+        )
     chosen = max(measured, key=lambda name: (_last_part(name) == "state", columns[name].width))
-    why = f"{columns[chosen].width} numbers, no pose could be recognised; all columns: {', '.join(measured)}"
-    return {"state": Knob([chosen], why, is_guess=True)}
+    reason = f"{columns[chosen].width} numbers; no pose was recognised; columns: {', '.join(measured)}"
+    return {"state": DraftValue([chosen], reason, is_guess=True)}
 
 
-def measured_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
+def select_measured_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
     """Return the columns that may contain a measured pose or gripper: no actions, joints or velocities."""
     return {
         name: one
@@ -279,34 +283,37 @@ def _left_out(chosen: _Numbers, numbers: Sequence[_Number]) -> list[str]:
 # ---- units and rotation formats ----
 
 
-def _keys_of(
+def _make_pose_values(
     chosen: _Numbers, left_out: Sequence[str], columns: Mapping[str, Column], samples: Samples, control_rate_hz: float
-) -> dict[str, Knob]:
+) -> dict[str, DraftValue]:
     """Return the config keys that select the chosen numbers, with formats that were checked with the samples."""
     used = list(dict.fromkeys(one.column for one in chosen))
     concatenated = [(name, index) for name in used for index in range(columns[name].width)]
     select = [concatenated.index((one.column, one.index)) for one in chosen]
-    unnamed = [columns[one.column] for one in chosen if not one.is_named]
-    group, is_stray = chosen[0].group, chosen[-1].group not in {chosen[0].group, ""}
+    unnamed_columns = [columns[number.column] for number in chosen if not number.is_named]
+    group = chosen[0].group
     doubts = []
-    why = f"by the names {', '.join(one.name for one in chosen)}"
-    if unnamed:
-        why = "by the width of the column: the numbers have no names, or are no quaternion, as their names say;"
-        why += " if they are joints, set states: vector"
-    if is_stray:
-        doubts.append(f"the gripper is called {chosen[-1].name}")
+    names = dict.fromkeys(re.sub(r"\[\d+\]$", "", number.name) for number in chosen)
+    reason = f"recognised by the names {', '.join(names)}"
+    if unnamed_columns:
+        reason = "recognised by the number of values: the names do not match a quaternion"
+        if not all(column.names for column in unnamed_columns):
+            reason = "recognised by the number of values, which have no names"
+        reason += "; if they are joint positions, set states: vector"
+    if chosen[-1].group not in {group, ""}:
+        doubts.append(f"the gripper is {chosen[-1].name}")
     if _is_not_measured(chosen):
-        doubts.append(f"{group or chosen[0].name} may not be the measured pose, which was not found")
+        doubts.append(f"no measured pose was found, {group or chosen[0].name} may be commanded or relative")
     elif not _HAND.fullmatch(group):
-        doubts.append(f"if {group} is not the hand, set states: vector")
+        doubts.append(f"if {group} is not the end effector, set states: vector")
     if left_out:
         shown = ", ".join(left_out[:8]) + (", …" if len(left_out) > 8 else "")
-        doubts.append(f"left out: {shown}. For all numbers of the robot: states: vector")
-    why = "; ".join([why, *doubts])
-    is_guess = bool(unnamed or doubts)
-    keys = {"state": Knob(used, why, is_guess)}
+        doubts.append(f"left out: {shown}; to use all numbers, set states: vector")
+    reason = "; ".join([reason, *doubts])
+    is_guess = bool(unnamed_columns or doubts)
+    keys = {"state": DraftValue(used, reason, is_guess)}
     if select != list(range(len(concatenated))):
-        keys["select"] = Knob(select, why, is_guess)
+        keys["select"] = DraftValue(select, reason, is_guess)
     keys["rotation"] = _rotation_format(chosen[3:-1], samples, control_rate_hz)
     unit = _position_unit(chosen[:3], samples)
     return keys if unit.value == "m" else {**keys, "position_unit": unit}
@@ -324,69 +331,75 @@ def _usual_size(values: Sequence[Numbers]) -> float:
     return float(np.quantile(np.concatenate([abs(one).max(axis=1) for one in values]), 0.95)) if values else 0.0
 
 
-def _rotation_format(rotation: _Numbers, samples: Samples, control_rate_hz: float) -> Knob:
+def _rotation_format(rotation: _Numbers, samples: Samples, control_rate_hz: float) -> DraftValue:
     if len(rotation) == 4:
         is_guess = rotation[-1].axis != "w"
-        why = "w last; the numbers cannot tell it from quaternion_wxyz (w first)" if is_guess else ""
-        return Knob("quaternion_xyzw", why, is_guess)
+        reason = "w last; alternative: quaternion_wxyz (w first), which the values cannot rule out" if is_guess else ""
+        return DraftValue("quaternion_xyzw", reason, is_guess)
     formats = [one for one in FORMATS if one == rotation[0].kind]
     if not formats:  # UR robots write rotation vectors as rx, ry, rz; Euler angles usually are roll, pitch, yaw
         is_r = re.search(r"(?:^|_)r[xyz]$", _words(rotation[0].name))
         formats = ["rotation_vector", "euler_xyz"] if is_r else ["euler_xyz", "rotation_vector"]
     values, proposed, is_guess = _values(rotation, samples), formats[0], len(formats) > 1
-    why = f"or {formats[1]}: the names fit both" if is_guess else ""
+    reason = f"alternative: {formats[1]}; the names fit both" if is_guess else ""
     if is_guess and not values:
-        why += "; the numbers were not read"
+        reason += "; the values were not read"
     largest = _usual_size(values)
     if proposed != "euler_xyz_degrees" and largest > ANGLE_RAD:
-        why = f"the numbers reach {largest:.0f}, which is too much for radians"
+        reason = f"the values reach {largest:.0f}, which is too large for radians"
         if proposed == "rotation_vector":
-            why += "; rotation vectors in degrees cannot be read"
-        return Knob("euler_xyz_degrees", why, is_guess or proposed == "rotation_vector")
+            reason += "; rotation vectors in degrees are not supported"
+        return DraftValue("euler_xyz_degrees", reason, is_guess or proposed == "rotation_vector")
     values = [one[abs(one).max(axis=1) <= max(largest, ANGLE_RAD)] for one in values]
     smoother = smoother_format(rotation_speeds(values, control_rate_hz), proposed, FASTEST_RAD_S) if values else None
     if smoother in {None, proposed}:
-        return Knob(proposed, why, is_guess)
-    why = f"{smoother} moves much more smoothly than {proposed}"
-    return Knob(smoother, why if is_guess else f"{why}, which the names say", is_guess=True)
+        return DraftValue(proposed, reason, is_guess)
+    reason = f"as {smoother} the rotations change much more smoothly than as {proposed}"
+    return DraftValue(smoother, reason if is_guess else f"{reason}, which the names suggest", is_guess=True)
 
 
-def _position_unit(position: _Numbers, samples: Samples) -> Knob:
+def _position_unit(position: _Numbers, samples: Samples) -> DraftValue:
     """Return the unit of the position, from the names or else from the largest values that an arm can reach."""
     if position[0].unit in {"m", "cm", "mm"}:
-        return Knob(position[0].unit)
+        return DraftValue(position[0].unit)
     largest = _usual_size(_values(position, samples))
     if largest <= REACH_M:
-        return Knob("m")
+        return DraftValue("m")
     unit = "mm" if largest > 100 * REACH_M / 2 else "cm"
-    return Knob(unit, f"the numbers reach {largest:.0f}, too much for metres", is_guess=True)
+    return DraftValue(unit, f"the values reach {largest:.0f}, which is too large for metres", is_guess=True)
 
 
 # ---- the gripper ----
 
 
-def gripper_knobs(name: str, ranges: Range | None) -> dict[str, Knob]:
+def guess_gripper_values(name: str, ranges: Range | None) -> dict[str, DraftValue]:
     """Return the values of the open and the closed gripper, guessed from its name and the range of its values.
 
     Args:
         name: Name of the gripper's number in the data set.
         ranges: Minimum and maximum of its values; None: unknown.
     """
-    opened, closed, why = 0.0, 1.0, "the range of its numbers is not known"
+    opened, closed, reason = 0.0, 1.0, "the range of the gripper's values is unknown"
     if ranges is not None:
         low, high = ranges
-        why = f"its numbers range from {low:.3g} to {high:.3g}"
+        reason = f"the gripper's values range from {low:.3g} to {high:.3g}"
         if 0 < max(abs(low), abs(high)) <= _MAX_GRIPPER_M:
-            opened, closed, why = round(high if high > -low else low, 4), 0.0, f"{why}: probably metres"
+            opened, closed, reason = round(high if high > -low else low, 4), 0.0, f"{reason}: probably metres"
         elif high > _MAX_SHARE:
-            opened, closed, why = round(high, 1), max(0.0, round(low, 1)), f"{why}: probably a width or percent"
+            opened, closed, reason = round(high, 1), max(0.0, round(low, 1)), f"{reason}: probably a width or percent"
         elif low < -0.5:
-            opened, closed, why = -1.0, 1.0, f"{why}: probably -1 open, 1 closed"
+            opened, closed, reason = -1.0, 1.0, f"{reason}: probably -1 open, 1 closed"
     words = set(re.findall("open|close", name.lower()))
     if len(words) == 1:
         low, high = sorted((opened, closed))
         opened, closed = (high, low) if words == {"open"} else (low, high)
         if ranges is not None and (low, high) == (0.0, 1.0):
-            return {"gripper_open": Knob(opened, f"by the name {name}"), "gripper_closed": Knob(closed)}
-    why = f"{why}; `data check CONFIG --model RUN_OR_MODEL` tests whether it is inverted"
-    return {"gripper_open": Knob(opened, why, is_guess=True), "gripper_closed": Knob(closed, "likewise", is_guess=True)}
+            return {
+                "gripper_open": DraftValue(opened, f"recognised by the name {name}"),
+                "gripper_closed": DraftValue(closed),
+            }
+    reason = f"{reason}; `data check CONFIG --model RUN_OR_MODEL` detects an inverted gripper"
+    return {
+        "gripper_open": DraftValue(opened, reason, is_guess=True),
+        "gripper_closed": DraftValue(closed, "see gripper_open", is_guess=True),
+    }

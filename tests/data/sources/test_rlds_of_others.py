@@ -17,8 +17,8 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.sources.indexed_source import open_source
-from vjepa2_ac.init.found import guesses, plain
-from vjepa2_ac.init.look import look_at
+from vjepa2_ac.init.draft_values import list_guesses, plain_values
+from vjepa2_ac.init.recognize import read_properties
 
 STEPS, EPISODES, SIZE = 12, 6, (24, 32)
 IMAGE, STATE, NAME = "steps/observation/image", "steps/observation/state", "episode_metadata/file_path"
@@ -42,11 +42,17 @@ def write(folder: Path, *, images: Any = None, states: Any = None, kinds: Any = 
 
 
 def proposed(folder: Path) -> tuple[DataConfig, dict[str, str]]:
-    """Return the data config that `init` proposes, and its guesses."""
-    found = look_at(str(folder))
-    data = {"source": "rlds", "path": str(folder), "states": found.states, **plain(found.knobs), "workers": 0}
+    """Return the data config that `init` proposes, and the guessed values."""
+    found = read_properties(str(folder))
+    data = {
+        "source": "rlds",
+        "path": str(folder),
+        "states": found.states,
+        **plain_values(found.config_values),
+        "workers": 0,
+    }
     values = {"run_dir": "none", "data": data, "model": {"base": "builtin:sim-tiny"}}
-    return parse_config(values, where="init").data, guesses(found.knobs)
+    return parse_config(values, where="init").data, list_guesses(found.config_values)
 
 
 def require_true(config: DataConfig, *, tolerance: float = 1e-5) -> None:
@@ -80,7 +86,7 @@ def test_png_images_are_read_by_their_content(mode: str | None, tmp_path: Path) 
 def test_records_without_a_usable_name_are_numbered(names: Any, tmp_path: Path) -> None:
     config, guessed = proposed(write(tmp_path / "set", names=names))
     assert config.fields.identity == "record"
-    assert "written again" in guessed["fields.identity"] or "writing the set again" in guessed["fields.identity"]
+    assert "written again" in guessed["fields.identity"] or "rewriting the data set" in guessed["fields.identity"]
     require_true(config)
     assert len({info.id for info in open_source(config).infos()}) == EPISODES
     assert len(open_dataset(config.model_copy(update={"frames": 3, "stride": 1})).windows("train"))

@@ -1,4 +1,4 @@
-"""Recognise RLDS data sets (dataset_info.json, features.json) and LeRobot data sets (meta/info.json)."""
+"""Read the properties of an RLDS data set from dataset_info.json, features.json and its first records."""
 
 from __future__ import annotations
 
@@ -11,17 +11,13 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import LeRobotData
-from vjepa2_ac.config.sources import JOINT_VELOCITY
-from vjepa2_ac.data.files import EpisodeFiles
-from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo, filled, list_by_template, read_info
-from vjepa2_ac.data.sources.parquet import ParquetRows
 from vjepa2_ac.data.sources.rlds_episode import Record
 from vjepa2_ac.data.sources.rlds_shards import Shard, dataset_name, find_shards, open_shard
 from vjepa2_ac.data.sources.tfrecord import HEADER_BYTES, Kind, span_at
 from vjepa2_ac.errors import InputError, MissingFileError, UserError, counted
-from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
-from vjepa2_ac.init.poses import Column, Samples, find_pose, measured_columns, vector_state
+from vjepa2_ac.init.dataset_properties import DatasetProperties, is_not_camera, make_camera_values, make_idle_section
+from vjepa2_ac.init.draft_values import DraftValue
+from vjepa2_ac.init.poses import Column, Samples, find_pose, select_measured_columns, select_vector_state
 from vjepa2_ac.storage.paths import SIMULATION_FILE
 from vjepa2_ac.storage.structured import read_json_object
 
@@ -33,14 +29,14 @@ _DROID_FEATURE, _BRIDGE_FEATURE = "steps/observation/exterior_image_1_left", "st
 _DROID_NAMES = frozenset({"droid", "droid_100", "droid_101", "r2d2_faceblur"})  # names in dataset_info.json
 _BRIDGE_NAMES = frozenset({"bridge", "bridge_dataset", "bridge_orig"})
 _BRIDGE_POSE = {
-    "state": Knob([_BRIDGE_FEATURE], "x, y, z, three angles, the gripper"),
-    "gripper_open": Knob(1.0, "BridgeData's"),
-    "gripper_closed": Knob(0.0),
+    "state": DraftValue([_BRIDGE_FEATURE], "x, y, z, three Euler angles, gripper"),
+    "gripper_open": DraftValue(1.0, "BridgeData's convention"),
+    "gripper_closed": DraftValue(0.0),
 }
 _DROID_RATE_HZ, _BRIDGE_RATE_HZ, _UNKNOWN_RATE_HZ = 15.0, 5.0, 10.0
 _VELOCITIES = "steps/action_dict/joint_velocity"
-_SAMPLED = 24  # number of records or episodes whose values are read to check what the column names suggest
-_NUMBERS = ("float", "int", "uint", "bool")
+_SAMPLED = 24  # number of records whose values are read to check what the column names suggest
+_NUMBER_DTYPES = ("float", "int", "uint", "bool")
 _ALL_KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")
 _PATHS = frozenset({"file_path", "episode_id", "recording_folderpath"})
 
@@ -53,18 +49,18 @@ class _Feature:
     channels: int = 0  # of an image; 0: unknown
 
 
-def droid() -> FoundData:
+def make_published_droid_properties() -> DatasetProperties:
     """Return the properties of DROID 1.0.1 without reading the data set."""
-    published = Knob("published", "openpi's ranges; they are valid for 1.0.1 only")
+    published = DraftValue("published", "openpi's list of non-idle ranges, valid for DROID 1.0.1 only")
     return replace(
-        like_droid(DROID, _DROID_EPISODES, "DROID 1.0.1"),
+        make_droid_properties(DROID, _DROID_EPISODES, "DROID 1.0.1"),
         steps=_DROID_STEPS,
-        idle={"rule": published, "ranges": Knob(RANGES)},
-        about=(f"DROID 1.0.1, {_DROID_EPISODES:,} episodes, 1.7 TB, fetched from Google Cloud as they are needed",),
+        idle={"rule": published, "ranges": DraftValue(RANGES)},
+        descriptions=(f"DROID 1.0.1, {_DROID_EPISODES:,} episodes, 1.7 TB, streamed from Google Cloud",),
     )
 
 
-def look_at_rlds(path: str) -> FoundData:
+def read_rlds_properties(path: str) -> DatasetProperties:
     """Read the properties of an RLDS data set.
 
     Raises:
@@ -76,10 +72,10 @@ def look_at_rlds(path: str) -> FoundData:
     name = dataset_name(path)
     if name in _DROID_NAMES and _DROID_FEATURE in features:
         is_simulated = storage.exists(storage.join(path, SIMULATION_FILE))
-        return like_droid(path, episodes, "the simulated arm" if is_simulated else "DROID")
+        return make_droid_properties(path, episodes, "simulated arm" if is_simulated else "DROID")
     images, depth = _cameras(features)
     where = storage.join(path, "features.json")
-    camera, all_cameras = camera_knobs(images, depth, where)
+    camera, all_cameras = make_camera_values(images, depth, where)
     is_bridge = name in _BRIDGE_NAMES and _BRIDGE_FEATURE in features
     rate = _rate(features, is_bridge=is_bridge)
     has_velocities = _VELOCITIES in features
@@ -87,61 +83,65 @@ def look_at_rlds(path: str) -> FoundData:
     columns = {
         name: Column(one.width)
         for name, one in features.items()
-        if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith(_NUMBERS) and one.width > 0
+        if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith(_NUMBER_DTYPES) and one.width > 0
     }
     texts_of_episode = [
         name
         for name, one in features.items()
         if name.startswith("episode_metadata/") and (one.kind == "text" or one.dtype.startswith(("int", "uint", "str")))
     ]
-    measured = measured_columns(columns)
+    measured = select_measured_columns(columns)
     records = _sample_records(shards, [*measured, *texts_of_episode])
     pose = _BRIDGE_POSE if is_bridge else find_pose(columns, _samples(records, measured), control_rate_hz=rate.value)
-    speed = f"{rate.value:g} steps a second{' (guessed)' * rate.is_guess}"
-    return FoundData(
+    control_rate = f"{rate.value:g} control steps per second{' (guessed)' if rate.is_guess else ''}"
+    return DatasetProperties(
         source="rlds",
         path=path,
-        knobs={
+        config_values={
             "camera": camera,
             "fields": {
-                **(pose or vector_state(columns, where)),
+                **(pose or select_vector_state(columns, where)),
                 "identity": _identity(records, texts_of_episode),
                 "cameras": all_cameras,
-                "language": Knob(next((name for name in texts if "instruction" in name), None)),
-                "joint_velocity": Knob(_VELOCITIES if has_velocities else None),
+                "language": DraftValue(next((name for name in texts if "instruction" in name), None)),
+                "joint_velocity": DraftValue(_VELOCITIES if has_velocities else None),
                 "control_rate_hz": rate,
             },
         },
         rate_hz=rate,
         states="pose" if pose else "vector",
         episodes=episodes,
-        idle=idle_rule(has_velocities=has_velocities) if pose else None,
-        about=(f"RLDS {name}, {counted(episodes, 'episode')}, {speed}",)
-        + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
+        idle=make_idle_section(has_velocities=has_velocities) if pose else None,
+        descriptions=(f"RLDS {name}, {counted(episodes, 'episode')}, {control_rate}",)
+        + ((f"unused depth maps: {', '.join(depth)}",) if depth else ()),
     )
 
 
-def like_droid(path: str, episodes: int, title: str) -> FoundData:
+def make_droid_properties(path: str, episodes: int, title: str) -> DatasetProperties:
     """Return the properties of a data set with the features of DROID, for example from the simulated arm."""
-    return FoundData(
+    return DatasetProperties(
         source="rlds",
         path=path,
-        knobs={"camera": Knob(_DROID_CAMERA)},
-        rate_hz=Knob(_DROID_RATE_HZ),
+        config_values={"camera": DraftValue(_DROID_CAMERA)},
+        rate_hz=DraftValue(_DROID_RATE_HZ),
         episodes=episodes,
-        idle={"rule": Knob("commands", "openpi's rule")},
-        about=(f"RLDS, {title}, {counted(episodes, 'episode')}, {_DROID_RATE_HZ:g} steps a second",),
+        idle={"rule": DraftValue("commands", "openpi's rule: removes steps without commanded joint velocities")},
+        descriptions=(f"RLDS ({title}), {counted(episodes, 'episode')}, {_DROID_RATE_HZ:g} control steps per second",),
     )
 
 
-def _rate(features: Mapping[str, _Feature], *, is_bridge: bool) -> Knob:
+def _rate(features: Mapping[str, _Feature], *, is_bridge: bool) -> DraftValue:
     """Return the control rate, which RLDS does not store: it is known only for known data sets, otherwise a guess."""
     if is_bridge:
-        return Knob(_BRIDGE_RATE_HZ, "RLDS does not say; BridgeData's")
+        return DraftValue(_BRIDGE_RATE_HZ, "BridgeData's control rate, which RLDS does not store")
     if _DROID_FEATURE in features:
-        why = "RLDS does not say; its cameras are called as DROID's, which has 15"
-        return Knob(_DROID_RATE_HZ, why, is_guess=True)
-    return Knob(_UNKNOWN_RATE_HZ, "RLDS does not say: your robot's control steps a second", is_guess=True)
+        reason = "RLDS does not store the control rate; the cameras have the names of DROID, which has 15 Hz"
+        return DraftValue(_DROID_RATE_HZ, reason, is_guess=True)
+    return DraftValue(
+        _UNKNOWN_RATE_HZ,
+        "RLDS does not store it. Enter the number of control steps per second of your robot",
+        is_guess=True,
+    )
 
 
 def _features(path: str) -> Iterator[tuple[str, _Feature]]:
@@ -152,16 +152,16 @@ def _features(path: str) -> Iterator[tuple[str, _Feature]]:
     """
     where = storage.join(path, "features.json")
     try:
-        content = read_json_object(where, needed="a description as TFDS writes it")
+        content = read_json_object(where, needed="a feature description written by TFDS")
     except MissingFileError:
-        fix = "Name the features in the config by hand: `vjepa2-ac config text builtin:bridge` is an example"
-        needed = "the features, as TFDS writes them"
+        fix = "Or list the features in a config: `vjepa2-ac config text builtin:bridge` prints an example"
+        needed = "a feature description written by TFDS"
         raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
     try:
         yield from _nested_features(content, "")
     except (AttributeError, TypeError, ValueError) as error:
-        found = f"not a description of features ({error})"
-        raise InputError(where=where, found=found, needed="the features, as TFDS writes them") from None
+        found = f"an invalid feature description ({error})"
+        raise InputError(where=where, found=found, needed="a feature description written by TFDS") from None
 
 
 def _nested_features(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
@@ -182,7 +182,7 @@ def _nested_features(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
 def _cameras(features: Mapping[str, _Feature]) -> tuple[list[str], list[str]]:
     """Return the features with camera images (colour, or grey if there are none), and those with depth maps."""
     images = {name: feature for name, feature in features.items() if feature.kind == "image" and _is_of_step(name)}
-    depth = [name for name, image in images.items() if is_no_camera(name) or image.dtype not in {"", "uint8"}]
+    depth = [name for name, image in images.items() if is_not_camera(name) or image.dtype not in {"", "uint8"}]
     colour = [name for name, image in images.items() if name not in depth and image.channels != 1]
     return colour or [name for name in images if name not in depth], depth
 
@@ -218,81 +218,17 @@ def _samples(records: Sequence[Mapping[str, tuple[Any, ...]]], columns: Mapping[
     }
 
 
-def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[str]) -> Knob:
+def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[str]) -> DraftValue:
     """Return the features that identify the sampled episodes; `record` if no features do."""
     paths = [name for name in names if name.rsplit("/", 1)[-1] in _PATHS]
     for candidates in (paths, names):
         values = [tuple(record.get(name, ()) for name in candidates) for record in records]
         is_named = all(any(part != b"" for feature in value for part in feature) for value in values)
         if candidates and values and is_named and len(set(values)) == len(values):
-            return Knob(list(candidates), "what tells episodes apart", is_guess=True)
+            return DraftValue(list(candidates), "features that identify an episode", is_guess=True)
     if not records and names:
-        return Knob(list(paths or names), "what tells episodes apart; no record could be read", is_guess=True)
-    why = "no feature tells the episodes apart; writing the set again may move episodes between train and test"
-    return Knob("record", why, is_guess=True)
-
-
-# ---- LeRobot ----
-
-_OURS = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "subtask_index"})
-_DROID_GRIPPER = "observation.state.gripper_position"
-_OF_DROID = frozenset({"building", "collector_id"})  # columns of DROID's conversions to LeRobot
-
-
-def look_at_lerobot(path: str) -> FoundData:
-    """Read the properties of a LeRobot data set.
-
-    Raises:
-        InputError: The data set cannot be read, or has no camera or no measured numbers of the robot.
-    """
-    info = read_info(path)
-    cameras = [name for name, one in info.features.items() if one.is_camera and not is_no_camera(name)]
-    depth = [name for name, one in info.features.items() if one.is_depth or (one.is_camera and is_no_camera(name))]
-    camera, all_cameras = camera_knobs(cameras, depth, info.where)
-    columns = {
-        name: Column(one.width, one.names)
-        for name, one in info.features.items()
-        if one.is_numbers and name not in _OURS
-    }
-    samples = _sampled_rows(info, measured_columns(columns))
-    pose = find_pose(columns, samples, control_rate_hz=info.fps)
-    if pose and _DROID_GRIPPER in pose["state"].value and info.features.keys() >= _OF_DROID:
-        pose |= {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
-    success = next((name for name in info.features if "success" in name), None)
-    return FoundData(
-        source="lerobot",
-        path=path,
-        knobs={
-            "camera": camera,
-            "lerobot": {
-                **(pose or vector_state(columns, info.where)),
-                "cameras": all_cameras,
-                "success": Knob(success),
-            },
-        },
-        rate_hz=Knob(info.fps, "of meta/info.json"),
-        states="pose" if pose else "vector",
-        episodes=info.episodes,
-        steps=info.frames,
-        idle=idle_rule(has_velocities=JOINT_VELOCITY in columns) if pose else None,
-        about=(f"LeRobot {info.version}, {counted(info.episodes, 'episode')} at {info.fps:g} a second",)
-        + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
-    )
-
-
-def _sampled_rows(info: DatasetInfo, columns: Mapping[str, Column]) -> Samples:
-    """Return the numbers of the first episodes, by column.
-
-    Reading stops at an episode that cannot be read, without an error: `data check` reports it later.
-    """
-    read: dict[str, list[np.ndarray]] = {name: [] for name in columns}
-    with suppress(UserError, OSError, KeyError):
-        files = list_by_template(info.root, info.data_path)
-        first = next(iter(files.values()))
-        rows_in = ParquetRows(EpisodeFiles(LeRobotData(path=info.root)), list(columns), f"{first.version} {first.size}")
-        for number in range(min(_SAMPLED, info.episodes)):
-            file = filled(info.data_path, number // info.chunk_episodes, number if info.version == "v2.1" else 0)
-            rows = rows_in.rows(storage.join(info.root, file), number)
-            for name in columns:
-                read[name].append(rows[name].astype(np.float64))
-    return {name: episodes for name, episodes in read.items() if episodes}
+        return DraftValue(
+            list(paths or names), "features that may identify an episode; no record could be read", is_guess=True
+        )
+    reason = "no feature identifies an episode: rewriting the data set may move episodes between train and test"
+    return DraftValue("record", reason, is_guess=True)

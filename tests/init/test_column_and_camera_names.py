@@ -1,8 +1,8 @@
-"""Where pose, gripper and camera probably are: told by names, guessed by widths, and joints are no pose."""
+"""Pose, gripper and camera are recognised by names, or guessed by column widths; joints are not a pose."""
 
 import pytest
 
-from vjepa2_ac.init.found import camera_names, pick_camera
+from vjepa2_ac.init.dataset_properties import make_camera_names, pick_camera
 from vjepa2_ac.init.poses import Column, find_pose
 
 JOINTS = Column(
@@ -10,7 +10,7 @@ JOINTS = Column(
 )
 
 
-def test_droids_columns_are_known() -> None:
+def test_droid_columns_are_recognised_without_a_guess() -> None:
     columns = {
         "action.cartesian_position": Column(6),
         "observation.state.joint_position": Column(7),
@@ -24,7 +24,7 @@ def test_droids_columns_are_known() -> None:
 
 
 @pytest.mark.parametrize(
-    ("columns", "rotation", "found"),
+    ("columns", "rotation", "num_columns"),
     [
         ({"observation.ee_pose": 6, "observation.gripper": 1}, "euler_xyz", 2),
         ({"observation.tcp_pose": 7, "observation.gripper_width": 1}, "quaternion_xyzw", 2),
@@ -32,12 +32,12 @@ def test_droids_columns_are_known() -> None:
         ({"observation.state": 8}, "quaternion_xyzw", 1),
     ],
 )
-def test_widths_are_a_guess(columns: dict[str, int], rotation: str, found: int) -> None:
+def test_pose_recognised_by_width_is_a_guess(columns: dict[str, int], rotation: str, num_columns: int) -> None:
     pose = find_pose({name: Column(width) for name, width in columns.items()})
     assert pose is not None
     state = pose["state"]
-    assert (pose["rotation"].value, len(state.value), state.is_guess) == (rotation, found, True)
-    assert "states: vector" in state.why
+    assert (pose["rotation"].value, len(state.value), state.is_guess) == (rotation, num_columns, True)
+    assert "states: vector" in state.reason
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_widths_are_a_guess(columns: dict[str, int], rotation: str, found: int) 
         {"action": Column(7, ("x", "y", "z", "roll", "pitch", "yaw", "gripper"))},
     ],
 )
-def test_joints_and_commands_are_no_pose(columns: dict[str, Column]) -> None:
+def test_joints_and_commands_are_not_taken_for_a_pose(columns: dict[str, Column]) -> None:
     assert find_pose(columns) is None
 
 
@@ -64,7 +64,7 @@ def test_joints_and_commands_are_no_pose(columns: dict[str, Column]) -> None:
         (["image_3", "image_0"], "image_0"),
     ],
 )
-def test_a_camera_that_looks_on_is_preferred(cameras: list[str], chosen: str) -> None:
+def test_exterior_camera_is_preferred(cameras: list[str], chosen: str) -> None:
     assert pick_camera(cameras) == chosen
 
 
@@ -77,9 +77,9 @@ def test_a_camera_that_looks_on_is_preferred(cameras: list[str], chosen: str) ->
         (["a.b.rgb", "a-b.rgb"], ["a_b_rgb", "a-b.rgb"]),
     ],
 )
-def test_cameras_have_short_distinct_names(features: list[str], names: list[str]) -> None:
-    found = camera_names(features)
-    assert list(found) == features
-    assert len(set(found.values())) == len(features)
+def test_camera_names_are_short_and_distinct(features: list[str], names: list[str]) -> None:
+    camera_names = make_camera_names(features)
+    assert list(camera_names) == features
+    assert len(set(camera_names.values())) == len(features)
     if "-" not in features[-1]:
-        assert list(found.values()) == names
+        assert list(camera_names.values()) == names

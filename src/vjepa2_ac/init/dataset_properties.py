@@ -1,0 +1,85 @@
+"""The properties of a data set that `init` reads from its description files, and the selection of a camera."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.init.draft_values import DraftValue, DraftValues
+
+
+@dataclass(frozen=True)
+class DatasetProperties:
+    """The properties of a data set that were read from its description files."""
+
+    source: str  # value of data.source
+    path: str
+    config_values: DraftValues  # further keys of the section `data`: cameras, names of columns
+    rate_hz: DraftValue  # control steps per second
+    states: Literal["pose", "vector"] = "pose"
+    episodes: int | None = None
+    steps: int | None = None  # control steps of all episodes
+    median_steps: int | None = None  # median number of control steps per episode
+    p10_steps: int | None = None  # 10th percentile of the number of control steps per episode
+    predefined_splits: tuple[Split, ...] = ()  # the splits among validation and test that the data set defines itself
+    idle: DraftValues | None = None  # section `data.idle`; None: no rule
+    descriptions: tuple[str, ...] = ()  # descriptions for the user
+
+
+def make_idle_section(*, has_velocities: bool) -> DraftValues:
+    """Return the section `data.idle`, with the rule for commanded velocities if the data set has them."""
+    return {
+        "rule": DraftValue(
+            "commands" if has_velocities else "motion", "steps without motion carry no information about actions"
+        )
+    }
+
+
+# ---- selection of a camera by its name ----
+
+_WRIST = re.compile(r"wrist|hand|eih|gripper", re.I)
+_EXTERIOR = re.compile(r"ext|front|side|third|agent|base|scene|top|over|left|image_0|primary", re.I)
+_NON_CAMERA = re.compile(r"depth|disparity|segment|mask|gelsight|tactile", re.I)
+
+
+def is_not_camera(feature: str) -> bool:
+    """Return whether a feature's name suggests a depth map, a segmentation or a tactile sensor instead of a camera."""
+    return _NON_CAMERA.search(feature) is not None
+
+
+def pick_camera(cameras: Sequence[str]) -> str:
+    """Return an exterior camera if there is one, because the released model was trained on exterior cameras."""
+    exterior = [name for name in cameras if not _WRIST.search(name)]
+    return next((name for name in exterior if _EXTERIOR.search(name)), (exterior or list(cameras))[0])
+
+
+def make_camera_values(
+    features: Sequence[str], non_cameras: Sequence[str], where: str
+) -> tuple[DraftValue, DraftValue]:
+    """Return the config keys `camera` (the selected camera) and `cameras` (the feature of each camera).
+
+    Raises:
+        InputError: There is no feature with images of a camera.
+    """
+    if not features:
+        found = f"no camera, only depth maps ({', '.join(non_cameras)})" if non_cameras else "no camera"
+        raise InputError(where=where, found=found, needed="videos, or one image of the robot per step")
+    names = make_camera_names(features)
+    reason = f"cameras: {', '.join(names.values())}; the released model was trained on DROID's camera exterior_1_left"
+    is_guess = len(names) > 1
+    camera = DraftValue(names[pick_camera(features)], reason if is_guess else "", is_guess)
+    return camera, DraftValue({name: feature for feature, name in names.items()})
+
+
+def make_camera_names(features: Sequence[str]) -> dict[str, str]:
+    """Return a short camera name for each feature: as many last parts of its name as are needed to be unique."""
+    parts = {name: [re.sub(r"\W+", "_", part) for part in re.split(r"[./]", name)] for name in features}
+    for count in range(1, 1 + max(map(len, parts.values()), default=0)):
+        short = {name: "_".join(part[-count:]) or "camera" for name, part in parts.items()}
+        if len(set(short.values())) == len(short):
+            return short
+    return {name: name for name in features}
