@@ -96,7 +96,7 @@ def private_words(path: Path, parts: Iterator[str]) -> list[str]:
 
 
 def sentences(text: str) -> list[str]:
-    return re.split(r"(?<=[.!?])[\")]*\s+(?=[A-Z`(\d]|int8)", text)
+    return re.split(r"(?<=[.!?])[\")]*\s+(?=[A-Z`\"(\d]|int8)", text)
 
 
 def test_pages_use_standard_terms() -> None:
