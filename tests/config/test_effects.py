@@ -16,7 +16,7 @@ from copied_sets import WRITERS
 from run_fixtures import TINY
 from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
 from vjepa2_ac.config.loading import changed_keys, config_as_dict, config_as_yaml, parse_config
-from vjepa2_ac.config.section import Affects, Component, Section, mark_of, marks_of, values_that_affect
+from vjepa2_ac.config.section import Affects, Component, Section, collect_effects, get_effect, values_that_affect
 from vjepa2_ac.data import idle as idle_ranges
 from vjepa2_ac.data.index import EpisodeInfo, EpisodeTable
 from vjepa2_ac.data.sources.indexed_source import open_source
@@ -121,8 +121,8 @@ def config_of(source: str, path: str | Path, run_dir: Path, **data: Any) -> Conf
 def knobs_of(config: Config) -> set[str]:
     """Return the knobs that a config of its form of data has."""
     foreign = set(DataConfig.kinds.values()) - {type(config.data)}
-    names = ("replay.", *(f"data.{name}." for kind in foreign for name in kind.own_sections()))  # see test_replay.py
-    return {key for key in marks_of(Config) if not key.startswith(names)}
+    names = ("replay.", *(f"data.{name}." for kind in foreign for name in kind.format_sections()))  # see test_replay.py
+    return {key for key in collect_effects(Config) if not key.startswith(names)}
 
 
 @cache
@@ -193,7 +193,7 @@ def test_a_knob_that_changes_makes_strangers_of_what_it_affects_and_of_nothing_e
     if (source, states) == ("droid_raw", "vector"):
         pytest.skip("raw DROID has poses")
     config = config_of(source, sets[source], tmp_path, **(recorded_by(source) if states == "vector" else {}))
-    usual, own = keys_of(config), tuple(f"data.{name}." for name in config.data.own_sections())
+    usual, own = keys_of(config), tuple(f"data.{name}." for name in config.data.format_sections())
     assert None not in usual.values()
     changed: dict[str, set[str]] = {}
     for key in knobs_of(config) - {"data.source", "data.path"} - ONLY_REMOTE:
@@ -201,7 +201,7 @@ def test_a_knob_that_changes_makes_strangers_of_what_it_affects_and_of_nothing_e
         if None not in found.values():  # else refused, not mistaken
             changed[key] = {name for name in usual if found[name] != usual[name]}
     for key, names in changed.items():
-        name, is_latents = key.removeprefix("data."), Affects.LATENTS in marks_of(Config)[key]
+        name, is_latents = key.removeprefix("data."), Affects.LATENTS in collect_effects(Config)[key]
         is_index = name in OF_THE_INDEX or (key.startswith(own) and name not in NOT_OF_THE_INDEX)
         assert names <= {"latents"} or is_latents, key
         assert "latents" in names or not is_latents, key
@@ -233,7 +233,9 @@ def test_settings_of_a_later_start_are_kept_in_the_run_unless_they_decide_it(tmp
     config = with_encoder(config_of("rlds", tmp_path, tmp_path / "run"))
     open_run_folder(config, "name")
     file, written, kept = tmp_path / "run/config.yaml", config_as_yaml(config), 0
-    keys = [key for key in knobs_of(config) - {"run_dir", "data.source"} if Affects.RUN not in marks_of(Config)[key]]
+    keys = [
+        key for key in knobs_of(config) - {"run_dir", "data.source"} if Affects.RUN not in collect_effects(Config)[key]
+    ]
     for section in {key.partition(".")[0] for key in keys}:
         start = config
         for key in keys:
@@ -256,7 +258,7 @@ def test_a_run_goes_on_only_where_no_knob_that_decides_it_has_changed(tmp_path: 
         other = with_other(config, key, key, "rlds")
         if key in {"run_dir", "data.source"} or not changed_keys(config, other):
             continue
-        if Affects.RUN in marks_of(Config)[key]:
+        if Affects.RUN in collect_effects(Config)[key]:
             with pytest.raises(InputError, match=f"differs in .*{key.partition('.')[0]}"):
                 check_run_folder(other)
         else:
@@ -264,7 +266,7 @@ def test_a_run_goes_on_only_where_no_knob_that_decides_it_has_changed(tmp_path: 
 
 
 def test_planning_takes_the_values_that_affect_a_decision_and_names_them() -> None:
-    for key, mark in marks_of(Config).items():
+    for key, mark in collect_effects(Config).items():
         named = key in USED or key.startswith(tuple(one.removesuffix("…") for one in USED if one.endswith("…")))
         assert (Affects.PLAN in mark) == named, key
         if Affects.PLAN not in mark:
@@ -273,13 +275,13 @@ def test_planning_takes_the_values_that_affect_a_decision_and_names_them() -> No
 
 
 def test_a_mark_of_a_section_holds_for_its_knobs_and_a_value_has_that_of_its_knob() -> None:
-    assert mark_of("tracking.wandb", Config) == Affects.NOTHING
-    assert mark_of("data.fields.cameras.left", Config) == mark_of("data.fields.cameras", Config) == Affects.CLIPS
-    assert mark_of("replay.data.frames", Config) == mark_of("replay.data", Config) == Affects.RUN
-    assert mark_of("replay.data.path", Config) == Affects.NOTHING
-    assert mark_of("training", Config) == Affects.RUN | Affects.LATENTS | Affects.PLAN
+    assert get_effect("tracking.wandb", Config) == Affects.NOTHING
+    assert get_effect("data.fields.cameras.left", Config) == get_effect("data.fields.cameras", Config) == Affects.CLIPS
+    assert get_effect("replay.data.frames", Config) == get_effect("replay.data", Config) == Affects.RUN
+    assert get_effect("replay.data.path", Config) == Affects.NOTHING
+    assert get_effect("training", Config) == Affects.RUN | Affects.LATENTS | Affects.PLAN
     with pytest.raises(KeyError):
-        mark_of("nothing.of.the.kind", Config)
+        get_effect("nothing.of.the.kind", Config)
 
 
 def test_the_values_that_affect_something_are_given_with_their_values(tmp_path: Path) -> None:

@@ -34,11 +34,11 @@ def write(folder: Path, text: str) -> Path:
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.name)
 def test_every_config_of_the_project_loads_and_is_in_line(path: Path) -> None:
-    assert load_config(path).adapter.out_of_line is None
+    assert load_config(path).adapter.alpha_warning is None
 
 
 def test_an_alpha_that_grows_with_the_rank_under_rslora_is_out_of_line() -> None:
-    found = AdapterConfig(rank=64, alpha=128).out_of_line
+    found = AdapterConfig(rank=64, alpha=128).alpha_warning
     assert "a scale of 16, alpha 32 one of" in found
     assert "Take adapter.alpha=32" in found
     for usual in (
@@ -47,7 +47,7 @@ def test_an_alpha_that_grows_with_the_rank_under_rslora_is_out_of_line() -> None
         {"alpha": 128, "rslora": False},
         {"kind": "none", "alpha": 128},
     ):
-        assert AdapterConfig.model_validate(usual).out_of_line is None
+        assert AdapterConfig.model_validate(usual).alpha_warning is None
 
 
 @pytest.mark.parametrize("adapter", [{"modules_to_save": ["state_encoder"]}, {"targets": ["q", "state_encoder"]}])

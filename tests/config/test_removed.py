@@ -28,7 +28,7 @@ def test_config_of_an_older_run_loads_and_a_value_that_changed_is_a_warning(
 ) -> None:
     older = {**VALUES, "training": {"momentum": value}}
     with caplog.at_level(logging.WARNING):
-        config = parse_config(older, where="run/config.yaml", here=False)
+        config = parse_config(older, where="run/config.yaml", local_plugins=False)
     assert config == parse_config(VALUES, where="today")
     assert [record.getMessage() for record in caplog.records] == [
         "run/config.yaml: training.momentum was 0.5; this version always uses 0.9"
@@ -38,7 +38,7 @@ def test_config_of_an_older_run_loads_and_a_value_that_changed_is_a_warning(
 def test_removed_section_of_data_is_dropped_from_replay_too() -> None:
     replay = {"data": {"source": "npz", "path": "other", "blur": {"radius": 0}}}
     older = {**VALUES, "data": {"source": "npz", "path": "data", "blur": {"radius": 0}}, "replay": replay}
-    values = config_as_dict(parse_config(older, where="run/config.yaml", here=False))
+    values = config_as_dict(parse_config(older, where="run/config.yaml", local_plugins=False))
     assert "blur" not in values["data"]
     assert "blur" not in values["replay"]["data"]
 
@@ -46,7 +46,7 @@ def test_removed_section_of_data_is_dropped_from_replay_too() -> None:
 def test_model_section_of_version_0_1_has_the_meaning_of_today() -> None:
     scratch, sizes = {**VALUES, "adapter": {"kind": "none"}}, {"predictor": {"width": 64, "depth": 2, "heads": 4}}
     older = {"base": None, "random": sizes, "encoder_weights": "target_encoder", "random_start": "persistence"}
-    found = parse_config({**scratch, "model": older}, where="run/config.yaml", here=False)
+    found = parse_config({**scratch, "model": older}, where="run/config.yaml", local_plugins=False)
     assert found == parse_config({**scratch, "model": {"base": "random", "sizes": sizes}}, where="today")
 
 
@@ -73,9 +73,11 @@ def test_options_of_an_older_run_move_to_their_components() -> None:
         "training": {"loss": {"name": "smooth_l1", "options": {"beta": 0.5}}},
         "planning": {"planner": {"name": "icem", "options": {"elites": 20}}, "energy": {"distance": "l2"}},
     }
-    read = [parse_config(values, where="run/config.yaml", here=False) for values in (older, {**VALUES, **today})]
+    read = [
+        parse_config(values, where="run/config.yaml", local_plugins=False) for values in (older, {**VALUES, **today})
+    ]
     assert read[0] == read[1]
-    changed = parse_config(older, ["planning.planner.options.elites=30"], where="run/config.yaml", here=False)
+    changed = parse_config(older, ["planning.planner.options.elites=30"], where="run/config.yaml", local_plugins=False)
     assert changed.planning.planner.options == {"elites": 30}
     with pytest.raises(InputError, match=r"planning.icem: moved in 0.2, to planning.planner: {name: icem, options"):
         parse_config(older, where="mine.yaml")
@@ -97,7 +99,7 @@ def test_norm_ball_of_an_older_run_becomes_a_limit_that_is_not_looser(
     limits: dict[str, object], l1: float | None, warnings: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     older = {**VALUES, "planning": {"limits": limits}}
-    config = parse_config(older, where="run/config.yaml", here=False)
+    config = parse_config(older, where="run/config.yaml", local_plugins=False)
     assert config.planning.limits.l1 == l1
     assert [record.getMessage() for record in caplog.records] == warnings
     with pytest.raises(InputError, match=r"planning.limits.ball: moved in 0.2, to planning.limits.l1: METRES"):
@@ -106,7 +108,9 @@ def test_norm_ball_of_an_older_run_becomes_a_limit_that_is_not_looser(
 
 def test_start_std_of_an_older_run_moves_to_the_planner_or_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     cem, gradient = (
-        parse_config({**VALUES, "planning": {"planner": name, "start_std": 0.5}}, where="run/config.yaml", here=False)
+        parse_config(
+            {**VALUES, "planning": {"planner": name, "start_std": 0.5}}, where="run/config.yaml", local_plugins=False
+        )
         for name in ("cem", "gradient")
     )
     assert cem.planning.planner.options == {"start_std": 0.5}
@@ -127,7 +131,7 @@ def test_start_std_of_an_older_run_moves_to_the_planner_or_is_a_warning(caplog: 
 )
 def test_values_of_another_type_in_the_config_of_an_older_run_are_an_error(values: dict[str, object]) -> None:
     with pytest.raises(InputError, match=r"run/config\.yaml"):
-        parse_config({**VALUES, **values}, where="run/config.yaml", here=False)
+        parse_config({**VALUES, **values}, where="run/config.yaml", local_plugins=False)
 
 
 @pytest.mark.parametrize(
@@ -159,4 +163,4 @@ def test_removed_key_on_the_command_line_of_a_run_is_an_error() -> None:
         "planning.limits.radius=0.05": "moved in 0.2, to planning.limits.l1",
     }.items():
         with pytest.raises(InputError, match=words):
-            parse_config(VALUES, [override], where="run/config.yaml", here=False)
+            parse_config(VALUES, [override], where="run/config.yaml", local_plugins=False)

@@ -96,4 +96,4 @@ def test_a_latent_cache_knows_the_groups_and_serves_any_grouping(tmp_path: Path)
     write_npz(tmp_path / "set", range(8), scene=lambda place: f"room {place % 3}")
     plain = config_of(source="npz", path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
     folder = write_cache(open_dataset(plain))
-    assert count_of_groups(open_dataset(plain.as_kind("latents", path=str(folder), split_by="scene"))) == 3
+    assert count_of_groups(open_dataset(plain.with_source("latents", path=str(folder), split_by="scene"))) == 3

@@ -70,7 +70,7 @@ def opened(config: Config) -> Dataset:
 
 def alone(config: Config, folder: Path | str, **changes: object) -> Dataset:
     """Return the data of a finished cache without its data set."""
-    return open_dataset(config.data.as_kind("latents", path=str(folder), cache="off", **changes))
+    return open_dataset(config.data.with_source("latents", path=str(folder), cache="off", **changes))
 
 
 def latents_in(bucket: Gcs) -> list[str]:

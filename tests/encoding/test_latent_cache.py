@@ -165,7 +165,7 @@ def cached_config(tmp_path: Path) -> DataConfig:
     config = DataConfig.model_validate(
         {"path": str(folder), "frames": 3, "stride": 2, "workers": 0, "disk_cache": {"dir": str(tmp_path / "cache")}}
     )
-    return config.as_kind("latents", path=str(write_cache(open_dataset(config))), camera=config.cameras)
+    return config.with_source("latents", path=str(write_cache(open_dataset(config))), camera=config.cameras)
 
 
 def test_only_the_frames_that_are_asked_for_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

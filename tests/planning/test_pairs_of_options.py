@@ -16,7 +16,7 @@ from tiny_models import DIM, TOKENS, tiny_model
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.config.section import marks_of
+from vjepa2_ac.config.section import collect_effects
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model import compilation
 from vjepa2_ac.model.world_model import WorldModel
@@ -161,7 +161,7 @@ def tried(scene: Scene, *names: str) -> None:
 
 
 def test_every_option_has_another_value(scene: Scene) -> None:
-    keys = {key.removeprefix("planning.") for key in marks_of(Config) if key.startswith("planning.")}
+    keys = {key.removeprefix("planning.") for key in collect_effects(Config) if key.startswith("planning.")}
     assert set(OTHERS) == keys, "a new key needs another value here"
     usual = scene.config()
     for name in OTHERS:

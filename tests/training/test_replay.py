@@ -1,4 +1,4 @@
-"""Replay: a share of the clips from a second data set, in an order that resumes exactly; misfits are refused."""
+"""Replay: a share of the clips from a second data set, in an order that resumes exactly; mismatches are errors."""
 
 import itertools
 import json

@@ -55,9 +55,9 @@ def _run(arguments: Sequence[str] | None) -> int:
         handler: Handler = options.handler
         _require_working_directory()
         if options.plugin:
-            from vjepa2_ac.config.loading import name_plugins
+            from vjepa2_ac.config.loading import register_plugins
 
-            name_plugins(options.plugin)
+            register_plugins(options.plugin)
         with watch_silence():
             return handler(options) or 0
     except ModuleNotFoundError as error:  # most missing libraries of extras already raise a UserError

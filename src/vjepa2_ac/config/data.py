@@ -14,9 +14,9 @@ from vjepa2_ac.config.section import (
     Component,
     ComponentOf,
     Count,
-    Local,
+    LocalPath,
     NonNegative,
-    Place,
+    PathOrUrl,
     Positive,
     PositiveInt,
     Section,
@@ -54,7 +54,7 @@ class IdleConfig(Section):
     rule: Literal["none", "published", "commands", "motion"] = "none"
     """none: keep all steps. published: ranges from a file. commands: openpi's rule on commanded joint velocities.
     motion: the same rule on the measured poses, for data sets without joint velocities."""
-    ranges: Place | None = None
+    ranges: PathOrUrl | None = None
     """For rule published: path or URL of a JSON file with the ranges to keep, {"recording_folderpath--file_path":
     [[start, end), ...]}; all other steps are idle."""
     velocity_change_rad_s: Positive = 1e-3
@@ -76,13 +76,13 @@ class IdleConfig(Section):
     @model_validator(mode="after")
     def _published_ranges_are_named(self) -> IdleConfig:
         is_broken = (self.rule == "published") != (self.ranges is not None)
-        return self.refused((is_broken, "rule published and ranges (a file or URL) belong together"))
+        return self.check_rules((is_broken, "rule published and ranges (a file or URL) belong together"))
 
 
 class DiskCacheConfig(Section):
     """The cache on this machine for remote data and for the indexes of data sets."""
 
-    dir: Local | None = None
+    dir: LocalPath | None = None
     """Folder of the cache; null: $VJEPA2_AC_CACHE, or vjepa2-ac in the user's cache folder."""
     limit_gb: NonNegative = 50.0
     """Size limit of the downloaded data in GB, over all processes; the least recently used data are removed first. 0:
@@ -108,7 +108,7 @@ class PoseFields(Section):
     @model_validator(mode="after")
     def _gripper_moves(self) -> Self:
         is_broken = self.gripper_open == self.gripper_closed
-        return self.refused((is_broken, "gripper_open and gripper_closed are the same number"))
+        return self.check_rules((is_broken, "gripper_open and gripper_closed are the same number"))
 
     @property
     def pose_keys(self) -> list[str]:
@@ -141,7 +141,7 @@ class DataConfig(Section):
 
     source: str
     """Format of the data set."""
-    path: Annotated[Place, Affects.NOTHING]
+    path: Annotated[PathOrUrl, Affects.NOTHING]
     """Folder of the data set: a local path, or a URL such as gs://bucket/folder or hf://datasets/owner/name. A run can
     resume after the folder was moved, because its content is compared, not its path."""
     camera: _CameraName | tuple[_CameraName, ...] | None = None
@@ -202,7 +202,7 @@ class DataConfig(Section):
     cache_dtype: Literal["bf16", "fp32", "int8"] = "bf16"
     """Storage type of cached latents. bf16: 2 bytes per number. fp32: twice the size of bf16. int8: about half the size
     of bf16, with a scale per token."""
-    cache_dir: Annotated[Place | None, Affects.NOTHING] = None
+    cache_dir: Annotated[PathOrUrl | None, Affects.NOTHING] = None
     """Folder that contains the latent caches: a local path, or a URL such as gs://bucket/folder. null: `latents` in the
     folder of `disk_cache`."""
     disk_cache: Annotated[DiskCacheConfig, Affects.NOTHING] = DiskCacheConfig()
@@ -245,12 +245,15 @@ class DataConfig(Section):
         known, cameras = self.known_cameras, self.cameras
         unknown = [camera for camera in cameras if known is not None and camera not in known]
         splits, of_camera = self.validation_share + self.test_share, self.pose_frame == "camera"
-        return self.refused(
+        return self.check_rules(
             (not cameras, "camera: an empty list; name one or more, or null for the source's first"),
             (unknown, f"camera: source {self.source} has no {unknown[:1]}; it has {', '.join(known or ())}"),
             (self.is_cache and self.stride == "auto", "stride auto: a latent cache has one stride; give its number"),
             (self.is_cache and self.cache != "off", f"source {self.source} is itself a cache: set cache: off"),
-            (self.transforms and self.takes_latents, "transforms change frames, latents in a cache stay: choose one"),
+            (
+                self.transforms and self.uses_cached_latents,
+                "transforms change frames, latents in a cache stay: choose one",
+            ),
             (splits >= 1.0, "validation_share and test_share leave nothing to train on"),
             (
                 of_camera and not self.has_camera_poses,
@@ -270,7 +273,7 @@ class DataConfig(Section):
         asked = [*(name for name, is_asked in of_poses.items() if is_asked), *(f"{section}.{key}" for key in formats)]
         is_vector, is_recorded = self.states == "vector", self.actions == "recorded"
         has_many = is_recorded and self.stride != 1 and self.join_actions is None
-        return self.refused(
+        return self.check_rules(
             (is_vector and asked, f"{', '.join(asked)}: a matter of poses, and states is vector"),
             (is_recorded and not is_vector, "actions recorded needs states vector: that of a pose is its difference"),
             (has_many, f"actions recorded at stride {self.stride}: set join_actions {_JOINED}"),
@@ -278,7 +281,7 @@ class DataConfig(Section):
         )
 
     @classmethod
-    def look(cls, path: str) -> dict[str, Any] | None:  # noqa: ARG003 - of a form that is looked for
+    def detect(cls, path: str) -> dict[str, Any] | None:  # noqa: ARG003 - used by subclasses
         """Return the values that `vjepa2-ac init` writes for a folder of this data format; None for other folders.
 
         They are the keys of this section except source and path, and `control_rate_hz`, the control steps per second.
@@ -303,7 +306,7 @@ class DataConfig(Section):
     @property
     def pose_fields(self) -> tuple[str, PoseFields | None]:
         """The name and the values of the section that describes how poses are stored; ("", None) if there is none."""
-        sections = ((name, getattr(self, name)) for name in self.own_sections())
+        sections = ((name, getattr(self, name)) for name in self.format_sections())
         return next(((name, fields) for name, fields in sections if isinstance(fields, PoseFields)), ("", None))
 
     @property
@@ -313,25 +316,25 @@ class DataConfig(Section):
             return (self.first_camera,)
         return (self.camera,) if isinstance(self.camera, str) else self.camera
 
-    def as_kind(self, source: str, **changes: Any) -> DataConfig:
+    def with_source(self, source: str, **changes: Any) -> DataConfig:
         """Return a config of another data format with the common keys of this one and `changes`, without validation."""
         same = {name: getattr(self, name) for name in DataConfig.model_fields}
         return self.kinds[source].model_construct(**{**same, "source": source, **changes})
 
     @classmethod
-    def own_sections(cls) -> dict[str, type[Section]]:
+    def format_sections(cls) -> dict[str, type[Section]]:
         """Return the sections that only this data format has."""
         own = [(name, one.annotation) for name, one in cls.model_fields.items() if name not in DataConfig.model_fields]
         return {name: kind for name, kind in own if isinstance(kind, type) and issubclass(kind, Section)}
 
     @property
-    def own_values(self) -> dict[str, dict[str, Any]]:
+    def format_values(self) -> dict[str, dict[str, Any]]:
         """The values of the sections that only this data format has, as in the keys of indexes and caches."""
-        values = self.model_dump(mode="json", include=set(self.own_sections()))
+        values = self.model_dump(mode="json", include=set(self.format_sections()))
         return {name: values.get(name, {}) | self.constants.get(name, {}) for name in {**values, **self.constants}}
 
     @property
-    def takes_latents(self) -> bool:
+    def uses_cached_latents(self) -> bool:
         """Whether clips come from a latent cache, so that training does not need the encoder."""
         return self.is_cache or self.cache != "off"
 

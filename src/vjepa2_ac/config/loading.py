@@ -18,10 +18,10 @@ from pydantic import ValidationError
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import source_of
 from vjepa2_ac.config.model import RANDOM
-from vjepa2_ac.config.removed import drop_removed_keys, move_component_options, move_norm_limit, why_removed
+from vjepa2_ac.config.removed import drop_removed_keys, explain_removed_key, move_component_options, move_norm_limit
 from vjepa2_ac.config.run import ReplayConfig, with_complete_replay
-from vjepa2_ac.config.section import key_of_data, marks_of
-from vjepa2_ac.config.training import TrainingConfig, usual_warmup
+from vjepa2_ac.config.section import collect_effects, to_data_key
+from vjepa2_ac.config.training import TrainingConfig, default_warmup_steps
 from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.registry import SOURCES, UNKNOWN_OPTION, import_plugins
 from vjepa2_ac.storage import read_small_file
@@ -55,7 +55,7 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
         return parse_config(config, overrides, where="load_config")
     path = config_path(config)
     of_run = any((path.parent / name).exists() for name in _OF_A_RUN)
-    return parse_config(_read_yaml(path), overrides, where=str(config), here=not of_run)
+    return parse_config(_read_yaml(path), overrides, where=str(config), local_plugins=not of_run)
 
 
 def config_of_model(base: str, overrides: Iterable[str] = (), *, where: str = "overrides", **model: Any) -> Config:
@@ -76,7 +76,7 @@ def config_of_model(base: str, overrides: Iterable[str] = (), *, where: str = "o
 
 def load_config_of_run(path: str | Path, overrides: Iterable[str] = ()) -> Config:
     """Load the config of a run. It may be untrusted, so its plug-ins are not imported from the working directory."""
-    return parse_config(_read_yaml(config_path(path)), overrides, where=str(path), here=False)
+    return parse_config(_read_yaml(config_path(path)), overrides, where=str(path), local_plugins=False)
 
 
 def packaged_configs() -> dict[str, str]:
@@ -99,22 +99,24 @@ def config_path(name: str | Path) -> Path:
     return _PACKAGED / f"{known}.yaml"
 
 
-def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str, here: bool = True) -> Config:
+def parse_config(
+    values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str, local_plugins: bool = True
+) -> Config:
     """Validate plain values, as from YAML or JSON, with `key.sub=value` overrides.
 
     Args:
         values: The values; a Path is converted to text.
         overrides: For example training.steps=100.
         where: The file of the values, for messages.
-        here: Whether plug-ins may be imported from the working directory; False for the config of a run, which may be
-            untrusted.
+        local_plugins: Whether plug-ins may be imported from the working directory; False for the config of a run, which
+            may be untrusted.
 
     Raises:
         InputError: A value is wrong; names every wrong key.
     """
     plain = json.loads(_as_json(values, where))
     _keep_drawn_splits(plain)
-    if not here:
+    if not local_plugins:
         drop_removed_keys(plain, where)
         move_norm_limit(plain, where)
         move_component_options(plain, where)
@@ -127,7 +129,7 @@ def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, wh
     if isinstance(plain.get("model"), dict):
         _replace_keys_of_model(plain["model"])
     try:
-        plain = with_plugins(plain, where=where, here=here)
+        plain = with_plugins(plain, where=where, local_plugins=local_plugins)
         return Config.model_validate_json(_as_json(with_complete_replay(plain), where))
     except ValidationError as error:
         lines = _wrong_values(error)
@@ -142,14 +144,14 @@ def config_as_dict(config: Config) -> dict[str, Any]:
 
 def config_as_flat_dict(config: Config) -> dict[str, Any]:
     """Return the resolved config by dotted keys, the format that trackers accept."""
-    return flat(config_as_dict(config))
+    return flatten(config_as_dict(config))
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested values by their dotted keys."""
     by_key: dict[str, Any] = {}
     for key, value in values.items():
-        by_key |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        by_key |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
     return by_key
 
 
@@ -166,7 +168,7 @@ def yaml_line(key: str, value: Any) -> str:
 
 def config_schema() -> dict[str, Any]:
     """Return the JSON schema of a config file, for editors."""
-    admit_forms_of_data(all_installed=True)
+    accept_new_data_formats(all_installed=True)
     return Config.model_json_schema()
 
 
@@ -247,7 +249,7 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
         values = inner
     if keys[-2:] == ["data", "source"] and value != values.get("source", "rlds"):
         others = [kind for name, kind in DataConfig.kinds.items() if name != value]
-        for section in {section for kind in others for section in kind.own_sections()}:
+        for section in {section for kind in others for section in kind.format_sections()}:
             values.pop(section, None)  # options of the former data format
     values[keys[-1]] = value
 
@@ -281,7 +283,7 @@ def _steps_after_warmup(training: Mapping[str, Any]) -> int:
     warmup_steps = training.get("warmup_steps")
     if not isinstance(steps, int) or not isinstance(warmup_steps, int | None):
         return 0
-    return max(0, steps - (usual_warmup({"steps": steps}) if warmup_steps is None else warmup_steps))
+    return max(0, steps - (default_warmup_steps({"steps": steps}) if warmup_steps is None else warmup_steps))
 
 
 # ---- plug-ins: modules that are imported before a config is validated, because it may use their components ----
@@ -289,7 +291,7 @@ def _steps_after_warmup(training: Mapping[str, Any]) -> int:
 _named: list[str] = []  # modules of `--plugin`
 
 
-def name_plugins(modules: list[str]) -> None:
+def register_plugins(modules: list[str]) -> None:
     """Import the modules of `--plugin`, and add them to the plug-ins of every config that is read later.
 
     Raises:
@@ -299,13 +301,13 @@ def name_plugins(modules: list[str]) -> None:
     _named.extend(modules)
 
 
-def with_plugins(values: Mapping[str, Any], *, where: str, here: bool) -> dict[str, Any]:
+def with_plugins(values: Mapping[str, Any], *, where: str, local_plugins: bool) -> dict[str, Any]:
     """Import the plug-ins of a config and its data format; return the values with all plug-ins, those of --plugin too.
 
     Args:
         values: The plain values, not validated yet.
         where: The file of the config.
-        here: See `registry.import_plugins`.
+        local_plugins: See `registry.import_plugins`.
 
     Raises:
         InputError: A plug-in does not exist.
@@ -316,16 +318,18 @@ def with_plugins(values: Mapping[str, Any], *, where: str, here: bool) -> dict[s
     ):
         return dict(values)  # an error that validation reports
     plugins = list(dict.fromkeys([*(configured or ()), *_named]))
-    import_plugins([module for module in plugins if module not in _named], where=f"{where}: plugins", here=here)
+    import_plugins(
+        [module for module in plugins if module not in _named], where=f"{where}: plugins", here=local_plugins
+    )
     replay = values.get("replay")
     for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
         if (source := source_of(data)) in SOURCES.names():
             SOURCES.find(source)
-    admit_forms_of_data()
+    accept_new_data_formats()
     return {**values, "plugins": plugins} if plugins else dict(values)
 
 
-def admit_forms_of_data(*, all_installed: bool = False) -> None:
+def accept_new_data_formats(*, all_installed: bool = False) -> None:
     """Rebuild the config classes, so that they accept data formats that were registered since the last call.
 
     Args:
@@ -333,14 +337,14 @@ def admit_forms_of_data(*, all_installed: bool = False) -> None:
     """
     for name in SOURCES.names() if all_installed else ():
         SOURCES.find(name)
-    if _admitted != DataConfig.kinds:
+    if _accepted_formats != DataConfig.kinds:
         for section in (DataConfig, ReplayConfig, Config):
             section.model_rebuild(force=True)
-        marks_of.cache_clear()
-        _admitted.update(DataConfig.kinds)
+        collect_effects.cache_clear()
+        _accepted_formats.update(DataConfig.kinds)
 
 
-_admitted = dict(DataConfig.kinds)
+_accepted_formats = dict(DataConfig.kinds)
 
 
 # ---- error messages ----
@@ -359,7 +363,7 @@ def _wrong_values(error: ValidationError) -> list[str]:
     inherited = {
         key
         for key, lines in lines_by_key.items()
-        if key_of_data(key) != key and lines_by_key.get(key_of_data(key)) == lines
+        if to_data_key(key) != key and lines_by_key.get(to_data_key(key)) == lines
     }
     return [
         f"{key}: {', or '.join(lines)}".removeprefix(": ")
@@ -370,7 +374,7 @@ def _wrong_values(error: ValidationError) -> list[str]:
 
 def all_keys() -> list[str]:
     """Return the dotted names of all sections and keys."""
-    paths = [key.split(".") for key in marks_of(Config)]
+    paths = [key.split(".") for key in collect_effects(Config)]
     return list(dict.fromkeys(".".join(path[:depth]) for path in paths for depth in range(1, len(path) + 1)))
 
 
@@ -379,7 +383,7 @@ def _key_of(location: Sequence[Any]) -> str:
     parts: list[str] = []
     for before, part in zip(["", *location], map(str, location), strict=False):
         is_form = before == "data" and part in DataConfig.kinds
-        if not is_form and not (_TYPE_OF_A_UNION.fullmatch(part) and key_of_data(".".join(parts)) in all_keys()):
+        if not is_form and not (_TYPE_OF_A_UNION.fullmatch(part) and to_data_key(".".join(parts)) in all_keys()):
             parts.append(part)
     return ".".join(parts)
 
@@ -393,9 +397,9 @@ def _explain(key: str, detail: Any) -> str:
         return str(detail["msg"])
     if detail["type"] != "extra_forbidden":
         return describe_validation_error(detail)
-    key = key_of_data(key)
+    key = to_data_key(key)
     section, dot, name = key.rpartition(".")
-    if (why := why_removed(key)) is not None:
+    if (why := explain_removed_key(key)) is not None:
         return why
     if key in all_keys():
         owners = [source for source, kind in DataConfig.kinds.items() if name in kind.model_fields]

@@ -83,7 +83,7 @@ class PredictorSizes(_PredictorShape):
     @model_validator(mode="after")
     def _widths_are_used(self) -> PredictorSizes:
         is_broken = not self.use_states and self.state_dim != _STATE_DIM
-        return self.refused(
+        return self.check_rules(
             (is_broken, f"state_dim {self.state_dim} with use_states false: any width fits, leave it out")
         )
 
@@ -106,7 +106,7 @@ class ModelSizes(Section):
         return (self.image_size // self.patch_size) ** 2
 
     @property
-    def too_narrow_to_copy(self) -> str | None:
+    def narrow_predictor_warning(self) -> str | None:
         """The warning for training from scratch if the predictor cannot start near persistence, otherwise None."""
         if self.predictor.width >= self.encoder.width:
             return None
@@ -119,14 +119,14 @@ class ModelSizes(Section):
     def _sizes_divide(self) -> ModelSizes:
         image, patch = self.image_size, self.patch_size
         old, as_image = self.encoder.family == "v2", self.encoder.frame == "image"
-        self.refused(
+        self.check_rules(
             (image % patch, f"image_size {image} is not a multiple of patch_size {patch}"),
             (old and as_image, "encoder.frame image: V-JEPA 2 has no path for images, only 2.1 has; take tubelet"),
             (not old and image == patch, "image_size of one patch: V-JEPA 2.1 needs a grid of two patches or more"),
         )
         for name, part in (("encoder", self.encoder), ("predictor", self.predictor)):
             head, rest = divmod(part.width, part.heads)
-            self.refused(
+            self.check_rules(
                 (rest, f"{name}.width {part.width} is not a multiple of {name}.heads {part.heads}"),
                 (
                     head < 6 or head % 2,
@@ -141,7 +141,7 @@ class ModelSizes(Section):
         parts, tokens = (self.encoder, self.predictor), self.tokens_per_frame
         weights = sum(part.depth * part.width**2 * (4 + 2 * part.mlp_ratio) for part in parts)
         weights += 6 * self.patch_size**2 * self.encoder.width  # patch embedding of 3 colours and 2 frames
-        return self.refused(
+        return self.check_rules(
             (tokens > _MOST_TOKENS, f"image_size: {tokens:,} tokens a frame, more than {_MOST_TOKENS:,}"),
             (
                 weights > _MOST_WEIGHTS,
@@ -169,7 +169,7 @@ class SizesConfig(Section):
     """The predictor."""
 
     @property
-    def whole(self) -> ModelSizes:
+    def model_sizes(self) -> ModelSizes:
         """All sizes: MLP widths as in the published models, and the widths of poses until the data are known."""
         released = EncoderSizes()
         ratio = released.mlp_ratio if self.encoder.width == released.width else 4.0
@@ -180,7 +180,7 @@ class SizesConfig(Section):
     @model_validator(mode="after")
     def _fit_together(self) -> SizesConfig:
         try:
-            _ = self.whole
+            _ = self.model_sizes
         except ValidationError as error:
             raise ValueError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
         return self
@@ -279,10 +279,10 @@ class AdapterConfig(Section):
         ours = [(True, f"peft.{name} is adapter.{PEFT_NAMES[name]} here") for name in self.peft if name in PEFT_NAMES]
         changes_base = start not in (True, False, "gaussian", "orthogonal")
         why = "changes the base to weights that nobody has; take true, false, gaussian or orthogonal"
-        return self.refused(*ours, (changes_base, f"peft.init_lora_weights {start!r} {why}"))
+        return self.check_rules(*ours, (changes_base, f"peft.init_lora_weights {start!r} {why}"))
 
     @property
-    def out_of_line(self) -> str | None:
+    def alpha_warning(self) -> str | None:
         """The warning if alpha seems to be raised with the rank although rsLoRA is on, otherwise None."""
         if self.kind != "lora" or not self.rslora or self.alpha < 2 * _USUAL_ALPHA:
             return None

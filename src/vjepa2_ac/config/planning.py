@@ -11,7 +11,7 @@ from vjepa2_ac.config.section import (
     OFF,
     Component,
     ComponentOf,
-    Local,
+    LocalPath,
     NonNegative,
     Positive,
     PositiveInt,
@@ -21,8 +21,8 @@ from vjepa2_ac.config.section import (
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.registry import ENERGIES, PLANNERS
 
-Place = Annotated[float, Field(ge=-5.0, le=5.0)]  # coordinate in the base frame in metres; no arm reaches farther
-Corner = tuple[Place, Place, Place]
+Coordinate = Annotated[float, Field(ge=-5.0, le=5.0)]  # coordinate in the base frame in metres; no arm reaches farther
+Corner = tuple[Coordinate, Coordinate, Coordinate]
 ELITES = 10  # default of the option `elites` of the planners cem and icem
 Metre = ZeroToOne  # no arm moves farther in a model step, so that larger values are probably millimetres
 
@@ -69,13 +69,13 @@ class LimitsConfig(Section):
     def _workspace_has_room(self) -> LimitsConfig:
         low, high = self.workspace or ((0, 0, 0), (1, 1, 1))
         is_broken = any(one >= other for one, other in zip(low, high, strict=True))
-        return self.refused((is_broken, f"workspace: the corner {low} is not below {high} on every axis"))
+        return self.check_rules((is_broken, f"workspace: the corner {low} is not below {high} on every axis"))
 
     @model_validator(mode="after")
     def _something_is_free(self) -> LimitsConfig:
         held = self.gripper_mode in {"held", "open", "close"} or not self.gripper
         is_broken = not any(self.xyz) and not self.rotation and held
-        return self.refused((is_broken, "nothing is left to plan: xyz, rotation and gripper are all held"))
+        return self.check_rules((is_broken, "nothing is left to plan: xyz, rotation and gripper are all held"))
 
 
 class EnergyConfig(Section):
@@ -108,10 +108,10 @@ class PlanningConfig(Section):
     budget_s: Positive | None = None
     """Time limit of a search in seconds: an iteration that would end later is not started, and the best plan so far is
     used. The first iteration always runs. Encoding the frame does not count. null: all iterations run."""
-    prior: Local | None = None
+    prior: LocalPath | None = None
     """Folder of an action prior (`vjepa2-ac prior`): every search starts from the mean and standard deviation that it
     predicts."""
-    monitor: Local | None = None
+    monitor: LocalPath | None = None
     """A monitor.json (`vjepa2-ac monitor`): each frame is compared with the prediction of the last decision."""
     warm_start: bool = False
     """Whether a search starts from the previous plan, shifted by the executed steps. Not recommended with horizon 1,
@@ -123,7 +123,7 @@ class PlanningConfig(Section):
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks. Needs a C compiler; the first decision takes a minute longer.
     Energies are equal up to rounding."""
-    axes: Local | None = None
+    axes: LocalPath | None = None
     """Calibrated axes of the model: the axes.json of `data calibrate --axes`. Actions and poses are rotated by the
     calibrated angle before the model receives them. Only for poses in the base frame."""
     limits: LimitsConfig = LimitsConfig()
@@ -136,7 +136,7 @@ class PlanningConfig(Section):
         views, repeat, elites = self.views > 1, self.action_repeat, self.planner.options.get("elites", ELITES)
         few_samples = self.planner.name in {"cem", "icem"} and elites > self.samples
         fix = "or set views: 1"
-        return self.refused(
+        return self.check_rules(
             (self.horizon % repeat, f"horizon {self.horizon} is not a multiple of action_repeat {repeat}"),
             (few_samples, f"planner {self.planner.name}: {elites} elites are more than {self.samples} samples"),
             (views and self.axes, f"views excludes axes, which are calibrated with one camera. Leave axes out, {fix}"),

@@ -92,7 +92,7 @@ MOVED = {
 """Removed keys and sections -> where their values are today; most are options of a component."""
 
 
-def why_removed(key: str) -> str | None:
+def explain_removed_key(key: str) -> str | None:
     """Return the explanation for a removed key; None if the key was never removed."""
     if key in MOVED:
         return f"moved in 0.2, to {MOVED[key]}"

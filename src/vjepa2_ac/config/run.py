@@ -39,12 +39,12 @@ class ReplayConfig(Section):
     except `exclude`, and `camera` if the source differs. Frames per clip, kind of states and actions, and use of a
     latent cache must be the same as in `data`. Only the training split is used; `workers` is ignored."""
 
-    def misfits(self, first: DataConfig) -> list[str]:
+    def find_mismatches(self, first: DataConfig) -> list[str]:
         """Return why clips of both data sets cannot be in one micro-batch, as far as their configs show."""
         same = ("frames", "states", "actions", "join_actions", "pose_frame")
         pairs = [(name, getattr(self.data, name), getattr(first, name)) for name in same]
         lines = [f"replay.data.{name} {one} is not data.{name} {other}" for name, one, other in pairs if one != other]
-        if self.data.takes_latents != first.takes_latents:
+        if self.data.uses_cached_latents != first.uses_cached_latents:
             lines.append("replay.data or data takes latents from a cache, and the other does not: set cache alike")
         if "auto" in (first.stride, self.data.stride):
             lines.append("stride auto with replay: give the numbers, so that steps of both last equally long")
@@ -55,7 +55,7 @@ class Config(Section):
     """A complete run."""
 
     run_dir: Annotated[str, AfterValidator(_run_folder), Affects.NOTHING]
-    """Local folder of the run: resolved config, checkpoints, metrics. `checkpoint.remote` keeps a copy."""
+    """LocalPath folder of the run: resolved config, checkpoints, metrics. `checkpoint.remote` keeps a copy."""
     seed: Annotated[int, Field(ge=0, lt=2**31), Affects.RUN | Affects.PLAN] = 0
     """Seed of the order of clips, new weights, dropout and the planner's samples."""
     plugins: Annotated[tuple[str, ...], Affects.NOTHING] = ()
@@ -104,8 +104,8 @@ class Config(Section):
         stray = [name for name in ("targets", "modules_to_save") if "state_encoder" in getattr(adapter, name)]
         stray = stray if lora and not predictor.use_states else []
         blind = [data.source for data in self.data_sets if not data.has_camera_poses]
-        misfits = [] if self.replay is None else self.replay.misfits(self.data)
-        return self.refused(
+        find_mismatches = [] if self.replay is None else self.replay.find_mismatches(self.data)
+        return self.check_rules(
             (steps >= self.data.frames, f"training.rollout_steps {steps} needs data.frames of at least {steps + 1}"),
             (model.is_random and lora, "model.base random with adapter.kind lora adapts noise; set adapter.kind: none"),
             (fp32 and model.dtype != "float32", "training.precision fp32 needs model.dtype float32"),
@@ -115,7 +115,7 @@ class Config(Section):
             (best == "off" and patient, "training.patience waits for a better one, and checkpoint.keep_best is off"),
             (predictor.use_extrinsics and blind, f"predictor.use_extrinsics needs camera poses, not in source {blind}"),
             (stray, f"adapter.{' and '.join(stray)}: no state_encoder where predictor.use_states is false"),
-            (misfits, "; ".join(misfits)),
+            (find_mismatches, "; ".join(find_mismatches)),
         )
 
     @property
@@ -152,7 +152,7 @@ def _inherited(data: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, 
     source = second.get("source", source_of(data))
     if source != source_of(data):
         kind = DataConfig.kinds.get(source_of(data), DataConfig)
-        dropped |= {"source", "camera", *kind.own_sections()}
+        dropped |= {"source", "camera", *kind.format_sections()}
     return {key: value for key, value in data.items() if key not in dropped}
 
 

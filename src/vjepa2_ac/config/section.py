@@ -29,9 +29,9 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 ZeroToOne = Annotated[float, Field(ge=0.0, le=1.0)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 OFF = BeforeValidator(lambda value: "off" if value is False else value)  # YAML reads off as a boolean
-Place = Annotated[str, AfterValidator(paths.resolve_path_or_url)]  # a local path (~ is the user's home) or a URL
-Local = Annotated[str, AfterValidator(paths.resolve_local_path)]  # a local path
-LocalOrBuiltin = Annotated[str, AfterValidator(paths.resolve_model_path)]  # a local path, or builtin:NAME
+PathOrUrl = Annotated[str, AfterValidator(paths.resolve_path_or_url)]  # a local path (~ is the user's home) or a URL
+LocalPath = Annotated[str, AfterValidator(paths.resolve_local_path)]  # a local path
+LocalPathOrBuiltin = Annotated[str, AfterValidator(paths.resolve_model_path)]  # a local path, or builtin:NAME
 
 
 class Affects(Flag):
@@ -54,7 +54,7 @@ class Section(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
-    def refused(self, *rules: tuple[object, str]) -> Self:
+    def check_rules(self, *rules: tuple[object, str]) -> Self:
         """Return the section, or raise an error if a rule is broken; called by validators.
 
         Args:
@@ -69,21 +69,21 @@ class Section(BaseModel):
         return self
 
 
-OVERLAY = "replay.data"  # contains the keys of `data` that differ in the replay data set
+REPLAY_DATA = "replay.data"  # contains the keys of `data` that differ in the replay data set
 
 
 @cache
-def marks_of(section: type[BaseModel]) -> Mapping[str, Affects]:
+def collect_effects(section: type[BaseModel]) -> Mapping[str, Affects]:
     """Return what each key of a section and of its inner sections affects, by dotted key.
 
     Raises:
         TypeError: A key has no annotation.
     """
-    return dict(_marks(section, getattr(section, "affects", None), ""))
+    return dict(_iterate_effects(section, getattr(section, "affects", None), ""))
 
 
 @cache
-def mark_of(key: str, section: type[BaseModel]) -> Affects:
+def get_effect(key: str, section: type[BaseModel]) -> Affects:
     """Return what a key affects; for a part of a value, such as data.fields.cameras.left, what the whole key affects.
 
     For a section the annotations of its keys are combined. The keys of `replay.data` are those of `data`, but affect
@@ -92,18 +92,18 @@ def mark_of(key: str, section: type[BaseModel]) -> Affects:
     Raises:
         KeyError: There is no such key.
     """
-    if (of_data := key_of_data(key)) != key:
-        return mark_of(of_data, section) & Affects.RUN
-    known = ((f"{name}.", mark) for name, mark in marks_of(section).items())
+    if (of_data := to_data_key(key)) != key:
+        return get_effect(of_data, section) & Affects.RUN
+    known = ((f"{name}.", mark) for name, mark in collect_effects(section).items())
     marks = [mark for name, mark in known if name.startswith(f"{key}.") or f"{key}.".startswith(name)]
     if not marks:
         raise KeyError(key)
     return reduce(or_, marks)
 
 
-def key_of_data(key: str) -> str:
+def to_data_key(key: str) -> str:
     """Return the key of `data` that a key of `replay.data` overlays; any other key is returned unchanged."""
-    return f"data.{key.removeprefix(f'{OVERLAY}.')}" if key.startswith(f"{OVERLAY}.") else key
+    return f"data.{key.removeprefix(f'{REPLAY_DATA}.')}" if key.startswith(f"{REPLAY_DATA}.") else key
 
 
 def values_that_affect(what: Affects, section: BaseModel) -> dict[str, Any]:
@@ -114,7 +114,7 @@ def values_that_affect(what: Affects, section: BaseModel) -> dict[str, Any]:
     """
     plain: dict[str, Any] = section.model_dump(mode="json")
     chosen: dict[str, Any] = {}
-    for key, mark in marks_of(type(section)).items():
+    for key, mark in collect_effects(type(section)).items():
         *outer, name = key.split(".")
         values, target = plain, chosen
         for part in outer:
@@ -126,13 +126,15 @@ def values_that_affect(what: Affects, section: BaseModel) -> dict[str, Any]:
     return chosen
 
 
-def _marks(section: type[BaseModel], outer: Affects | None, prefix: str) -> Iterator[tuple[str, Affects]]:
+def _iterate_effects(section: type[BaseModel], outer: Affects | None, prefix: str) -> Iterator[tuple[str, Affects]]:
     for name, info in section.model_fields.items():
         mark = next((one for one in info.metadata if isinstance(one, Affects)), None)
-        inner = [] if prefix + name == OVERLAY else sections_in(info.annotation)
+        inner = [] if prefix + name == REPLAY_DATA else sections_in(info.annotation)
         for one in (kind for base in inner for kind in [*getattr(base, "kinds", {}).values()] or [base]):
             marks = (mark, getattr(one, "affects", None), outer)
-            yield from _marks(one, next((known for known in marks if known is not None), None), f"{prefix}{name}.")
+            yield from _iterate_effects(
+                one, next((known for known in marks if known is not None), None), f"{prefix}{name}."
+            )
         if not inner:
             mark = outer if mark is None else mark
             if mark is None:

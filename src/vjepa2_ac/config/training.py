@@ -12,10 +12,10 @@ from vjepa2_ac.config.section import (
     Component,
     ComponentOf,
     Count,
-    Local,
-    LocalOrBuiltin,
+    LocalPath,
+    LocalPathOrBuiltin,
     NonNegative,
-    Place,
+    PathOrUrl,
     Positive,
     PositiveInt,
     Section,
@@ -26,7 +26,7 @@ from vjepa2_ac.registry import LOSSES, TRACKERS
 DecoderSize = Literal["tiny", "small", "medium"]
 
 
-def usual_warmup(values: dict[str, Any]) -> int:
+def default_warmup_steps(values: dict[str, Any]) -> int:
     """Return the default of `training.warmup_steps` for the values of the section `training`."""
     return min(1_000, int(values.get("steps", 0)) // 10)
 
@@ -52,7 +52,7 @@ class TrainingConfig(Section):
     schedule: Literal["cosine", "warmup_stable_decay"] = "cosine"
     """Both start with a linear warm-up from 0. cosine: then half a cosine down to 0. warmup_stable_decay: then
     constant, with a linear decay to 0 in the last decay_steps."""
-    warmup_steps: Count = Field(default_factory=usual_warmup)
+    warmup_steps: Count = Field(default_factory=default_warmup_steps)
     """Number of optimizer steps of the linear warm-up. Default: the smaller of 1,000 and a tenth of the steps."""
     decay_steps: Count = 0
     """Number of optimizer steps of the final decay, for warmup_stable_decay only; 0: the rate stays constant."""
@@ -88,7 +88,7 @@ class TrainingConfig(Section):
     @model_validator(mode="after")
     def _parts_fit(self) -> TrainingConfig:
         warmup, decay = self.warmup_steps, self.decay_steps
-        return self.refused(
+        return self.check_rules(
             (warmup + decay > self.steps, f"warmup_steps {warmup} and decay_steps {decay} exceed steps {self.steps}"),
             (decay and self.schedule == "cosine", "decay_steps belongs to schedule warmup_stable_decay, not cosine"),
         )
@@ -109,7 +109,7 @@ class ValidationConfig(Section):
     ranking_samples: Annotated[PositiveInt, Affects.MEASURED] = 32
     """Number of alternative actions per motion, drawn twice: from a box of 7.5 cm to each side, and with the length of
     the true action in random directions."""
-    decoder: Annotated[LocalOrBuiltin | None, Affects.NOTHING] = None
+    decoder: Annotated[LocalPathOrBuiltin | None, Affects.NOTHING] = None
     """Folder of a decoder (docs/decoding.md), or builtin:sim-tiny: each validation then draws the frames that base
     model and trained model predict for the validation clip with the most motion, in RUN/imagined and in the trackers.
     null: no images."""
@@ -128,7 +128,7 @@ class CheckpointConfig(Section):
     half a percentage point of it the lowest rollout error; the untrained state is a candidate, because a lower error
     may come with worse plans. error: the rollout error relative to persistence at the last horizon. off: no best
     checkpoint, the default is the newest."""
-    remote: Place | None = None
+    remote: PathOrUrl | None = None
     """Where the run is copied during training: gs://bucket/folder, another writable fsspec URL, or a folder. A start
     with an empty run_dir resumes from the copy. `keep` and the best checkpoint apply to the copy, too. null: no
     copy."""
@@ -161,7 +161,7 @@ class TrackingConfig(Section):
 class DecoderConfig(Section):
     """The decoder that `vjepa2-ac decoder` trains, to display latents as frames."""
 
-    folder: Annotated[Local | None, Affects.NOTHING] = None
+    folder: Annotated[LocalPath | None, Affects.NOTHING] = None
     """Folder of the decoder; null: the folder `decoder` next to run_dir. A decoder belongs to an encoder and a camera,
     not to a run."""
     size: DecoderSize = "small"

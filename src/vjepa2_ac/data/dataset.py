@@ -289,7 +289,7 @@ def through_latents(dataset: Dataset, folder: Path | str) -> Dataset:
     Raises:
         InputError: The cache lacks episodes or is damaged.
     """
-    config = dataset.config.as_kind("latents", path=str(folder), cache="off", camera=dataset.config.cameras)
+    config = dataset.config.with_source("latents", path=str(folder), cache="off", camera=dataset.config.cameras)
     source = open_source(config)
     # The labels are copied, because caches of older versions lack the labels of splits.
     table = replace(EpisodeTable.of(source.infos()), labels=dataset.table.labels)

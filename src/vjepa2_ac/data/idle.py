@@ -33,7 +33,7 @@ def find_ranges(
     Raises:
         InputError: The list of ranges cannot be read or belongs to another data set, or the rule fits no episode.
     """
-    values = {"idle": config.idle.model_dump(mode="json"), **config.own_values}
+    values = {"idle": config.idle.model_dump(mode="json"), **config.format_values}
     parts: dict[str, object] = {"found": "idle ranges", "table": fingerprint_of(table), "data": values}
     make = partial(_computed, source, table, config, progress or no_progress)
     if config.idle.rule == "published":

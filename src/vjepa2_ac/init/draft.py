@@ -187,7 +187,7 @@ def make_draft(data: DatasetProperties, machine: Machine, model: ModelChoice, *,
     }
     config = parse_config(plain_values(values), where="vjepa2-ac init")
     costs: list[str] = []
-    if data.steps and config.data.takes_latents:
+    if data.steps and config.data.uses_cached_latents:
         costs.append(f"Disk space for cached latents: at most {_gigabytes(data.steps * model.bytes_per_frame)} GB.")
     if model.is_tiny:
         return Draft(values, config, costs)

@@ -13,7 +13,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
+from vjepa2_ac.config.loading import accept_new_data_formats, parse_config
 from vjepa2_ac.data.files import in_parallel, walk
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import describe_splits, held_out_by
@@ -173,9 +173,9 @@ def read_properties(path: str) -> DatasetProperties:
 
 def _read_with_plugins(path: str) -> DatasetProperties | None:
     """Return the properties of a data set if a third-party source recognises it (docs/extending.md)."""
-    admit_forms_of_data(all_installed=True)
+    accept_new_data_formats(all_installed=True)
     for source, kind in DataConfig.kinds.items():
-        if (values := kind.look(path)) is not None:
+        if (values := kind.detect(path)) is not None:
             reason = f"returned by {kind.__name__}.look"
             rate = DraftValue(10.0, _UNKNOWN_RATE, is_guess=True)
             if "control_rate_hz" in values:

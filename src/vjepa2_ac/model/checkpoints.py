@@ -99,8 +99,8 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     encoder = None if config.encoder is None else find_encoder(config.encoder)
     if config.is_random:
         if encoder is None:
-            return WorldModel.random(config.sizes.whole, seed, dtype, at_persistence=True)
-        model = _on_encoder(encoder, sizes_with(encoder, config.sizes.whole), dtype)
+            return WorldModel.random(config.sizes.model_sizes, seed, dtype, at_persistence=True)
+        model = _on_encoder(encoder, sizes_with(encoder, config.sizes.model_sizes), dtype)
         model.draw_predictor(torch.Generator().manual_seed(seed), dtype, at_persistence=True)
         return model
     path = find_base(config.base)
@@ -110,8 +110,8 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
         fix = "Leave out model.encoder; or train a fresh predictor on it, with model.base: random"
         raise InputError(where=f"model.base: {config.base}", found=said, fix=fix)
     if file is not None:
-        return _of_meta(file, encoder, config.sizes.whole, dtype)
-    check_sizes(read_sizes(path), config.sizes.whole, where=f"model.base: {config.base}")
+        return _of_meta(file, encoder, config.sizes.model_sizes, dtype)
+    check_sizes(read_sizes(path), config.sizes.model_sizes, where=f"model.base: {config.base}")
     return WorldModel.from_pretrained(path, dtype=dtype)
 
 
@@ -124,12 +124,12 @@ def base_sizes(config: ModelConfig) -> ModelSizes:
         InputError: The folder is not a world model; or `model.encoder` is not an encoder.
     """
     if config.encoder is not None:
-        return expected_sizes(config.encoder, config.sizes.whole)
+        return expected_sizes(config.encoder, config.sizes.model_sizes)
     if config.is_random:
-        return config.sizes.whole
+        return config.sizes.model_sizes
     is_there = config.base.startswith(BUILTIN) or Path(config.base).exists()
     path = find_base(config.base) if is_there else Path(config.base)
-    return read_sizes(path) if path.is_dir() else config.sizes.whole
+    return read_sizes(path) if path.is_dir() else config.sizes.model_sizes
 
 
 def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, SizesConfig
-from vjepa2_ac.config.loading import flat
+from vjepa2_ac.config.loading import flatten
 from vjepa2_ac.config.model import Family, FramePath
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError, shell_command
 from vjepa2_ac.reporter import SILENT, Reporter
@@ -120,8 +120,8 @@ def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
     Raises:
         InputError: A size differs; names it.
     """
-    actual, configured, default = (flat(sizes.model_dump()) for sizes in (found, given, ModelSizes()))
-    wrong = [key for key in flat(SizesConfig().model_dump()) if configured[key] not in (actual[key], default[key])]
+    actual, configured, default = (flatten(sizes.model_dump()) for sizes in (found, given, ModelSizes()))
+    wrong = [key for key in flatten(SizesConfig().model_dump()) if configured[key] not in (actual[key], default[key])]
     if wrong:
         said = ", ".join(f"{key} {actual[key]}, and model.sizes says {configured[key]}" for key in wrong)
         raise InputError(where=where, found=said, fix="Leave them out of model.sizes: the model file has them")

@@ -193,7 +193,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         """Initialise the predictor close to persistence: the input layer is a rotation, the output layer its inverse.
 
         Without this initialisation a tiny predictor spends most of its training on learning to copy. A predictor
-        narrower than the latents can copy only a random part of them (`ModelSizes.too_narrow_to_copy`).
+        narrower than the latents can copy only a random part of them (`ModelSizes.narrow_predictor_warning`).
         """
         shape = self.predictor_embed.weight.shape
         drawn = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)

@@ -14,7 +14,7 @@ from pydantic import AliasPath, BaseModel, Field
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.loading import config_of_model, load_config
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.config.section import Affects, mark_of
+from vjepa2_ac.config.section import Affects, get_effect
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import CHANGES, MOVABLE, is_of_moved, is_run, read_run_config
@@ -131,7 +131,7 @@ def _require_relevant(subject: str, overrides: Sequence[str]) -> None:
     for override in overrides:
         key = override.partition("=")[0]
         try:
-            is_relevant = Affects.PLAN in mark_of(key, Config)
+            is_relevant = Affects.PLAN in get_effect(key, Config)
         except KeyError:  # an unknown key; loading the config reports it
             continue
         if is_of_moved(override) and not is_run(subject):

@@ -36,7 +36,7 @@ from filelock import FileLock, Timeout
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config_of_run
 from vjepa2_ac.config.model import RANDOM
-from vjepa2_ac.config.section import Affects, mark_of
+from vjepa2_ac.config.section import Affects, get_effect
 from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
 from vjepa2_ac.storage import (
@@ -87,7 +87,7 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
         raise InputError(where=str(folder), found="a file", needed="a folder for the run", fix="Set another run_dir")
     if (folder / CONFIG).exists():
         changed = [] if allow_config_change else changed_keys(read_run_config(folder), config)
-        if differing := [key for key in changed if Affects.RUN in mark_of(key, Config)]:
+        if differing := [key for key in changed if Affects.RUN in get_effect(key, Config)]:
             found = f"a run of another config; it differs in {', '.join(differing)}"
             same = f"Set another run_dir for a new run, or resume with `{shell_command('train', folder, '--resume')}`"
             fix = f"{same}; where the change is meant, add --allow-config-change"
@@ -154,7 +154,7 @@ def write_config(config: Config) -> list[str]:
 def asks_nothing_new(config: Config) -> bool:
     """Return whether a config changes neither the computation, the measurements nor the paths of its run."""
     changed = changed_keys(read_run_config(Path(config.run_dir)), config)
-    return not any(key in _PATHS or (Affects.RUN | Affects.MEASURED) & mark_of(key, Config) for key in changed)
+    return not any(key in _PATHS or (Affects.RUN | Affects.MEASURED) & get_effect(key, Config) for key in changed)
 
 
 def config_changes(config: Config) -> list[str]:

@@ -26,7 +26,7 @@ _SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])  # a reachable pose
 def metadata_of(loaded: Subject, session: Session) -> dict[str, Any]:
     """Return the metadata that clients receive on connect, as plain values without local paths."""
     planning, options, model = loaded.config.planning, session.options, loaded.as_dict()["model"]
-    sections = (getattr(loaded.config.data, name) for name in loaded.config.data.own_sections())
+    sections = (getattr(loaded.config.data, name) for name in loaded.config.data.format_sections())
     rates = (getattr(section, "control_rate_hz", None) for section in sections)
     rate = next((rate for rate in rates if rate is not None), None)  # None: it is stored in the data set only
     return {

@@ -338,7 +338,7 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
     number, trained = HALF if config.model.dtype == "bfloat16" else FLOAT32, parameters.trained * FLOAT32
     encoder = parameters.encoder * number
     parts = {
-        "encoder weights": 0 if config.data.takes_latents else encoder,
+        "encoder weights": 0 if config.data.uses_cached_latents else encoder,
         "predictor weights": parameters.predictor * number if config.adapter.kind == "lora" else 0,  # frozen
         "trained weights": trained,
         "gradients": trained,
@@ -382,7 +382,7 @@ def _memory_savings(config: Config) -> Iterator[tuple[str, dict[str, dict[str, A
     yield "training.batch_size=1 (and as much more accumulation)", {"training": {"batch_size": 1}}
     bf16 = {"model": {"dtype": "bfloat16"}, "training": {"precision": "bf16"}}
     yield "model.dtype=bfloat16 with training.precision=bf16", bf16
-    if not (config.data.transforms or config.data.takes_latents):
+    if not (config.data.transforms or config.data.uses_cached_latents):
         yield "data.cache=auto", {"data": {"cache": "auto"}}
     fewest = max(8, config.training.rollout_steps + 1)
     yield "data.frames=8", {"data": {"frames": min(config.data.frames, fewest)}}
@@ -406,7 +406,7 @@ def _moments(config: Config, elements: int) -> int:
 def batch_bytes(config: Config, sizes: ModelSizes) -> int:
     """Return the bytes of a batch from the loader: latents, or frames, assumed to have the model's image size."""
     frames = config.training.batch_size * config.data.frames
-    if not config.data.takes_latents:
+    if not config.data.uses_cached_latents:
         return frames * 3 * sizes.image_size**2
     return frames * sizes.tokens_per_frame * sizes.encoder.width * _BYTES_OF_CACHED[config.data.cache_dtype]
 
@@ -417,7 +417,7 @@ def _latents(config: Config, sizes: ModelSizes, clips: int) -> int:
 
 def _encoding(config: Config, sizes: ModelSizes, clips: int) -> int:
     """Return the peak bytes of encoding clips: the larger half of an encoder block, the frames, and the features."""
-    return 0 if config.data.takes_latents else _at_work(config, sizes, clips * config.data.frames)
+    return 0 if config.data.uses_cached_latents else _at_work(config, sizes, clips * config.data.frames)
 
 
 def _caching(config: Config, sizes: ModelSizes) -> int:

@@ -192,7 +192,7 @@ class Throughput:
         device = accelerator.device
         ceiling = accelerator.num_processes * measure_matmul_speed(device, PRECISIONS[config.training.precision])
         flops = clip_flops(config, sizes)
-        return cls(flops.predictor if config.data.takes_latents else flops.total, ceiling, device)
+        return cls(flops.predictor if config.data.uses_cached_latents else flops.total, ceiling, device)
 
     def metrics(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
         """Return the metrics of one step.

@@ -12,7 +12,7 @@ from typing import Any
 from accelerate.utils import broadcast
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import flat
+from vjepa2_ac.config.loading import flatten
 from vjepa2_ac.config.section import Affects, values_that_affect
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import fingerprint_of
@@ -119,7 +119,7 @@ def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any]
 
 def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
     """Return the config values, and the hash of the clips, that determine the metrics of a validation."""
-    settings = {key: json.dumps(value) for key, value in flat(values_that_affect(Affects.MEASURED, config)).items()}
+    settings = {key: json.dumps(value) for key, value in flatten(values_that_affect(Affects.MEASURED, config)).items()}
     windows = validation_windows(dataset, "validation", clips=config.validation.clips)
     clips = [(dataset.table.identity(episode), int(start)) for episode, start in windows]
     return {**settings, "its clips": hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}

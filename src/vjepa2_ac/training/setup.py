@@ -117,7 +117,7 @@ def set_up(
 
 
 def _require_shared_memory(config: Config, clip: Batch, sizes: ModelSizes, accelerator: Accelerator) -> None:
-    is_encoded_later = config.data.takes_latents and clip.latents is None
+    is_encoded_later = config.data.uses_cached_latents and clip.latents is None
     size = batch_bytes(config, sizes) if is_encoded_later else clip.nbytes * config.training.batch_size
     nodes = all_gather_object(accelerator, platform.node())
     run_on_all(accelerator, lambda: require_shared_memory(config.data, size, nodes.count(platform.node())))
@@ -128,10 +128,10 @@ def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, r
     _fit_heads(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed)
     reporter.note(str(trainable_report(world_model)))
-    if problem := config.adapter.out_of_line:
+    if problem := config.adapter.alpha_warning:
         reporter.note(f"Warning: {problem}.")
     copies = config.model.is_random
-    if copies and (reason := world_model.sizes.too_narrow_to_copy):
+    if copies and (reason := world_model.sizes.narrow_predictor_warning):
         reporter.note(f"Warning: {reason}.")
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
     world_model.set_attention(config.training.attention)
@@ -226,7 +226,7 @@ def require_fitting_clips(first: Dataset, others: Sequence[Dataset]) -> None:
         InputError: Frames differ in size, or latents in type; the message describes both.
     """
     for replayed in others:
-        if any(one.config.takes_latents and not one.config.is_cache for one in (first, replayed)):
+        if any(one.config.uses_cached_latents and not one.config.is_cache for one in (first, replayed)):
             continue  # not encoded yet
         found, needed = (_form(first_clip(dataset)) for dataset in (replayed, first))
         if found != needed:

@@ -118,7 +118,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         parts = {
             "source": "droid_raw",
             "cameras": config.cameras,
-            **config.own_values,
+            **config.format_values,
             "pose_frame": config.pose_frame,
             "folders": listed,
         }

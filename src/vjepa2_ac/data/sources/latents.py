@@ -91,14 +91,14 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
         "data.cache_dtype": config.cache_dtype,
         "data.camera": list(config.cameras),
         "data.pose_frame": config.pose_frame,
-        "data set": {"source": config.source, "episodes": fingerprint, **config.own_values},
+        "data set": {"source": config.source, "episodes": fingerprint, **config.format_values},
     })  # fmt: skip
 
 
 def clip_parts(config: DataConfig) -> dict[str, Any]:
     """Return the parts that determine the frames and other data of clips, to check a cache that is used by itself."""
     values = values_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
-    names = values.keys() - _OF_THE_FRAMES - config.own_sections().keys()
+    names = values.keys() - _OF_THE_FRAMES - config.format_sections().keys()
     return {f"data.{name}": values[name] for name in sorted(names)}
 
 

@@ -108,7 +108,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         for key in keys:
             if info.features[key].dtype == "video":
                 files |= listed(info.video_path or "", key)
-        fields = config.own_values["lerobot"]
+        fields = config.format_values["lerobot"]
         fields.pop("action")  # included in the columns if it matters
         parts = {
             **({"vector": wanted_columns(config)} if config.states == "vector" else {}),
