@@ -28,7 +28,7 @@ from vjepa2_ac.config import Config, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.sources.latent_files import bytes_per_frame
 from vjepa2_ac.distributed import measure_matmul_speed
-from vjepa2_ac.encoding.latent_cache import picture_bytes
+from vjepa2_ac.encoding.latent_cache import image_bytes
 from vjepa2_ac.model.model_files import PUBLISHED
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import write_atomically
@@ -143,7 +143,7 @@ def cost_of(
     }
     any_of = {side: next(iter(by_predictor.values())) for side, by_predictor in by_size.items()}
     first = any_of[str(image_sizes[0])]
-    per_frame = bytes_per_frame(first.tokens_per_frame, encoder.width, "bf16") + picture_bytes(first.image_size)
+    per_frame = bytes_per_frame(first.tokens_per_frame, encoder.width, "bf16") + image_bytes(first.image_size)
     return Cost(
         encoder=name,
         downloads=downloads,

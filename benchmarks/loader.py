@@ -32,10 +32,10 @@ from synthetic_droid import draw_episodes
 from vjepa2_ac.config import DataConfig, DiskCacheConfig, RldsData
 from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import open_dataset, read_clip
-from vjepa2_ac.data.index import EpisodeTable, StepSelection, get_or_build
+from vjepa2_ac.data.index import EpisodeTable, StepSelection, get_or_build_index
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.sources import rlds as rlds_source
-from vjepa2_ac.data.windows import ClipOrder, clip_starts, windows_of
+from vjepa2_ac.data.windows import ClipOrder, find_clip_windows, select_split_windows
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.simulation.droid_writer import write_droid_rlds
 
@@ -179,8 +179,8 @@ def measure_index(config: DataConfig) -> None:
     ]
     columns = {"shard": np.int32, "record": np.int32, "offset": np.int64, "length": np.int64}
     locators = {name: np.arange(DROID_EPISODES, dtype=kind) for name, kind in columns.items()}
-    table = replace(EpisodeTable.of(infos), locators=locators)
-    get_or_build(config.disk_cache, "synthetic", config.path, lambda: table)
+    table = replace(EpisodeTable.from_infos(infos), locators=locators)
+    get_or_build_index(config.disk_cache, "synthetic", config.path, lambda: table)
     del infos, table
     with multiprocessing.get_context("spawn").Pool(1) as fresh:  # memory freed by this process would be used again
         clips, opened, taken, memory = fresh.apply(_open_index, (config,))
@@ -192,11 +192,13 @@ def measure_index(config: DataConfig) -> None:
 def _open_index(config: DataConfig) -> tuple[int, float, float, float]:
     process = psutil.Process()
     before, start = process.memory_info().rss, time.perf_counter()
-    table = get_or_build(config.disk_cache, "synthetic", config.path, _never)
+    table = get_or_build_index(config.disk_cache, "synthetic", config.path, _never)
     opened = time.perf_counter() - start
     everyone = np.ones(len(table), bool)
-    kept = StepSelection.whole(table, everyone)
-    order = ClipOrder(windows_of(table, everyone, clip_starts(table, kept, config), config, "train"), seed=0)
+    kept = StepSelection.all_steps(table, everyone)
+    order = ClipOrder(
+        select_split_windows(table, everyone, find_clip_windows(table, kept, config), config, "train"), seed=0
+    )
     order.window(123_456)
     taken, memory = time.perf_counter() - start, (process.memory_info().rss - before) / 1e6
     return len(order.windows), opened, taken, memory

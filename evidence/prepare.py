@@ -14,7 +14,7 @@ from vjepa2_ac.config import Config, DataConfig, ModelConfig, RldsData
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.encoding.encode_dataset import encode_config, with_latents_if_there
+from vjepa2_ac.encoding.encode_dataset import encode_config, use_finished_cache
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.export import export_run
 from vjepa2_ac.model.checkpoints import load_base
@@ -111,7 +111,7 @@ def keep_latents(data: DataConfig, base: str) -> None:
 
 def encoded(config: Config, model: WorldModel, split: Split, clips: int) -> list[LatentBatch]:
     """Return so many clips of a split, from the latents that training used."""
-    dataset = with_latents_if_there(config, open_dataset(config.data), model)
+    dataset = use_finished_cache(config, open_dataset(config.data), model)
     return [encode(model, batch, chunk=64) for batch in read_clips(dataset, split, clips=clips, batch_size=32)]
 
 
@@ -122,7 +122,7 @@ def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...
         ValueError: There are not as many.
     """
     dataset = open_dataset(data)
-    names = [dataset.table.identity(int(number)) for number in np.flatnonzero(dataset.members("train"))]
+    names = [dataset.table.identity(int(number)) for number in np.flatnonzero(dataset.split_mask("train"))]
     if len(names) < count:
         raise ValueError(f"{data.path} has {len(names)} training episodes, not {count}")
     order = np.random.default_rng([seed, 77]).permutation(len(names))

@@ -15,7 +15,7 @@ from accidents import without_permission
 from random_decoder import write_decoder
 from run_fixtures import TINY, TINY_CONFIG, MakeConfig
 from vjepa2_ac.config import AdapterConfig, DiskCacheConfig, EncoderConfig, ModelConfig, ModelSizes, SizesConfig
-from vjepa2_ac.data.index import EpisodeTable, get_or_build
+from vjepa2_ac.data.index import EpisodeTable, get_or_build_index
 from vjepa2_ac.data.sources.latent_files import LatentFiles
 from vjepa2_ac.data.sources.latents import EPISODES, read_table
 from vjepa2_ac.decoding.decoder import load_decoder
@@ -32,7 +32,7 @@ from vjepa2_ac.reports.metrics_json import read_metrics
 from vjepa2_ac.training.loop import train
 
 SIZES = ModelSizes.model_validate(TINY)
-TABLE = EpisodeTable.of([EpisodeInfo("one", 10)])
+TABLE = EpisodeTable.from_infos([EpisodeInfo("one", 10)])
 
 
 def model() -> WorldModel:
@@ -59,7 +59,7 @@ def write_all(root: Path) -> None:
     write_adapter(root / "predictor", "none")
     write_decoder(root / "decoder", model())
     write_prior(root / "prior")
-    get_or_build(DiskCacheConfig(dir=str(root)), "key", "/data", lambda: TABLE)
+    get_or_build_index(DiskCacheConfig(dir=str(root)), "key", "/data", lambda: TABLE)
     (root / "latents").mkdir()
     (root / "latents" / EPISODES).write_bytes(TABLE.to_bytes())
     (root / "metrics.json").write_text("{}")
@@ -74,7 +74,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "decoder/decoder.safetensors": lambda root: load_decoder(root / "decoder"),
     "prior/prior.safetensors": lambda root: load_prior(root / "prior", where="planning.prior"),
     "official.pt": lambda root: load_official(root / "official.pt", SIZES),
-    "index/key.index": lambda root: get_or_build(
+    "index/key.index": lambda root: get_or_build_index(
         DiskCacheConfig(dir=str(root)), "key", "/data", lambda: pytest.fail("built again")
     ),
     f"latents/{EPISODES}": lambda root: read_table(str(root / "latents" / EPISODES), EpisodeTable),

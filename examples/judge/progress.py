@@ -29,11 +29,11 @@ def main(run: str, out: str, every: str = "1") -> None:
     trained = load_run(run)
     model, config = trained.world_model, trained.config
     dataset = open_dataset(config.data)
-    held_out = dataset.members("validation") | dataset.members("test")
+    held_out = dataset.split_mask("validation") | dataset.split_mask("test")
     episode_index = dataset.table.locators.get("index", np.arange(len(dataset.table)))  # LeRobot's, if it has one
     rows: list[dict[str, object]] = []
     monotony: dict[str, float] = {}
-    for index in np.flatnonzero(dataset.taking_part).tolist():
+    for index in np.flatnonzero(dataset.is_selected).tolist():
         name, episode = dataset.table.identity(index), dataset.source.read(index)
         last = len(episode.states) - 1
         steps = np.unique([*range(0, last, int(every)), last]).tolist()

@@ -21,7 +21,7 @@ from vjepa2_ac.data import idle as idle_ranges
 from vjepa2_ac.data.index import EpisodeInfo, EpisodeTable
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.latents import key_of_cache
-from vjepa2_ac.encoding.batch import encoding_of
+from vjepa2_ac.encoding.batch import get_encoding
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.settings import USED, planning_settings
@@ -138,8 +138,8 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
         raise Found(keys)
 
     for source in WRITERS:
-        monkeypatch.setattr(f"vjepa2_ac.data.sources.{source}.get_or_build", stop)
-    monkeypatch.setattr(idle_ranges, "get_or_make", stop)
+        monkeypatch.setattr(f"vjepa2_ac.data.sources.{source}.get_or_build_index", stop)
+    monkeypatch.setattr(idle_ranges, "get_or_build", stop)
 
     def found(action: Callable[[], Any]) -> Any:
         with pytest.raises(Found) as caught:
@@ -151,9 +151,9 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
             index: str = found(lambda: open_source(config.data).infos())
         except InputError:
             return dict.fromkeys(("index", "idle", "latents"))
-        table = replace(EpisodeTable.of([EpisodeInfo("one", 9, None)]), texts={"index": index})
+        table = replace(EpisodeTable.from_infos([EpisodeInfo("one", 9, None)]), texts={"index": index})
         ranges = found(lambda: idle_ranges.find_ranges(open_source(config.data), table, config.data, None))
-        latents = key_of_cache(config.data, index, encoding_of(world_model(), config))
+        latents = key_of_cache(config.data, index, get_encoding(world_model(), config))
         return {"index": index, "idle": ranges, "latents": latents.digest}
 
     return keys
@@ -179,7 +179,7 @@ def test_the_options_of_a_plug_in_are_a_part_of_the_key_of_a_cache(monkeypatch: 
         wall: WallOptions = WallOptions()
         first_camera: ClassVar[str] = "front"
 
-    encoding = encoding_of(world_model(), config_of("rlds", "x", Path()))
+    encoding = get_encoding(world_model(), config_of("rlds", "x", Path()))
     options = (WallOptions(size=size) for size in (32, 64))
     keys = [key_of_cache(WallData(path="x", wall=wall), "its episodes", encoding) for wall in options]
     assert keys[0].digest != keys[1].digest

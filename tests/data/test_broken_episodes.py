@@ -14,7 +14,7 @@ from memory_source import MemorySource
 from vjepa2_ac.config.sources import NpzData
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index import EpisodeProblem
-from vjepa2_ac.data.loader import batches_of
+from vjepa2_ac.data.loader import read_batches
 from vjepa2_ac.data.selection import max_broken
 from vjepa2_ac.errors import InputError
 
@@ -49,7 +49,7 @@ def broken_in_a_clip(episodes: int, broken: int, _folder: Path) -> Use:
     def use(**values: Any) -> Dataset:
         dataset = open_in_memory(source, **values)
         windows = dataset.windows("train")
-        list(batches_of(dataset, [windows[index] for index in range(len(windows))], batch_size=2))
+        list(read_batches(dataset, [windows[index] for index in range(len(windows))], batch_size=2))
         return dataset
 
     return use

@@ -53,13 +53,13 @@ def test_an_outcome_that_nobody_tells_is_refused() -> None:
 def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> None:
     def resumed(**knobs: Any) -> BrokenEpisodes:
         ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip", **knobs), 300)
-        ledger.recall({name: f"{name} is damaged" for name in "abc"})
+        ledger.restore({name: f"{name} is damaged" for name in "abc"})
         return ledger
 
-    resumed().met("a", "a is damaged")
+    resumed().record("a", "a is damaged")
     with pytest.raises(InputError, match=r"4 of 300 episodes are broken\. The first, a: a is damaged\."):
-        resumed().met("d", "d is damaged")
-    resumed(exclude=("b",)).met("d", "d is damaged")
+        resumed().record("d", "d is damaged")
+    resumed(exclude=("b",)).record("d", "d is damaged")
 
 
 def test_excluding_what_there_is_not_is_refused() -> None:

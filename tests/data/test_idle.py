@@ -103,11 +103,15 @@ def starts(dataset: Dataset) -> set[tuple[int, int]]:
 
 def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
     dataset = open_with(restful(), idle=MOTION)
-    assert [dataset.kept.of(episode) for episode in range(3)] == [((0, 10), (35, 50)), ((0, 10),), ((0, 10), (35, 70))]
+    assert [dataset.kept_steps.ranges_of(episode) for episode in range(3)] == [
+        ((0, 10), (35, 50)),
+        ((0, 10),),
+        ((0, 10), (35, 70)),
+    ]
     assert starts(dataset) == {
         (episode, start)
         for episode in range(3)
-        for first, end in dataset.kept.of(episode)
+        for first, end in dataset.kept_steps.ranges_of(episode)
         for start in range(first, end - 4)
     }
     removed = {one.name: one for one in dataset.removed}["idle"]
@@ -117,12 +121,12 @@ def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
 
 def test_the_episodes_are_indexed_once(open_with: Any) -> None:
     first, second, third = restful(), restful(), restful()
-    kept = open_with(first, idle=MOTION).kept
-    again = open_with(second, idle=MOTION, exclude=("episode 1",), stride=3).kept
+    kept = open_with(first, idle=MOTION).kept_steps
+    again = open_with(second, idle=MOTION, exclude=("episode 1",), stride=3).kept_steps
     assert [index for index, *_ in first.reads] == [0, 1, 2]
     assert second.reads == []
-    assert again.of(2) == kept.of(2)
-    assert again.of(1) == ()
+    assert again.ranges_of(2) == kept.ranges_of(2)
+    assert again.ranges_of(1) == ()
     open_with(third, idle=MOTION.model_copy(update={"cut_last_steps": 4}))
     assert len(third.reads) == 3, "another rule is another pass"
 
@@ -134,7 +138,7 @@ def test_an_episode_that_breaks_on_the_way_is_a_broken_episode(open_with: Any, c
         open_with(source, idle=MOTION)
     dataset = open_with(source, idle=MOTION, broken_episodes="skip")
     assert "2 of 200 episodes are broken and left out: episode 7, episode 9" in caplog.text
-    assert not dataset.taking_part[[7, 9]].any()
+    assert not dataset.is_selected[[7, 9]].any()
     assert {one.name: one.episodes for one in dataset.removed}["broken"] == 2
     assert len(open_with(source, idle=MOTION, exclude=("episode 7", "episode 9")).broken) == 0
 
@@ -159,14 +163,14 @@ def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, 
     ranges = {"episode 1": [[0, 12], [20, 40]], "elsewhere": [[0, 9999]], "episode 2": []}
     source = restful()
     dataset = open_with(source, **published(tmp_path, ranges))
-    assert [dataset.kept.of(episode) for episode in range(3)] == [(), ((0, 12), (20, 40)), ()]
+    assert [dataset.kept_steps.ranges_of(episode) for episode in range(3)] == [(), ((0, 12), (20, 40)), ()]
     assert "knows 2 of the 3 episodes; the other 1 count as idle" in caplog.text
     assert source.reads == []
     assert starts(dataset) == {(1, start) for start in (*range(8), *range(20, 36))}
     other = open_with(source, **published(tmp_path, {"episode 1": [[0, 13]]}))
-    assert other.kept.of(1) == ((0, 13),), "a changed list is read anew"
+    assert other.kept_steps.ranges_of(1) == ((0, 13),), "a changed list is read anew"
     url = gcs.put("robots/ranges.json", json.dumps({"episode 1": [[0, 13]]}).encode())
-    assert open_with(source, idle=IdleConfig(rule="published", ranges=url)).kept.of(1) == ((0, 13),)
+    assert open_with(source, idle=IdleConfig(rule="published", ranges=url)).kept_steps.ranges_of(1) == ((0, 13),)
     with pytest.raises(InputError, match=r"nowhere\.json: cannot be read"):
         open_with(source, idle=IdleConfig(rule="published", ranges=str(tmp_path / "nowhere.json")))
 

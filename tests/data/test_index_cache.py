@@ -14,18 +14,18 @@ from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.data.index import (
     EpisodeProblem,
     EpisodeTable,
-    fingerprint_of,
-    get_or_build,
+    build_labels,
+    compute_fingerprint,
+    get_or_build_index,
     index_key,
-    labels_of,
 )
 from vjepa2_ac.episode import EpisodeInfo
 
 TABLE = replace(
-    EpisodeTable.of([EpisodeInfo(f"küche/{number}", 10 + number) for number in range(5)]),
+    EpisodeTable.from_infos([EpisodeInfo(f"küche/{number}", 10 + number) for number in range(5)]),
     problems=(EpisodeProblem("bad", "here", "damaged"),),
     locators={"offset": np.arange(5)},
-    labels=labels_of([{"task": task} for task in (None, "lift", "push", "", "lift")]),
+    labels=build_labels([{"task": task} for task in (None, "lift", "push", "", "lift")]),
 )
 
 
@@ -38,22 +38,24 @@ def ids(table: EpisodeTable) -> list[str]:
 
 def kept(tmp_path: Path, key: str = KEY, place: str = "/data/set", table: EpisodeTable | None = None) -> EpisodeTable:
     """Return the cached table; without one to build it must be there."""
-    return get_or_build(DiskCacheConfig(dir=str(tmp_path)), key, place, lambda: table or pytest.fail("built again"))
+    return get_or_build_index(
+        DiskCacheConfig(dir=str(tmp_path)), key, place, lambda: table or pytest.fail("built again")
+    )
 
 
 def test_a_table_is_built_once_and_again_when_that_is_asked_for(tmp_path: Path) -> None:
     for table in (TABLE, None):
         found = kept(tmp_path, table=table)
-        assert (ids(found), found.problems, fingerprint_of(found)) == (ids(TABLE), TABLE.problems, KEY)
+        assert (ids(found), found.problems, compute_fingerprint(found)) == (ids(TABLE), TABLE.problems, KEY)
         assert found.labels["task"].of_episode(2) == "push"
         assert np.array_equal(found.id_rank, TABLE.id_rank)
     (tmp_path / f"index/{KEY}.index").unlink()
-    assert ids(kept(tmp_path, table=EpisodeTable.of([EpisodeInfo("other", 1)]))) == ["other"]
+    assert ids(kept(tmp_path, table=EpisodeTable.from_infos([EpisodeInfo("other", 1)]))) == ["other"]
 
 
 def test_an_index_of_a_folder_is_found_wherever_it_is_moved_and_its_problems_are_there(tmp_path: Path) -> None:
     problem = EpisodeProblem("bad", "/data/set/a.npz: x", "damaged")
-    broken = replace(EpisodeTable.of([EpisodeInfo("one", 3)]), problems=(problem,))
+    broken = replace(EpisodeTable.from_infos([EpisodeInfo("one", 3)]), problems=(problem,))
     kept(tmp_path, table=broken)
     table = kept(tmp_path, index_key({"files": 3}, "/mnt/set"), "/mnt/set")
     assert [problem.where for problem in table.problems] == ["/mnt/set/a.npz: x"]
@@ -85,7 +87,7 @@ def test_the_index_of_another_data_set_is_not_used_under_this_name(
     [path] = (tmp_path / "index").iterdir()
     other = index_key({"files": 4}, "/data/set")
     path.rename(path.with_name(f"{other}.index"))
-    assert ids(kept(tmp_path, other, table=EpisodeTable.of([EpisodeInfo("other", 1)]))) == ["other"]
+    assert ids(kept(tmp_path, other, table=EpisodeTable.from_infos([EpisodeInfo("other", 1)]))) == ["other"]
     assert "of other data" in caplog.text
     assert ids(kept(tmp_path, other)) == ["other"]
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.data import RotationFormat
-from vjepa2_ac.data.poses import FORMATS, rotation_speeds, smoother_format
+from vjepa2_ac.data.poses import FORMATS, find_smoother_format, measure_rotation_speeds
 
 MAX_RAD_S = 10.0
 RATES_HZ = (1.0, 5.0, 15.0, 30.0)
@@ -43,8 +43,8 @@ def numbers_of(rotation: Rotation, written_as: RotationFormat) -> np.ndarray:
 
 
 def formats_named(numbers: list[np.ndarray], rate_hz: float) -> dict[RotationFormat, RotationFormat | None]:
-    speeds = rotation_speeds(numbers, rate_hz)
-    return {configured: smoother_format(speeds, configured, MAX_RAD_S) for configured in FORMATS}
+    speeds = measure_rotation_speeds(numbers, rate_hz)
+    return {configured: find_smoother_format(speeds, configured, MAX_RAD_S) for configured in FORMATS}
 
 
 def as_written(numbers: np.ndarray) -> np.ndarray:
@@ -94,7 +94,7 @@ def test_wrong_format_is_named_for_a_hand_that_points_down(
 
 def test_numbers_without_jumps_do_not_tell_the_format() -> None:
     numbers = [numbers_of(one, "rotation_vector") for one in smooth_motion("near zero", 0)[0]]
-    speeds = rotation_speeds(numbers, 15.0)
+    speeds = measure_rotation_speeds(numbers, 15.0)
     assert {one.num_jumps for one in speeds.values()} == {0}
     assert set(formats_named(numbers, 15.0).values()) == {None}
 
@@ -102,7 +102,7 @@ def test_numbers_without_jumps_do_not_tell_the_format() -> None:
 def test_speeds_are_those_of_the_rotation_in_each_format() -> None:
     angles = np.linspace(3.0, 3.5, 11)[:, None] * [1.0, 0, 0]
     wrapped = np.where(angles > np.pi, angles - 2 * np.pi, angles) + np.array([0.0, 0.3, 0.0])
-    speeds = rotation_speeds([wrapped], 10.0)
+    speeds = measure_rotation_speeds([wrapped], 10.0)
     assert speeds["euler_xyz"].median_rad_s == pytest.approx(0.5)
     assert speeds["euler_xyz_degrees"].median_rad_s == pytest.approx(0.5 * np.pi / 180)
     (at_the_wrap,) = speeds["euler_xyz"].at_jumps
@@ -113,7 +113,7 @@ def test_speeds_are_those_of_the_rotation_in_each_format() -> None:
 
 def test_numbers_too_large_or_too_fast_for_radians_are_degrees() -> None:
     degrees = np.linspace(-170.0, -120.0, 40)[:, None] * [1.0, 0, 0] + [0.0, 3.0, 20.0]
-    assert [*rotation_speeds([degrees], 10.0)] == ["euler_xyz_degrees"]
+    assert [*measure_rotation_speeds([degrees], 10.0)] == ["euler_xyz_degrees"]
     assert formats_named([degrees], 10.0) == dict.fromkeys(FORMATS, "euler_xyz_degrees") | {"euler_xyz_degrees": None}
     small = 5 * np.sin(np.arange(60)[:, None] * [1.0, 1.3, 1.7] / 3)
     assert formats_named([small], 10.0)["euler_xyz"] == "euler_xyz_degrees"

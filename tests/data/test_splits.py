@@ -66,7 +66,7 @@ def members(dataset: Dataset) -> dict[str, str]:
     """Return the split of each episode, by the number at the end of its identity."""
     found = {}
     for split in SPLITS:
-        for place in dataset.members(split).nonzero()[0].tolist():
+        for place in dataset.split_mask(split).nonzero()[0].tolist():
             identity = dataset.table.identity(place)
             assert identity not in found
             found[identity] = split
@@ -85,7 +85,7 @@ def test_splits_of_rlds_are_read_as_the_set_has_them(val: str, opened: Opened, t
         set(range(start, 3 * EPISODES, 3)) for start in range(3)
     ]
     assert {int(place) for place in dataset.windows("test").episodes} == set(
-        dataset.members("test").nonzero()[0].tolist()
+        dataset.split_mask("test").nonzero()[0].tolist()
     )
     role = "validation" if val == "validation" else f"{val} (4 episodes) as validation"
     text = describe_splits(dataset.table, dataset.config)

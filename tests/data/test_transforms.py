@@ -10,11 +10,11 @@ from paths import GOLDEN
 from vjepa2_ac.data import transforms
 from vjepa2_ac.data.transforms import (
     CropBox,
+    channel_constants,
     crop_box,
+    crop_frames,
     input_to_pixels,
-    per_channel,
     pixels_to_input,
-    view,
 )
 from vjepa2_ac.errors import InputError
 
@@ -38,7 +38,7 @@ def test_the_square_is_what_the_official_code_evaluates_on() -> None:
 @pytest.mark.parametrize(("height", "width"), [(18, 32), (32, 18), (17, 32), (20, 20)])
 def test_a_letterbox_shows_every_pixel_between_black_bars(height: int, width: int) -> None:
     frames = np.random.default_rng(0).integers(1, 256, (2, height, width, 3), dtype=np.uint8)
-    seen = view(frames, "letterbox")
+    seen = crop_frames(frames, "letterbox")
     side = max(height, width)
     assert seen.shape == (2, side, side, 3)
     top, left = (side - height) // 2, (side - width) // 2
@@ -50,7 +50,7 @@ def test_a_letterbox_shows_every_pixel_between_black_bars(height: int, width: in
 @pytest.mark.parametrize("size", [(16, 20_000), (20_000, 16)])
 def test_a_letterbox_that_would_take_gigabytes_is_refused(size: tuple[int, int]) -> None:
     with pytest.raises(InputError, match=r"data\.crop: letterbox: 1 images of 20000 x 20000 pixels"):
-        view(np.zeros((1, *size, 3), np.uint8), "letterbox")
+        crop_frames(np.zeros((1, *size, 3), np.uint8), "letterbox")
 
 
 @pytest.mark.parametrize(("height", "width", "expected"), [(200, 100, (33, 0, 133, 100)), (180, 243, (0, 0, 180, 243))])
@@ -61,16 +61,16 @@ def test_tall_frames_are_cut_too_and_cropped_ones_are_left(height: int, width: i
 def test_the_transform_equals_the_official_one_on_a_frame() -> None:
     with np.load(GOLDEN / "transform_frame.npz") as golden:
         frame, expected = golden["frame"], golden["clip"].astype(np.float32)
-    found = pixels_to_input(torch.from_numpy(view(frame[None]))[None], 256)[0, 0]
+    found = pixels_to_input(torch.from_numpy(crop_frames(frame[None]))[None], 256)[0, 0]
     assert abs(found.numpy()[:, ::8, ::8] - expected).max() <= FLOAT16_ROUNDING
 
 
 def test_what_inference_has_kept_can_be_trained_with() -> None:
-    per_channel.cache_clear()
+    channel_constants.cache_clear()
     with torch.inference_mode():
         pixels_to_input(torch.zeros(1, 1, 8, 8, 3, dtype=torch.uint8), 8)
     assert not any(
-        per_channel(kept, torch.device("cpu")).is_inference() for kept in (transforms._MEAN, transforms._STD)
+        channel_constants(kept, torch.device("cpu")).is_inference() for kept in (transforms._MEAN, transforms._STD)
     )
 
 

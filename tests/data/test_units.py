@@ -9,7 +9,7 @@ import pytest
 from lerobot_sets import STATE, Recorded, recorded, write_v30
 from synthetic import synthetic_states
 from vjepa2_ac.config import LeRobotData, LeRobotFields
-from vjepa2_ac.data.poses import poses_from
+from vjepa2_ac.data.poses import convert_poses
 from vjepa2_ac.data.sources.lerobot import LeRobotSource
 from vjepa2_ac.errors import InputError
 
@@ -44,5 +44,5 @@ def test_a_unit_that_the_config_names_is_not_doubted() -> None:
     numbers = synthetic_states(12, seed=0) * ([1e6] * 3 + [180 / np.pi] * 3 + [1])
     fields = LeRobotFields(position_unit="mm", rotation="rotation_vector")
     with pytest.raises(InputError, match="within 5 m") as raised:
-        poses_from(numbers, fields, "here", section="data.lerobot")
+        convert_poses(numbers, fields, "here", section="data.lerobot")
     assert raised.value.fix.startswith("Check data.lerobot: ")

@@ -14,17 +14,17 @@ from paths import GOLDEN, ROOT
 from vjepa2_ac.config.data import DataConfig, Split
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.index import EpisodeTable, StepSelection
-from vjepa2_ac.data.selection import in_split, included
+from vjepa2_ac.data.selection import draw_split, select_included
 from vjepa2_ac.data.windows import (
     ClipOrder,
     Windows,
-    clip_starts,
-    far_neighbours,
-    permuted,
-    spread,
+    find_clip_windows,
+    interleave_halves,
+    permute_index,
+    spread_indices,
 )
 from vjepa2_ac.data.windows import (
-    windows_of as windows_of_starts,
+    select_split_windows as windows_of_starts,
 )
 from vjepa2_ac.episode import EpisodeInfo
 
@@ -37,12 +37,12 @@ def episodes(*lengths: int) -> list[EpisodeInfo]:
     return [EpisodeInfo(id=f"episode {number}", num_steps=length) for number, length in enumerate(lengths)]
 
 
-def windows_of(infos: list[EpisodeInfo], config: DataConfig, split: Split) -> Windows:
+def select_split_windows(infos: list[EpisodeInfo], config: DataConfig, split: Split) -> Windows:
     """Return the windows of episodes of which every step is kept."""
-    table = EpisodeTable.of(infos)
-    taking_part = included(table, config)
-    starts = clip_starts(table, StepSelection.whole(table, taking_part), config)
-    members = taking_part & in_split(table.id_hash, config, split)
+    table = EpisodeTable.from_infos(infos)
+    is_selected = select_included(table, config)
+    starts = find_clip_windows(table, StepSelection.all_steps(table, is_selected), config)
+    members = is_selected & draw_split(table.id_hash, config, split)
     return windows_of_starts(table, members, starts, config, split)
 
 
@@ -52,14 +52,14 @@ ALL_TRAIN = {"validation_share": 0.0, "test_share": 0.0}
 @settings(max_examples=60)
 @given(size=st.integers(1, 300), seed=st.integers(0, 2**31), epoch=st.integers(0, 1000))
 def test_a_permutation_hits_every_index_once(size: int, seed: int, epoch: int) -> None:
-    assert sorted(permuted(index, size=size, seed=seed, epoch=epoch) for index in range(size)) == list(range(size))
+    assert sorted(permute_index(index, size=size, seed=seed, epoch=epoch) for index in range(size)) == list(range(size))
 
 
 def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> None:
-    table = EpisodeTable.of([EpisodeInfo("a", 40), EpisodeInfo("b", 20)])
+    table = EpisodeTable.from_infos([EpisodeInfo("a", 40), EpisodeInfo("b", 20)])
     kept = StepSelection(*(np.array(column, np.int32) for column in ([0, 0, 1], [3, 20, 0], [16, 31, 20])))
     config = settings_of(frames=3, stride=2, start_every=4)
-    starts = clip_starts(table, kept, config)
+    starts = find_clip_windows(table, kept, config)
     found = [
         (int(starts.episode[run]), step) for run in range(len(starts.first)) for step in starts.steps_of(run).tolist()
     ]
@@ -73,7 +73,7 @@ def test_order_and_split_do_not_depend_on_the_order_of_the_episodes() -> None:
     for split in ("train", "validation", "test"):
         named = []
         for order in (infos, shuffled):
-            clips = ClipOrder(windows_of(order, config, split), seed=1)
+            clips = ClipOrder(select_split_windows(order, config, split), seed=1)
             named.append([(order[episode].id, start) for episode, start in map(clips.window, range(30))])
         assert named[0] == named[1]
 
@@ -83,17 +83,17 @@ def test_the_demo_sees_the_clips_it_always_saw() -> None:
     infos = [EpisodeInfo(f"{folder}/recordings/MP4--{folder}/trajectory.h5", 41) for folder in golden["folders"]]
     config = load_config(ROOT / "configs/demo.yaml", []).data
     for split, count in golden["windows"].items():
-        windows = windows_of(infos, config, split)
+        windows = select_split_windows(infos, config, split)
         assert len(windows) == count
         if split == "train":
             order = ClipOrder(windows, seed=0)
             assert {place: list(order.window(int(place))) for place in golden["train"]} == golden["train"]
         else:
-            assert [list(windows[index]) for index in far_neighbours(spread(count, 40))] == golden[split]
+            assert [list(windows[index]) for index in interleave_halves(spread_indices(count, 40))] == golden[split]
 
 
 def test_short_episodes_are_left_out_counted_and_named(caplog: pytest.LogCaptureFixture) -> None:
-    windows = windows_of(episodes(9, 10, 3), settings_of(**ALL_TRAIN), "train")
+    windows = select_split_windows(episodes(9, 10, 3), settings_of(**ALL_TRAIN), "train")
     assert windows.short == (0, 2)
     assert windows.episodes.tolist() == [1]
     assert "2 of 3 train episodes are shorter than a clip of 10 control steps" in caplog.text
@@ -103,7 +103,7 @@ def test_short_episodes_are_left_out_counted_and_named(caplog: pytest.LogCapture
 @settings(max_examples=50)
 @given(size=st.integers(1, 500), count=st.integers(1, 100))
 def test_what_is_spread_is_distinct_and_even(size: int, count: int) -> None:
-    chosen = spread(size, count)
+    chosen = spread_indices(size, count)
     assert len(chosen) == len(set(chosen)) == min(size, count)
     gaps = np.diff([-size / len(chosen) / 2, *chosen])
     assert 0 <= min(chosen) <= max(chosen) < size
@@ -116,7 +116,7 @@ HASHES = st.lists(st.integers(0, 1023), min_size=1, max_size=40, unique=True)  #
 
 def counts(hashes: list[int], **shares: float) -> dict[str, int]:
     config = DataConfig(path="nowhere", **shares)
-    return {split: int(in_split(np.array(hashes, np.uint64), config, split).sum()) for split in SPLITS}
+    return {split: int(draw_split(np.array(hashes, np.uint64), config, split).sum()) for split in SPLITS}
 
 
 @given(numbers=HASHES, validation=st.floats(0, 0.4), test=st.floats(0, 0.4))
@@ -133,7 +133,7 @@ def test_each_episode_is_in_one_split_and_none_that_has_a_share_is_empty(
 def test_growing_a_share_moves_episodes_out_of_training_only() -> None:
     hashes = [number * 2**54 for number in range(1024)]
     before, after = (
-        {split: in_split(np.array(hashes, np.uint64), settings_of(validation_share=share, test_share=0.05), split)
+        {split: draw_split(np.array(hashes, np.uint64), settings_of(validation_share=share, test_share=0.05), split)
          for split in SPLITS}
         for share in (0.1, 0.2)
     )  # fmt: skip
@@ -148,7 +148,7 @@ def splits_of(source: MemorySource, **knobs: object) -> dict[str, Split]:
     return {
         dataset.table.identity(int(place)): split
         for split in SPLITS
-        for place in np.flatnonzero(dataset.members(split))
+        for place in np.flatnonzero(dataset.split_mask(split))
     }
 
 

@@ -15,7 +15,7 @@ from failing_rows import Rows
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import loader
-from vjepa2_ac.data.loader import require_shared_memory, results_of_workers
+from vjepa2_ac.data.loader import map_in_workers, require_shared_memory
 from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.process import StopRequest
 from vjepa2_ac.training.setup import set_up
@@ -80,7 +80,7 @@ def test_a_batch_without_room_in_shared_memory_is_an_error_of_the_worker(monkeyp
 
 
 def take_all(failure: str) -> list[list[int]]:
-    return list(results_of_workers(Rows(failure), ([number] for number in range(4)), 1))
+    return list(map_in_workers(Rows(failure), ([number] for number in range(4)), 1))
 
 
 def test_a_worker_that_dies_or_cannot_send_ends_the_run() -> None:

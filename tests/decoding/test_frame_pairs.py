@@ -10,7 +10,7 @@ import torch
 from decoders import EncodeSplit
 from run_fixtures import MakeConfig
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
+from vjepa2_ac.data.transforms import crop_frames, input_to_pixels, pixels_to_input
 from vjepa2_ac.decoding.decoder import Decoder, DecoderShape
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, measure_decoders, wanted_frames
 from vjepa2_ac.encoding.latent_cache import needed_frames
@@ -37,7 +37,7 @@ def test_pairs_are_what_the_encoder_saw_and_what_it_gave(
     for number, latents, image, name in zip(numbers, read.latents, read.images, read.episode_ids, strict=True):
         episode, step = places[number]
         assert name == dataset.table.identity(episode)
-        seen = view(dataset.source.read(episode, config.data.cameras[0]).read_frames([step]), config.data.crop)
+        seen = crop_frames(dataset.source.read(episode, config.data.cameras[0]).read_frames([step]), config.data.crop)
         inputs = pixels_to_input(torch.from_numpy(np.ascontiguousarray(seen))[None], 32)
         assert torch.equal(image, input_to_pixels(inputs)[0, 0])
         with torch.no_grad():
@@ -50,7 +50,7 @@ def test_frames_are_of_the_split_at_most_as_many_as_asked_and_spread(
 ) -> None:
     config = make_config(data__camera=["wrist_left", "exterior_1_left"])
     dataset = open_dataset(config.data)
-    members = dataset.members(split)  # type: ignore[arg-type]
+    members = dataset.split_mask(split)  # type: ignore[arg-type]
     wanted = wanted_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
     needed = {(one.episode, one.camera): set(one.steps.tolist()) for one in needed_frames(dataset)}
     there = sum(len(steps) for (episode, _), steps in needed.items() if members[episode])

@@ -8,7 +8,7 @@ from torch import Tensor
 from decisions import asked, image
 from random_decoder import write_decoder
 from tiny_models import tiny_model
-from vjepa2_ac.data.transforms import frames_as_seen, view
+from vjepa2_ac.data.transforms import crop_frames, to_display_frames
 from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import Start, rolled_out, shown
 from vjepa2_ac.evaluation.imagined import imagine_plan
@@ -84,7 +84,7 @@ def test_the_imagined_steps_are_the_decoded_rollout_of_the_chosen_actions(decode
     assert np.array_equal(np.stack([*found.steps.values()]), shown(decoder.decoder, latents[0]))
     encoded = torch.stack([answer.controller.encoded(image(seed)) for seed in (0, 101)])
     assert np.array_equal(np.stack([found.start, found.decoded_goal]), shown(decoder.decoder, encoded))
-    assert np.array_equal(found.goal, frames_as_seen(view(image(101)[None]), 48)[0])
+    assert np.array_equal(found.goal, to_display_frames(crop_frames(image(101)[None]), 48)[0])
 
 
 def test_of_a_long_plan_eight_steps_are_shown_the_end_among_them(decoder: TrainedDecoder) -> None:

@@ -13,7 +13,7 @@ from ranks import Rank, finish, free_port, run_ranks, start_rank, wait_until
 from run_fixtures import signalled_reporter
 from same_run import assert_equal_up_to_rounding
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.data.loader import ProcessShare, first_clips
+from vjepa2_ac.data.loader import ProcessShare, first_positions
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.process import EXIT_STATUS, StoppedError
 from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
@@ -104,15 +104,22 @@ def test_accumulation_changed_on_purpose_counts_as_it_is_written(make_config, re
     assert micro_batches_of(config, RunState(step=3, clips_per_step=8, clips_asked=4), 2, reporter) == 6
 
 
-@given(processes=st.integers(1, 6), of_step=st.integers(1, 9), batch_size=st.integers(1, 3), steps=st.integers(1, 3))
-def test_every_clip_of_a_step_has_one_process(processes: int, of_step: int, batch_size: int, steps: int) -> None:
+@given(
+    processes=st.integers(1, 6),
+    micro_batches_per_step=st.integers(1, 9),
+    batch_size=st.integers(1, 3),
+    steps=st.integers(1, 3),
+)
+def test_every_clip_of_a_step_has_one_process(
+    processes: int, micro_batches_per_step: int, batch_size: int, steps: int
+) -> None:
     """Also where the processes do not divide the micro-batches of a step: none twice, none left out, in every step."""
     firsts = [
-        list(islice(first_clips(share, batch_size, start=5), steps * len(share.own)))
+        list(islice(first_positions(share, batch_size, start=5), steps * len(share.micro_batches)))
         for rank in range(processes)
-        if (share := ProcessShare(rank, processes, of_step)).own
+        if (share := ProcessShare(rank, processes, micro_batches_per_step)).micro_batches
     ]
-    assert sorted(chain(*firsts)) == list(range(5, 5 + steps * of_step * batch_size, batch_size))
+    assert sorted(chain(*firsts)) == list(range(5, 5 + steps * micro_batches_per_step * batch_size, batch_size))
 
 
 def test_a_run_whose_step_changes_counts_on_from_the_clips_it_has_had(make_config, reporter) -> None:

@@ -18,7 +18,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.encoding.encode_dataset import encode_config, with_latents_if_there
+from vjepa2_ac.encoding.encode_dataset import encode_config, use_finished_cache
 from vjepa2_ac.errors import InputError, RefusedError
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.training.loop import train
@@ -63,7 +63,7 @@ def batches(dataset: Dataset) -> list[torch.Tensor]:
 
 
 def opened(config: Config) -> Dataset:
-    found = with_latents_if_there(config, open_dataset(config.data), load_base(config.model, seed=config.seed))
+    found = use_finished_cache(config, open_dataset(config.data), load_base(config.model, seed=config.seed))
     assert found.config.is_cache
     return found
 

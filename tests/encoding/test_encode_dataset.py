@@ -16,7 +16,7 @@ from run_fixtures import MakeConfig, SilentReporter, as_yaml
 from same_run import assert_same_run
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.encoding.encode_dataset import EncodedSet, encode_config
+from vjepa2_ac.encoding.encode_dataset import EncodingResult, encode_config
 from vjepa2_ac.encoding.latent_cache import needed_frames
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
@@ -26,7 +26,7 @@ from vjepa2_ac.training.loop import train
 
 def encode(
     config: Config, out: Path, progress: Progress | None = None, reporter: SilentReporter | None = None
-) -> EncodedSet:
+) -> EncodingResult:
     reporter = reporter or SilentReporter()
     if progress is not None:
         reporter.task = lambda *_: progress

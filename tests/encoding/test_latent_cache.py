@@ -22,7 +22,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index import StepSelection
-from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
+from vjepa2_ac.data.loader import read_batches, training_loader, validation_batches
 from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.data.sources.latent_files import (
     OPTIONAL,
@@ -71,7 +71,7 @@ def written(folder: Path, kind: CacheType = "fp32", *, exact: bool = False) -> L
     files = LatentFiles(folder, "key")
     pictures = np.stack([np.full((16, 16, 3), 20 * step, np.uint8) for step in FRAMES])
     latents = pack_latents(drawn_latents(), kind)
-    files.write(0, EncodedEpisode(episode(), "left", FRAMES, latents, pictures), exact_pictures=exact)
+    files.write(0, EncodedEpisode(episode(), "left", FRAMES, latents, pictures), lossless_images=exact)
     return files
 
 
@@ -221,7 +221,7 @@ def cached(path: Path, tmp_path: Path, **knobs: Any) -> tuple[Dataset, Dataset]:
     """Return a data set, and the same through its cache."""
     original = open_dataset(config_of(path, tmp_path, **knobs))
     write_cache(original)
-    return original, LatentCache.of(original, NUMBERS).opened()
+    return original, LatentCache.for_dataset(original, NUMBERS).open_dataset()
 
 
 def alone(through: Dataset, **knobs: Any) -> Dataset:
@@ -283,14 +283,16 @@ def with_a_broken_one(tmp_path: Path) -> Dataset:
     source = MemorySource([6] * 100, pictureless=unreadable)
     config = config_of(tmp_path, tmp_path, broken_episodes="skip", validation_share=0.1, test_share=0.1)
     table = source.infos()
-    taking_part = np.ones(100, bool)
-    return Dataset(config, source, table, StepSelection.whole(table, taking_part), BrokenEpisodes(config, 100))
+    is_selected = np.ones(100, bool)
+    return Dataset(config, source, table, StepSelection.all_steps(table, is_selected), BrokenEpisodes(config, 100))
 
 
 def test_an_episode_that_could_not_be_encoded_is_left_out_as_it_was_without_a_cache(with_a_broken_one: Dataset) -> None:
     original = with_a_broken_one
     write_cache(original)
-    through = replace(LatentCache.of(original, NUMBERS).opened(), broken=BrokenEpisodes(original.config, 100))
+    through = replace(
+        LatentCache.for_dataset(original, NUMBERS).open_dataset(), broken=BrokenEpisodes(original.config, 100)
+    )
     batches = first_batches(original, 90), first_batches(through, 90)
     assert_same_clips(*batches)
     assert {len(batch.starts) for batch in batches[1]} > {2}
@@ -307,17 +309,21 @@ def test_damage_to_a_cache_is_handled_as_damage_to_the_data(with_a_broken_one: D
         return replace(with_a_broken_one, config=config, source=source, broken=broken)
 
     write_cache(opened("error"))
-    files = LatentCache.of(opened("error"), NUMBERS).files
+    files = LatentCache.for_dataset(opened("error"), NUMBERS).files
     path = Path(files.path(7, "exterior_1_left"))
     changed(path, lambda tensors, _: tensors.pop("states"))  # found when it is read
     with pytest.raises(InputError, match=r"000007.*data\.broken_episodes"):
-        list(batches_of(LatentCache.of(opened("error"), NUMBERS).opened(), [(6, 0), (7, 0)], batch_size=1))
-    through = LatentCache.of(opened("skip"), NUMBERS).opened()
-    assert len(list(batches_of(through, [(6, 0), (7, 0)], batch_size=1))) == 1
+        list(
+            read_batches(
+                LatentCache.for_dataset(opened("error"), NUMBERS).open_dataset(), [(6, 0), (7, 0)], batch_size=1
+            )
+        )
+    through = LatentCache.for_dataset(opened("skip"), NUMBERS).open_dataset()
+    assert len(list(read_batches(through, [(6, 0), (7, 0)], batch_size=1))) == 1
     assert list(through.broken.reasons) == ["episode 7"]
     path.unlink()  # found when the cache is opened
     with pytest.raises(InputError, match=r"no latents of 1 of 100 episodes, such as episode 7"):
-        LatentCache.of(opened("skip"), NUMBERS).opened()
+        LatentCache.for_dataset(opened("skip"), NUMBERS).open_dataset()
 
 
 # ---- what is refused ---------------------------------------------------------------------------------------------
@@ -349,7 +355,7 @@ def test_a_cache_of_other_clips_is_refused_and_the_difference_named(
         alone(through, **knobs)
     config = DataConfig.model_validate(original.config.model_dump() | knobs)
     with pytest.raises(InputError, match=reported):
-        LatentCache.of(open_dataset(config), NUMBERS).opened()
+        LatentCache.for_dataset(open_dataset(config), NUMBERS).open_dataset()
 
 
 @pytest.mark.parametrize(
@@ -365,9 +371,9 @@ def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
 ) -> None:
     original, through, _ = a_cache
     encoding = replace(NUMBERS, parts={**NUMBERS.parts, **change})
-    monkeypatch.setattr(batch, "encoding_of", lambda model, _: model)
+    monkeypatch.setattr(batch, "get_encoding", lambda model, _: model)
     with pytest.raises(InputError, match=f"no latent cache.*Other caches there: 1; .*{reported}.*vjepa2-ac encode"):
-        LatentCache.of(original, encoding).opened()
+        LatentCache.for_dataset(original, encoding).open_dataset()
     with pytest.raises(InputError, match=reported):
         batch.require_same_encoder(encoding, alone(through), None)  # type: ignore[arg-type]
     batch.require_same_encoder(NUMBERS, alone(through), None)  # type: ignore[arg-type]
@@ -388,7 +394,7 @@ def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_p
         alone(through)
     (folder / "other").rename(folder / KEPT)
     next(folder.rglob("*.safetensors")).unlink()
-    for read in (lambda: alone(through), lambda: LatentCache.of(original, NUMBERS).opened()):
+    for read in (lambda: alone(through), lambda: LatentCache.for_dataset(original, NUMBERS).open_dataset()):
         with pytest.raises(InputError, match=r"no latents of 1 of \d+ episodes.*vjepa2-ac encode"):
             read()
     with pytest.raises(InputError, match="no latent cache"):

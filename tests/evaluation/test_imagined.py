@@ -202,7 +202,7 @@ def test_under_vector_states_only_recorded_actions_can_be_imagined(make_config: 
     vectors = {"states": "vector", "actions": "recorded", "join_actions": "last"}
     config = make_config(**{f"data__{key}": value for key, value in vectors.items()})
     dataset = open_dataset(config.data)
-    batch = next(imagined.batches_of(dataset, validation_windows(dataset, "test", clips=1), batch_size=1))
+    batch = next(imagined.read_batches(dataset, validation_windows(dataset, "test", clips=1), batch_size=1))
     options = ImagineOptions(decoder="", actions=("true",))
     assert list(imagined._actions_of(options, batch, dataset, limits=None)) == [AS_RECORDED]
     options = ImagineOptions(decoder="", actions=("true", "up"))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import synthetic_states
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.data.poses import poses_from
+from vjepa2_ac.data.poses import convert_poses
 from vjepa2_ac.init.draft_values import DraftValue, list_guesses, plain_values
 from vjepa2_ac.init.poses import Column, find_pose, guess_gripper_values
 
@@ -47,7 +47,7 @@ def max_rotation_error_deg(pose: dict[str, DraftValue], numbers: Numbers, states
     assert isinstance(config, LeRobotData)
     fields = config.lerobot
     chosen = numbers if fields.select is None else numbers[:, list(fields.select)]
-    read = poses_from(chosen, fields, "episode", section="data.lerobot")
+    read = convert_poses(chosen, fields, "episode", section="data.lerobot")
     assert np.allclose(read[:, :3], states[:, :3])
     away = Rotation.from_euler("xyz", read[:, 3:6]) * Rotation.from_euler("xyz", states[:, 3:6]).inv()
     return float(np.rad2deg(away.magnitude()).max())

@@ -95,7 +95,7 @@ def test_a_test_split_that_cannot_answer_is_told_the_share_that_can(tmp_path: Pa
     few, many = (write_vectors(tmp_path / str(episodes), width=3, episodes=episodes) for episodes in (6, 45))
     values = {"source": "npz", "states": "vector", "validation_share": 0.1, "test_share": 0.15}
     dataset = open_dataset(knobs(many, **values))
-    tested = [dataset.table.identity(index) for index in np.flatnonzero(dataset.members("test")).tolist()]
+    tested = [dataset.table.identity(index) for index in np.flatnonzero(dataset.split_mask("test")).tolist()]
     unlucky = knobs(
         many, **values, exclude=tuple(tested[3:])
     )  # a hash draws 3 of 38 episodes, where the share says 5.7
@@ -104,7 +104,7 @@ def test_a_test_split_that_cannot_answer_is_told_the_share_that_can(tmp_path: Pa
         (texts[config.path],) = (one.text for one in check_data(config, clips=2) if "cannot show whether" in one.text)
     assert texts[str(few)].endswith("Record more episodes")
     proposed = float(re.search(r"data.test_share=([\d.]+)", texts[str(many)])[1])
-    members = open_dataset(unlucky.model_copy(update={"test_share": proposed})).members("test").sum()
+    members = open_dataset(unlucky.model_copy(update={"test_share": proposed})).split_mask("test").sum()
     assert proposed > 0.15
     assert members >= 5
     assert texts[str(many)].endswith(f"the split then has {members}")

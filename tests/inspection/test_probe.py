@@ -113,7 +113,7 @@ def dataset_of(fault: Fault, *, episodes: int = EPISODES, steps: int = STEPS, **
     config = DataConfig.model_validate(values | changes)
     source = TwoSided([steps] * episodes, states=lambda number: fault(truth(number, steps)))
     table = source.infos()
-    kept = StepSelection.whole(table, np.ones(episodes, bool))
+    kept = StepSelection.all_steps(table, np.ones(episodes, bool))
     return Dataset(config, source, table, kept, BrokenEpisodes(config, episodes))
 
 

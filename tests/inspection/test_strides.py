@@ -34,7 +34,7 @@ def dataset_of(source: MemorySource, **knobs: object) -> Dataset:
     values = {"path": "tracks", "frames": 4, "stride": 1, "validation_share": 0.9, "test_share": 0.0, "workers": 0}
     config = DataConfig.model_validate(values | knobs)
     table = source.infos()
-    kept = StepSelection.whole(table, np.ones(len(table), bool))
+    kept = StepSelection.all_steps(table, np.ones(len(table), bool))
     return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
 
 

@@ -54,7 +54,7 @@ def test_every_frame_is_predicted_from_the_one_before_it(whole_run: Path, datase
 def test_the_threshold_is_of_the_held_out_episodes_alone(whole_run: Path, dataset: Dataset) -> None:
     model = load_run(whole_run, device="cpu").world_model
     monitor = calibrate_monitor(model, dataset, 0.3)
-    held_out = np.flatnonzero(dataset.members("validation") | dataset.members("test"))
+    held_out = np.flatnonzero(dataset.split_mask("validation") | dataset.split_mask("test"))
     watched = list(watch_episodes(model, dataset, held_out.tolist()))
     np.testing.assert_allclose(monitor.expected, np.concatenate([one.errors for one in watched]).mean(axis=0))
     others = np.concatenate([one.errors for one in watched[1:]]).mean(axis=0)

@@ -123,7 +123,7 @@ def test_a_run_resumes_on_its_moved_base_and_keeps_the_path(
     run, moved = shutil.copytree(whole_run, tmp_path / "run"), shutil.copytree(base_folder, tmp_path / "moved")
     shutil.rmtree(run / "checkpoints/step-00000006")
     with monkeypatch.context() as patched:
-        patched.setattr(setup, "with_latents", lambda *_, **__: pytest.fail("encodes with another encoder"))
+        patched.setattr(setup, "use_latent_cache", lambda *_, **__: pytest.fail("encodes with another encoder"))
         assert main(["train", str(run), "--resume", f"model.base={another}"]) == 2
     assert "an adapter trained on another predictor" in capsys.readouterr().err
     assert read_run_config(run).model.base == str(base_folder)

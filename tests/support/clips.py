@@ -11,7 +11,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import Dataset, read_clip
-from vjepa2_ac.data.index import EpisodeTable, StepSelection, identity_hash
+from vjepa2_ac.data.index import EpisodeTable, StepSelection, hash_identity
 from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.episode import Batch, Clip, EpisodeSource
 
@@ -28,8 +28,8 @@ def open_in_memory(source: Any, /, **knobs: Any) -> Dataset:
 def dataset_in_memory(source: EpisodeSource, /, **knobs: Any) -> Dataset:
     """Return the data set of a source as it is: no filter looks at it."""
     config = DataConfig.model_validate({"path": "memory", "frames": 3, **knobs})
-    table = EpisodeTable.of(source.infos())
-    kept = StepSelection.whole(table, np.ones(len(table), bool))
+    table = EpisodeTable.from_infos(source.infos())
+    kept = StepSelection.all_steps(table, np.ones(len(table), bool))
     return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
 
 
@@ -40,7 +40,7 @@ def clip_at(dataset: Dataset, episode: int, start: int, *, camera: str | None = 
 
 def split_of(name: str, config: DataConfig) -> Split:
     """Return the split of an episode or group: the law, written a second time."""
-    number = identity_hash(name) / 2**64
+    number = hash_identity(name) / 2**64
     if number < config.test_share:
         return "test"
     return "validation" if number < config.test_share + config.validation_share else "train"

@@ -46,10 +46,10 @@ def encode_split(tmp_path: Path) -> EncodeSplit:
     def encode(config: Config, split: str = "train", frames: int = 40, folder: str = "pairs") -> FramePairs:
         dataset = open_dataset(config.data)
         model = load_base(config.model, seed=config.seed)
-        encoder = EncoderOnDevice.of(config, model, torch.device("cpu"))
+        encoder = EncoderOnDevice.from_model(config, model, torch.device("cpu"))
         wanted = wanted_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
         files = LatentFiles(tmp_path / folder, "key")
-        encode_files(dataset, wanted, encoder, files, exact_pictures=True)
+        encode_files(dataset, wanted, encoder, files, lossless_images=True)
         return FramePairs.of(dataset, wanted, files)
 
     return encode

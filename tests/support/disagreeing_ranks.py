@@ -95,7 +95,7 @@ def each_meets_another_broken_episode() -> None:
     def loader(dataset: object, **given: object) -> object:
         for batch in make(dataset, **given):  # type: ignore[arg-type]
             for number in range(2):
-                dataset.dataset.broken.met(f"episode {2 * RANK + number}", "damaged")  # type: ignore[attr-defined]
+                dataset.dataset.broken.record(f"episode {2 * RANK + number}", "damaged")  # type: ignore[attr-defined]
             yield some_clips(batch, [0])
 
     step.training_loader = loader

@@ -14,8 +14,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latent_files import EncodedEpisode, pack_latents
 from vjepa2_ac.data.sources.latents import Encoding
-from vjepa2_ac.data.transforms import pixels_to_input, view
-from vjepa2_ac.encoding.batch import encoding_of
+from vjepa2_ac.data.transforms import crop_frames, pixels_to_input
+from vjepa2_ac.encoding.batch import get_encoding
 from vjepa2_ac.encoding.latent_cache import LatentCache
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.world_model import WorldModel
@@ -34,12 +34,12 @@ def as_numbers(frames: np.ndarray) -> torch.Tensor:
 
 def write_cache(dataset: Dataset, encoding: Encoding = NUMBERS, encode: Encode = as_numbers) -> Path:
     """Write the cache of a data set where it is looked for, and return its folder."""
-    cache = LatentCache.of(dataset, encoding)
+    cache = LatentCache.for_dataset(dataset, encoding)
     cache.begin()
-    for one in cache.wanted:
+    for one in cache.requests:
         try:
             episode = dataset.source.read(one.episode, one.camera)
-            frames = view(episode.read_frames(one.steps.tolist()), dataset.config.crop)
+            frames = crop_frames(episode.read_frames(one.steps.tolist()), dataset.config.crop)
         except InputError as error:
             cache.files.note_broken(one.episode, one.camera, str(error))
             continue
@@ -58,7 +58,7 @@ def encode_for(config: Config, world_model: WorldModel, dataset: Dataset) -> Pat
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=is_bf16):
             return world_model.encode(inputs)[0]
 
-    return write_cache(dataset, encoding_of(world_model, config), encode)
+    return write_cache(dataset, get_encoding(world_model, config), encode)
 
 
 def _squashed(frames: Frames, side: int) -> Frames:

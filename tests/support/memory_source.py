@@ -41,7 +41,7 @@ class MemorySource:
         outcomes = self.success or [None] * len(self.lengths)
         names = self.names or [f"episode {number}" for number in range(len(self.lengths))]
         infos = [EpisodeInfo(*about) for about in zip(names, self.lengths, outcomes, strict=True)]
-        return replace(EpisodeTable.of(infos), problems=tuple(self.problems))
+        return replace(EpisodeTable.from_infos(infos), problems=tuple(self.problems))
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
         """Return an episode, and remember it."""

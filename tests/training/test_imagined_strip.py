@@ -68,7 +68,7 @@ def test_the_clip_is_the_one_with_the_most_motion_and_its_rows_are_true(make_con
     assert found.truth.shape == (3, 32, 32, 3)
 
 
-@pytest.mark.parametrize("failing", ["frames_of", "write_atomically"])
+@pytest.mark.parametrize("failing", ["frames_for_display", "write_atomically"])
 def test_a_strip_that_fails_costs_a_warning_and_never_the_run(
     make_config, reporter, decoder, monkeypatch, caplog, failing: str
 ) -> None:
@@ -85,7 +85,7 @@ def test_a_decoder_that_will_not_do_is_told_before_what_is_expensive(
     make_config, reporter, decoder, tmp_path, monkeypatch
 ) -> None:
     other = write_decoder(tmp_path / "other", load_base(make_config().model, seed=0), encoder="other")
-    monkeypatch.setattr("vjepa2_ac.training.setup.with_latents", lambda *_, **__: pytest.fail("encodes"))
+    monkeypatch.setattr("vjepa2_ac.training.setup.use_latent_cache", lambda *_, **__: pytest.fail("encodes"))
     for check_only in (False, True):
         with pytest.raises(InputError, match=r"validation\.decoder: .*other: the decoder of another encoder"):
             train(make_config(validation__decoder=str(other)), reporter, check_only=check_only)

@@ -13,7 +13,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.loader import Mixed, training_loader
+from vjepa2_ac.data.loader import MixedDataset, training_loader
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
@@ -50,7 +50,7 @@ def names(batches: list[Batch]) -> Names:
 def clips_of(config: Config, count: int, **knobs: object) -> Names:
     first, replayed = (open_dataset(one) for one in config.data_sets)
     chosen = {"seed": 1, "batch_size": 4, **knobs}
-    batches = training_loader(Mixed(first, replayed, config.replay.share), **chosen)
+    batches = training_loader(MixedDataset(first, replayed, config.replay.share), **chosen)
     return names(list(itertools.islice(batches, count)))
 
 
@@ -99,7 +99,7 @@ def test_a_clip_that_cannot_be_read_counts_for_its_own_data_set(replaying, monke
         return read(dataset, request)
 
     monkeypatch.setattr(loader, "read_clip", broken)
-    found = list(itertools.islice(training_loader(Mixed(first, replayed, 0.5), seed=1, batch_size=2), 4))
+    found = list(itertools.islice(training_loader(MixedDataset(first, replayed, 0.5), seed=1, batch_size=2), 4))
     assert [len(batch.starts) for batch in found] == [1, 1, 1, 1]
     assert not first.broken.reasons
     assert replayed.broken.reasons

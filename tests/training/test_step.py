@@ -15,7 +15,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.distributed import make_accelerator
-from vjepa2_ac.encoding.batch import extrinsics_for
+from vjepa2_ac.encoding.batch import get_extrinsics
 from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.loop import train
@@ -69,12 +69,12 @@ def test_camera_poses_go_to_the_model_that_wants_them_only(make_config, reporter
     run = prepared(make_config, reporter, 2, 1)
     batch = next(training_loader(run.dataset, seed=0, batch_size=2))
     posed = replace(batch, extrinsics=torch.ones(2, 4, 6))
-    assert extrinsics_for(run.world_model, posed) is None
+    assert get_extrinsics(run.world_model, posed) is None
     wanting = run.world_model.sizes.predictor.model_copy(update={"use_extrinsics": True})
     run.world_model.sizes = run.world_model.sizes.model_copy(update={"predictor": wanting})
-    assert extrinsics_for(run.world_model, posed) is posed.extrinsics
+    assert get_extrinsics(run.world_model, posed) is posed.extrinsics
     with pytest.raises(InputError, match=r"use_extrinsics: no pose of the camera in some of these episodes: /data/LAB"):
-        extrinsics_for(run.world_model, batch)
+        get_extrinsics(run.world_model, batch)
 
 
 def with_loss_scale(run: Run, scale: float) -> Run:

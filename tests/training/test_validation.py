@@ -8,7 +8,7 @@ import pytest
 from run_fixtures import set_up
 from same_run import assert_same_run
 from vjepa2_ac.data import loader
-from vjepa2_ac.data.windows import spread
+from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
@@ -59,7 +59,7 @@ def test_clips_that_cannot_be_read_are_replaced_in_the_ranking(make_config, repo
         (run.dataset.table.identity(episode), start)
         for episode, start in loader.validation_windows(run.dataset, "validation", clips=8)
     ]
-    chosen = [names[place] for place in spread(8, 3)]
+    chosen = [names[place] for place in spread_indices(8, 3)]
     others = [name for name in names if name not in chosen]
     ranked, broken, read = [], {*chosen[1:], others[0]}, loader.read_clip
 

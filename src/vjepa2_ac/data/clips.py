@@ -14,10 +14,10 @@ from torch.utils.data import Dataset as TorchDataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.files import in_parallel
-from vjepa2_ac.data.selection import with_exclusion
+from vjepa2_ac.data.files import map_in_threads
+from vjepa2_ac.data.selection import add_exclusion_fix
 from vjepa2_ac.data.sources.indexed_source import measured_space
-from vjepa2_ac.data.transforms import view
+from vjepa2_ac.data.transforms import crop_frames
 from vjepa2_ac.episode import Batch, Clip, Episode, StoredLatents, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import states_in_camera_frame
@@ -54,10 +54,10 @@ class ClipDataset(TorchDataset[Clip]):
 
     def __getitems__(self, indices: Sequence[SupportsIndex]) -> list[Clip]:
         """Return several clips for a DataLoader; clips behind a URL are read concurrently."""
-        return list(in_parallel(self.__getitem__, indices, self.connections))
+        return list(map_in_threads(self.__getitem__, indices, self.connections))
 
 
-def clip_of(recording: Episode, request: ClipRequest, config: DataConfig) -> Clip:
+def cut_clip(recording: Episode, request: ClipRequest, config: DataConfig) -> Clip:
     """Return a clip of an episode, decoding only the frames of the clip.
 
     Raises:
@@ -68,7 +68,7 @@ def clip_of(recording: Episode, request: ClipRequest, config: DataConfig) -> Cli
     if recording.read_latents is not None:
         latents = recording.read_latents(steps)
     else:
-        frames = view(recording.read_frames(steps), config.crop)
+        frames = crop_frames(recording.read_frames(steps), config.crop)
     states = recording.states[list(steps)]
     extrinsics = None if recording.extrinsics is None else recording.extrinsics[list(steps)]
     if config.pose_frame == "camera":
@@ -79,7 +79,7 @@ def clip_of(recording: Episode, request: ClipRequest, config: DataConfig) -> Cli
     return Clip(
         frames=frames,
         states=states.astype(np.float32),
-        actions=actions_of(states, recording.commands, steps, config).astype(np.float32),
+        actions=compute_actions(states, recording.commands, steps, config).astype(np.float32),
         extrinsics=None if extrinsics is None else extrinsics.astype(np.float32),
         episode_id=recording.info.id,
         start=request.start,
@@ -89,7 +89,7 @@ def clip_of(recording: Episode, request: ClipRequest, config: DataConfig) -> Cli
     )
 
 
-def actions_of(
+def compute_actions(
     states: Float[np.ndarray, "time state_dim"],
     commands: Float[np.ndarray, "steps action_dim"] | None,
     steps: Sequence[int],
@@ -110,10 +110,10 @@ def actions_of(
         return measured_space(config, states.shape[1]).differences(states)
     if commands is None:
         raise ValueError("no commands: a source gives them where data.actions is recorded")
-    return joined(commands[steps[0] : steps[-1]], config.model_stride, config.join_actions)
+    return join_commands(commands[steps[0] : steps[-1]], config.model_stride, config.join_actions)
 
 
-def joined(
+def join_commands(
     commands: Float[np.ndarray, "steps action_dim"], stride: int, how: str | None
 ) -> Float[np.ndarray, "model_steps action_dim"]:
     """Join the commands of each model step to one action: their sum, mean, or the last command.
@@ -143,7 +143,7 @@ def collate(clips: Sequence[Clip]) -> Batch:
         (size, first), (other_size, name) = sizes[0], other
         found = f"frames of {other_size} after the crop; those of episode {first} are {size}"
         fix = "Train on episodes of one size, or set training.batch_size: 1"
-        raise with_exclusion(InputError(where=f"episode {name}", found=found, fix=fix), [name])
+        raise add_exclusion_fix(InputError(where=f"episode {name}", found=found, fix=fix), [name])
     latents = [clip.latents for clip in clips if clip.latents is not None]
     extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
     return Batch(
@@ -153,7 +153,7 @@ def collate(clips: Sequence[Clip]) -> Batch:
         extrinsics=torch.from_numpy(np.stack(extrinsics)) if len(extrinsics) == len(clips) else None,
         episode_ids=tuple(clip.episode_id for clip in clips),
         starts=tuple(clip.start for clip in clips),
-        latents=joined_latents(latents, torch.stack) if latents else None,
+        latents=join_latents(latents, torch.stack) if latents else None,
         cameras=tuple(clip.camera for clip in clips),
     )
 
@@ -165,13 +165,13 @@ def _collate_by_default(clips: Sequence[Clip], **_: Any) -> Batch:
 default_collate_fn_map[Clip] = _collate_by_default  # PyTorch documents this as the way to extend `default_collate`
 
 
-def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:
+def join_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:
     """Join latents and their scales with `torch.stack` or `torch.cat`."""
     scales = [part.scales for part in latents if part.scales is not None]
     return StoredLatents(join([part.values for part in latents]), join(scales) if scales else None)
 
 
-def no_clips(frames: int, widths: Widths) -> Batch:
+def empty_batch(frames: int, widths: Widths) -> Batch:
     """Return an empty micro-batch, used if none of its clips could be read."""
     return Batch(
         frames=torch.zeros(0, frames, 1, 1, 3, dtype=torch.uint8),

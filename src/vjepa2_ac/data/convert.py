@@ -66,7 +66,7 @@ def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> 
     if wrong := [camera for camera in config.cameras if "/" in camera]:
         raise InputError(where="data.camera", found=repr(wrong[0]), needed="a name without /, as LeRobot requires")
     dataset = open_dataset(config.model_copy(update={"idle": IdleConfig()}), progress=reporter.task(INDEXING))
-    episodes = np.flatnonzero(dataset.taking_part).tolist()
+    episodes = np.flatnonzero(dataset.is_selected).tolist()
     is_known = dataset.table.success[episodes] >= 0
     if is_known.any() and not is_known.all():
         reporter.note(f"Success is left out: {(~is_known).sum()} of {counted(len(episodes), 'episode')} lack it.")
@@ -80,7 +80,7 @@ def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> 
             try:
                 _add(writer, dataset, index, has_success=bool(is_known.all()))
             except InputError as error:
-                dataset.leave_out(index, error)
+                dataset.skip_episode(index, error)
             progress(done, len(episodes))
         writer.finish()
     return writer.num_episodes, writer.num_steps
@@ -156,7 +156,7 @@ class LeRobotWriter:
         for name, values in columns.items():
             about = {"dtype": str(values.dtype), "shape": [values.shape[1]], "names": self._names.get(name)}
             self._features.setdefault(name, about)
-        statistics = {name: statistics_of(values) for name, values in columns.items()}
+        statistics = {name: compute_statistics(values) for name, values in columns.items()}
         row = {"episode_index": number, "tasks": [task], "length": steps, **_place("data", 0, 0)}
         row |= {"dataset_from_index": start, "dataset_to_index": start + steps}
         chunk, file = divmod(number, self._form["info"]["chunks_size"])
@@ -174,7 +174,9 @@ class LeRobotWriter:
         self._append(filled(self._form["info"]["data_path"], 0, 0), rows)
         for name, new in statistics.items():
             row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in new.items()}
-            self._statistics[name] = joined(self._statistics[name], new) if name in self._statistics else new
+            self._statistics[name] = (
+                combine_statistics(self._statistics[name], new) if name in self._statistics else new
+            )
         self._rows.append(row | _place("meta/episodes", 0, 0))
         self._tasks.setdefault(task, len(self._tasks))
         self.num_episodes, self.num_steps = number + 1, start + steps
@@ -216,7 +218,7 @@ class LeRobotWriter:
                 yield frame
 
         write_video(path, sampled(), rate_hz=float(self._rate_hz), crf=_CRF, key_frame_every=_KEY_FRAME_EVERY)
-        of_pixels = statistics_of(np.stack(sample).reshape(-1, 3) / 255) | {"count": np.array([len(sample)])}
+        of_pixels = compute_statistics(np.stack(sample).reshape(-1, 3) / 255) | {"count": np.array([len(sample)])}
         return {name: value if name == "count" else value.reshape(3, 1, 1) for name, value in of_pixels.items()}
 
     def _camera(self, height: int, width: int) -> dict[str, Any]:
@@ -243,7 +245,7 @@ class LeRobotWriter:
         self._tables[name].write_table(table)
 
 
-def statistics_of(values: Shaped[np.ndarray, "steps numbers"]) -> Statistics:
+def compute_statistics(values: Shaped[np.ndarray, "steps numbers"]) -> Statistics:
     """Return the statistics of each number of a column."""
     numbers = values.astype(np.float64)
     moments = {"mean": numbers.mean(axis=0), "std": numbers.std(axis=0), "count": np.array([len(values)])}
@@ -251,7 +253,7 @@ def statistics_of(values: Shaped[np.ndarray, "steps numbers"]) -> Statistics:
     return {"min": values.min(axis=0), "max": values.max(axis=0), **moments, **quantiles}
 
 
-def joined(known: Statistics, new: Statistics) -> Statistics:
+def combine_statistics(known: Statistics, new: Statistics) -> Statistics:
     """Combine the statistics of two sets of steps; quantiles are averaged with weights, as in LeRobot."""
     share = new["count"] / (known["count"] + new["count"])
     averages = {name: known[name] + (new[name] - known[name]) * share for name in ("mean", *_QUANTILES)}

@@ -14,21 +14,21 @@ from jaxtyping import Bool, Int, UInt8, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.files import connections_to
+from vjepa2_ac.data.files import num_connections
 from vjepa2_ac.data.idle import find_ranges
 from vjepa2_ac.data.index import EpisodeTable, StepSelection
 from vjepa2_ac.data.selection import (
     BrokenEpisodes,
-    groups_of,
-    held_out_by,
-    included,
-    members_of,
-    of_outcome,
+    add_exclusion_fix,
+    hash_groups,
+    held_out_splits,
     require_distinct,
-    with_exclusion,
+    select_included,
+    select_outcome,
+    select_split,
 )
 from vjepa2_ac.data.sources.indexed_source import open_source, spaces_of
-from vjepa2_ac.data.windows import Windows, clip_starts, drawn, require_stride, windows_of
+from vjepa2_ac.data.windows import Windows, draw_uniform, find_clip_windows, require_stride, select_split_windows
 from vjepa2_ac.episode import POSE_WIDTHS, Batch, Clip, Episode, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import Spaces
@@ -62,15 +62,15 @@ class Dataset:
     config: DataConfig
     source: EpisodeSource  # a LatentSource if the data are a latent cache
     table: EpisodeTable
-    kept: StepSelection
+    kept_steps: StepSelection
     broken: BrokenEpisodes  # grows in the process that opened the data set
     groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each episode's group; None without `data.split_by`
 
     @cached_property
-    def taking_part(self) -> Bool[np.ndarray, " episodes"]:
+    def is_selected(self) -> Bool[np.ndarray, " episodes"]:
         """A mask of the episodes that are used; the idle filter may still remove all steps of such an episode."""
-        chosen = np.asarray(included(self.table, self.config) & of_outcome(self.table, self.config))
-        chosen[[index for index, _ in self.kept.problems]] = False
+        chosen = np.asarray(select_included(self.table, self.config) & select_outcome(self.table, self.config))
+        chosen[[index for index, _ in self.kept_steps.problems]] = False
         return chosen
 
     @property
@@ -78,10 +78,10 @@ class Dataset:
         """The hash that determines the split of each episode."""
         return self.table.id_hash if self.groups is None else self.groups
 
-    def members(self, split: Split) -> Bool[np.ndarray, " episodes"]:
+    def split_mask(self, split: Split) -> Bool[np.ndarray, " episodes"]:
         """Return a mask of the episodes that are used and belong to a split."""
-        among = of_outcome(self.table, self.config)
-        return np.asarray(self.taking_part & members_of(self.table, self.split_hash, self.config, split, among))
+        among = select_outcome(self.table, self.config)
+        return np.asarray(self.is_selected & select_split(self.table, self.split_hash, self.config, split, among))
 
     def clips(self, split: Split = "train") -> ClipDataset:
         """Return the clips of a split as a `torch.utils.data.Dataset`.
@@ -107,39 +107,39 @@ class Dataset:
         from vjepa2_ac.data.clips import ClipDataset
 
         windows = self.windows(split)
-        return ClipDataset(partial(_read_window, self, windows), len(windows), connections_to(self.config))
+        return ClipDataset(partial(_read_window, self, windows), len(windows), num_connections(self.config))
 
-    def request(self, window: tuple[int, int]) -> ClipRequest:
+    def clip_request(self, window: tuple[int, int]) -> ClipRequest:
         """Return the request for the clip of a window (episode, first control step); a hash selects its camera."""
         from vjepa2_ac.data.clips import ClipRequest
 
         episode, start = window
-        number = drawn(int(~self.table.id_hash[episode]), start)
+        number = draw_uniform(int(~self.table.id_hash[episode]), start)
         return ClipRequest(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
 
     def windows(self, split: Split) -> Windows:
         """Return the windows of a split, one per clip, in the fixed order of `clips`.
 
         Raises:
-            InputError: No such split, or no clips; see `windows_of`. Or `data.stride` is auto.
+            InputError: No such split, or no clips; see `select_split_windows`. Or `data.stride` is auto.
         """
         if split not in get_args(Split):
             raise InputError(where="split", found=repr(split), needed=", ".join(get_args(Split)))
         require_stride(self.config, to="read clips", fix="Give one: open_dataset(config, stride=4)")
-        members = self.members(split)
+        members = self.split_mask(split)
         if not members.any():
             raise self._empty_split(split)
-        return windows_of(self.table, members, self.starts, self.config, split)
+        return select_split_windows(self.table, members, self.starts, self.config, split)
 
     def _empty_split(self, split: Split) -> InputError:
-        config, taking_part = self.config, self.taking_part
-        groups = None if config.split_by is None else len(np.unique(self.split_hash[taking_part]))
+        config, is_selected = self.config, self.is_selected
+        groups = None if config.split_by is None else len(np.unique(self.split_hash[is_selected]))
         together = "" if groups is None else f" in {groups} groups (data.split_by)"
         shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
         fix = "Lower data.validation_share or data.test_share" if split == "train" else f"Raise data.{split}_share"
-        if split in held_out_by(self.table, config):
+        if split in held_out_splits(self.table, config):
             fix = "Set data.splits: hash, to draw the splits from all episodes"
-        found = f"no {split} episodes among {taking_part.sum()}{together} ({shares})"
+        found = f"no {split} episodes among {is_selected.sum()}{together} ({shares})"
         return InputError(where=f"data.path: {config.path}", found=found, fix=fix)
 
     def with_frames(self, frames: int) -> Dataset:
@@ -161,11 +161,11 @@ class Dataset:
     @cached_property
     def removed(self) -> tuple[Removed, ...]:
         """The parts that the filters removed, in the order of the filters."""
-        not_excluded = included(self.table, self.config)
-        chosen = not_excluded & of_outcome(self.table, self.config)
-        masks = np.ones(len(self.table), bool), not_excluded, chosen, self.taking_part
-        left = [self._count(StepSelection.whole(self.table, mask)) for mask in masks]
-        removed = -np.diff([*left, self._count(self.kept)], axis=0)
+        not_excluded = select_included(self.table, self.config)
+        chosen = not_excluded & select_outcome(self.table, self.config)
+        masks = np.ones(len(self.table), bool), not_excluded, chosen, self.is_selected
+        left = [self._count(StepSelection.all_steps(self.table, mask)) for mask in masks]
+        removed = -np.diff([*left, self._count(self.kept_steps)], axis=0)
         excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
         unread = {"excluded": excluded, "outcome": 0, "broken": len(self.table.problems) - excluded, "idle": 0}
         is_known = self.config.stride != "auto"
@@ -177,13 +177,13 @@ class Dataset:
     def _count(self, kept: StepSelection) -> tuple[int, int, int]:
         """Return the numbers of episodes, steps and windows (0 if the stride is unknown)."""
         is_known = self.config.stride != "auto"
-        windows = len(clip_starts(self.table, kept, self.config)) if is_known else 0
-        return len(np.unique(kept.episode)), kept.steps, windows
+        windows = len(find_clip_windows(self.table, kept, self.config)) if is_known else 0
+        return len(np.unique(kept.episode)), kept.num_steps, windows
 
     @property
     def episodes(self) -> Int[np.ndarray, " episodes"]:
         """The indices of the episodes that clips may come from."""
-        return np.unique(self.kept.episode)
+        return np.unique(self.kept_steps.episode)
 
     @cached_property
     def starts(self) -> Windows:
@@ -192,7 +192,7 @@ class Dataset:
         Raises:
             ValueError: The stride is not yet calibrated.
         """
-        return clip_starts(self.table, self.kept, self.config)
+        return find_clip_windows(self.table, self.kept_steps, self.config)
 
     @cached_property
     def control_rate_hz(self) -> float:
@@ -218,10 +218,10 @@ class Dataset:
             return Widths(*map(int, widths.split()))
         for episode in self.episodes[:_MOST_EPISODES_READ].tolist():
             with suppress(InputError):
-                return widths_of(self.source.read(episode))
-        return widths_of(self.source.read(int(self.episodes[0])))
+                return get_widths(self.source.read(episode))
+        return get_widths(self.source.read(int(self.episodes[0])))
 
-    def leave_out(self, episode: int, error: InputError) -> None:
+    def skip_episode(self, episode: int, error: InputError) -> None:
         """Apply `data.broken_episodes` to an episode that cannot be read: record the episode, or raise the error.
 
         Raises:
@@ -229,8 +229,8 @@ class Dataset:
         """
         name = self.table.identity(episode)
         if self.config.broken_episodes == "error":
-            raise self.broken.refusal(error, [name]) from None
-        self.broken.met(name, str(error))
+            raise self.broken.add_fix(error, [name]) from None
+        self.broken.record(name, str(error))
 
     def read(self, episode: int, camera: str | None = None) -> Episode:
         """Return an episode; frames are read only on `Episode.read_frames`.
@@ -244,7 +244,7 @@ class Dataset:
 
     def needed_steps(self, episode: int) -> StepRanges | None:
         """Return the steps of an episode that clips may come from; None: all of them."""
-        return None if self.config.idle.rule == "none" else self.kept.of(episode)
+        return None if self.config.idle.rule == "none" else self.kept_steps.ranges_of(episode)
 
 
 def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dataset:
@@ -260,30 +260,30 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
             episode remains.
     """
     source: Any = open_source(config)
-    table = EpisodeTable.of(source.infos(progress))
-    chosen = included(table, config)
+    table = EpisodeTable.from_infos(source.infos(progress))
+    chosen = select_included(table, config)
     require_distinct(table, chosen, config)
-    chosen &= of_outcome(table, config)
+    chosen &= select_outcome(table, config)
     broken = BrokenEpisodes(config, len(table) + len(table.problems), table.id_hash[chosen])
-    broken.found([problem for problem in table.problems if problem.name not in config.exclude])
-    kept = StepSelection.whole(table, chosen)
+    broken.record_problems([problem for problem in table.problems if problem.name not in config.exclude])
+    kept = StepSelection.all_steps(table, chosen)
     if config.idle.rule != "none":
         ranges = source.kept_ranges() if config.is_cache else find_ranges(source, table, config, progress)
-        broken.found([problem for index, problem in ranges.problems if chosen[index]])
-        kept = ranges.only(chosen)
+        broken.record_problems([problem for index, problem in ranges.problems if chosen[index]])
+        kept = ranges.select_episodes(chosen)
     dataset = Dataset(config, source, table, kept, broken)
-    dataset = replace(dataset, groups=groups_of(table, dataset.taking_part, config))
+    dataset = replace(dataset, groups=hash_groups(table, dataset.is_selected, config))
     if not len(dataset.episodes):
         filters = ", ".join(f"{removed.name} {removed.episodes}" for removed in dataset.removed if removed.episodes)
         left_out = f" (left out: {filters})" if filters else ""
         found = f"none of {counted(len(table) + len(table.problems), 'episode')} is left{left_out}"
         fix = "Look at data.exclude, data.outcome and data.idle" if filters else ""
         raise InputError(where=f"data.path: {config.path}", found=found, fix=fix)
-    logger.info("%s: %d episodes take part, %d steps of them", config.path, dataset.taking_part.sum(), kept.steps)
+    logger.info("%s: %d episodes take part, %d steps of them", config.path, dataset.is_selected.sum(), kept.num_steps)
     return _settled(dataset)
 
 
-def through_latents(dataset: Dataset, folder: Path | str) -> Dataset:
+def open_cached_latents(dataset: Dataset, folder: Path | str) -> Dataset:
     """Return the same data set, with the same clips in the same order, read from its latent cache.
 
     Raises:
@@ -292,7 +292,7 @@ def through_latents(dataset: Dataset, folder: Path | str) -> Dataset:
     config = dataset.config.with_source("latents", path=str(folder), cache="off", camera=dataset.config.cameras)
     source = open_source(config)
     # The labels are copied, because caches of older versions lack the labels of splits.
-    table = replace(EpisodeTable.of(source.infos()), labels=dataset.table.labels)
+    table = replace(EpisodeTable.from_infos(source.infos()), labels=dataset.table.labels)
     return _settled(replace(dataset, source=source, table=table, config=config))
 
 
@@ -308,27 +308,27 @@ def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
     Raises:
         InputError: The episode or one of the frames cannot be read. The error has no fix that excludes the episode.
     """
-    from vjepa2_ac.data.clips import clip_of
+    from vjepa2_ac.data.clips import cut_clip
 
-    return clip_of(dataset.read(request.episode, request.camera), request, dataset.config)
+    return cut_clip(dataset.read(request.episode, request.camera), request, dataset.config)
 
 
 def _read_window(dataset: Dataset, windows: Windows, index: int) -> Clip:
-    request = dataset.request(windows[index])
+    request = dataset.clip_request(windows[index])
     try:
         return read_clip(dataset, request)
     except InputError as error:
-        raise with_exclusion(error, [dataset.table.identity(request.episode)]) from None
+        raise add_exclusion_fix(error, [dataset.table.identity(request.episode)]) from None
 
 
-def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
+def frames_for_display(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
     """Return the cropped frames of a clip in a batch, for display; for cached latents the small frames of the cache.
 
     Raises:
         InputError: The frames of a cache cannot be read.
         ValueError: The clip belongs to another data set.
     """
-    from vjepa2_ac.data.transforms import view
+    from vjepa2_ac.data.transforms import crop_frames
 
     if batch.frames is not None:
         return batch.frames[row].numpy()
@@ -336,7 +336,7 @@ def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "ti
     if episode is None:
         raise ValueError(f"no episode {batch.episode_ids[row]}")
     steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
-    return view(dataset.source.read(episode, batch.cameras[row]).read_frames(steps), dataset.config.crop)
+    return crop_frames(dataset.source.read(episode, batch.cameras[row]).read_frames(steps), dataset.config.crop)
 
 
 def find_episode(dataset: Dataset, name: str) -> int:
@@ -359,7 +359,7 @@ def find_episode(dataset: Dataset, name: str) -> int:
     return matching[0]
 
 
-def widths_of(episode: Episode) -> Widths:
+def get_widths(episode: Episode) -> Widths:
     """Return the widths of an episode's states and actions."""
     state = int(episode.states.shape[1])
     return Widths(state, state if episode.commands is None else int(episode.commands.shape[1]))
@@ -371,7 +371,7 @@ def require_widths(episode: Episode, widths: Widths) -> None:
     Raises:
         InputError: The widths differ.
     """
-    actual = widths_of(episode)
+    actual = get_widths(episode)
     if actual != widths:
         found = f"states of {actual.state} and actions of {actual.action} numbers"
         needed = f"{widths.state} and {widths.action}, as in the others"

@@ -12,7 +12,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, DiskCacheConfig
-from vjepa2_ac.data.index import NotATableError, cache_folder, pack, unpack
+from vjepa2_ac.data.index import InvalidTableError, cache_folder, pack, unpack
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 open_cache = functools.cache(DiskCache)  # one instance per process and folder, so that a warning is logged once
 
 
-def fetched_data(config: DiskCacheConfig) -> DiskCache:
+def open_download_cache(config: DiskCacheConfig) -> DiskCache:
     """Return the disk cache of fetched data, which all sources and runs share, with one size limit."""
     return open_cache(cache_folder(config) / "fetched", int(config.limit_gb * 1e9))
 
@@ -37,7 +37,7 @@ class EpisodeFiles:
     """A reader of files that caches remote and parsed content on this machine, within `data.disk_cache.limit_gb`."""
 
     def __init__(self, config: DataConfig) -> None:
-        self.cache = fetched_data(config.disk_cache)
+        self.cache = open_download_cache(config.disk_cache)
 
     def open(self, path: str, *, version: str) -> str | BlockCachedFile:
         """Return a local path unchanged, or open a remote file for partial reads with a cache of its blocks.
@@ -65,22 +65,22 @@ class EpisodeFiles:
                 return self.cache.read_or_create(f"{path}@{version}", lambda: storage.read_bytes(path))
             return storage.read_bytes(path)
 
-    def parsed(self, key: str, parse: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
+    def read_parsed(self, key: str, parse: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
         """Return arrays from the disk cache, or parse them now and cache the result."""
         if (data := self.cache.read(key)) is not None:
-            with suppress(NotATableError):
+            with suppress(InvalidTableError):
                 return unpack(data)[0]
         arrays = parse()
         self.cache.write(key, pack(arrays))
         return arrays
 
 
-def connections_to(config: DataConfig) -> int:
+def num_connections(config: DataConfig) -> int:
     """Return the number of concurrent reads of a data set: several behind a URL, where latency dominates, else one."""
     return CONNECTIONS if storage.is_url(config.path) else 1
 
 
-def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> Iterator[Result]:
+def map_in_threads(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> Iterator[Result]:
     """Apply a function to all items with several threads; yield the results in order or raise the first error."""
     if connections == 1 or len(items) < 2:
         yield from map(function, items)
@@ -105,7 +105,7 @@ def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
     folders, visited = [""], {storage.canonical_path(root)}
     for _ in range(DEEPEST):
         below: list[str] = []
-        listed = in_parallel(lambda folder: list_folder(root, folder), folders, connections)
+        listed = map_in_threads(lambda folder: list_folder(root, folder), folders, connections)
         for folder, (files, names) in zip(folders, listed, strict=True):
             yield from ((folder, file) for file in files if not file.name.startswith("."))
             below += [storage.join(folder, name) for name in names]

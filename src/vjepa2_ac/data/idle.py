@@ -10,8 +10,15 @@ from jaxtyping import Bool, Float
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, IdleConfig
-from vjepa2_ac.data.files import connections_to, in_parallel
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, StepSelection, fingerprint_of, get_or_make, key_of
+from vjepa2_ac.data.files import map_in_threads, num_connections
+from vjepa2_ac.data.index import (
+    EpisodeProblem,
+    EpisodeTable,
+    StepSelection,
+    compute_fingerprint,
+    get_or_build,
+    hash_key,
+)
 from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import POSE, rotation_angles
@@ -34,14 +41,14 @@ def find_ranges(
         InputError: The list of ranges cannot be read or belongs to another data set, or the rule fits no episode.
     """
     values = {"idle": config.idle.model_dump(mode="json"), **config.format_values}
-    parts: dict[str, object] = {"found": "idle ranges", "table": fingerprint_of(table), "data": values}
+    parts: dict[str, object] = {"found": "idle ranges", "table": compute_fingerprint(table), "data": values}
     make = partial(_computed, source, table, config, progress or no_progress)
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
         make = partial(published_ranges, path, table)
         with storage.translate_read_errors(path):
             parts["list"] = [storage.canonical_path(path), storage.file_size(path), storage.file_version(path)]
-    return get_or_make(config.disk_cache, key_of(parts), make, StepSelection)
+    return get_or_build(config.disk_cache, hash_key(parts), make, StepSelection)
 
 
 def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress) -> StepSelection:
@@ -49,17 +56,17 @@ def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, pr
         try:
             return kept_ranges(source.read(index), config.idle)
         except InputError as error:
-            return EpisodeProblem.of(error, table.identity(index))
+            return EpisodeProblem.from_error(error, table.identity(index))
 
     results: list[RangesOrProblem] = []
-    for result in in_parallel(ranges_of, range(len(table)), connections_to(config)):
+    for result in map_in_threads(ranges_of, range(len(table)), num_connections(config)):
         results.append(result)
         progress(len(results), len(table))
         if len(results) == min(_ALL_BROKEN, len(table)):
             problems = [problem for problem in results if isinstance(problem, EpisodeProblem)]
             if len(problems) == len(results):
                 raise problems[0].error
-    return StepSelection.of_each(results)
+    return StepSelection.from_ranges(results)
 
 
 def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
@@ -90,7 +97,7 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
         logging.INFO if listed == len(table) else logging.WARNING,
         "%s: knows %d of the %d episodes; the other %d count as idle", path, listed, len(table), len(table) - listed,
     )  # fmt: skip
-    return StepSelection.of_each(ranges)
+    return StepSelection.from_ranges(ranges)
 
 
 def _pairs(ranges: object, steps: int) -> list[tuple[int, int]] | None:
@@ -146,7 +153,7 @@ def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> 
 def long_idle_runs(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
     """Return a mask of the steps in idle runs of at least `data.idle.shortest_idle_steps` steps."""
     is_long = np.zeros(len(idle), bool)
-    for start, end in runs_of(idle):
+    for start, end in find_runs(idle):
         is_long[start:end] = end - start >= config.shortest_idle_steps
     return is_long
 
@@ -156,12 +163,12 @@ def moving_ranges(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> list[
 
     Source: Physical-Intelligence/openpi @ 15a9616, examples/droid/compute_droid_nonidle_ranges.py.
     """
-    moving, cut = runs_of(~long_idle_runs(idle, config)), config.cut_last_steps
+    moving, cut = find_runs(~long_idle_runs(idle, config)), config.cut_last_steps
     ranges = [(start, end) for start, end in moving if end - start >= config.shortest_kept_steps]
     return [(start, end - cut) for start, end in ranges if end - cut > start]
 
 
-def runs_of(mask: Bool[np.ndarray, " steps"]) -> list[tuple[int, int]]:
+def find_runs(mask: Bool[np.ndarray, " steps"]) -> list[tuple[int, int]]:
     """Return the ranges [start, end) of consecutive steps at which a mask is true."""
     edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))

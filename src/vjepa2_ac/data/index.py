@@ -29,7 +29,7 @@ from vjepa2_ac.storage import paths
 
 logger = logging.getLogger(__name__)
 
-UNKNOWN = 0  # `state_hash` of an episode whose states were not read; `hash_of_states` never returns it
+UNKNOWN = 0  # `state_hash` of an episode whose states were not read; `hash_states` never returns it
 
 _NOT_KNOWN = -1  # in the columns of labels and of success
 _COLUMNS = ("num_steps", "success", "ids", "id_hash", "id_rank")
@@ -41,7 +41,7 @@ _CACHE = "VJEPA2_AC_CACHE"
 _VERSION = 5  # of the cache; a new number invalidates all entries
 
 
-class NotATableError(ValueError):
+class InvalidTableError(ValueError):
     """The bytes are not a table written by `to_bytes`."""
 
 
@@ -56,18 +56,18 @@ def unpack(data: bytes) -> tuple[dict[str, np.ndarray], Any]:
     """Return the arrays and the JSON value of `pack`; nothing is unpickled or expands beyond the file's size.
 
     Raises:
-        NotATableError: The bytes are another kind of file, or damaged.
+        InvalidTableError: The bytes are another kind of file, or damaged.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(member.file_size for member in archive.infolist()) > len(data) or archive.testzip() is not None:
-                raise NotATableError("compressed or damaged arrays")  # noqa: TRY301
+                raise InvalidTableError("compressed or damaged arrays")  # noqa: TRY301
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = dict(file)
         text = arrays.pop("problems" if "problems" in arrays else _TEXT)  # "problems": ranges of older versions
         return arrays, json.loads(text.tobytes())
     except Exception as error:  # zipfile and numpy raise many types of errors for damaged files
-        raise NotATableError(str(error)[:200] or type(error).__name__) from None
+        raise InvalidTableError(str(error)[:200] or type(error).__name__) from None
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class EpisodeProblem:
     fix: str = ""
 
     @classmethod
-    def of(cls, error: InputError, name: str) -> EpisodeProblem:
+    def from_error(cls, error: InputError, name: str) -> EpisodeProblem:
         """Return the record of an error."""
         return cls(name=name, where=error.where, found=error.found, needed=error.needed, fix=error.fix)
 
@@ -104,13 +104,13 @@ class Labels:
             raise ValueError(f"labels of {len(self.names)} names with numbers up to {self.number.max()}")
 
     @classmethod
-    def of(cls, values: Sequence[str | None]) -> Labels:
+    def from_names(cls, values: Sequence[str | None]) -> Labels:
         """Create labels; None or an empty name means unknown."""
         names = sorted({value for value in values if value})
         number = {name: index for index, name in enumerate(names)}
         return cls(tuple(names), np.array([number.get(value or "", _NOT_KNOWN) for value in values], np.int32))
 
-    def of_episode(self, index: int) -> str | None:
+    def name_at(self, index: int) -> str | None:
         """Return the name of one episode, or None if unknown."""
         number = int(self.number[index])
         return None if number == _NOT_KNOWN else self.names[number]
@@ -133,11 +133,11 @@ class EpisodeTable(Sequence[EpisodeInfo]):
     problems: tuple[EpisodeProblem, ...] = ()
     locators: Mapping[str, np.ndarray] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
-    state_hash: UInt64[np.ndarray, " episodes"] | None = None  # `hash_of_states`; None: unknown for all
+    state_hash: UInt64[np.ndarray, " episodes"] | None = None  # `hash_states`; None: unknown for all
     labels: Mapping[str, Labels] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, infos: Sequence[EpisodeInfo]) -> EpisodeTable:
+    def from_infos(cls, infos: Sequence[EpisodeInfo]) -> EpisodeTable:
         """Create a table without the optional columns; an existing table is returned unchanged.
 
         Raises:
@@ -153,7 +153,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             num_steps=np.array([info.num_steps for info in infos], np.int32),
             success=np.array([_NOT_KNOWN if info.success is None else info.success for info in infos], np.int8),
             ids=ids,
-            id_hash=np.array([identity_hash(info.id) for info in infos], np.uint64),
+            id_hash=np.array([hash_identity(info.id) for info in infos], np.uint64),
             id_rank=np.argsort(np.argsort(ids, kind="stable")).astype(np.int32),
             motion=np.array([_NO_MOTION for _ in infos], np.float32),
         )
@@ -176,11 +176,11 @@ class EpisodeTable(Sequence[EpisodeInfo]):
 
     def label(self, name: str, index: int) -> str | None:
         """Return a label of one episode, such as its task, or None."""
-        return self.labels[name].of_episode(index) if name in self.labels else None
+        return self.labels[name].name_at(index) if name in self.labels else None
 
     def find(self, identity: str) -> int | None:
         """Return the index of an episode, or None if the identity is unknown."""
-        for index in np.flatnonzero(self.id_hash == np.uint64(identity_hash(identity))):
+        for index in np.flatnonzero(self.id_hash == np.uint64(hash_identity(identity))):
             if self.identity(int(index)) == identity:
                 return int(index)
         return None
@@ -203,7 +203,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         """Read the result of `to_bytes`.
 
         Raises:
-            NotATableError: The bytes are another kind of file, or damaged.
+            InvalidTableError: The bytes are another kind of file, or damaged.
         """
         arrays, text = unpack(data)
         try:
@@ -220,9 +220,9 @@ class EpisodeTable(Sequence[EpisodeInfo]):
                 labels={name: Labels(tuple(names), arrays[_LABEL + name]) for name, names in text["labels"].items()},
             )
         except (LookupError, TypeError, ValueError, AttributeError) as error:
-            raise NotATableError(str(error)) from None
+            raise InvalidTableError(str(error)) from None
         if len({len(column) for column in (*columns.values(), *locators.values())}) != 1:
-            raise NotATableError("columns of several lengths")
+            raise InvalidTableError("columns of several lengths")
         return table
 
 
@@ -236,31 +236,31 @@ class StepSelection:
     problems: tuple[tuple[int, EpisodeProblem], ...] = ()  # (index into the table, problem) of unreadable episodes
 
     @classmethod
-    def whole(cls, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"]) -> StepSelection:
+    def all_steps(cls, table: EpisodeTable, is_selected: Bool[np.ndarray, " episodes"]) -> StepSelection:
         """Return a selection of all steps of the used episodes."""
-        episode = np.flatnonzero(taking_part).astype(np.int32)
+        episode = np.flatnonzero(is_selected).astype(np.int32)
         return cls(episode, np.zeros(len(episode), np.int32), table.num_steps[episode])
 
     @classmethod
-    def of_each(cls, found: Sequence[list[tuple[int, int]] | EpisodeProblem]) -> StepSelection:
+    def from_ranges(cls, results: Sequence[list[tuple[int, int]] | EpisodeProblem]) -> StepSelection:
         """Create a selection from the ranges or the problem of each episode."""
-        problems = tuple((index, part) for index, part in enumerate(found) if isinstance(part, EpisodeProblem))
-        ranges = [(index, *pair) for index, part in enumerate(found) if isinstance(part, list) for pair in part]
+        problems = tuple((index, part) for index, part in enumerate(results) if isinstance(part, EpisodeProblem))
+        ranges = [(index, *pair) for index, part in enumerate(results) if isinstance(part, list) for pair in part]
         episode, start, end = np.ascontiguousarray(np.array(ranges, np.int32).reshape(-1, 3).T)
         return cls(episode, start, end, problems)
 
-    def only(self, episodes: Bool[np.ndarray, " episodes"]) -> StepSelection:
+    def select_episodes(self, episodes: Bool[np.ndarray, " episodes"]) -> StepSelection:
         """Return the part of the selection that belongs to a mask of episodes."""
         selected = episodes[self.episode]
         return replace(self, episode=self.episode[selected], start=self.start[selected], end=self.end[selected])
 
-    def of(self, episode: int) -> StepRanges:
+    def ranges_of(self, episode: int) -> StepRanges:
         """Return the ranges of one episode."""
         first, last = np.searchsorted(self.episode, np.array([episode, episode + 1], np.int32))
         return tuple(zip(self.start[first:last].tolist(), self.end[first:last].tolist(), strict=True))
 
     @property
-    def steps(self) -> int:
+    def num_steps(self) -> int:
         """The total number of selected steps."""
         return int((self.end.astype(np.int64) - self.start).sum())
 
@@ -274,13 +274,13 @@ class StepSelection:
         """Read the result of `to_bytes`.
 
         Raises:
-            NotATableError: The bytes are another kind of file, or damaged.
+            InvalidTableError: The bytes are another kind of file, or damaged.
         """
         arrays, problems = unpack(data)
         try:
             return cls(**arrays, problems=tuple((index, EpisodeProblem(**values)) for index, values in problems))
         except (LookupError, TypeError, ValueError) as error:
-            raise NotATableError(f"no ranges of steps ({error})") from None
+            raise InvalidTableError(f"no ranges of steps ({error})") from None
 
 
 T = TypeVar("T", EpisodeTable, StepSelection)
@@ -292,19 +292,19 @@ def nul_error(identity: str, where: str) -> InputError:
     return InputError(where=where, found=text, needed="text without NUL characters", fix=fix)
 
 
-def identity_hash(identity: str) -> int:
+def hash_identity(identity: str) -> int:
     """Return 64 bits of the identity's SHA-256; divided by 2**64 they determine the episode's split."""
     return int.from_bytes(hashlib.sha256(identity.encode()).digest()[:8], "big")
 
 
-def labels_of(values: Sequence[Mapping[str, str | None]]) -> dict[str, Labels]:
+def build_labels(values: Sequence[Mapping[str, str | None]]) -> dict[str, Labels]:
     """Return labels from one {label: name} mapping per episode; labels without any name are dropped."""
     names = {name for episode in values for name in episode}
-    all_labels = {name: Labels.of([episode.get(name) for episode in values]) for name in sorted(names)}
+    all_labels = {name: Labels.from_names([episode.get(name) for episode in values]) for name in sorted(names)}
     return {name: labels for name, labels in all_labels.items() if labels.names}
 
 
-def hash_of_states(states: Float[np.ndarray, "steps state_dim"]) -> int:
+def hash_states(states: Float[np.ndarray, "steps state_dim"]) -> int:
     """Return 64 bits of the BLAKE2b of the states as float32, never `UNKNOWN`.
 
     The states are hashed as float32, because a recording may be float64 in one file and float32 in another. Coarser
@@ -326,15 +326,15 @@ class StatesSummary(NamedTuple):
     motion: Sequence[float] = _NO_MOTION
 
 
-UNREAD = StatesSummary()
+STATES_NOT_READ = StatesSummary()
 
 
-def summary_of(states: Float[np.ndarray, "steps state_dim"]) -> StatesSummary:
+def summarize_states(states: Float[np.ndarray, "steps state_dim"]) -> StatesSummary:
     """Summarise the states of an episode with one or more steps."""
     width = states.shape[1]
     fastest = step_sizes(states).max(axis=0, initial=0.0) if width == STATE_DIM else np.zeros(2)
     positions = states[:, np.arange(3) % width]
-    return StatesSummary(hash_of_states(states), [*fastest, *positions.mean(axis=0), *positions.std(axis=0)])
+    return StatesSummary(hash_states(states), [*fastest, *positions.mean(axis=0), *positions.std(axis=0)])
 
 
 def cache_folder(config: DiskCacheConfig) -> Path:
@@ -353,7 +353,7 @@ def cache_folder(config: DiskCacheConfig) -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
 
 
-def key_of(parts: Mapping[str, object]) -> str:
+def hash_key(parts: Mapping[str, object]) -> str:
     """Return a short hash of all values that a cached result depends on."""
     text = json.dumps({"version": _VERSION, **parts}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
@@ -370,15 +370,17 @@ def index_key(parts: Mapping[str, object], place: str, *, named: str = "") -> st
         place: The folder of the data set.
         named: An episode's identity, if identities depend on the name of the folder.
     """
-    return key_of({**parts, "path": place} if storage.is_url(place) else {**parts, "named": named})
+    return hash_key({**parts, "path": place} if storage.is_url(place) else {**parts, "named": named})
 
 
-def fingerprint_of(table: EpisodeTable) -> str:
+def compute_fingerprint(table: EpisodeTable) -> str:
     """Return a fingerprint of the episodes: the key of their index, or a hash of the table."""
     return table.texts.get("index") or hashlib.sha256(table.to_bytes()).hexdigest()
 
 
-def get_or_build(config: DiskCacheConfig, key: str, place: str, build: Callable[[], EpisodeTable]) -> EpisodeTable:
+def get_or_build_index(
+    config: DiskCacheConfig, key: str, place: str, build: Callable[[], EpisodeTable]
+) -> EpisodeTable:
     """Return the table cached under a key; build and cache it if it is missing or damaged. `texts` contains the key.
 
     If the data set was moved, paths in cached problems are rewritten from the old folder to `place`.
@@ -389,14 +391,14 @@ def get_or_build(config: DiskCacheConfig, key: str, place: str, build: Callable[
         table = build()
         return replace(table, texts={**table.texts, "index": key, "place": folder})
 
-    table = get_or_make(config, key, build_with_key, EpisodeTable)
+    table = get_or_build(config, key, build_with_key, EpisodeTable)
     problems = [
         replace(problem, where=problem.where.replace(table.texts["place"], folder, 1)) for problem in table.problems
     ]
     return replace(table, problems=tuple(problems))
 
 
-def get_or_make(config: DiskCacheConfig, key: str, make: Callable[[], T], kind: type[T]) -> T:
+def get_or_build(config: DiskCacheConfig, key: str, make: Callable[[], T], kind: type[T]) -> T:
     """Return the table cached under a key; make and cache it if it is missing or damaged.
 
     The file ends with its key, so that a renamed file of another key is not used.
@@ -409,11 +411,11 @@ def get_or_make(config: DiskCacheConfig, key: str, make: Callable[[], T], kind: 
         with storage.translate_read_errors(path):
             data = path.read_bytes()
         if not data.endswith(key.encode()):
-            raise NotATableError("it is damaged, from an older version, or of other data")  # noqa: TRY301
+            raise InvalidTableError("it is damaged, from an older version, or of other data")  # noqa: TRY301
         return kind.from_bytes(data.removesuffix(key.encode()))
     except MissingFileError:
         pass
-    except (InputError, NotATableError) as error:
+    except (InputError, InvalidTableError) as error:
         logger.warning("%s: cannot be used (%s); the index is built again", path, error)
     table = make()
     try:

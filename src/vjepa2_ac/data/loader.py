@@ -34,12 +34,12 @@ from torch.utils.data import Dataset as TorchDataset
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips import ClipRequest, collate, no_clips
+from vjepa2_ac.data.clips import ClipRequest, collate, empty_batch
 from vjepa2_ac.data.dataset import Dataset, read_clip
-from vjepa2_ac.data.files import connections_to, in_parallel
-from vjepa2_ac.data.selection import BrokenEpisodes, named
-from vjepa2_ac.data.transforms import ClipChanges
-from vjepa2_ac.data.windows import ClipOrder, far_neighbours, spread
+from vjepa2_ac.data.files import map_in_threads, num_connections
+from vjepa2_ac.data.selection import BrokenEpisodes, format_identities
+from vjepa2_ac.data.transforms import ClipTransforms
+from vjepa2_ac.data.windows import ClipOrder, interleave_halves, spread_indices
 from vjepa2_ac.episode import Batch, Clip, Skipped
 from vjepa2_ac.errors import InputError, UnreachableError, UserError, counted
 from vjepa2_ac.process import safe_imports, stop_request
@@ -50,7 +50,7 @@ _POLL_S = 1.0  # interval of checks of workers and signals while waiting for a b
 _GRACE_S = 5.0  # time limit for a batch after a stop signal, so that the step can be finished
 _NO_WORKERS = "data.workers=0"
 _ROOM = f"With Docker add --shm-size=8g or --ipc=host to `docker run`, set {_NO_WORKERS}"
-CLIPS_WORTH_WORKERS = 256  # starting workers takes longer than reading fewer validation clips
+MIN_CLIPS_FOR_WORKERS = 256  # starting workers takes longer than reading fewer validation clips
 
 
 @dataclass(frozen=True)
@@ -59,19 +59,25 @@ class ProcessShare:
 
     rank: int = 0
     processes: int = 1
-    of_step: int | None = None  # micro-batches per optimizer step of all processes together; None: one per process
+    micro_batches_per_step: int | None = (
+        None  # micro-batches per optimizer step of all processes together; None: one per process
+    )
 
     @property
-    def own(self) -> range:
+    def micro_batches(self) -> range:
         """The indices of the micro-batches of a step that this process computes: rank, rank + processes, ..."""
-        return range(self.rank, self.processes if self.of_step is None else self.of_step, self.processes)
+        return range(
+            self.rank,
+            self.processes if self.micro_batches_per_step is None else self.micro_batches_per_step,
+            self.processes,
+        )
 
 
-WHOLE = ProcessShare()
+SINGLE_PROCESS = ProcessShare()
 
 
 @dataclass(frozen=True)
-class Mixed:
+class MixedDataset:
     """A data set, and optionally a second one that provides a share of the training clips (replay)."""
 
     dataset: Dataset
@@ -80,12 +86,12 @@ class Mixed:
 
 
 def training_loader(
-    dataset: Dataset | Mixed,
+    dataset: Dataset | MixedDataset,
     *,
     seed: int,
     batch_size: int,
     start_position: int = 0,
-    share: ProcessShare = WHOLE,
+    share: ProcessShare = SINGLE_PROCESS,
     pinned: bool = False,
 ) -> Batches:
     """Yield the micro-batches of one process, endlessly, from any position of the run.
@@ -104,26 +110,28 @@ def training_loader(
     Raises:
         InputError: There are no training clips, or a clip cannot be read, also in a worker.
     """
-    both = dataset if isinstance(dataset, Mixed) else Mixed(dataset)
+    both = dataset if isinstance(dataset, MixedDataset) else MixedDataset(dataset)
     dataset, replayed = both.dataset, both.replayed
     clips = _training_clips(dataset, seed)
     if replayed is not None:
         clips = replace(clips, replayed=_training_clips(replayed, seed), share=Fraction(str(both.share)))
-    firsts = first_clips(share, batch_size, start=start_position)
+    firsts = first_positions(share, batch_size, start=start_position)
     rows = (list(range(first, first + batch_size)) for first in firsts)
-    micro_batches = results_of_workers(clips, rows, dataset.config.workers, pinned=pinned)
+    micro_batches = map_in_workers(clips, rows, dataset.config.workers, pinned=pinned)
     return Batches(micro_batches, dataset.broken, replayed.broken if replayed else None)
 
 
-def first_clips(share: ProcessShare, batch_size: int, *, start: int) -> Iterator[int]:
+def first_positions(share: ProcessShare, batch_size: int, *, start: int) -> Iterator[int]:
     """Yield the position of the first clip of each micro-batch of a process, endlessly."""
-    for before in itertools.count(0, share.of_step or share.processes):
-        yield from (start + (before + number) * batch_size for number in share.own)
+    for before in itertools.count(0, share.micro_batches_per_step or share.processes):
+        yield from (start + (before + number) * batch_size for number in share.micro_batches)
 
 
 def _training_clips(dataset: Dataset, seed: int) -> _MicroBatches:
     order = ClipOrder(dataset.windows("train"), seed)
-    return _MicroBatches(dataset, partial(_training_clip, dataset.config, order), ClipChanges.of(dataset.config, seed))
+    return _MicroBatches(
+        dataset, partial(_training_clip, dataset.config, order), ClipTransforms.from_config(dataset.config, seed)
+    )
 
 
 def _training_clip(config: DataConfig, order: ClipOrder, position: int) -> ClipRequest:
@@ -141,7 +149,7 @@ def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size
     Raises:
         InputError: The split is empty, or a clip cannot be read.
     """
-    return batches_of(dataset, validation_windows(dataset, split, clips=clips), batch_size=batch_size)
+    return read_batches(dataset, validation_windows(dataset, split, clips=clips), batch_size=batch_size)
 
 
 def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tuple[int, int]]:
@@ -151,35 +159,35 @@ def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tu
         InputError: The split is empty.
     """
     windows = dataset.windows(split)
-    return [windows[index] for index in far_neighbours(spread(len(windows), clips))]
+    return [windows[index] for index in interleave_halves(spread_indices(len(windows), clips))]
 
 
-def batches_of(
-    dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int, may_be_none: bool = False
+def read_batches(
+    dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int, allow_empty: bool = False
 ) -> Iterator[Batch]:
     """Yield batches of the clips at these windows (episode, first control step), in order.
 
     If `data.broken_episodes` is skip, a batch may be smaller, but never empty. Many clips are read by workers.
 
     Raises:
-        InputError: A clip cannot be read; or all clips were skipped and `may_be_none` is False.
+        InputError: A clip cannot be read; or all clips were skipped and `allow_empty` is False.
     """
-    count, empty = len(windows), not may_be_none
+    count, empty = len(windows), not allow_empty
     rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
-    workers = dataset.config.workers if count >= CLIPS_WORTH_WORKERS else 0
+    workers = dataset.config.workers if count >= MIN_CLIPS_FOR_WORKERS else 0
     clips = _MicroBatches(dataset, partial(_chosen_clip, dataset, windows))
-    for batch in Batches(results_of_workers(clips, iter(rows), workers), dataset.broken):
+    for batch in Batches(map_in_workers(clips, iter(rows), workers), dataset.broken):
         if batch.starts:
             empty = False
             yield batch
     if empty:
-        found = f"none of the clips can be read; broken episodes: {named(tuple(dataset.broken.reasons))}"
+        found = f"none of the clips can be read; broken episodes: {format_identities(tuple(dataset.broken.reasons))}"
         fix = "Repair or fetch these episodes again, or add them to data.exclude"
         raise InputError(where=f"data.path: {dataset.config.path}", found=found, fix=fix)
 
 
 def _chosen_clip(dataset: Dataset, windows: Sequence[tuple[int, int]], position: int) -> ClipRequest:
-    return dataset.request(windows[position])
+    return dataset.clip_request(windows[position])
 
 
 @dataclass(frozen=True)
@@ -188,7 +196,7 @@ class _MicroBatches(TorchDataset[Batch]):
 
     dataset: Dataset
     request_at: Callable[[int], ClipRequest]  # a pure function of the position, the same in every worker
-    changes: ClipChanges | None = None  # transforms of training clips; pure functions, too
+    changes: ClipTransforms | None = None  # transforms of training clips; pure functions, too
     replayed: _MicroBatches | None = None  # clips of the second data set
     share: Fraction = Fraction(0)  # share of clips from the second data set
 
@@ -202,7 +210,7 @@ class _MicroBatches(TorchDataset[Batch]):
             results = self._read(positions)
             clips = [result for result in results if isinstance(result, Clip)]
             skipped = tuple(result for result in results if isinstance(result, Skipped))
-            batch = collate(clips) if clips else no_clips(self.dataset.config.frames, self.dataset.widths)
+            batch = collate(clips) if clips else empty_batch(self.dataset.config.frames, self.dataset.widths)
             batch = replace(batch, bytes_fetched=storage.bytes_fetched() - before, skipped=skipped)
             return batch if get_worker_info() is None else _in_shared_memory(batch)
         except UserError as error:
@@ -210,8 +218,8 @@ class _MicroBatches(TorchDataset[Batch]):
 
     def _read(self, positions: list[int]) -> list[Clip | Skipped]:
         datasets = [clips.dataset for clips in (self, self.replayed) if clips is not None]
-        connections = max(connections_to(dataset.config) for dataset in datasets)
-        return list(in_parallel(self._clip, positions, connections))
+        connections = max(num_connections(dataset.config) for dataset in datasets)
+        return list(map_in_threads(self._clip, positions, connections))
 
     def _clip(self, position: int) -> Clip | Skipped:
         if self.replayed is not None:
@@ -226,7 +234,7 @@ class _MicroBatches(TorchDataset[Batch]):
         except InputError as error:
             name = self.dataset.table.identity(request.episode)
             if self.dataset.config.broken_episodes == "error":
-                raise self.dataset.broken.refusal(error, [name]) from None
+                raise self.dataset.broken.add_fix(error, [name]) from None
             return Skipped(name, str(error))
         return clip if self.changes is None else self.changes.apply(clip, position)
 
@@ -260,7 +268,7 @@ class Batches(Iterator[Batch]):
             raise row
         for clip in row.skipped:
             broken = self._replayed if clip.replayed and self._replayed is not None else self._broken
-            broken.met(clip.episode_id, clip.reason)
+            broken.record(clip.episode_id, clip.reason)
         return row
 
     def close(self) -> None:
@@ -271,7 +279,7 @@ class Batches(Iterator[Batch]):
 # ---- worker processes ----
 
 
-def results_of_workers(
+def map_in_workers(
     items: TorchDataset[Any], positions: Iterator[list[int]], workers: int, *, pinned: bool = False
 ) -> Generator[Any, None, None]:
     """Yield `items.__getitems__(list)` for each list of positions, in order, computed by worker processes.
@@ -321,7 +329,7 @@ def _identity(batch: Any) -> Any:
 
 
 def _next_row(rows: Iterator[Any], workers: Iterable[BaseProcess]) -> Any:
-    """Return the next result, or None at the end; errors as for `results_of_workers`."""
+    """Return the next result, or None at the end; errors as for `map_in_workers`."""
     started = time.monotonic()
     while True:
         try:

@@ -39,7 +39,7 @@ def num_rotation_numbers(written_as: RotationFormat) -> int:
     return 4 if written_as.startswith("quaternion") else 3
 
 
-def rotations_from(numbers: Float[np.ndarray, "steps _"], written_as: RotationFormat) -> Rotation:
+def convert_rotations(numbers: Float[np.ndarray, "steps _"], written_as: RotationFormat) -> Rotation:
     """Convert rotation numbers of a format to SciPy rotations.
 
     Raises:
@@ -54,7 +54,7 @@ def rotations_from(numbers: Float[np.ndarray, "steps _"], written_as: RotationFo
     return Rotation.from_euler("xyz", numbers, degrees=written_as == "euler_xyz_degrees")
 
 
-def poses_from(
+def convert_poses(
     numbers: Float[np.ndarray, "steps _"], fields: PoseFields, where: str, *, section: str
 ) -> Float[np.ndarray, "steps 7"]:
     """Convert the numbers of an episode (position, rotation and gripper of each step) to states.
@@ -78,7 +78,7 @@ def poses_from(
         unit = np.pi / 180 if fields.rotation == "euler_xyz_degrees" else 1.0
         require_plausible(np.concatenate([positions, unit * rotation, gripper], axis=1))
     if fields.rotation != "euler_xyz":
-        rotation = rotations_from(rotation, fields.rotation).as_euler("xyz")
+        rotation = convert_rotations(rotation, fields.rotation).as_euler("xyz")
     states = np.concatenate([positions, rotation, gripper], axis=1)
     require_plausible(states)
     return states
@@ -159,7 +159,7 @@ class RotationSpeeds:
         return int(((self.at_jumps <= _SMOOTH) & (other.at_jumps >= _ABRUPT)).sum())
 
 
-def rotation_speeds(
+def measure_rotation_speeds(
     episodes: Iterable[Float[np.ndarray, "steps 3"]], control_rate_hz: float
 ) -> dict[RotationFormat, RotationSpeeds]:
     """Return the rotation speeds of the hand in each format that three rotation numbers may have.
@@ -188,7 +188,7 @@ def rotation_speeds(
     return speeds
 
 
-def smoother_format(
+def find_smoother_format(
     speeds: Mapping[RotationFormat, RotationSpeeds], written_as: RotationFormat, max_rad_s: float
 ) -> RotationFormat | None:
     """Return the format in which the hand turns much more smoothly than in the configured one, or None.
@@ -199,7 +199,7 @@ def smoother_format(
     for radians.
 
     Args:
-        speeds: The result of `rotation_speeds`.
+        speeds: The result of `measure_rotation_speeds`.
         written_as: The configured format.
         max_rad_s: The largest possible median speed; if it is exceeded, the numbers are degrees.
     """
@@ -228,7 +228,7 @@ def _jumps_in(numbers: Float[np.ndarray, "steps 3"]) -> Bool[np.ndarray, " chang
 
 
 def _step_angles(numbers: Float[np.ndarray, "steps 3"], written_as: RotationFormat) -> Float[np.ndarray, " changes"]:
-    rotations = rotations_from(numbers, written_as)
+    rotations = convert_rotations(numbers, written_as)
     return np.asarray((rotations[1:] * rotations[:-1].inv()).magnitude())
 
 

@@ -13,15 +13,15 @@ from jaxtyping import Bool, Float, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, Labels, identity_hash
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, Labels, hash_identity
 from vjepa2_ac.errors import InputError, counted
 
 logger = logging.getLogger(__name__)
 
-NAMED = 10  # most identities in one message
+MAX_NAMED = 10  # most identities in one message
 _ALLOWED_BROKEN = 3  # broken episodes that are tolerated in all but the smallest data sets
 _ALLOWED_SHARE = 0.01  # share of broken episodes that is tolerated in large data sets
-SPLIT = "split"  # label of an episode: the name of its split in the data set
+SPLIT_LABEL = "split"  # label of an episode: the name of its split in the data set
 
 _HELD_OUT: tuple[Split, ...] = ("validation", "test")
 _ROLES: dict[str, Split] = {"val": "validation", "valid": "validation", "validation": "validation", "test": "test"}
@@ -30,34 +30,34 @@ _FEWEST_GROUPS = 3  # one per split
 Members = Bool[np.ndarray, " episodes"]
 
 # Patterns for DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.
-IN_IDENTITY = {
+IDENTITY_PATTERNS = {
     "lab": r"([^/]+)/(?:success|failure)/",
     "day": r"/(?:success|failure)/([0-9]{4}-[0-9]{2}-[0-9]{2})(?:/|$)",
     "folder": r"^(.+)/[^/]*$",
 }
 
 
-def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
+def select_included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
     """Return a mask of the episodes that are not in `data.exclude`.
 
     Raises:
         InputError: `data.exclude` contains an unknown identity.
     """
     excluded = frozenset(config.exclude)
-    hashes = np.array([identity_hash(name) for name in excluded], np.uint64)
+    hashes = np.array([hash_identity(name) for name in excluded], np.uint64)
     candidates = np.flatnonzero(np.isin(table.id_hash, hashes)).tolist()
     names = {index: name for index in candidates if (name := table.identity(index)) in excluded}
     unknown = excluded.difference(names.values(), (problem.name for problem in table.problems))
     if unknown:
-        found = f"not the identity of any episode: {named(sorted(unknown))}"
+        found = f"not the identity of any episode: {format_identities(sorted(unknown))}"
         needed = "identities as errors name them" + (f", such as {table.identity(0)}" if len(table) else "")
         raise InputError(where="data.exclude", found=found, needed=needed)
-    taking_part = np.ones(len(table), bool)
-    taking_part[list(names)] = False
-    return taking_part
+    is_selected = np.ones(len(table), bool)
+    is_selected[list(names)] = False
+    return is_selected
 
 
-def of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
+def select_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
     """Return a mask of the episodes that have the outcome of `data.outcome`.
 
     Raises:
@@ -71,13 +71,13 @@ def of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " ep
     return np.asarray(table.success == (config.outcome == "success"))
 
 
-def require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig) -> None:
+def require_distinct(table: EpisodeTable, is_selected: Bool[np.ndarray, " episodes"], config: DataConfig) -> None:
     """Refuse two episodes with the same identity, because errors and `data.exclude` could not tell them apart.
 
     Raises:
         InputError: Two used episodes have the same identity.
     """
-    members = np.flatnonzero(taking_part)
+    members = np.flatnonzero(is_selected)
     hashes, counts = np.unique(table.id_hash[members], return_counts=True)
     indices: dict[str, int] = {}
     for index in members[np.isin(table.id_hash[members], hashes[counts > 1])].tolist():
@@ -88,7 +88,7 @@ def require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episod
                 config.same_identity_fix,
             )
             error = InputError(where=f"data.path: {config.path}", found=found, fix=fix)
-            raise with_exclusion(error, [name]) if hashes.size > 1 else error
+            raise add_exclusion_fix(error, [name]) if hashes.size > 1 else error
         indices[name] = index
 
 
@@ -120,7 +120,7 @@ class BrokenEpisodes:
     def __len__(self) -> int:
         return len(self.reasons)
 
-    def found(self, problems: Sequence[EpisodeProblem]) -> None:
+    def record_problems(self, problems: Sequence[EpisodeProblem]) -> None:
         """Record problems that were found while the data set was opened or indexed.
 
         Raises:
@@ -132,14 +132,14 @@ class BrokenEpisodes:
         if self._config.broken_episodes == "error":
             first, more = problems[0], len(problems) - 1
             more_problems = f"{more} more cannot be used either. " if more else ""
-            raise self.refusal(replace(first, fix=more_problems + first.fix).error, names)
+            raise self.add_fix(replace(first, fix=more_problems + first.fix).error, names)
         logger.warning(
             "%s: %d of %d episodes are broken and left out: %s; the first: %s",
-            self._config.path, len(problems), self._episodes, named(names), problems[0].error,
+            self._config.path, len(problems), self._episodes, format_identities(names), problems[0].error,
         )  # fmt: skip
         self._add({problem.name: str(problem.error) for problem in problems})
 
-    def met(self, name: str, reason: str) -> None:
+    def record(self, name: str, reason: str) -> None:
         """Record an episode of which a clip could not be read.
 
         Raises:
@@ -150,7 +150,7 @@ class BrokenEpisodes:
             logger.warning("A clip is left out, %d of %d episodes are broken: %s", count, self._episodes, reason)
             self._add({name: reason})
 
-    def recall(self, reasons: Mapping[str, str]) -> None:
+    def restore(self, reasons: Mapping[str, str]) -> None:
         """Record broken episodes that the run found before it was resumed, or in other processes.
 
         Raises:
@@ -158,7 +158,7 @@ class BrokenEpisodes:
         """
         self._add({name: why for name, why in reasons.items() if name not in self._config.exclude})
 
-    def refusal(self, error: InputError, names: Sequence[str]) -> InputError:
+    def add_fix(self, error: InputError, names: Sequence[str]) -> InputError:
         """Return an error about broken episodes whose fix names the config keys that would leave them out.
 
         The fix names `data.broken_episodes: skip` if the episodes are few enough, and `data.exclude` if other episodes
@@ -169,11 +169,11 @@ class BrokenEpisodes:
             names: The identities of all episodes that are known to be broken.
         """
         names = list(dict.fromkeys(names))
-        hashes = np.array([identity_hash(name) for name in names], np.uint64)
+        hashes = np.array([hash_identity(name) for name in names], np.uint64)
         if self._usable is not None and np.isin(self._usable, hashes).all():  # no episode would remain
             return error
         is_few = len(names) <= max_broken(self._episodes)
-        return with_exclusion(error, names, is_skippable=is_few and self._config.broken_episodes == "error")
+        return add_exclusion_fix(error, names, is_skippable=is_few and self._config.broken_episodes == "error")
 
     def _add(self, reasons: Mapping[str, str]) -> None:
         new = {name: why for name, why in reasons.items() if name not in self.reasons}
@@ -184,10 +184,10 @@ class BrokenEpisodes:
         found = f"{len(self)} of {self._episodes} episodes are broken. The first, {name}: {reason.rstrip('.')}"
         needed, fix = f"at most {allowed} with data.broken_episodes: skip", "Repair or fetch them again"
         error = InputError(where=f"data.path: {self._config.path}", found=found, needed=needed, fix=fix)
-        raise self.refusal(error, tuple(self.reasons))
+        raise self.add_fix(error, tuple(self.reasons))
 
 
-def with_exclusion(error: InputError, names: Sequence[str], *, is_skippable: bool = False) -> InputError:
+def add_exclusion_fix(error: InputError, names: Sequence[str], *, is_skippable: bool = False) -> InputError:
     """Return an error about some episodes whose fix also shows how to exclude them.
 
     Args:
@@ -196,23 +196,23 @@ def with_exclusion(error: InputError, names: Sequence[str], *, is_skippable: boo
         is_skippable: Whether `data.broken_episodes: skip` would leave them out.
     """
     fix = f"{error.fix.rstrip('.')}. " if error.fix else ""
-    listed = json.dumps(names[:NAMED], ensure_ascii=False)
-    of_all = f" (the first {NAMED} of {len(names)})" if len(names) > NAMED else ""
+    listed = json.dumps(names[:MAX_NAMED], ensure_ascii=False)
+    of_all = f" (the first {MAX_NAMED} of {len(names)})" if len(names) > MAX_NAMED else ""
     skip = "set data.broken_episodes: skip, or " if is_skippable else ""
     fix = f"{fix}To leave {'it' if len(names) == 1 else 'them'} out, {skip}add{of_all} to data.exclude: {listed}"
     return InputError(where=error.where, found=error.found, needed=error.needed, fix=fix)
 
 
-def named(ids: Sequence[str], count: int | None = None) -> str:
+def format_identities(ids: Sequence[str], count: int | None = None) -> str:
     """Return identities for a message: the first ten, and the number of the rest (of `count` in total)."""
-    more = (len(ids) if count is None else count) - NAMED
-    return ", ".join(ids[:NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = (len(ids) if count is None else count) - MAX_NAMED
+    return ", ".join(ids[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 # ---- splits ----
 
 
-def roles_of(names: Iterable[str]) -> dict[str, Split]:
+def map_split_roles(names: Iterable[str]) -> dict[str, Split]:
     """Return the split (train, validation or test) as which each split of a data set is used, by its name.
 
     An unknown name counts as train. The result is empty unless the data set has both a training split and a held-out
@@ -222,59 +222,59 @@ def roles_of(names: Iterable[str]) -> dict[str, Split]:
     return roles if "train" in roles.values() and len(set(roles.values())) > 1 else {}
 
 
-def with_own_splits(table: EpisodeTable, names: Sequence[str | None]) -> EpisodeTable:
+def add_split_labels(table: EpisodeTable, names: Sequence[str | None]) -> EpisodeTable:
     """Add the name of each episode's split in the data set as a label, if the data set has several splits."""
-    labels = Labels.of(names)
-    return table if len(labels.names) < 2 else replace(table, labels={**table.labels, SPLIT: labels})
+    labels = Labels.from_names(names)
+    return table if len(labels.names) < 2 else replace(table, labels={**table.labels, SPLIT_LABEL: labels})
 
 
-def held_out_by(table: EpisodeTable, config: DataConfig) -> dict[Split, Members]:
+def held_out_splits(table: EpisodeTable, config: DataConfig) -> dict[Split, Members]:
     """Return the masks of the data set's own validation and test splits, if it has them and `data.splits` uses them."""
-    labels = table.labels.get(SPLIT)
+    labels = table.labels.get(SPLIT_LABEL)
     if labels is None or config.splits == "hash":
         return {}
-    roles = roles_of(labels.names)
+    roles = map_split_roles(labels.names)
     numbers = {split: [n for n, name in enumerate(labels.names) if roles.get(name) == split] for split in _HELD_OUT}
     return {split: np.isin(labels.number, of_split) for split, of_split in numbers.items() if of_split}
 
 
 def describe_splits(table: EpisodeTable, config: DataConfig) -> str:
     """Describe how the data set's own splits are used; empty if the data set has only one split."""
-    labels = table.labels.get(SPLIT)
+    labels = table.labels.get(SPLIT_LABEL)
     if labels is None:
         return ""
     counts = np.bincount(labels.number[labels.number >= 0], minlength=len(labels.names)).tolist()
     listed = [f"{name} ({counted(count, 'episode')})" for name, count in zip(labels.names, counts, strict=True)]
-    if not (held_out := held_out_by(table, config)):
+    if not (held_out := held_out_splits(table, config)):
         why = "data.splits is hash" if config.splits == "hash" else "no train beside val, validation or test"
         return f"drawn by hash from all of the data set's own, {', '.join(listed)}: {why}"
-    roles = zip(listed, roles_of(labels.names).items(), strict=True)
+    roles = zip(listed, map_split_roles(labels.names).items(), strict=True)
     used = ", ".join(text if name == role else f"{text} as {role}" for text, (name, role) in roles)
     drawn = next((f"; {split} is drawn from train by hash" for split in _HELD_OUT if split not in held_out), "")
     return f"the data set's own: {used}{drawn}"
 
 
-def members_of(
+def select_split(
     table: EpisodeTable, split_hash: UInt64[np.ndarray, " episodes"], config: DataConfig, split: Split, among: Members
 ) -> Members:
-    """Return a mask of the episodes of a split: the data set's own split, or drawn from the others by `in_split`.
+    """Return a mask of the episodes of a split: the data set's own split, or drawn from the others by `draw_split`.
 
     Args:
         table: The episodes, with the names of the data set's own splits.
-        split_hash: As for `in_split`.
+        split_hash: As for `draw_split`.
         config: `data.splits` and the shares; the share of a split that the data set has is not used.
         split: The split.
-        among: As for `in_split`.
+        among: As for `draw_split`.
     """
-    held_out = held_out_by(table, config)
+    held_out = held_out_splits(table, config)
     if split in held_out:
         return np.asarray(among & held_out[split])
     shares = {f"{own}_share": 0.0 for own in held_out}
     left = among & ~np.any([*held_out.values()], axis=0) if held_out else among
-    return in_split(split_hash, config.model_copy(update=shares), split, left)
+    return draw_split(split_hash, config.model_copy(update=shares), split, left)
 
 
-def in_split(
+def draw_split(
     split_hash: UInt64[np.ndarray, " episodes"],
     config: DataConfig,
     split: Split,
@@ -316,14 +316,14 @@ def _bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[f
     return test, held_out
 
 
-def groups_of(
-    table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig
+def hash_groups(
+    table: EpisodeTable, is_selected: Bool[np.ndarray, " episodes"], config: DataConfig
 ) -> UInt64[np.ndarray, " episodes"] | None:
     """Return the hash of each episode's group (`data.split_by`), which determines its split; None without groups.
 
     Args:
         table: The episodes.
-        taking_part: Mask of the used episodes; other episodes without a group get the hash of an arbitrary group.
+        is_selected: Mask of the used episodes; other episodes without a group get the hash of an arbitrary group.
         config: `data.split_by`.
 
     Raises:
@@ -333,28 +333,28 @@ def groups_of(
     if split_by is None:
         return None
     groups = _groups(table, split_by)
-    ungrouped = [table.identity(index) for index in np.flatnonzero(taking_part).tolist() if not groups[index]]
+    ungrouped = [table.identity(index) for index in np.flatnonzero(is_selected).tolist() if not groups[index]]
     if ungrouped:
         from_source = split_by in table.labels
         reason = "the data set does not say it of" if from_source else "found nothing in the identities of"
         alternative = "choose another field" if from_source else "choose a pattern that fits every identity"
-        found = f"{reason} {len(ungrouped)} of {counted(taking_part.sum(), 'episode')}: {named(ungrouped)}"
+        found = f"{reason} {len(ungrouped)} of {counted(is_selected.sum(), 'episode')}: {format_identities(ungrouped)}"
         fix = f"Leave these out with data.exclude, or {alternative}"
         raise InputError(where=f"data.split_by: {split_by}", found=found, fix=fix)
-    hashes = {group: identity_hash(group) for group in groups if group}
+    hashes = {group: hash_identity(group) for group in groups if group}
     any_hash = next(iter(hashes.values()), 0)
     return np.array([hashes[group] if group else any_hash for group in groups], np.uint64)
 
 
 def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
     if labels := table.labels.get(split_by):
-        return [labels.of_episode(index) for index in range(len(table))]
+        return [labels.name_at(index) for index in range(len(table))]
     identities = [table.identity(index) for index in range(len(table))]
-    if split_by not in IN_IDENTITY and re.fullmatch(r"[A-Za-z_]+", split_by):
+    if split_by not in IDENTITY_PATTERNS and re.fullmatch(r"[A-Za-z_]+", split_by):
         fields = ", ".join(table.labels) or "none of its own"
         example = f", such as {identities[0]}" if identities else ""
-        found = f"no such field; this data set has {fields}, and its identities may have {', '.join(IN_IDENTITY)}"
+        found = f"no such field; this data set has {fields}, and its identities may have {', '.join(IDENTITY_PATTERNS)}"
         needed = f"a field, or a regular expression with one group for the identity{example}"
         raise InputError(where=f"data.split_by: {split_by}", found=found, needed=needed)
-    search = re.compile(IN_IDENTITY.get(split_by, split_by)).search
+    search = re.compile(IDENTITY_PATTERNS.get(split_by, split_by)).search
     return [match.group(1) if (match := search(identity)) else None for identity in identities]

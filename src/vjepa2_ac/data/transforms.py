@@ -61,7 +61,7 @@ def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
     return CropBox((height - box_height) // 2, (width - box_width) // 2, box_height, box_width)
 
 
-def view(
+def crop_frames(
     frames: UInt8[np.ndarray, "time height width 3"], kind: Crop = "released"
 ) -> UInt8[np.ndarray, "time seen_height seen_width 3"]:
     """Return the part of the frames that the model receives, at the original resolution; see `DataConfig.crop`.
@@ -108,24 +108,24 @@ def pixels_to_input(
     """Convert cropped frames to encoder input: resized to a square (bilinear) and normalised as for ImageNet.
 
     Args:
-        frames: Stacked results of `view`, on any device.
+        frames: Stacked results of `crop_frames`, on any device.
         image_size: Height and width of the result in pixels.
     """
     pixels = frames.flatten(0, 1).permute(0, 3, 1, 2).to(torch.float32)
     resized = torch.nn.functional.interpolate(
         pixels, size=(image_size, image_size), mode="bilinear", align_corners=False, antialias=False
     )
-    normalised: Tensor = (resized - per_channel(_MEAN, frames.device)) / per_channel(_STD, frames.device)
+    normalised: Tensor = (resized - channel_constants(_MEAN, frames.device)) / channel_constants(_STD, frames.device)
     return normalised.reshape(*frames.shape[:2], 3, image_size, image_size)
 
 
 def input_to_pixels(inputs: Float[Tensor, "*batch 3 size size"]) -> UInt8[Tensor, "*batch 3 size size"]:
     """Invert the normalisation of encoder input, and round to uint8 images."""
-    pixels = inputs.float() * per_channel(_STD, inputs.device) + per_channel(_MEAN, inputs.device)
+    pixels = inputs.float() * channel_constants(_STD, inputs.device) + channel_constants(_MEAN, inputs.device)
     return pixels.round().clamp(0, 255).to(torch.uint8)
 
 
-def frames_as_seen(
+def to_display_frames(
     frames: UInt8[np.ndarray, "time height width 3"], size: int
 ) -> UInt8[np.ndarray, "time size size 3"]:
     """Return cropped frames at the resolution of the encoder input, as uint8 images for display."""
@@ -134,14 +134,14 @@ def frames_as_seen(
 
 
 @dataclass(frozen=True)
-class ClipChanges:
+class ClipTransforms:
     """The user's transforms of the training clips of a run."""
 
     transforms: tuple[tuple[str, Transform], ...]  # (name, transform) in the config's order
     seed: int
 
     @classmethod
-    def of(cls, data: DataConfig, seed: int) -> ClipChanges:
+    def from_config(cls, data: DataConfig, seed: int) -> ClipTransforms:
         """Create the transforms of a config, once, in the process that starts the workers."""
         transforms = ((config.name, TRANSFORMS.make(config.name, config.options)) for config in data.transforms)
         return cls(tuple(transforms), seed)
@@ -176,7 +176,7 @@ def _form(clip: object, part: str) -> str:
 
 
 @lru_cache(maxsize=32)
-def per_channel(values: tuple[float, float, float], device: torch.device) -> Float[Tensor, "3 1 1"]:
+def channel_constants(values: tuple[float, float, float], device: torch.device) -> Float[Tensor, "3 1 1"]:
     """Return numbers for red, green and blue as a tensor on a device, cached because the copy blocks the host."""
     with torch.inference_mode(False):  # inference tensors cannot be used in training
         return torch.tensor(values, device=device).view(3, 1, 1)

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Int, Int32, Int64
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.index import EpisodeTable, StepSelection
-from vjepa2_ac.data.selection import NAMED, named
+from vjepa2_ac.data.selection import MAX_NAMED, format_identities
 from vjepa2_ac.errors import InputError, counted
 
 logger = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ class Windows:
     every: int = 1  # control steps between the starts of consecutive clips
     short: tuple[int, ...] = ()  # episodes that are skipped because they are shorter than a clip
 
-    def of(self, runs: np.ndarray) -> Windows:
+    def select(self, runs: np.ndarray) -> Windows:
         """Select runs by a mask or by indices."""
         return replace(self, episode=self.episode[runs], first=self.first[runs], count=self.count[runs])
 
@@ -70,7 +70,7 @@ class Windows:
         return np.unique(self.episode)
 
 
-def clip_starts(table: EpisodeTable, kept: StepSelection, config: DataConfig) -> Windows:
+def find_clip_windows(table: EpisodeTable, kept: StepSelection, config: DataConfig) -> Windows:
     """Return the windows of all clips that fit into the kept ranges.
 
     With `data.start_every` = n, clips start at every n-th step, counted from the first kept step of their episode.
@@ -80,11 +80,11 @@ def clip_starts(table: EpisodeTable, kept: StepSelection, config: DataConfig) ->
     phase[kept.episode[::-1]] = kept.start[::-1]  # reversed, so that the first range of an episode is written last
     skipped = (phase[kept.episode] - kept.start) % config.start_every
     count = -((skipped - span) // config.start_every)  # rounded up; 0 or less if no clip fits
-    runs = Windows(kept.episode, kept.start + skipped, count, config.start_every).of(count > 0)
-    return runs.of(np.lexsort((runs.first, table.id_rank[runs.episode])))
+    runs = Windows(kept.episode, kept.start + skipped, count, config.start_every).select(count > 0)
+    return runs.select(np.lexsort((runs.first, table.id_rank[runs.episode])))
 
 
-def windows_of(
+def select_split_windows(
     table: EpisodeTable, members: Bool[np.ndarray, " episodes"], starts: Windows, config: DataConfig, split: Split
 ) -> Windows:
     """Return the windows of a split.
@@ -92,7 +92,7 @@ def windows_of(
     Args:
         table: The episodes.
         members: Mask of the episodes that are used and belong to the split; at least one.
-        starts: The result of `clip_starts`, which includes these episodes.
+        starts: The result of `find_clip_windows`, which includes these episodes.
         config: The length of a clip.
         split: The name of the split.
 
@@ -103,17 +103,17 @@ def windows_of(
     length = f"{counted(config.clip_steps, 'step')} for a clip of {config.frames} frames at stride {config.stride}"
     short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
     short = short[np.argsort(table.id_rank[short])]
-    names = tuple(table.identity(index) for index in short[: NAMED + 1].tolist())
+    names = tuple(table.identity(index) for index in short[: MAX_NAMED + 1].tolist())
     if len(short) == count:
         longest = int(short[np.argmax(table.num_steps[short])])
         found = f"all {count} {split} episodes are shorter than a clip; the longest,"
         found += f" {table.identity(longest)}, has {counted(table.num_steps[longest], 'step')}."
-        found += f" Too short: {named(names, len(short))}"
+        found += f" Too short: {format_identities(names, len(short))}"
         raise InputError(where=where, found=found, needed=length, fix="Lower data.frames or data.stride")
     if len(short):
-        clip = f"a clip of {config.clip_steps} control steps and left out: {named(names, len(short))}"
+        clip = f"a clip of {config.clip_steps} control steps and left out: {format_identities(names, len(short))}"
         _warn_once(f"{config.path}: {len(short)} of {count} {split} episodes are shorter than {clip}")
-    windows = starts.of(members[starts.episode])
+    windows = starts.select(members[starts.episode])
     if not len(windows):
         found = f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})"
         fix = "Lower data.frames or data.stride, or set data.idle.rule: none"
@@ -136,7 +136,7 @@ class ClipOrder:
     def window(self, position: int) -> tuple[int, int]:
         """Return (episode, first control step) of the clip at a position of the run."""
         epoch, index = divmod(position, len(self.windows))
-        return self.windows[permuted(index, size=len(self.windows), seed=self.seed, epoch=epoch)]
+        return self.windows[permute_index(index, size=len(self.windows), seed=self.seed, epoch=epoch)]
 
     def choice(self, position: int, count: int) -> int:
         """Draw an index from `range(count)` uniformly for the clip at a position of the run."""
@@ -144,7 +144,7 @@ class ClipOrder:
         return int.from_bytes(digest, "big") % count
 
 
-def permuted(index: int, *, size: int, seed: int, epoch: int) -> int:
+def permute_index(index: int, *, size: int, seed: int, epoch: int) -> int:
     """Return the image of an index under a keyed permutation of `range(size)`, computed without storing it.
 
     A Feistel network permutes the range up to the next power of four; results outside `range(size)` are permuted again
@@ -179,7 +179,7 @@ def _round_keys(size: int, seed: int, epoch: int) -> tuple[int, ...]:
     return tuple(int.from_bytes(digest[8 * number : 8 * number + 8], "big") for number in range(_ROUNDS))
 
 
-def drawn(id_hash: int, start: int) -> float:
+def draw_uniform(id_hash: int, start: int) -> float:
     """Return a pseudo-random number in [0, 1) for a window, from its episode's identity hash and its first step."""
     return (_mix((id_hash + (start + 1) * 0x9E3779B97F4A7C15) & _MASK64) >> 11) / (1 << 53)
 
@@ -220,18 +220,18 @@ def require_frames(config: DataConfig, *, to: str) -> None:
         raise InputError(where="data.source", found="latents, without frames", needed=needed)
 
 
-def spread(size: int, count: int) -> list[int]:
+def spread_indices(size: int, count: int) -> list[int]:
     """Return at most `count` distinct indices from `range(size)`, evenly spread."""
     count = min(size, count)
     return [(2 * number + 1) * size // (2 * count) for number in range(count)]
 
 
-def spread_with_ends(size: int, count: int) -> list[int]:
+def spread_indices_with_ends(size: int, count: int) -> list[int]:
     """Return at most `count` distinct indices from `range(size)`, evenly spread, including the first and the last."""
     return sorted({round(position) for position in np.linspace(0, size - 1, min(size, count))})
 
 
-def far_neighbours(items: list[int]) -> list[int]:
+def interleave_halves(items: list[int]) -> list[int]:
     """Reorder sorted items so that consecutive items are about half the list apart."""
     half = (len(items) + 1) // 2
     pairs = itertools.zip_longest(items[:half], items[half:])

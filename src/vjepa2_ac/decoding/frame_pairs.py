@@ -20,7 +20,7 @@ from torch import Tensor
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latent_files import LatentFiles, unpack_latents
-from vjepa2_ac.data.windows import spread
+from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.decoding.decoder import Decoder, DecoderShape, as_images
 from vjepa2_ac.encoding.latent_cache import FramesToEncode, needed_frames
 from vjepa2_ac.episode import Progress
@@ -80,7 +80,7 @@ def wanted_frames(dataset: Dataset, split: Split, *, frames: int) -> list[Frames
 
     They are among those that clips use: the decoder is to show clips. None, if the split has no clips.
     """
-    members = dataset.members(split)
+    members = dataset.split_mask(split)
     needed = [one for one in needed_frames(dataset) if members[one.episode]]
     total = sum(len(one.steps) for one in needed)
     places, counted = np.linspace(0, total, min(frames, total), endpoint=False).astype(int), 0
@@ -89,7 +89,7 @@ def wanted_frames(dataset: Dataset, split: Split, *, frames: int) -> list[Frames
         count = int(((places >= counted) & (places < counted + len(one.steps))).sum())
         counted += len(one.steps)
         if count:
-            steps = one.steps[spread(len(one.steps), count)]
+            steps = one.steps[spread_indices(len(one.steps), count)]
             wanted.append(FramesToEncode(one.episode, one.camera, steps))
     return wanted
 
@@ -113,7 +113,7 @@ def fit_linear(pairs: FramePairs, shape: DecoderShape, device: torch.device, pro
         progress: Called with (done, total) in frames.
     """
     decoder = Decoder(DecoderShape("linear", shape.dim, shape.grid, shape.patch_size))
-    numbers = spread(len(pairs), _FRAMES)
+    numbers = spread_indices(len(pairs), _FRAMES)
     inner: Float[Tensor, "dim+1 dim+1"] = torch.zeros(shape.dim + 1, shape.dim + 1, dtype=torch.float64)
     outer: Float[Tensor, "dim+1 pixels"] = torch.zeros(shape.dim + 1, 3 * shape.patch_size**2, dtype=torch.float64)
     done = 0
@@ -139,7 +139,7 @@ def fit_linear(pairs: FramePairs, shape: DecoderShape, device: torch.device, pro
 @torch.no_grad()
 def mean_image(pairs: FramePairs) -> Float[Tensor, "3 size size"]:
     """Return the mean of some images, spread over the pairs: what a decoder shows that has learned nothing else."""
-    numbers = spread(len(pairs), _FRAMES_OF_MEAN)
+    numbers = spread_indices(len(pairs), _FRAMES_OF_MEAN)
     total = sum(as_images(some.images).sum(dim=0) for some in _parts(pairs, numbers, _MEASURED_AT_ONCE))
     return torch.as_tensor(total / len(numbers))
 

@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.dataset import Dataset, frames_of
-from vjepa2_ac.data.transforms import frames_as_seen
+from vjepa2_ac.data.dataset import Dataset, frames_for_display
+from vjepa2_ac.data.transforms import to_display_frames
 from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, TrainedDecoder, as_pixels, load_decoder
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import UnreachableError
@@ -280,7 +280,7 @@ class ImaginedStrip:
             raise ValueError("no clip was seen")
         batch, row, clip = self._clip
         if self._frames is None:
-            self._frames = frames_as_seen(frames_of(self._dataset, batch, row), world_model.image_size)
+            self._frames = to_display_frames(frames_for_display(self._dataset, batch, row), world_model.image_size)
         decoder, latents = self._decoder.to(device).decoder, clip.latents.to(device)
         actions, states = (values[0].double().cpu().numpy() for values in (clip.actions, clip.states))
         start = Start.of(replace(clip, latents=latents), self._dataset.spaces.state)

@@ -23,10 +23,10 @@ from torch import Tensor
 from vjepa2_ac.config import Config, DecoderConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.selection import SPLIT
+from vjepa2_ac.data.selection import SPLIT_LABEL
 from vjepa2_ac.data.sources.latent_files import LatentFiles, bytes_per_frame
 from vjepa2_ac.data.sources.latents import CacheKey, Encoding, require_own_folder
-from vjepa2_ac.data.windows import permuted, require_frames, require_stride
+from vjepa2_ac.data.windows import permute_index, require_frames, require_stride
 from vjepa2_ac.decoding.decoder import (
     CARD,
     UPSAMPLED,
@@ -40,13 +40,13 @@ from vjepa2_ac.decoding.decoder import (
 )
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
 from vjepa2_ac.distributed import autocast, select_device
-from vjepa2_ac.encoding.batch import encoding_of
+from vjepa2_ac.encoding.batch import get_encoding
 from vjepa2_ac.encoding.latent_cache import (
     EncoderOnDevice,
     FramesToEncode,
     LatentCache,
+    count_frames,
     encode_files,
-    frames_in,
     require_space,
 )
 from vjepa2_ac.errors import InputError
@@ -183,31 +183,33 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
         raise InputError(where=f"data.path: {config.data.path}", found=found, needed=needed, fix=fix)
     reporter.task(LOADING)
     model = load_base(config.model, seed=config.seed)
-    encoding, size, patch = encoding_of(model, config), model.image_size, model.sizes.patch_size
+    encoding, size, patch = get_encoding(model, config), model.image_size, model.sizes.patch_size
     if patch % UPSAMPLED or size < _SMALLEST:
         needed = f"{_SMALLEST} px or more, and patches of a multiple of {UPSAMPLED} px"
         raise InputError(where="model", found=f"images of {size} px in patches of {patch} px", needed=needed)
     key = CacheKey({
         "decoder": decoder.model_dump(mode="json", exclude={"folder"}),
         "seed": config.seed,
-        "latents": dict(LatentCache.of(dataset, encoding).key.parts),
+        "latents": dict(LatentCache.for_dataset(dataset, encoding).key.parts),
         "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
-        **({"data.splits": config.data.splits} if SPLIT in dataset.table.labels else {}),
+        **({"data.splits": config.data.splits} if SPLIT_LABEL in dataset.table.labels else {}),
     })  # fmt: skip
     require_own_folder(folder, KEY, key, where=f"decoder.folder {folder}")
     shape = DecoderShape(decoder.size, model.latent_dim, size // patch, patch)
-    return Setup(config, folder, shape, encoding, key, dataset, EncoderOnDevice.of(config, model, device), wanted)
+    return Setup(
+        config, folder, shape, encoding, key, dataset, EncoderOnDevice.from_model(config, model, device), wanted
+    )
 
 
 def _require_space(ready: Setup, reporter: Reporter) -> None:
     encoding, kind = ready.encoding, ready.config.data.cache_dtype
     per_frame = bytes_per_frame(encoding.tokens, encoding.dim, kind) + 3 * encoding.image_size**2
     everything = [one for some in ready.wanted.values() for one in some]
-    left = frames_in([one for one in everything if not ready.files.has(one.episode, one.camera)])
+    left = count_frames([one for one in everything if not ready.files.has(one.episode, one.camera)])
     fix = "Lower decoder.frames, set data.cache_dtype: int8, or put decoder.folder on a larger disk"
     require_space(ready.folder, left, per_frame, fix=fix)
     size = f"{left * per_frame / 1e9:.3g} GB of disk for them and their latents, while training"
-    reporter.note(f"{frames_in(everything):,} frames; {size}")
+    reporter.note(f"{count_frames(everything):,} frames; {size}")
 
 
 def _try_one_step(ready: Setup) -> None:
@@ -229,7 +231,7 @@ def _encoded(ready: Setup, split: Split, reporter: Reporter, stop: StopRequest) 
             raise StoppedError(ready.folder, 0, stop.reason)
 
     left = [one for one in wanted if not files.is_done(one.episode, one.camera)]
-    encode_files(ready.dataset, left, ready.encoder, files, progress, exact_pictures=True)
+    encode_files(ready.dataset, left, ready.encoder, files, progress, lossless_images=True)
     pairs = FramePairs.of(ready.dataset, wanted, files)
     if wanted and not len(pairs):
         raise InputError(where=ready.config.data.path, found="no frame that can be read", needed="one or more")
@@ -273,7 +275,7 @@ def _batches(pairs: FramePairs, config: Config, done: int) -> Generator[tuple[in
 
     def read(step: int) -> Pairs:
         places = range((step - 1) * size, step * size)
-        return pairs.read([permuted(at % count, size=count, seed=seed, epoch=at // count) for at in places])
+        return pairs.read([permute_index(at % count, size=count, seed=seed, epoch=at // count) for at in places])
 
     with ThreadPoolExecutor(1, thread_name_prefix="pairs") as pool:
         ahead = pool.submit(read, done + 1)

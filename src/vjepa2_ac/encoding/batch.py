@@ -16,7 +16,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latent_files import unpack_latents
 from vjepa2_ac.data.sources.latents import Encoding, LatentSource, another_cache
-from vjepa2_ac.data.transforms import Crop, pixels_to_input, split_views, view
+from vjepa2_ac.data.transforms import Crop, crop_frames, pixels_to_input, split_views
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.encoder import ENCODE_CHUNK
@@ -51,7 +51,7 @@ def encode_batch(
         latents=latents,
         states=batch.states,
         actions=batch.actions,
-        extrinsics=extrinsics_for(world_model, batch),
+        extrinsics=get_extrinsics(world_model, batch),
         episode_ids=batch.episode_ids,
         starts=batch.starts,
     )
@@ -82,7 +82,7 @@ def encode_frames(
     """
 
     def encoded(part: UInt8[np.ndarray, "frames height all 3"]) -> Tensor:
-        cropped = view(split_views(part, views), crop)
+        cropped = crop_frames(split_views(part, views), crop)
         pixels = torch.from_numpy(np.ascontiguousarray(cropped)).to(world_model.device)[None]
         latents = world_model.encode(pixels_to_input(pixels, world_model.image_size), chunk=chunk)[0]
         return latents.reshape(len(part), -1, latents.shape[-1])
@@ -90,7 +90,7 @@ def encode_frames(
     return torch.cat([encoded(frames[first : first + chunk]) for first in range(0, len(frames), chunk)])
 
 
-def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
+def get_encoding(world_model: WorldModel, config: Config) -> Encoding:
     """Return the settings that determine a model's latents: part of the key by which a cache is found or refused.
 
     This function hashes the encoder's weights, which takes time.
@@ -114,7 +114,7 @@ def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Conf
         InputError: Lists the differences.
     """
     if isinstance(dataset.source, LatentSource):  # the weights are hashed only for caches
-        differing = dataset.source.key.differences_of(encoding_of(world_model, config))
+        differing = dataset.source.key.differences_of(get_encoding(world_model, config))
         if differing:
             raise another_cache(Path(dataset.config.path), differing)
 
@@ -137,7 +137,7 @@ def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> No
         raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 
-def extrinsics_for(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "batch time 6"] | None:
+def get_extrinsics(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "batch time 6"] | None:
     """Return the camera poses of a batch if the model needs them, otherwise None.
 
     Raises:

@@ -22,8 +22,8 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.distributed import run_on_all, run_on_first, select_device
-from vjepa2_ac.encoding.batch import encoding_of, require_same_encoder
-from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, LatentCache, encode_files, frames_in
+from vjepa2_ac.encoding.batch import get_encoding, require_same_encoder
+from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, LatentCache, count_frames, encode_files
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.world_model import WorldModel
@@ -37,7 +37,7 @@ _LONGEST_UNSEEN_S = 60.0  # a new file in a network folder becomes visible to ot
 
 
 @dataclass(frozen=True)
-class EncodedSet:
+class EncodingResult:
     """The result of encoding a cache."""
 
     folder: Path | str
@@ -51,7 +51,7 @@ class EncodedSet:
 
 def encode_config(
     config: Config, reporter: Reporter = SILENT, *, out: Path | str | None = None, engine: Engine | None = None
-) -> EncodedSet:
+) -> EncodingResult:
     """Encode all frames that the clips of a config need, or this process's share of them, into a latent cache.
 
     Episodes that could not be read before are tried again.
@@ -73,17 +73,17 @@ def encode_config(
         engine(config, cache, left, reporter)
     elif left:
         share = ProcessShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
-        encode_share(cache, left, EncoderOnDevice.of(config, model, device), share, reporter)
+        encode_share(cache, left, EncoderOnDevice.from_model(config, model, device), share, reporter)
     else:
         cache.begin()
         reporter.note(f"Everything is encoded already, in {cache.folder}")
     table, broken, files = cache.dataset.table, cache.broken, cache.files
-    sizes = [(request, files.size(request.episode, request.camera)) for request in cache.wanted]
+    sizes = [(request, files.size(request.episode, request.camera)) for request in cache.requests]
     absent = {request.episode for request, size in sizes if not size}
-    return EncodedSet(
+    return EncodingResult(
         folder=cache.folder,
         episodes=len(table),
-        encoded=len({request.episode for request in cache.wanted} - absent),
+        encoded=len({request.episode for request in cache.requests} - absent),
         frames=sum(len(request.steps) for request, size in sizes if size),
         bytes=sum(size for _, size in sizes),
         broken={table.identity(number): reason for number, reason in broken.items()},
@@ -102,8 +102,8 @@ def open_cache(
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     reporter.task(LOADING)
     model = load_base(config.model, seed=config.seed)
-    cache = LatentCache.of(dataset, encoding_of(model, config), folder)
-    cache.require_own()
+    cache = LatentCache.for_dataset(dataset, get_encoding(model, config), folder)
+    cache.require_same_key()
     return cache, model
 
 
@@ -159,10 +159,10 @@ def encode_share(
     requests = [request for request in left if request.episode % share.processes == share.rank]
     encode_files(dataset, requests, encoder, cache.files, reporter.task("encoding frames", "frames"))
     for number, reason in cache.broken.items():
-        dataset.broken.met(dataset.table.identity(number), reason)
+        dataset.broken.record(dataset.table.identity(number), reason)
 
 
-def with_latents(
+def use_latent_cache(
     config: Config,
     dataset: Dataset,
     model: WorldModel,
@@ -191,27 +191,27 @@ def with_latents(
     if config.data.cache == "auto":
         if not check_only:
             _encode_together(
-                cache, partial(EncoderOnDevice.of, config, model, accelerator.device), accelerator, reporter
+                cache, partial(EncoderOnDevice.from_model, config, model, accelerator.device), accelerator, reporter
             )
         elif left := cache.missing():
-            cache.require_own()
+            cache.require_same_key()
             cache.require_space(left)
-            frames = counted(frames_in(left), "frame")
+            frames = counted(count_frames(left), "frame")
             reporter.note(f"A run would first encode {frames} of {cache.summary(left)}. The cache is {cache.folder}")
             return dataset
-    cached_dataset = cache.opened()
+    cached_dataset = cache.open_dataset()
     reporter.note(f"Latents come from {cache.folder}: the encoder is not needed")
     return cached_dataset
 
 
-def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -> Dataset:
+def use_finished_cache(config: Config, dataset: Dataset, model: WorldModel) -> Dataset:
     """Return a data set with clips from a finished latent cache of this encoder, or unchanged if there is none.
 
     Raises:
         InputError: The data set is itself a latent cache, from another encoder.
     """
     cache = _cache_of(config, dataset, model)
-    return dataset if cache is None or cache.missing() else cache.opened()
+    return dataset if cache is None or cache.missing() else cache.open_dataset()
 
 
 def _cache_of(config: Config, dataset: Dataset, model: WorldModel) -> LatentCache | None:
@@ -219,7 +219,7 @@ def _cache_of(config: Config, dataset: Dataset, model: WorldModel) -> LatentCach
     if config.data.is_cache or config.data.cache == "off":
         require_same_encoder(model, dataset, config)
         return None
-    return LatentCache.of(dataset, encoding_of(model, config))
+    return LatentCache.for_dataset(dataset, get_encoding(model, config))
 
 
 def _encode_together(

@@ -24,11 +24,11 @@ from torch import Tensor
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips import joined_latents
-from vjepa2_ac.data.dataset import Dataset, through_latents
-from vjepa2_ac.data.files import CONNECTIONS, fetched_data, in_parallel
+from vjepa2_ac.data.clips import join_latents
+from vjepa2_ac.data.dataset import Dataset, open_cached_latents
+from vjepa2_ac.data.files import CONNECTIONS, map_in_threads, open_download_cache
 from vjepa2_ac.data.idle import find_ranges
-from vjepa2_ac.data.index import cache_folder, fingerprint_of
+from vjepa2_ac.data.index import cache_folder, compute_fingerprint
 from vjepa2_ac.data.sources.latent_files import CacheType, EncodedEpisode, LatentFiles, bytes_per_frame, pack_latents
 from vjepa2_ac.data.sources.latents import (
     CACHE,
@@ -40,7 +40,7 @@ from vjepa2_ac.data.sources.latents import (
     read_key,
     require_own_folder,
 )
-from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
+from vjepa2_ac.data.transforms import crop_frames, input_to_pixels, pixels_to_input
 from vjepa2_ac.distributed import autocast
 from vjepa2_ac.episode import Episode, Progress, StoredLatents, no_progress
 from vjepa2_ac.errors import InputError, counted
@@ -94,7 +94,7 @@ class LatentCache:
     folder: Path | str  # local folder or URL
 
     @classmethod
-    def of(cls, dataset: Dataset, encoding: Encoding, folder: Path | str | None = None) -> LatentCache:
+    def for_dataset(cls, dataset: Dataset, encoding: Encoding, folder: Path | str | None = None) -> LatentCache:
         """Return the cache of a data set and an encoder.
 
         Args:
@@ -103,7 +103,7 @@ class LatentCache:
             folder: The folder of the cache; None: a folder in `data.cache_dir`, or in the machine's default cache.
         """
         config = dataset.config
-        key = key_of_cache(config, fingerprint_of(dataset.table), encoding)
+        key = key_of_cache(config, compute_fingerprint(dataset.table), encoding)
         parent = config.cache_dir or cache_folder(config.disk_cache) / "latents"
         path = storage.join(parent, key.digest) if folder is None else str(folder)
         return cls(dataset, encoding, key, storage.parse_folder(path))
@@ -111,11 +111,11 @@ class LatentCache:
     @property
     def files(self) -> LatentFiles:
         """The files of the cache; behind a URL each access lists the folder again."""
-        cache = fetched_data(self.dataset.config.disk_cache) if storage.is_url(self.folder) else None
+        cache = open_download_cache(self.dataset.config.disk_cache) if storage.is_url(self.folder) else None
         return LatentFiles(self.folder, self.key.digest, cache)
 
     @cached_property
-    def wanted(self) -> tuple[FramesToEncode, ...]:
+    def requests(self) -> tuple[FramesToEncode, ...]:
         """The frames of the finished cache."""
         return tuple(needed_frames(self.dataset))
 
@@ -126,11 +126,13 @@ class LatentCache:
         URL headers are read only with `retry`.
         """
         if not self.is_begun:
-            return list(self.wanted)
+            return list(self.requests)
         files = self.files
         is_present = files.has if retry else files.is_done
-        results = in_parallel(lambda request: is_present(request.episode, request.camera), self.wanted, CONNECTIONS)
-        return [request for request, is_complete in zip(self.wanted, results, strict=True) if not is_complete]
+        results = map_in_threads(
+            lambda request: is_present(request.episode, request.camera), self.requests, CONNECTIONS
+        )
+        return [request for request, is_complete in zip(self.requests, results, strict=True) if not is_complete]
 
     @property
     def is_begun(self) -> bool:
@@ -140,7 +142,7 @@ class LatentCache:
     @property
     def broken(self) -> dict[int, str]:
         """The reasons of the episodes that any process could not read, by the index of the episode."""
-        reasons, episodes = self.files.broken, {request.episode for request in self.wanted}
+        reasons, episodes = self.files.broken, {request.episode for request in self.requests}
         return {number: reason for number, reason in reasons.items() if number in episodes}
 
     @property
@@ -148,15 +150,15 @@ class LatentCache:
         """The approximate size of a frame in bytes: its latents and its image."""
         encoding = self.encoding
         latents = bytes_per_frame(encoding.tokens, encoding.dim, self.dataset.config.cache_dtype)
-        return latents + picture_bytes(encoding.image_size)
+        return latents + image_bytes(encoding.image_size)
 
     def summary(self, left: Sequence[FramesToEncode]) -> str:
         """Return the number of frames and the size of the cache as text, and how many frames are left to encode."""
-        frames, num_left = frames_in(self.wanted), frames_in(left)
+        frames, num_left = count_frames(self.requests), count_frames(left)
         size = f"{counted(frames, 'frame')} ({frames * self.bytes_per_frame / _GIGABYTE:.3g} GB)"
         return size if num_left == frames else f"{size}; {frames - num_left:,} cached, {num_left:,} to encode"
 
-    def require_own(self) -> None:
+    def require_same_key(self) -> None:
         """Refuse a folder that holds another cache or other files.
 
         Raises:
@@ -171,7 +173,7 @@ class LatentCache:
             InputError: The folder holds another cache or other files, or cannot be written.
             UnreachableError: The URL cannot be written.
         """
-        self.require_own()
+        self.require_same_key()
         if self.is_begun:
             return
         dataset = self.dataset
@@ -195,16 +197,16 @@ class LatentCache:
             f"Set data.cache_dtype: int8, or data.start_every: {self.dataset.config.model_stride}; take fewer episodes"
             " (data.outcome, data.idle, data.exclude); or name a folder on a larger disk (data.cache_dir)"
         )
-        require_space(self.folder, frames_in(left), self.bytes_per_frame, fix=fix)
+        require_space(self.folder, count_frames(left), self.bytes_per_frame, fix=fix)
 
-    def opened(self) -> Dataset:
+    def open_dataset(self) -> Dataset:
         """Return the same data set, with the same clips in the same order, read as latents from this cache.
 
         Raises:
             InputError: The cache is not finished; if it was not begun, names how other caches in the folder differ.
         """
         if self.is_begun:
-            return through_latents(self.dataset, self.folder)
+            return open_cached_latents(self.dataset, self.folder)
         parent, others = str(self.folder).rpartition("/")[0], []
         for name in storage.list_names(parent):
             if storage.exists(storage.join(other := storage.join(parent, name), CACHE)):
@@ -217,12 +219,12 @@ class LatentCache:
         raise InputError(where=where, found=found, fix=fix)
 
 
-def frames_in(wanted: Sequence[FramesToEncode]) -> int:
+def count_frames(wanted: Sequence[FramesToEncode]) -> int:
     """Return the total number of frames of some requests."""
     return sum(len(request.steps) for request in wanted)
 
 
-def picture_bytes(image_size: int) -> int:
+def image_bytes(image_size: int) -> int:
     """Return the approximate size in bytes of a frame's JPEG image, including its share of the states."""
     return 1000 + image_size**2 // 3
 
@@ -259,7 +261,7 @@ class EncoderOnDevice:
     chunk: int = ENCODE_CHUNK  # frames per encoder call
 
     @classmethod
-    def of(cls, config: Config, model: WorldModel, device: torch.device) -> EncoderOnDevice:
+    def from_model(cls, config: Config, model: WorldModel, device: torch.device) -> EncoderOnDevice:
         """Move the encoder of a model, and only the encoder, to a device."""
         model.present_encoder.to(device)
         return cls(model, device, partial(autocast, config.training, device))
@@ -282,7 +284,7 @@ def encode_files(
     files: LatentFiles,
     progress: Progress = no_progress,
     *,
-    exact_pictures: bool = False,
+    lossless_images: bool = False,
 ) -> None:
     """Encode the requested frames and write one file per request.
 
@@ -295,7 +297,7 @@ def encode_files(
         encoder: Computes the latents.
         files: The files of the cache.
         progress: Called with (done, total) in frames.
-        exact_pictures: Store the encoder's input images without loss instead of as JPEGs.
+        lossless_images: Store the encoder's input images without loss instead of as JPEGs.
 
     Raises:
         InputError: An episode cannot be read and the policy does not skip it, too many episodes are broken, or a file
@@ -303,7 +305,7 @@ def encode_files(
         UnreachableError: A failure of the connection, not of the episode.
     """
     threads, writes = max(1, dataset.config.workers), deque[Future[None]]()
-    done, total = 0, frames_in(wanted)
+    done, total = 0, count_frames(wanted)
     progress(done, total)
     writers = _WRITES_UNDER_WAY if storage.is_url(files.folder) else 1
     with ThreadPoolExecutor(threads, "decode") as decoders, ThreadPoolExecutor(writers, "write") as writer:
@@ -313,10 +315,12 @@ def encode_files(
                 try:
                     encoded = _encode(encoder, request, parts, dataset.config.cache_dtype)
                 except InputError as error:
-                    dataset.leave_out(request.episode, error)
+                    dataset.skip_episode(request.episode, error)
                     files.note_broken(request.episode, request.camera, str(error))
                 else:
-                    writes.append(writer.submit(_write, files, request.episode, encoded, exact_pictures=exact_pictures))
+                    writes.append(
+                        writer.submit(_write, files, request.episode, encoded, lossless_images=lossless_images)
+                    )
                 while len(writes) > _WRITES_UNDER_WAY:
                     writes.popleft().result()
                 done += len(request.steps)
@@ -351,7 +355,7 @@ def _parts(
 
 def _read(dataset: Dataset, opened: Future[Episode], steps: Sequence[int], *, pinned: bool) -> tuple[Episode, _Frames]:
     recording = opened.result()
-    frames = torch.from_numpy(view(recording.read_frames(steps), dataset.config.crop))
+    frames = torch.from_numpy(crop_frames(recording.read_frames(steps), dataset.config.crop))
     return recording, frames.pin_memory() if pinned else frames
 
 
@@ -372,7 +376,7 @@ def _encode(
             torch.cuda.synchronize(encoder.device)
         images = np.ascontiguousarray(rearrange(torch.cat(pictures), "n c h w -> n h w c").numpy())
         return EncodedEpisode(
-            recording, request.camera, request.steps.tolist(), joined_latents(latents, torch.cat), images
+            recording, request.camera, request.steps.tolist(), join_latents(latents, torch.cat), images
         )
 
     return fetched
@@ -385,5 +389,5 @@ def _to_host(tensor: Tensor) -> Tensor:
     return torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)
 
 
-def _write(files: LatentFiles, number: int, encoded: Callable[[], EncodedEpisode], *, exact_pictures: bool) -> None:
-    files.write(number, encoded(), exact_pictures=exact_pictures)
+def _write(files: LatentFiles, number: int, encoded: Callable[[], EncodedEpisode], *, lossless_images: bool) -> None:
+    files.write(number, encoded(), lossless_images=lossless_images)

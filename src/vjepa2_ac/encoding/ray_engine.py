@@ -17,7 +17,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.distributed import select_device
 from vjepa2_ac.encoding.encode_dataset import Engine, begin_encoding, open_cache, require_shared
-from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, LatentCache, encode_files, frames_in
+from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, LatentCache, count_frames, encode_files
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
 from vjepa2_ac.reporter import Reporter
 
@@ -90,14 +90,14 @@ def _encode(where: str, config: Config, cache: LatentCache, left: Sequence[Frame
         num_cpus=int(kind == "CPU"),
         num_gpus=int(kind == "GPU"),
     )
-    progress, done, total = reporter.task("encoding frames", "frames"), 0, frames_in(left)
+    progress, done, total = reporter.task("encoding frames", "frames"), 0, count_frames(left)
     progress(done, total)
     for row in results.iter_rows():
         result: _Result = row["found"]
         if result.error is not None:
             raise result.error
         for name, reason in result.broken.items():
-            cache.dataset.broken.met(name, reason)
+            cache.dataset.broken.record(name, reason)
         done += result.frames
         progress(done, total)
     require_shared(cache, lambda: not cache.missing())
@@ -128,7 +128,7 @@ class _Actor:
         config = parse_config(self._config, where="the config")
         cache, model = open_cache(config, self._folder)
         require_shared(cache, lambda: cache.is_begun)
-        return cache, EncoderOnDevice.of(config, model, select_device(config.training))
+        return cache, EncoderOnDevice.from_model(config, model, select_device(config.training))
 
     def __call__(self, row: Mapping[str, Any]) -> dict[str, _Result]:
         requests = row["wanted"].wanted
@@ -140,4 +140,4 @@ class _Actor:
         except Exception as error:
             error.add_note(traceback.format_exc())
             return {"found": _Result(0, {}, error)}
-        return {"found": _Result(frames_in(requests), cache.dataset.broken.reasons)}
+        return {"found": _Result(count_frames(requests), cache.dataset.broken.reasons)}

@@ -15,7 +15,7 @@ from einops import rearrange
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.data.windows import spread
+from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.distributed import gather_shared
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_use import (
@@ -108,7 +108,7 @@ def evaluate(
     width, starts = sums.actions.shape[-1], sums.starts
     is_moving = {name: bool(steps.any()) for name, steps in zip(sums.names, known.moving, strict=True)}
     moving = [start for start in starts if is_moving[start.episode_id, start.first_step]] or starts
-    mapped = [moving[index] for index in spread(len(moving), probes.landscape_clips)]
+    mapped = [moving[index] for index in spread_indices(len(moving), probes.landscape_clips)]
     models: dict[str, ModelResult] = {}
     for contender in contenders:
         model, name = contender.model, contender.name
@@ -169,7 +169,7 @@ def _collect(
     true, copies = LatentSums(origins[0]), LatentSums(origins[0])
     actions, names = list[np.ndarray](), list[ClipName]()
     starts, moves = list[RolloutStart](), list[RolloutStart]()
-    probed = {clips.names[index] for index in spread(len(clips.names), probes.ranking_clips)}
+    probed = {clips.names[index] for index in spread_indices(len(clips.names), probes.ranking_clips)}
 
     def add(ids: Sequence[str], name: str, way: Way, mode: Mode, latents: torch.Tensor) -> None:
         if (way, mode) == ("true", "rollout"):

@@ -14,13 +14,13 @@ from torch import Tensor
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.dataset import Dataset, frames_of, open_dataset
-from vjepa2_ac.data.loader import batches_of, validation_windows
-from vjepa2_ac.data.transforms import frames_as_seen, pixels_to_input
+from vjepa2_ac.data.dataset import Dataset, frames_for_display, open_dataset
+from vjepa2_ac.data.loader import read_batches, validation_windows
+from vjepa2_ac.data.transforms import pixels_to_input, to_display_frames
 from vjepa2_ac.decoding.decoder import TrainedDecoder, as_pixels, load_decoder
 from vjepa2_ac.distributed import join_processes, own_share, run_first_per_machine, run_on_first, share_work
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
-from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
+from vjepa2_ac.encoding.encode_dataset import use_finished_cache
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, measure_decoded
@@ -152,7 +152,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions, *, reporter: Report
         reporter.task(LOADING)
         loaded = load_models(subject, config, asked, dataset, decoder)
         world_model, device = loaded.world_model, accelerator.device
-        through_cache = with_latents_if_there(config, dataset, world_model)
+        through_cache = use_finished_cache(config, dataset, world_model)
         if through_cache.config.is_cache and decoder is None:
             world_model.set_encoder_aside()
         loaded.put_on(device)
@@ -202,17 +202,17 @@ def _clips(
     encode = partial(encode_batch, world_model, device=device)
     part = own_share(len(windows), batch_size)
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
-    read_batches = partial(batches_of, dataset, may_be_none=True)
+    read_windows = partial(read_batches, dataset, allow_empty=True)
 
     def frames(batch: Batch, row: int) -> UInt8[np.ndarray, "time size size 3"]:
-        return frames_as_seen(frames_of(dataset, batch, row), world_model.image_size)
+        return to_display_frames(frames_for_display(dataset, batch, row), world_model.image_size)
 
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
         selected = windows[part.start : part.stop] if names is None else [by_name[name] for name in names]
-        for batch in read_batches(selected, batch_size=batch_size):
+        for batch in read_windows(selected, batch_size=batch_size):
             yield encode(batch), partial(frames, batch)
 
-    before = actions_before(part, windows, partial(read_batches, batch_size=1))
+    before = actions_before(part, windows, partial(read_windows, batch_size=1))
     return RepeatableClips(tuple(by_name), read, dataset.spaces.action, not dataset.config.is_cache, before, device)
 
 

@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.config import Config, LimitsConfig
 from vjepa2_ac.data.dataset import Dataset, find_episode, open_dataset
-from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.loader import read_batches, validation_windows
 from vjepa2_ac.data.sources.indexed_source import measured_space
-from vjepa2_ac.data.transforms import frames_as_seen, split_views, view
-from vjepa2_ac.data.windows import require_frames, spread_with_ends
+from vjepa2_ac.data.transforms import crop_frames, split_views, to_display_frames
+from vjepa2_ac.data.windows import require_frames, spread_indices_with_ends
 from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown, worth_knowing
 from vjepa2_ac.distributed import make_accelerator
@@ -92,8 +92,8 @@ def imagine_image(session: Subject, asked: ImagineOptions, seen: Seen) -> Imagin
     latents = encode_frames(model, seen.image[None], config.data.crop, views=views)
     state = np.asarray(seen.state, dtype=np.float64)
     starts = [Start(view_latents, state, space, camera) for view_latents in latents[0].chunk(views)]
-    cut = view(split_views(seen.image[None], views), config.data.crop)
-    first = np.concatenate(frames_as_seen(cut, model.image_size), axis=1)
+    cut = crop_frames(split_views(seen.image[None], views), config.data.crop)
+    first = np.concatenate(to_display_frames(cut, model.image_size), axis=1)
     decoded_first = shown(decoder.decoder, latents, views)[0]
 
     def predicted_frames(actions: Float[np.ndarray, "steps 7"]) -> Frames:
@@ -155,11 +155,11 @@ def imagine_clip(
     models = load_models(subject, config, asked.evaluation, dataset, decoder)
     models.put_on(accelerator.device)
     decoder.to(accelerator.device)
-    (batch,) = batches_of(dataset, [window], batch_size=1)
+    (batch,) = read_batches(dataset, [window], batch_size=1)
     size = models.world_model.image_size
     chosen = _actions_of(asked, batch, dataset, limits=config.planning.limits)
     assert batch.frames is not None  # noqa: S101  # `require_frames` refuses cached latents
-    frames = frames_as_seen(batch.frames[0].numpy(), size)
+    frames = to_display_frames(batch.frames[0].numpy(), size)
     truths: dict[str, tuple[Frames, np.ndarray | None]] = {AS_RECORDED: (frames[1:], None)}
     notes: tuple[str, ...] = ()
     try:
@@ -210,7 +210,7 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
     """Return the episode and the first control step of the clip to show."""
     lengths, clip, split = dataset.table.num_steps, dataset.config.clip_steps, asked.evaluation.split
     if asked.episode is None:
-        members = dataset.members(split)[dataset.episodes]
+        members = dataset.split_mask(split)[dataset.episodes]
         longest = int(lengths[dataset.episodes[members]].max(initial=0))
         if 0 < longest < clip:
             most = (longest - 1) // dataset.config.model_stride
@@ -239,7 +239,9 @@ def _as_seen(
 ) -> tuple[Frames, Bool[np.ndarray, "time size size"]]:
     """Return the frames after the first one, and the arm's silhouettes in all frames, cropped and resized as inputs."""
     silhouettes = np.repeat(np.uint8(255) * arm[..., None], 3, axis=-1)
-    inputs, outlines = (frames_as_seen(view(images, config.data.crop), size) for images in (frames, silhouettes))
+    inputs, outlines = (
+        to_display_frames(crop_frames(images, config.data.crop), size) for images in (frames, silhouettes)
+    )
     return inputs[1:], outlines[..., 0] > 127
 
 
@@ -268,9 +270,9 @@ def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
     latents = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
     start, decoded_goal = shown(decoder.decoder, latents, controller.config.views)
     frames = _rollout(answer.decision, decoder)
-    shown_steps = spread_with_ends(len(frames), _MOST_PLAN_STEPS)
-    views = view(split_views(goal[None], controller.config.views), controller.crop)
-    goal_input = np.concatenate(frames_as_seen(views, decoder.card.shape.image_size), axis=1)
+    shown_steps = spread_indices_with_ends(len(frames), _MOST_PLAN_STEPS)
+    views = crop_frames(split_views(goal[None], controller.config.views), controller.crop)
+    goal_input = np.concatenate(to_display_frames(views, decoder.card.shape.image_size), axis=1)
     return ImaginedPlan(start, {step + 1: frames[step] for step in shown_steps}, goal_input, decoded_goal)
 
 

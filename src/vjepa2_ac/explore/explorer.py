@@ -17,8 +17,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.loader import batches_of
-from vjepa2_ac.data.transforms import frames_as_seen, view
+from vjepa2_ac.data.loader import read_batches
+from vjepa2_ac.data.transforms import crop_frames, to_display_frames
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.decoding.decoder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import shown
@@ -193,12 +193,12 @@ class Explorer:
 
     @torch.no_grad()
     def _read_pair(self, episode: int, step: int) -> tuple[Moment, Moment]:
-        (batch,) = batches_of(self.dataset, [(self.episodes[episode], step)], batch_size=1)
+        (batch,) = read_batches(self.dataset, [(self.episodes[episode], step)], batch_size=1)
         with self.autocast():
             encoded = encode_batch(self.world_model, batch, device=self.device, chunk=2)
         if batch.frames is None:
             raise ValueError("a cache was refused")  # `open_explorer` has checked that the data have frames
-        pixels = frames_as_seen(batch.frames[0].numpy(), self.world_model.image_size)
+        pixels = to_display_frames(batch.frames[0].numpy(), self.world_model.image_size)
         states = batch.states[0].double().numpy()
         action = batch.actions[0, 0].double().numpy()
         if self.spaces.action.follows == "target":
@@ -221,7 +221,7 @@ class Explorer:
         frame, state, reached = self.simulate(episode, place.start, place.actions, cancelled)
         with self.autocast():
             latents = encode_frames(self.world_model, frame[None], crop)[0]
-        (pixels,) = frames_as_seen(view(frame[None], crop), self.world_model.image_size)
+        (pixels,) = to_display_frames(crop_frames(frame[None], crop), self.world_model.image_size)
         return Moment(pixels, latents, state, is_simulated=True, reached=reached)
 
     # ---- predictions ----
@@ -311,7 +311,7 @@ def open_explorer(
     models = load(dataset, decoder)
     models.put_on(accelerator.device)
     decoder.to(accelerator.device)
-    members = dataset.members(split)[dataset.episodes]
+    members = dataset.split_mask(split)[dataset.episodes]
     long_enough = dataset.table.num_steps[dataset.episodes] > config.data.model_stride
     episodes = tuple(int(index) for index in dataset.episodes[members & long_enough])
     if not episodes:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.data.windows import spread_with_ends
+from vjepa2_ac.data.windows import spread_indices_with_ends
 from vjepa2_ac.episode import Progress, short_names
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.explore.explorer import MOST_STEPS, Explorer, Moment, Pixels, Place, Search, relative_spread
@@ -177,7 +177,7 @@ class Views:
         explorer, index = self.explorer, request.episode
         explorer.require(Place(index, 0))
         last, stride = explorer.steps(index) - 1, explorer.stride
-        steps = [index * stride for index in spread_with_ends(last // stride + 1, _MOST_FRAMES)]
+        steps = [index * stride for index in spread_indices_with_ends(last // stride + 1, _MOST_FRAMES)]
         images = [
             Image(f"frame-{number}", explorer.moment(index, step).pixels, f"recorded at control step {step}")
             for number, step in enumerate(steps)

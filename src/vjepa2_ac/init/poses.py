@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.data.poses import FORMATS, rotation_speeds, smoother_format
+from vjepa2_ac.data.poses import FORMATS, find_smoother_format, measure_rotation_speeds
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft_values import DraftValue
 from vjepa2_ac.inspection.motion import FASTEST_RAD_S
@@ -351,7 +351,11 @@ def _rotation_format(rotation: _Numbers, samples: Samples, control_rate_hz: floa
             reason += "; rotation vectors in degrees are not supported"
         return DraftValue("euler_xyz_degrees", reason, is_guess or proposed == "rotation_vector")
     values = [one[abs(one).max(axis=1) <= max(largest, ANGLE_RAD)] for one in values]
-    smoother = smoother_format(rotation_speeds(values, control_rate_hz), proposed, FASTEST_RAD_S) if values else None
+    smoother = (
+        find_smoother_format(measure_rotation_speeds(values, control_rate_hz), proposed, FASTEST_RAD_S)
+        if values
+        else None
+    )
     if smoother in {None, proposed}:
         return DraftValue(proposed, reason, is_guess)
     reason = f"as {smoother} the rotations change much more smoothly than as {proposed}"

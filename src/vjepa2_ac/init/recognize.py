@@ -14,9 +14,9 @@ import numpy as np
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import accept_new_data_formats, parse_config
-from vjepa2_ac.data.files import in_parallel, walk
+from vjepa2_ac.data.files import map_in_threads, walk
 from vjepa2_ac.data.index import EpisodeTable
-from vjepa2_ac.data.selection import describe_splits, held_out_by
+from vjepa2_ac.data.selection import describe_splits, held_out_splits
 from vjepa2_ac.data.sources.droid_raw import find_episodes
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.lerobot_meta import INFO
@@ -205,7 +205,7 @@ def _find_described_sets(path: str) -> list[tuple[str, str]]:
     described: dict[str, tuple[str, str]] = {}  # by absolute path, because several links may lead to one data set
     folders = [path]
     for depth in range(_DEEPEST + 2):
-        listed = zip(folders, in_parallel(storage.list_folder, folders, _CONNECTIONS), strict=True)
+        listed = zip(folders, map_in_threads(storage.list_folder, folders, _CONNECTIONS), strict=True)
         folders = []
         for folder, entries in listed:
             names = {entry.name for entry in entries}
@@ -294,7 +294,7 @@ def add_episode_lengths(data: DatasetProperties, progress: Progress | None = Non
         return data
     try:
         config = parse_config(values, where="vjepa2-ac init").data
-        table = EpisodeTable.of(open_source(config).infos(progress))
+        table = EpisodeTable.from_infos(open_source(config).infos(progress))
     except UserError:
         return data
     if not len(table):
@@ -306,6 +306,6 @@ def add_episode_lengths(data: DatasetProperties, progress: Progress | None = Non
         steps=int(lengths.sum()),
         median_steps=int(np.median(lengths)),
         p10_steps=int(np.quantile(lengths, 0.1)),
-        predefined_splits=tuple(held_out_by(table, config)),
+        predefined_splits=tuple(held_out_splits(table, config)),
         descriptions=(*data.descriptions, f"splits: {splits}") if splits else data.descriptions,
     )

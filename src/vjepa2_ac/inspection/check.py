@@ -16,7 +16,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.data.selection import describe_splits, held_out_by
+from vjepa2_ac.data.selection import describe_splits, held_out_splits
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.inspection.coverage import coverage_findings, coverage_in
@@ -94,8 +94,8 @@ def _check_selection(dataset: Dataset) -> Iterator[Finding]:
         yield Finding("ok", split, f"{clips} in {counted(len(np.unique(windows.episodes)), 'episode')}{short}")
     yield from _check_test_split(dataset)
     if config.split_by is not None:
-        groups = len(np.unique(dataset.split_hash[dataset.taking_part]))
-        exception = ", except for the splits of the data set" if held_out_by(dataset.table, config) else ""
+        groups = len(np.unique(dataset.split_hash[dataset.is_selected]))
+        exception = ", except for the splits of the data set" if held_out_splits(dataset.table, config) else ""
         yield Finding("ok", "groups", f"{groups:,} groups by {config.split_by}; each is in one split{exception}")
     yield duplicates_finding(dataset)
 
@@ -103,17 +103,17 @@ def _check_selection(dataset: Dataset) -> Iterator[Finding]:
 def _check_test_split(dataset: Dataset) -> Iterator[Finding]:
     """Yield a warning if the test split is too small for intervals, with a share that suffices."""
     config, is_long_enough = dataset.config, dataset.table.num_steps >= dataset.config.clip_steps
-    count = int((dataset.members("test") & is_long_enough).sum())
+    count = int((dataset.split_mask("test") & is_long_enough).sum())
     if not 0 < count < ENOUGH_EPISODES:
         return
     text = f"{counted(count, 'test episode')} cannot show whether training helped; {ENOUGH_EPISODES} are needed"
-    if "test" in held_out_by(dataset.table, config):
+    if "test" in held_out_splits(dataset.table, config):
         yield Finding("warning", "test", f"{text}. data.splits=hash draws the test split from all episodes")
         return
     fix = "Record more episodes"
     for percent in range(5, 55, 5):  # tried, because a hash draws the split: its size is not exactly its share
         other = replace(dataset, config=config.model_copy(update={"test_share": percent / 100}))
-        test, train = (int((other.members(split) & is_long_enough).sum()) for split in ("test", "train"))
+        test, train = (int((other.split_mask(split) & is_long_enough).sum()) for split in ("test", "train"))
         if test >= ENOUGH_EPISODES and train > test:
             fix = f"Set data.test_share={percent / 100:g}: the split then has {test}"
             break

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.files import connections_to, in_parallel
-from vjepa2_ac.data.windows import spread
+from vjepa2_ac.data.files import map_in_threads, num_connections
+from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.findings import Finding
@@ -71,7 +71,7 @@ def sample_of(dataset: Dataset, count: int) -> list[int]:
     # A latent cache contains only episodes from which clips are taken.
     members = dataset.starts.episodes if dataset.config.is_cache else dataset.episodes
     members = members[np.argsort(dataset.table.id_hash[members], kind="stable")]
-    return [int(members[index]) for index in spread(len(members), count)]
+    return [int(members[index]) for index in spread_indices(len(members), count)]
 
 
 def read_each(
@@ -91,11 +91,11 @@ def read_each(
         except InputError as error:
             return error
 
-    results = in_parallel(read_or_error, chosen, connections_to(dataset.config))
+    results = map_in_threads(read_or_error, chosen, num_connections(dataset.config))
     for done, (index, result) in enumerate(zip(chosen, results, strict=True), start=1):
         progress(done, len(chosen))
         if isinstance(result, InputError):
-            dataset.leave_out(index, result)
+            dataset.skip_episode(index, result)
         else:
             yield index, result
 
@@ -111,7 +111,9 @@ def read_sample(
     chosen = list(dict.fromkeys([*also, *sample_of(dataset, count)]))
     for index, episode in read_each(dataset, chosen, dataset.source.read, progress):
         camera = episode.extrinsics if dataset.config.pose_frame == "camera" else None
-        yield ReadEpisode(index, np.asarray(episode.states, np.float64), tuple(dataset.kept.of(index)), camera)
+        yield ReadEpisode(
+            index, np.asarray(episode.states, np.float64), tuple(dataset.kept_steps.ranges_of(index)), camera
+        )
 
 
 @dataclass(frozen=True, eq=False)

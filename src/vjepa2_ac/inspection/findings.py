@@ -100,14 +100,14 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
     table = dataset.table
     if table.state_hash is None:
         return Duplicates(is_known=False)
-    members = np.flatnonzero(dataset.taking_part & (table.state_hash != UNKNOWN))
+    members = np.flatnonzero(dataset.is_selected & (table.state_hash != UNKNOWN))
     members = members[np.argsort(table.id_rank[members])]
     recordings = _recordings(table, members, table.state_hash[members])
     is_copied = np.bincount(recordings)[recordings] > 1
     members, recordings = members[is_copied], recordings[is_copied]
     if not len(members):
         return Duplicates(is_known=True)
-    splits = np.argmax([dataset.members(split)[members] for split in SPLITS], axis=0)
+    splits = np.argmax([dataset.split_mask(split)[members] for split in SPLITS], axis=0)
     groups: dict[int, list[tuple[str, Split]]] = defaultdict(list)
     for number, member, split in zip(recordings.tolist(), members.tolist(), splits.tolist(), strict=True):
         groups[number].append((table.identity(member), SPLITS[split]))

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Float32
 from vjepa2_ac.config.data import RotationFormat
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import MEANS, SPANS
-from vjepa2_ac.data.poses import MIN_JUMPS, num_rotation_numbers, rotation_speeds, smoother_format
-from vjepa2_ac.data.selection import named
+from vjepa2_ac.data.poses import MIN_JUMPS, find_smoother_format, measure_rotation_speeds, num_rotation_numbers
+from vjepa2_ac.data.selection import format_identities
 from vjepa2_ac.data.sources.indexed_source import IndexedSource
 from vjepa2_ac.errors import counted
 from vjepa2_ac.inspection.coverage import PERCENTILE, ReadEpisode, read_each, read_sample, sample_of
@@ -188,9 +188,13 @@ def _check_rotation_format(dataset: Dataset, sample: Sequence[ReadEpisode]) -> I
     if configured != "euler_xyz" and isinstance(source, IndexedSource):
         raw = source.with_raw_states()
         states = {index: np.asarray(one.states) for index, one in read_each(dataset, [*states], raw.read)}
-    numbers = [one[start:end, POSE.rotation] for index, one in states.items() for start, end in dataset.kept.of(index)]
-    speeds = rotation_speeds(numbers, dataset.control_rate_hz)
-    if smoother := smoother_format(speeds, configured, FASTEST_RAD_S):
+    numbers = [
+        one[start:end, POSE.rotation]
+        for index, one in states.items()
+        for start, end in dataset.kept_steps.ranges_of(index)
+    ]
+    speeds = measure_rotation_speeds(numbers, dataset.control_rate_hz)
+    if smoother := find_smoother_format(speeds, configured, FASTEST_RAD_S):
         readings = "; ".join(
             f"read as {name}, the hand turns by {one.median_rad_s:.2f} rad/s (median) and smoothly at"
             f" {one.num_smooth_jumps} of {one.num_jumps} jumps of the numbers"
@@ -216,7 +220,7 @@ def _check_ends(dataset: Dataset) -> Finding:
     is_pose = dataset.spaces.state.position is not None
 
     def read(index: int) -> list[tuple[int, int, str]]:
-        ranges = dataset.kept.of(index)
+        ranges = dataset.kept_steps.ranges_of(index)
         start, end = ranges[0][0], ranges[-1][1]
         count = min(_END_STEPS, (end - start + 1) // 2)
         episode = dataset.read(index)
@@ -242,13 +246,13 @@ def _check_middles(dataset: Dataset) -> Finding:
     """Return the finding about episodes whose middle frame is blank, because a camera failed or images were lost."""
 
     def is_blank(index: int) -> bool:
-        start, end = max(dataset.kept.of(index), key=lambda one: one[1] - one[0])
+        start, end = max(dataset.kept_steps.ranges_of(index), key=lambda one: one[1] - one[0])
         return bool(np.ptp(small_grey(dataset.read(index).read_frames([(start + end) // 2]))) < BLANK)
 
     seen = dict(read_each(dataset, sample_of(dataset, affordable(dataset, _MIDDLES)), is_blank))
     blank = [dataset.table.identity(index) for index, is_one in seen.items() if is_one]
     text = f"the middle frame is black or uniform in {len(blank)} of {counted(len(seen), 'episode')} checked"
-    return first_case("blank frames", text, (bool(blank), "warning", f"{named(blank)}. {_EXCLUDE}"))
+    return first_case("blank frames", text, (bool(blank), "warning", f"{format_identities(blank)}. {_EXCLUDE}"))
 
 
 def count_at_end(

@@ -18,7 +18,7 @@ from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import validation_windows
-from vjepa2_ac.data.windows import spread
+from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Episode, Progress, no_progress
@@ -149,7 +149,7 @@ def _with_room(
             break
         fitting = wider
         shifts.append(shift)
-    return [fitting[index] for index in spread(len(fitting), clips)], shifts
+    return [fitting[index] for index in spread_indices(len(fitting), clips)], shifts
 
 
 def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:

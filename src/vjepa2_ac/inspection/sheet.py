@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.patches import Patch, Rectangle
 
-from vjepa2_ac.data.idle import runs_of
+from vjepa2_ac.data.idle import find_runs
 from vjepa2_ac.data.transforms import CropBox, crop_box
 from vjepa2_ac.episode import Progress, no_progress, short_names
 from vjepa2_ac.errors import InputError, counted
@@ -59,7 +59,7 @@ def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress:
         try:
             strips.append(_strip_of(inspection, one, names[name]))
         except InputError as error:
-            dataset.leave_out(one.index, error)
+            dataset.skip_episode(one.index, error)
         progress(done, len(shown))
     return plot_contact_sheet(inspection, strips, path)
 
@@ -84,7 +84,7 @@ def _strip_of(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
         frames=episode.read_frames([int(step) for step in at]),
         speed=changed * episode.control_rate_hz,
         closedness=one.states[:, space.gripper] if is_pose else None,
-        shaded=tuple(runs_of(left_out)),
+        shaded=tuple(find_runs(left_out)),
         seen=crop_box(height, width, dataset.config.crop),
     )
 

@@ -101,7 +101,7 @@ class Inspection:
             windows = len(self.dataset.windows(split))
         except InputError:  # an empty split is a statistic here, not an error
             windows = 0
-        return {"episodes": int(self.dataset.members(split).sum()), "windows": windows}
+        return {"episodes": int(self.dataset.split_mask(split).sum()), "windows": windows}
 
     @cached_property
     def summary(self) -> dict[str, str]:

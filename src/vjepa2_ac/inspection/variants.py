@@ -21,7 +21,7 @@ from jaxtyping import Float
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.loader import read_batches, validation_windows
 from vjepa2_ac.data.windows import candidate_strides
 from vjepa2_ac.distributed import broadcast_object, make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_same_encoder, require_widths
@@ -124,7 +124,7 @@ def measure_variants(
     """
     first, done, dataset, windows = variants[0], 0, clips.dataset, clips.windows
     parts: list[VariantErrors] = [{} for _ in variants]
-    for batch in batches_of(first.view(dataset), windows, batch_size=clips.batch_size):
+    for batch in read_batches(first.view(dataset), windows, batch_size=clips.batch_size):
         latents, read = encode(batch), replace(dataset, source=ReadOnce(dataset.source))
         indices = [dataset.table.find(name) for name in batch.episode_ids]
         starts = [(index, start) for index, start in zip(indices, batch.starts, strict=True) if index is not None]
@@ -141,7 +141,7 @@ def _read(
     variant: Variant, dataset: Dataset, windows: Sequence[tuple[int, int]], encode: Encode, latents: LatentBatch
 ) -> Iterable[LatentBatch]:
     """Yield a batch of clips under a variant; frames are encoded only if the variant changes them."""
-    for batch in batches_of(variant.view(dataset), windows, batch_size=len(windows)):
+    for batch in read_batches(variant.view(dataset), windows, batch_size=len(windows)):
         if variant.has_frames:
             yield encode(batch)
         else:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.transforms import Crop, split_views, view
+from vjepa2_ac.data.transforms import Crop, crop_frames, split_views
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import (
@@ -82,7 +82,7 @@ class Cameras:
             return None
         require_mask(mask, where="mask", like=like)
         pixels = np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1)
-        received = np.ascontiguousarray(view(split_views(pixels, self.views), self.crop)[..., 0])
+        received = np.ascontiguousarray(crop_frames(split_views(pixels, self.views), self.crop)[..., 0])
         grid = self.model.image_size // self.model.sizes.patch_size
         try:
             return patch_weights(torch.from_numpy(received) > 0, grid).to(self.model.device)
@@ -92,7 +92,7 @@ class Cameras:
     def _received(self, image: Image) -> UInt8[np.ndarray, "views height width 3"]:
         """Return the part of each camera's image that the model receives, without the bars of a letterbox."""
         views = split_views(image[None], self.views)
-        return views if self.crop == "letterbox" else view(views, self.crop)
+        return views if self.crop == "letterbox" else crop_frames(views, self.crop)
 
 
 def require_views(config: DataConfig, views: int, *, to: str = "make goals of") -> None:

@@ -30,7 +30,7 @@ from vjepa2_ac.data.loader import training_loader, validation_batches
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.distributed import select_device
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
+from vjepa2_ac.encoding.encode_dataset import use_finished_cache
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.intervals import Estimate, ratio
@@ -264,7 +264,7 @@ def train_prior(
     if spaces.action.follows == "unknown":
         found = "commands of which nobody knows what they do to the state"
         raise InputError(where="data.actions: recorded", found=found, needed="actions that a planner can search among")
-    dataset = with_latents_if_there(config, frames, model)
+    dataset = use_finished_cache(config, frames, model)
     if options.ahead is not None:
         dataset = dataset.with_frames(options.ahead + 1)
     prior = _trained(dataset, model, config, options, reporter)
@@ -352,7 +352,7 @@ def _measured(dataset: Dataset, model: WorldModel, prior: ActionPrior, spaces: S
     drawn, size = torch.Generator().manual_seed(0), spaces.action.sized
     errors: dict[str, list[Tensor]] = {"true_goals": [], "goals_of_others": [], "nothing": []}
     ids: list[str] = []
-    if dataset.members("test").any():
+    if dataset.split_mask("test").any():
         for clips in _encoded(validation_batches(dataset, "test", clips=_HELD_OUT, batch_size=32), model):
             pairs = _pairs(clips, spaces, drawn)
             for name, goals in (("true_goals", pairs.wanted), ("goals_of_others", pairs.wanted.roll(1, dims=0))):

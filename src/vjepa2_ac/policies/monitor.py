@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.loader import batches_of
+from vjepa2_ac.data.loader import read_batches
 from vjepa2_ac.data.windows import require_frames, require_stride
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Progress, no_progress
@@ -148,7 +148,7 @@ def watch_episodes(
         length = len(dataset.source.read(index).states)
         starts = range(0, length - stride, stride)
         errors = []
-        for batch in batches_of(pairs, [(index, start) for start in starts], batch_size=_AT_ONCE):
+        for batch in read_batches(pairs, [(index, start) for start in starts], batch_size=_AT_ONCE):
             seen = encode_batch(model, batch, device=model.device, chunk=_AT_ONCE)
             camera = None if seen.extrinsics is None else seen.extrinsics[:, :1]
             predicted = model.predict(seen.latents[:, :1], seen.actions, seen.states[:, :1], camera)
@@ -175,7 +175,7 @@ def calibrate_monitor(
     """
     require_frames(dataset.config, to="watch")
     require_stride(dataset.config, to="know how long a model step is")
-    held_out = np.flatnonzero(dataset.members("validation") | dataset.members("test"))
+    held_out = np.flatnonzero(dataset.split_mask("validation") | dataset.split_mask("test"))
     chosen = held_out[np.linspace(0, len(held_out), min(MOST_EPISODES, len(held_out)), endpoint=False).astype(int)]
     if not len(chosen):
         needed = "validation or test episodes, which the threshold is of"

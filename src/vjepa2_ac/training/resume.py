@@ -15,7 +15,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import flatten
 from vjepa2_ac.config.section import Affects, values_that_affect
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.index import fingerprint_of
+from vjepa2_ac.data.index import compute_fingerprint
 from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.distributed import broadcast_object, require_same, run_on_first
 from vjepa2_ac.errors import InputError, counted
@@ -55,7 +55,8 @@ def save_checkpoint(run: Run, folder: Path) -> None:
     run.state = replace(
         run.state,
         data=tuple(
-            DataState(fingerprint_of(one.table), len(one.windows("train")), one.broken.reasons) for one in run.datasets
+            DataState(compute_fingerprint(one.table), len(one.windows("train")), one.broken.reasons)
+            for one in run.datasets
         ),
         clips_per_step=run.clips_per_step,
         clips_asked=run.config.training.batch_size * run.config.training.accumulation,
@@ -77,7 +78,7 @@ def restore(run: Run, reporter: Reporter) -> Run:
     if state.loss_scale is not None and run.scaler.is_enabled():
         run.scaler.load_state_dict(dict(state.loss_scale))
     for dataset, before in zip(run.datasets, state.data, strict=False):
-        dataset.broken.recall(before.broken)
+        dataset.broken.restore(before.broken)
         if (windows := len(dataset.windows("train"))) != before.windows:
             reporter.note(
                 f"The data has changed: {counted(windows, 'training clip')} instead of {before.windows:,}."

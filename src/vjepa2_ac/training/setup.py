@@ -16,12 +16,12 @@ from vjepa2_ac.config import Config, ReplayConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.model import ModelSizes
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.index import fingerprint_of
+from vjepa2_ac.data.index import compute_fingerprint
 from vjepa2_ac.data.loader import require_shared_memory, validation_batches
-from vjepa2_ac.data.selection import describe_splits, named
+from vjepa2_ac.data.selection import describe_splits, format_identities
 from vjepa2_ac.distributed import all_gather_object, make_accelerator, run_first_per_machine, run_on_all, run_on_first
-from vjepa2_ac.encoding.batch import extrinsics_for
-from vjepa2_ac.encoding.encode_dataset import with_latents
+from vjepa2_ac.encoding.batch import get_extrinsics
+from vjepa2_ac.encoding.encode_dataset import use_latent_cache
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.model.adapter_folder import read_card
@@ -87,13 +87,15 @@ def set_up(
     reporter.task(LOADING)
     base = world_model or load_base(config.model, seed=config.seed)
     run_on_first(accelerator, lambda: require_same_base(config, base))
-    extrinsics_for(base, clip)
+    get_extrinsics(base, clip)
     if strip is not None:
         strip.require_fit(base, config)
     _require_shared_memory(config, clip, base.sizes, accelerator)
     for replayed in replay_datasets:
-        extrinsics_for(base, first_clip(replayed))
-    cache_latents = partial(with_latents, model=base, accelerator=accelerator, reporter=reporter, check_only=check_only)
+        get_extrinsics(base, first_clip(replayed))
+    cache_latents = partial(
+        use_latent_cache, model=base, accelerator=accelerator, reporter=reporter, check_only=check_only
+    )
     dataset = cache_latents(config, dataset)
     replay_datasets = [cache_latents(config.for_replay(), replayed) for replayed in replay_datasets]
     require_fitting_clips(dataset, replay_datasets)
@@ -202,12 +204,12 @@ def _open_replay(replay: ReplayConfig, dataset: Dataset, reporter: Reporter) -> 
         raise InputError(where="replay.data.stride", found=found, needed=needed, fix=fix)
     windows = replayed.windows("train")
     reporter.note(f"Replay: {replay.share:.0%} of the clips are from {replay.data.path}, which has {len(windows):,}.")
-    hashes = dataset.table.id_hash[dataset.taking_part & ~dataset.members("train")]
-    indices = np.flatnonzero(replayed.members("train") & np.isin(replayed.table.id_hash, hashes))
+    hashes = dataset.table.id_hash[dataset.is_selected & ~dataset.split_mask("train")]
+    indices = np.flatnonzero(replayed.split_mask("train") & np.isin(replayed.table.id_hash, hashes))
     if held_out := sorted(replayed.table.identity(int(index)) for index in indices):
         reporter.note(
             f"Warning: {counted(len(held_out), 'episode')} that the first data set holds out are replayed in training:"
-            f" {named(held_out)}. Add them to replay.data.exclude."
+            f" {format_identities(held_out)}. Add them to replay.data.exclude."
         )
     return replayed
 
@@ -252,7 +254,7 @@ def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
     for key, dataset, old_config, new_config, state in zip(
         keys, datasets, earlier_configs, config.data_sets, states, strict=False
     ):
-        if old_config.path != new_config.path and state.fingerprint != fingerprint_of(dataset.table):
+        if old_config.path != new_config.path and state.fingerprint != compute_fingerprint(dataset.table):
             found, needed = (
                 "other episodes or files than the run has seen",
                 f"the data set that was at {old_config.path}",

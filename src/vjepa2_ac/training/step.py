@@ -18,7 +18,7 @@ from torch.nn.functional import smooth_l1_loss
 from vjepa2_ac.config import Config, TrainingConfig
 from vjepa2_ac.config.section import Positive, Section
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader
+from vjepa2_ac.data.loader import Batches, MixedDataset, ProcessShare, training_loader
 from vjepa2_ac.distributed import PRECISIONS, all_gather_object, all_reduce, all_reduce_gradients, raise_first_error
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch
@@ -89,7 +89,7 @@ def batches_from(run: Run) -> Batches:
     """Return an iterator over the micro-batches of this process, starting at the current step."""
     replay = run.config.replay
     return training_loader(
-        Mixed(run.dataset, run.replayed, replay.share if replay else 0.0),
+        MixedDataset(run.dataset, run.replayed, replay.share if replay else 0.0),
         seed=run.config.seed,
         batch_size=run.config.training.batch_size,
         start_position=run.state.clips_done,
@@ -187,7 +187,7 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
 def _accumulate(run: Run, batches: Iterator[Batch]) -> tuple[Float[Tensor, 2], list[str]]:
     """Return this process's share of both losses, and the names of its clips."""
     totals, names = torch.zeros(2, device=run.accelerator.device), list[str]()
-    for _ in run.share.own:
+    for _ in run.share.micro_batches:
         batch = next(batches)
         if not batch.starts:
             continue
@@ -296,7 +296,7 @@ def _share_broken_episodes(run: Run) -> None:
     for dataset in run.datasets:
         for reasons in all_gather_object(run.accelerator, dataset.broken.reasons):
             for name, reason in reasons.items():
-                dataset.broken.met(name, reason)
+                dataset.broken.record(name, reason)
 
 
 def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> None:

@@ -8,8 +8,8 @@ from itertools import islice
 from typing import Any
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.loader import batches_of, validation_windows
-from vjepa2_ac.data.windows import spread
+from vjepa2_ac.data.loader import read_batches, validation_windows
+from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.distributed import broadcast_object, gather_shared, own_share, share_work
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
@@ -118,21 +118,21 @@ def validate(run: Run, reporter: Reporter) -> Validation:
 def _measure(run: Run) -> Validation:
     windows = validation_windows(run.dataset, "validation", clips=run.config.validation.clips)
     windows_range = own_share(len(windows), run.config.validation.batch_size)
-    read = partial(batches_of, run.dataset, batch_size=run.config.validation.batch_size, may_be_none=True)
+    read = partial(read_batches, run.dataset, batch_size=run.config.validation.batch_size, allow_empty=True)
     batches, moves = read(windows[windows_range.start : windows_range.stop]), list[RolloutStart]()
     names = [(run.dataset.table.identity(episode), start) for episode, start in windows]
-    chosen = {names[index] for index in spread(len(names), run.config.validation.ranking_clips or 0)}
+    chosen = {names[index] for index in spread_indices(len(names), run.config.validation.ranking_clips or 0)}
     encoded = _encoded(run, batches, chosen, moves)
     errors = prediction_errors(run.world_model, encoded, before=actions_before(windows_range, windows, read))
     for name, reason in gather_shared(list(run.dataset.broken.reasons.items())):
-        run.dataset.broken.met(name, reason)
+        run.dataset.broken.record(name, reason)
     config, space = run.config.validation, run.dataset.spaces.action
     moves = gathered_starts(moves, run.accelerator.device)
     missing = len(chosen) - len({(move.episode_id, move.first_step) for move in moves})
     replacements = (
         [window for window, name in zip(windows, names, strict=True) if name not in chosen] if missing else []
     )
-    for batch in islice(batches_of(run.dataset, replacements, batch_size=1, may_be_none=True), missing):
+    for batch in islice(read_batches(run.dataset, replacements, batch_size=1, allow_empty=True), missing):
         moves += moves_of(encode(run, batch), 0, space, RANKING_REACH_CM / 100)
     if not moves:
         return Validation(errors, None)

@@ -103,9 +103,9 @@ def test_every_form_moves_and_rests_at_the_same_steps(forms: Path, form: str) ->
     rules = [MOTION] if form == "npz" else [MOTION, COMMANDS]  # .npz has no commanded velocities
     for rule in rules:
         expected, found = opened(forms, "rlds", idle=rule), opened(forms, form, idle=rule)
-        assert 0 < expected.kept.steps < sum(LENGTHS)
+        assert 0 < expected.kept_steps.num_steps < sum(LENGTHS)
         by_rank = [
-            [dataset.kept.of(episode) for episode in np.argsort(dataset.table.id_rank).tolist()]
+            [dataset.kept_steps.ranges_of(episode) for episode in np.argsort(dataset.table.id_rank).tolist()]
             for dataset in (expected, found)
         ]
         assert by_rank[0] == by_rank[1]

@@ -41,7 +41,7 @@ class EveryOther(IndexedSource[DataConfig, NpzSource]):
     def _look(self, progress: Progress) -> tuple[EpisodeTable, NpzSource]:
         type(self).looks += 1
         inner = NpzSource(self._config)
-        return EpisodeTable.of(list(inner.infos(progress))[::2]), inner
+        return EpisodeTable.from_infos(list(inner.infos(progress))[::2]), inner
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
         return self._open()[1].read(2 * index, camera, needed)
@@ -84,4 +84,4 @@ def test_an_identity_with_a_nul_is_a_problem_of_that_episode(identity: str, tmp_
     assert re.search(r"^file .*: a NUL character in the identity '.*\\x00", str(problem.error))
     assert EpisodeTable.from_bytes(table.to_bytes()).problems == table.problems
     with pytest.raises(InputError, match=r"episode .*: a NUL character in the identity"):
-        EpisodeTable.of([EpisodeInfo("a", 30), EpisodeInfo(identity, 30)])
+        EpisodeTable.from_infos([EpisodeInfo("a", 30), EpisodeInfo(identity, 30)])

@@ -87,7 +87,7 @@ def test_an_index_reads_a_part_of_the_records_and_is_made_once(
 READ_ALL = """
 import sys
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.files import fetched_data
+from vjepa2_ac.data.files import open_download_cache
 from vjepa2_ac.data.sources.rlds import RldsSource
 
 config = DataConfig(path=sys.argv[1], disk_cache={"dir": sys.argv[2], "limit_gb": float(sys.argv[3])})

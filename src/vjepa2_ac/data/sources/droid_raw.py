@@ -18,8 +18,8 @@ from jaxtyping import Float, Shaped, UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.sources import RAW_CAMERAS, RAW_RATE_HZ
-from vjepa2_ac.data.files import CONNECTIONS, DEEPEST, in_parallel, list_folder
-from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key, key_of, summary_of
+from vjepa2_ac.data.files import CONNECTIONS, DEEPEST, list_folder, map_in_threads
+from vjepa2_ac.data.index import EpisodeTable, get_or_build_index, hash_key, index_key, summarize_states
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Scanned, frames_by_step, require_as_indexed
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted, require_library
@@ -101,7 +101,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
     ) -> UInt8[np.ndarray, "time height width 3"]:
         opened = partial(self._files.open, video, version=version)
         walk = lambda: {"times": np.array(read_frame_times(opened(), where=video), np.int64)}  # noqa: E731
-        times = self._files.parsed(f"times {video} {version}", walk)["times"].tolist()
+        times = self._files.read_parsed(f"times {video} {version}", walk)["times"].tolist()
         return read_frames(opened(), [frames[step] for step in steps], where=video, times=times)
 
     def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
@@ -125,7 +125,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         key = index_key(parts, root, named=identity_of(root, folders[0]))
         identities = {folder: identity_of(root, folder) for folder in folders}
         build = partial(self._scanned, self._scan, identities, progress)
-        return get_or_build(config.disk_cache, key, root, build), None
+        return get_or_build_index(config.disk_cache, key, root, build), None
 
     def _scan(self, folder: str) -> Scanned:
         identity = identity_of(self._config.path, folder)
@@ -134,7 +134,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         if not has_trajectory or listed.metadata is None:
             found = f"episode {identity} has no {'metadata_*.json' if has_trajectory else TRAJECTORY}"
             raise InputError(where=self._path(folder, ""), found=found, needed="one", fix=_FIX)
-        version, path = key_of({"files": listed}), self._path(folder, listed.metadata)
+        version, path = hash_key({"files": listed}), self._path(folder, listed.metadata)
         metadata = parse_json_object(
             self._files.read(path, version=version), where=path, needed="the metadata of an episode"
         )
@@ -156,7 +156,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             EpisodeInfo(identity, len(states), outcome),
             self._path(folder, TRAJECTORY),
             place={"place": json.dumps(vars(place)).encode()},
-            states=summary_of(states),
+            states=summarize_states(states),
             labels=_labels(metadata),
             rate_hz=RAW_RATE_HZ,
         )
@@ -170,7 +170,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         path = self._path(place.folder, TRAJECTORY)
         key = f"trajectory {path} {place.version} {serials}"
         read = partial(self._files.read, path, version=place.version)
-        found = self._files.parsed(key, lambda: parse_trajectory(read(), path, serials))
+        found = self._files.read_parsed(key, lambda: parse_trajectory(read(), path, serials))
         steps = len(found["pose"])
         for serial, count in place.frames.items():
             if abs(steps - count) > 1:
@@ -293,7 +293,7 @@ def find_episodes(root: str, connections: int) -> list[str]:
     found: list[str] = []
     folders = [""]
     for _ in range(DEEPEST):
-        children = in_parallel(lambda folder: _children(root, folder), folders, connections)
+        children = map_in_threads(lambda folder: _children(root, folder), folders, connections)
         together = [child for group in children for child in group]
         found += [path for path, is_episode in together if is_episode]
         folders = [path for path, is_episode in together if not is_episode]

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.files import EpisodeFiles, connections_to, in_parallel
-from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, StatesSummary, labels_of, nul_error
+from vjepa2_ac.data.files import EpisodeFiles, map_in_threads, num_connections
+from vjepa2_ac.data.index import STATES_NOT_READ, EpisodeProblem, EpisodeTable, StatesSummary, build_labels, nul_error
 from vjepa2_ac.episode import EpisodeInfo, EpisodeSource, FrameReader, Progress, Widths, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import CAMERA_POSE, POSE, POSE_CHANGE, Spaces, StateSpace, vector_states
@@ -50,7 +50,7 @@ class Scanned:
     info: EpisodeInfo
     where: str  # the file of the episode, for messages
     place: Mapping[str, Any] = field(default_factory=dict)  # numbers or bytes by which the source finds the episode
-    states: StatesSummary = UNREAD
+    states: StatesSummary = STATES_NOT_READ
     labels: Mapping[str, str | None] = field(default_factory=dict)
     rate_hz: float | None = None  # control steps per second; None: unknown
     kind: str = ""  # description of the properties that all episodes must share
@@ -81,7 +81,7 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
         if isinstance(one, EpisodeProblem):
             problems.append(one)
         elif "\0" in one.info.id:
-            problems.append(EpisodeProblem.of(nul_error(one.info.id, one.where), one.info.id))
+            problems.append(EpisodeProblem.from_error(nul_error(one.info.id, one.where), one.info.id))
         elif (first := usable.setdefault(one.info.id, one)) is one:
             kinds[one.kind] = kinds.get(one.kind, 0) + 1
         else:
@@ -100,13 +100,13 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
     logger.info("%s: %d episodes, %d that cannot be used", config.path, len(rows), len(problems))
     hashes, rate = [one.states.state_hash for one in rows], rows[0].rate_hz
     return replace(
-        EpisodeTable.of([one.info for one in rows]),
+        EpisodeTable.from_infos([one.info for one in rows]),
         problems=tuple(problems),
         locators={name: np.array([one.place[name] for one in rows]) for name in rows[0].place},
         texts={} if rate is None else {"control_rate_hz": str(rate)},
         state_hash=np.array(hashes, np.uint64) if any(hashes) else None,
         motion=np.array([one.states.motion for one in rows], np.float32),
-        labels=labels_of([one.labels for one in rows]),
+        labels=build_labels([one.labels for one in rows]),
     )
 
 
@@ -173,9 +173,9 @@ class IndexedSource(ABC, Generic[Config, More]):
             try:
                 return scan(key)
             except InputError as error:
-                return EpisodeProblem.of(error, identities[key])
+                return EpisodeProblem.from_error(error, identities[key])
 
-        found = in_parallel(scan_one, [*identities], connections_to(self._config))
+        found = map_in_threads(scan_one, [*identities], num_connections(self._config))
         return table_of(found, self._config, len(identities), progress)
 
     @abstractmethod

@@ -171,7 +171,7 @@ class LatentFiles:
         key = f"{place} {file.version} {file.size}"
         return EpisodeFile(place, self.key, file.size, partial(cached_ranges, place, key=key, cache=self.cache))
 
-    def write(self, number: int, encoded: EncodedEpisode, *, exact_pictures: bool = False) -> None:
+    def write(self, number: int, encoded: EncodedEpisode, *, lossless_images: bool = False) -> None:
         """Write the file of an episode and camera.
 
         Raises:
@@ -184,7 +184,7 @@ class LatentFiles:
             "states": episode.states,
             **{name: getattr(episode, name) for name in OPTIONAL},
         }
-        if exact_pictures:
+        if lossless_images:
             arrays["pictures"] = encoded.pictures
         else:
             jpegs = [encode_jpeg(frame, quality=_JPEG_QUALITY) for frame in encoded.pictures]

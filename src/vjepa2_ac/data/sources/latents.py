@@ -16,8 +16,8 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.removed import REMOVED
 from vjepa2_ac.config.section import Affects, values_that_affect
-from vjepa2_ac.data.files import fetched_data
-from vjepa2_ac.data.index import EpisodeTable, NotATableError, StepSelection, T
+from vjepa2_ac.data.files import open_download_cache
+from vjepa2_ac.data.index import EpisodeTable, InvalidTableError, StepSelection, T
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, measured_space
 from vjepa2_ac.data.sources.latent_files import FIX, OPTIONAL, LatentFiles
 from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
@@ -36,7 +36,7 @@ _ENCODE = "Run `vjepa2-ac encode`, which resumes where it was stopped; or copy t
 
 @dataclass(frozen=True)
 class Encoding:
-    """The settings that determine a frame's latents, and the size of the latents; see `encoding.batch.encoding_of`.
+    """The settings that determine a frame's latents, and the size of the latents; see `encoding.batch.get_encoding`.
 
     The number of frames per encoder call is not included, because it changes only the order of a sum, and on some CPUs
     nothing (tests/encoding/test_training_cache.py).
@@ -173,7 +173,7 @@ def read_table(path: str, kind: type[T]) -> T:
     try:
         with storage.translate_read_errors(path, fix=_ENCODE):
             return kind.from_bytes(storage.read_small_file(path, _MOST_BYTES))
-    except NotATableError as error:
+    except InvalidTableError as error:
         raise InputError(where=path, found=f"damaged ({error})", fix=_ENCODE) from None
 
 
@@ -275,7 +275,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
             raise another_cache(folder, differing)
         has_idle_rule = self._config.idle.rule != "none"
         kept = read_table(storage.join(folder, KEPT), StepSelection) if has_idle_rule else None
-        cache = fetched_data(self._config.disk_cache) if storage.is_url(folder) else None
+        cache = open_download_cache(self._config.disk_cache) if storage.is_url(folder) else None
         table = read_table(storage.join(folder, EPISODES), EpisodeTable)
         return table, _Cache(key, LatentFiles(folder, key.digest, cache), kept)
 

@@ -13,10 +13,17 @@ from jaxtyping import Float, UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.sources import JOINT_VELOCITY
-from vjepa2_ac.data.files import connections_to, in_parallel
-from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, get_or_build, index_key, summary_of
-from vjepa2_ac.data.poses import poses_from
-from vjepa2_ac.data.selection import with_own_splits
+from vjepa2_ac.data.files import map_in_threads, num_connections
+from vjepa2_ac.data.index import (
+    STATES_NOT_READ,
+    EpisodeProblem,
+    EpisodeTable,
+    get_or_build_index,
+    index_key,
+    summarize_states,
+)
+from vjepa2_ac.data.poses import convert_poses
+from vjepa2_ac.data.selection import add_split_labels
 from vjepa2_ac.data.sources.indexed_source import Found, IndexedSource, Scanned, frames_by_step, table_of
 from vjepa2_ac.data.sources.lerobot_meta import (
     FIX_EPISODE,
@@ -102,7 +109,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
             import_pyav(info.where)
-        listed = partial(list_by_template, info.root, connections=connections_to(config))
+        listed = partial(list_by_template, info.root, connections=num_connections(config))
         tables, files = listed(TABLES[info.version]), listed(info.data_path)
         num_bytes = sum(file.size for file in files.values())
         for key in keys:
@@ -122,13 +129,13 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         }
         self._version = index_key(parts, config.path)
         build = partial(self._built, list(tables), files.keys(), keys, progress)
-        table = get_or_build(config.disk_cache, self._version, config.path, build)
+        table = get_or_build_index(config.disk_cache, self._version, config.path, build)
         table = replace(table, texts={**table.texts, _DATA_BYTES: str(num_bytes)})
-        return with_own_splits(table, [info.split_of(number) for number in table.locators["index"].tolist()]), info
+        return add_split_labels(table, [info.split_of(number) for number in table.locators["index"].tolist()]), info
 
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, config, fields = self._info, self._config, self._config.lerobot
-        is_far, connections = storage.is_url(config.path), connections_to(config)
+        is_far, connections = storage.is_url(config.path), num_connections(config)
         of_config = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
         videos = [key for key in of_config if info.features[key].dtype == "video"]
         rows = read_episodes(info, tables, videos, fields.success, self._open_file)
@@ -140,7 +147,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         header_of = cache(lambda path: read_header(path, where=path))
 
         def look(row: EpisodeRow) -> Found:
-            success, summary = row.success, UNREAD
+            success, summary = row.success, STATES_NOT_READ
             try:
                 require_files(info, row, files, keys)
                 if row.id in overlaps:
@@ -148,11 +155,11 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
                 if reads_rows:
                     content, outcome = self._content(row)
                     success = success if outcome is None else outcome
-                    summary = summary_of(content["states"])
+                    summary = summarize_states(content["states"])
                 if not is_far:
                     require_long_videos(info, row, keys, header_of)
             except InputError as error:
-                return EpisodeProblem.of(error, row.id)
+                return EpisodeProblem.from_error(error, row.id)
             facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
             return Scanned(facts, self._where(row), row.place, summary, labels, self._info.fps)
 
@@ -160,7 +167,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         for row in rows:
             by_file.setdefault(row.data_file(info), []).append(row)
         found: dict[str, Found] = {}
-        seen = in_parallel(lambda some: [(row.id, look(row)) for row in some], [*by_file.values()], connections)
+        seen = map_in_threads(lambda some: [(row.id, look(row)) for row in some], [*by_file.values()], connections)
         for of_file in seen:
             found.update(of_file)
             progress(len(found), len(rows))
@@ -199,7 +206,9 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         if fields.select is not None:
             states = states[:, list(fields.select)]
         content = {
-            "states": poses_from(states, fields, where, section="data.lerobot") if config.states == "pose" else states,
+            "states": convert_poses(states, fields, where, section="data.lerobot")
+            if config.states == "pose"
+            else states,
             "commands": joined(fields.action) if config.actions == "recorded" else None,
             "joint_velocities": None if optional(JOINT_VELOCITY) is None else joined([JOINT_VELOCITY]),
         }

@@ -13,7 +13,7 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData, LeRobotFields
-from vjepa2_ac.data.files import in_parallel
+from vjepa2_ac.data.files import map_in_threads
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.poses import require_selection
 from vjepa2_ac.data.sources.parquet import read_table
@@ -244,7 +244,7 @@ def list_by_template(root: str, template: str, key: str = "", *, connections: in
     for part in folders:
         names = {folder: storage.list_names(storage.join(root, folder)) if "[" in part else [part] for folder in found}
         found = [f"{folder}{one}/" for folder in found for one in names[folder] if fnmatchcase(one, part)]
-    listings = in_parallel(lambda folder: storage.list_files(storage.join(root, folder)), found, connections)
+    listings = map_in_threads(lambda folder: storage.list_files(storage.join(root, folder)), found, connections)
     files = [(folder, file) for folder, inside in zip(found, listings, strict=True) for file in inside]
     fitting = dict(sorted((f"{folder}{file.name}", file) for folder, file in files if fnmatchcase(file.name, name)))
     for path, file in fitting.items():

@@ -39,7 +39,7 @@ from jaxtyping import Float64, Shaped, UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import CONNECTIONS, walk
-from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key, summary_of
+from vjepa2_ac.data.index import EpisodeTable, get_or_build_index, index_key, summarize_states
 from vjepa2_ac.data.sources.indexed_source import (
     IndexedSource,
     Scanned,
@@ -146,13 +146,13 @@ class NpzSource(IndexedSource[DataConfig, None]):
         key = index_key({"source": "npz", **knobs, "listed": listed}, root)
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
         build = partial(self._scanned, partial(self._scan, key), dict(zip(ids, ids, strict=True)), progress)
-        return get_or_build(config.disk_cache, key, root, build), None
+        return get_or_build_index(config.disk_cache, key, root, build), None
 
     def _scan(self, version: str, identity: str) -> Scanned:
         episode, labels = self._episode(identity, version, self._config.cameras)
         action = "" if episode.commands is None else f", {episode.commands.shape[1]} an action"
         kind = f"{episode.control_rate_hz:g} steps a second (fps_hz), {episode.states.shape[1]} numbers a state{action}"
-        where, states = self._path(identity), summary_of(episode.states)
+        where, states = self._path(identity), summarize_states(episode.states)
         return Scanned(episode.info, where, {}, states, labels, episode.control_rate_hz, kind)
 
     def _path(self, identity: str) -> str:

@@ -70,7 +70,7 @@ class ParquetRows:
                     parts.append({name: column[of_episode] for name, column in group.items()})
             return {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
 
-        return self._files.parsed(f"rows {self._version} {path} {episode}", read)
+        return self._files.read_parsed(f"rows {self._version} {path} {episode}", read)
 
     def images(self, path: str, column: str, episode: int) -> list[bytes]:
         """Read the encoded images of one episode from a column of {bytes, path}.

@@ -21,9 +21,9 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig, RldsData
-from vjepa2_ac.data.files import fetched_data, open_cache
-from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build, index_key
-from vjepa2_ac.data.selection import with_own_splits
+from vjepa2_ac.data.files import open_cache, open_download_cache
+from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build_index, index_key
+from vjepa2_ac.data.selection import add_split_labels
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, frames_by_step
 from vjepa2_ac.data.sources.rlds_episode import STEP_FLAG, Record, build_index, episode_of, position_of, step_features
 from vjepa2_ac.data.sources.rlds_shards import NEEDED, Shard, find_shards, open_shard
@@ -92,8 +92,8 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
         }
         key = index_key(parts, config.path)
         build = partial(build_index, shards, config, cameras, progress)
-        table = get_or_build(config.disk_cache, key, config.path, build)
-        table = with_own_splits(table, [shards[number].split for number in table.locators["shard"].tolist()])
+        table = get_or_build_index(config.disk_cache, key, config.path, build)
+        table = add_split_labels(table, [shards[number].split for number in table.locators["shard"].tolist()])
         return replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)}), shards
 
 
@@ -139,7 +139,7 @@ class RemoteEpisode:
 
     def __init__(self, shard: Shard, span: RecordSpan, config: DiskCacheConfig) -> None:
         self._shard, self._span = shard, span
-        self._places, self._contents = open_cache(cache_folder(config) / "places", None), fetched_data(config)
+        self._places, self._contents = open_cache(cache_folder(config) / "places", None), open_download_cache(config)
         self._key = f"{shard.path} {shard.version} {shard.size} {span.offset}"
 
     def record(self, names: Sequence[str]) -> Record:

@@ -17,9 +17,9 @@ from jaxtyping import Float
 from vjepa2_ac import storage
 from vjepa2_ac.config import RldsData, RldsFields
 from vjepa2_ac.config.sources import RECORD
-from vjepa2_ac.data.files import CONNECTIONS, in_parallel
-from vjepa2_ac.data.index import UNREAD, EpisodeProblem, EpisodeTable, summary_of
-from vjepa2_ac.data.poses import num_rotation_numbers, poses_from, require_selection
+from vjepa2_ac.data.files import CONNECTIONS, map_in_threads
+from vjepa2_ac.data.index import STATES_NOT_READ, EpisodeProblem, EpisodeTable, summarize_states
+from vjepa2_ac.data.poses import convert_poses, num_rotation_numbers, require_selection
 from vjepa2_ac.data.sources.indexed_source import Found, Scanned, require_as_indexed, table_of
 from vjepa2_ac.data.sources.rlds_shards import Shard, open_shard
 from vjepa2_ac.data.sources.tfrecord import (
@@ -210,7 +210,7 @@ def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float
     if config.states == "vector":
         require_finite(numbers, where, fix="Check data.fields.state, or leave the episode out")
         return numbers
-    return poses_from(numbers, fields, where, section="data.fields")
+    return convert_poses(numbers, fields, where, section="data.fields")
 
 
 def commands_of(
@@ -264,7 +264,7 @@ def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str
         with open_shard(shards[number]) as read:
             return list(_scan(shards[number], number, read, config, cameras))
 
-    found = (one for of_shard in in_parallel(scan, range(len(shards)), threads) for one in of_shard)
+    found = (one for of_shard in map_in_threads(scan, range(len(shards)), threads) for one in of_shard)
     return table_of(found, config, sum(shard.episodes for shard in shards), progress)
 
 
@@ -285,7 +285,7 @@ def _scan(shard: Shard, place: int, read: Read, config: RldsData, cameras: Seque
         try:
             span = span_at(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
         except InputError as error:
-            yield from (EpisodeProblem.of(error, f"{shard.name}: record {one}") for one in hidden)
+            yield from (EpisodeProblem.from_error(error, f"{shard.name}: record {one}") for one in hidden)
             return
         yield _examine(read, span, place, f"{shard.name}: record {number}", config, cameras)
         offset = span.end
@@ -312,13 +312,13 @@ def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsDa
         if steps == 0:
             raise zero_steps(f"{span} ({name})")
     except InputError as error:
-        return EpisodeProblem.of(error if is_far else _damage_or(error, read, span), name)
+        return EpisodeProblem.from_error(error if is_far else _damage_or(error, read, span), name)
     place = dict(zip(_PLACE, (shard, span.number, span.offset, span.length), strict=True))
     success = (
         True if "/success/" in name else False if "/failure/" in name else None
     )  # only DROID's identities contain the outcome
     info = EpisodeInfo(id=name, num_steps=steps, success=success)
-    return Scanned(info, str(span), place, UNREAD if states is None else summary_of(states))
+    return Scanned(info, str(span), place, STATES_NOT_READ if states is None else summarize_states(states))
 
 
 def _checked_states(

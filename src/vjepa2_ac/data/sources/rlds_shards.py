@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.selection import named
+from vjepa2_ac.data.selection import format_identities
 from vjepa2_ac.data.sources.tfrecord import Read
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.storage.structured import read_json_object
@@ -60,7 +60,7 @@ def find_shards(folder: str) -> list[Shard]:
     names = [name for name, *_ in listed]
     present = {file.name: file for file in storage.list_files(folder)}
     if missing := [name for name in names if name not in present]:
-        found = f"{len(missing)} of {len(names)} shards are missing: {named(missing)}"
+        found = f"{len(missing)} of {len(names)} shards are missing: {format_identities(missing)}"
         fix = f"Download them, or rename the shards that are there as {_INFO} lists them"
         raise InputError(where=folder, found=found, needed=f"every shard that {_INFO} lists", fix=fix)
     return [
@@ -93,8 +93,10 @@ def _nothing_in(folder: str) -> str:
         return f"{folder} {'is empty' if storage.exists(folder) else 'does not exist'}"
     inner = [name for name in names if storage.exists(storage.join(storage.join(folder, name), _INFO))]
     if inner:
-        return f"no {_INFO} in {folder}; did you mean {named([storage.join(folder, name) for name in inner])}?"
-    return f"no {_INFO} in {folder}, only {named(names)}"
+        return (
+            f"no {_INFO} in {folder}; did you mean {format_identities([storage.join(folder, name) for name in inner])}?"
+        )
+    return f"no {_INFO} in {folder}, only {format_identities(names)}"
 
 
 def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int, str]]:
