@@ -21,7 +21,7 @@ from vjepa2_ac.config.section import Component
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.evaluation.measure import prediction_errors
-from vjepa2_ac.evaluation.result import PredictionErrors, Way
+from vjepa2_ac.evaluation.result import ActionMode, PredictionErrors
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.model.world_model import WorldModel
@@ -152,8 +152,10 @@ def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
 
 def _as_dict(errors: PredictionErrors) -> dict[str, Any]:
     """Return ratios to persistence."""
-    one_step = {way: errors.of("teacher_forced", way=way).mean(axis=1).sum() for way in get_args(Way)}
-    rolled, nothing = (errors.of("rollout", way=way).sum(axis=0) for way in ("true", "persistence"))
+    one_step = {
+        actions: errors.of("teacher_forced", actions=actions).mean(axis=1).sum() for actions in get_args(ActionMode)
+    }
+    rolled, nothing = (errors.of("rollout", actions=actions).sum(axis=0) for actions in ("true", "persistence"))
     return {
         "rollout_over_persistence": (rolled / nothing).tolist(),
         "one_step": float(one_step["true"] / one_step["persistence"]),

@@ -10,8 +10,8 @@ import torch
 from scipy.stats import spearmanr
 
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.action_use import moves_of, rank_actions
-from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of
+from vjepa2_ac.evaluation.action_use import rank_actions, select_moves
+from vjepa2_ac.evaluation.distribution import LatentSums, compare_distributions
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.spaces import ActionSpace
@@ -27,10 +27,10 @@ def offline_figures(model: WorldModel, space: ActionSpace, held_out: Sequence[La
         true.add(batch.latents[:, 1:], batch.episode_ids)
         rolled = model.rollout(batch.latents[:, :1], batch.actions, batch.states[:, :-1])
         predicted.add(rolled, batch.episode_ids)
-    distribution = distribution_of(predicted, true)
+    distribution = compare_distributions(predicted, true)
     rows = [(batch, row) for batch in held_out for row in range(len(batch.starts))]
     chosen = [rows[place] for place in np.linspace(0, len(rows) - 1, MOVES).astype(int)]
-    moves = [move for batch, row in chosen for move in moves_of(batch, row, space, 0.075)]
+    moves = [move for batch, row in chosen for move in select_moves(batch, row, space, 0.075)]
     ranking = rank_actions(model, moves, space, ProbeOptions(samples=32), seed=0)
     return {
         "action-ranking error": ranking.rank.value,

@@ -17,7 +17,7 @@ from vjepa2_ac.config import AdapterConfig, Config, ModelConfig, ReplayConfig, V
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.reporter import SILENT
@@ -150,7 +150,7 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
         merge_adapter(model)
     spec = BenchmarkOptions("reach", WORLD, goals, GOALS + cell.run.seed)
     result = run_task(spec, Planning(Controller(model.eval(), PLANNING)))
-    measured = {row.key: row.value for row in rows_of(evaluation) if row.model == evaluation.trained}
+    measured = {row.key: row.value for row in make_rows(evaluation) if row.model == evaluation.trained}
     return {
         "cell": asdict(cell.run) | {"step": cell.step},
         "validation": validated,
@@ -171,7 +171,7 @@ def run_of(one: dict[str, Any]) -> Run:
 
 def compact(measured: dict[str, Any]) -> dict[str, Any]:
     """Return what the tables need of a measurement."""
-    ends = [way[-1] for way in measured["distance_cm"]]
+    ends = [actions[-1] for actions in measured["distance_cm"]]
     validation = measured["validation"]
     kept = {
         "cell": measured["cell"],

@@ -35,7 +35,7 @@ from vjepa2_ac.runs.subject import Subject, load_subject, run_config_of
 
 if TYPE_CHECKING:
     from vjepa2_ac.evaluation.result import Validation
-    from vjepa2_ac.reports.write import Evaluated
+    from vjepa2_ac.reports.write import WrittenEvaluation
 
 logger = logging.getLogger(__name__)
 
@@ -269,7 +269,7 @@ def evaluate(
     clips: int = 256,
     checkpoint: str | int = "selected",
     probes: bool = True,
-) -> Evaluated:
+) -> WrittenEvaluation:
     """Measure a run or a model on held-out episodes, as `vjepa2-ac evaluate` does, and write the report.
 
     For more options, such as other models to compare with, see `vjepa2_ac.evaluation.evaluate_run.evaluate_subject`.

@@ -14,7 +14,7 @@ from vjepa2_ac.cli import main, tables
 from vjepa2_ac.cli import progress as console_module
 from vjepa2_ac.cli.progress import ConsoleReporter, ProgressBar
 from vjepa2_ac.cli.tables import TrainingConsole
-from vjepa2_ac.evaluation.measure import VALIDATED
+from vjepa2_ac.evaluation.measure import VALIDATION_PREDICTIONS
 from vjepa2_ac.evaluation.result import PredictionErrors, Validation
 from vjepa2_ac.inspection.findings import Finding
 
@@ -34,7 +34,7 @@ def shown_on(monkeypatch: pytest.MonkeyPatch, *, terminal: bool) -> io.StringIO:
 def errors() -> PredictionErrors:
     ones = np.ones((4, 3))
     better = {("true", "rollout"): 0.5, ("true", "teacher_forced"): 0.25}
-    arrays = {(way, mode, "l1"): ones * better.get((way, mode), 1.0) for way, mode in VALIDATED}
+    arrays = {(way, mode, "l1"): ones * better.get((way, mode), 1.0) for way, mode in VALIDATION_PREDICTIONS}
     return PredictionErrors(("a", "b", "c", "d"), arrays)
 
 

@@ -12,9 +12,9 @@ from rich.table import Table
 
 from vjepa2_ac.cli.progress import PlainConsole
 from vjepa2_ac.cli.tables import benchmark_table, plan_table, row_tables, variants_table
-from vjepa2_ac.evaluation.evaluate import Contender, evaluate
+from vjepa2_ac.evaluation.evaluate import EvaluatedModel, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.rows import Row, rows_of
+from vjepa2_ac.evaluation.rows import Row, make_rows
 from vjepa2_ac.inspection.variants import VariantResult
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
@@ -37,11 +37,13 @@ def variants() -> list[Table]:
 
 def evaluations() -> list[Table]:
     names = ["base", "adapter", "runs/of-another-day/with-a-long-name", "vjepa2-ac-vitg.pt"]
-    contenders = [Contender(name, "trained" if name == "adapter" else "base", Halfway()) for name in names[:2]]
-    contenders += [Contender(name, "other", Copier()) for name in names[2:]]
+    evaluated_models = [
+        EvaluatedModel(name, "trained" if name == "adapter" else "base", Halfway()) for name in names[:2]
+    ]
+    evaluated_models += [EvaluatedModel(name, "other", Copier()) for name in names[2:]]
     probes = ProbeOptions(ranking_clips=4, samples=4, landscape_clips=2, nodes=3, examples=0)
-    found = evaluate(cast("Any", contenders), again(clips_batch(12, 0)), about(), probes=probes)
-    return row_tables(rows_of(found), "Held-out episodes")
+    found = evaluate(cast("Any", evaluated_models), again(clips_batch(12, 0)), about(), probes=probes)
+    return row_tables(make_rows(found), "Held-out episodes")
 
 
 def comparisons() -> list[Table]:

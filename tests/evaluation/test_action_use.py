@@ -10,12 +10,12 @@ from torch import Tensor
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.action_use import (
     RolloutStart,
-    alternatives,
+    draw_alternatives,
     evaluate_actions,
     measure_landscapes,
-    moves_of,
     rank_actions,
-    start_of,
+    rollout_start,
+    select_moves,
 )
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
@@ -43,7 +43,7 @@ def walked(actions: Tensor) -> LatentBatch:
 
 
 def moves(batch: LatentBatch, space: ActionSpace = POSE_CHANGE, reach: float = REACH) -> list[RolloutStart]:
-    return [move for clip in range(CLIPS) for move in moves_of(batch, clip, space, reach)]
+    return [move for clip in range(CLIPS) for move in select_moves(batch, clip, space, reach)]
 
 
 def ranked(model: Predictor, batch: LatentBatch, samples: int = 40) -> ActionRanking:
@@ -56,7 +56,7 @@ def drawn_for(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the alternatives in the box, and those on the shell."""
     largest = np.abs([one.true for one in moves]).max(axis=0)
-    drawn = alternatives(move.true, largest, space, ProbeOptions(samples=samples), generator)
+    drawn = draw_alternatives(move.true, largest, space, ProbeOptions(samples=samples), generator)
     return drawn[:samples], drawn[samples:]
 
 
@@ -168,7 +168,7 @@ def test_what_others_are_drawn_does_not_depend_on_the_moves_beside_it() -> None:
 
 def starts(step: int = 0) -> list[RolloutStart]:
     batch = clips_batch(FEW)
-    return [start_of(batch, clip, step) for clip in range(FEW)]
+    return [rollout_start(batch, clip, step) for clip in range(FEW)]
 
 
 def test_energy_and_change_are_the_distances_of_the_world() -> None:

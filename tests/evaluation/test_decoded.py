@@ -19,7 +19,7 @@ from vjepa2_ac.evaluation.decoded import (
     NEIGHBOURS,
     measure_decoded,
 )
-from vjepa2_ac.evaluation.evaluate import Contender, RepeatableClips
+from vjepa2_ac.evaluation.evaluate import EvaluatedModel, RepeatableClips
 from vjepa2_ac.evaluation.result import DecodedRollouts, Example
 from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, clips_batch, in_batches, rows
 
@@ -69,10 +69,10 @@ class Known:
         return self.latents[clips, 1:]
 
 
-def contenders(trained: object, base: object | None = None) -> Sequence[Contender]:
+def evaluated_models(trained: object, base: object | None = None) -> Sequence[EvaluatedModel]:
     """Return a base, if there is one, and a trained model."""
-    found = [] if base is None else [Contender("base", "base", base)]  # type: ignore[arg-type]
-    return [*found, Contender("adapter", "trained", trained)]  # type: ignore[arg-type]
+    found = [] if base is None else [EvaluatedModel("base", "base", base)]  # type: ignore[arg-type]
+    return [*found, EvaluatedModel("adapter", "trained", trained)]  # type: ignore[arg-type]
 
 
 TRAINED = decoder()
@@ -80,7 +80,7 @@ BATCH = clips_batch(24)
 
 
 def measured(*models: object, size: int = 4, **how: object) -> DecodedRollouts:
-    return measure_decoded(contenders(*models), clips(BATCH, TRAINED, size), TRAINED, **how)  # type: ignore[arg-type]
+    return measure_decoded(evaluated_models(*models), clips(BATCH, TRAINED, size), TRAINED, **how)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -116,18 +116,18 @@ def test_what_goes_half_of_the_way_is_between_its_neighbours() -> None:
 def test_a_clip_in_which_nothing_moves_does_not_count_in_the_moving_region() -> None:
     still = replace(BATCH, latents=BATCH.latents.clone(), actions=BATCH.actions.clone())
     still.latents[:3] = still.latents[:3, :1]
-    found = measure_decoded(contenders(Copier()), clips(still, TRAINED), TRAINED)
+    found = measure_decoded(evaluated_models(Copier()), clips(still, TRAINED), TRAINED)
     rest = replace(BATCH, **{
         name: getattr(BATCH, name)[3:] for name in ("latents", "actions", "states", "episode_ids", "starts")
     })  # fmt: skip
-    without = measure_decoded(contenders(Copier()), clips(rest, TRAINED), TRAINED)
+    without = measure_decoded(evaluated_models(Copier()), clips(rest, TRAINED), TRAINED)
     key = ("adapter", "psnr_db.moving.truth")
     assert found.curves[key][0].value == pytest.approx(without.curves[key][0].value, rel=1e-5)
     assert any("3 clips are left out" in note for note in found.notes)
 
 
 def test_from_a_cache_nothing_is_compared_with_true_frames() -> None:
-    found = measure_decoded(contenders(Oracle()), replace(clips(BATCH, TRAINED), has_frames=False), TRAINED)
+    found = measure_decoded(evaluated_models(Oracle()), replace(clips(BATCH, TRAINED), has_frames=False), TRAINED)
     assert not [metric for _, metric in found.curves if metric.endswith(".truth") or ".moving." in metric]
     assert "come from a cache" in found.notes[0]
     assert found.sources == (DECODED_TRUTH, DECODED_PERSISTENCE, "adapter")
@@ -135,7 +135,7 @@ def test_from_a_cache_nothing_is_compared_with_true_frames() -> None:
 
 def test_the_images_of_examples_begin_with_the_given_frame() -> None:
     example = Example("best", BATCH.episode_ids[3], BATCH.starts[3], None, {})
-    found = measure_decoded(contenders(Oracle()), clips(BATCH, TRAINED), TRAINED, [example])
+    found = measure_decoded(evaluated_models(Oracle()), clips(BATCH, TRAINED), TRAINED, [example])
     (strip,) = found.strips
     assert list(strip.rows) == ["truth", "decoded_truth", "adapter"]
     np.testing.assert_array_equal(strip.rows["adapter"], strip.rows["decoded_truth"])
@@ -148,7 +148,7 @@ def test_fvd_of_images_is_lowest_for_the_decoded_truth_and_needs_the_encoder() -
     def encode(images: Tensor) -> Tensor:
         return images.mean(dim=(-2, -1)).repeat(1, 1, 2)[:, :, None]
 
-    found = measure_decoded(contenders(Oracle(), Copier()), clips(BATCH, TRAINED), TRAINED, encode=encode).fvd
+    found = measure_decoded(evaluated_models(Oracle(), Copier()), clips(BATCH, TRAINED), TRAINED, encode=encode).fvd
     assert list(found) == [DECODED_TRUTH, DECODED_PERSISTENCE, "base", "adapter"]
     assert found["adapter"] == found[DECODED_TRUTH]
     assert found["base"] == found[DECODED_PERSISTENCE]

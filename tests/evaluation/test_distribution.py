@@ -8,11 +8,11 @@ import torch
 
 from vjepa2_ac.evaluation.distribution import (
     LatentSums,
-    distance_of_halves,
-    distribution_of,
+    compare_distributions,
     frechet_distance,
+    frechet_distance_of_halves,
     mmd,
-    spread_of,
+    relative_spread,
 )
 
 CLIPS, EPISODES = 48, 12
@@ -42,37 +42,37 @@ def trace(values: torch.Tensor) -> np.ndarray:
 
 def test_spread_is_the_ratio_of_the_traces_of_the_covariances() -> None:
     predicted, true = latents(1, spread=0.5), latents(2)
-    found = spread_of(summed(predicted), summed(true))
+    found = relative_spread(summed(predicted), summed(true))
     assert [one.value for one in found] == pytest.approx(trace(predicted) / trace(true))
     assert not any(one.has_interval for one in found)
 
 
 def test_latents_as_varied_as_the_truth_have_spread_1() -> None:
     true = latents(2)
-    assert [one.value for one in spread_of(summed(latents(3)), summed(true))] == pytest.approx([1, 1], abs=0.3)
-    (one, other) = spread_of(summed(true + 5), summed(true))  # where their mean is does not matter
+    assert [one.value for one in relative_spread(summed(latents(3)), summed(true))] == pytest.approx([1, 1], abs=0.3)
+    (one, other) = relative_spread(summed(true + 5), summed(true))  # where their mean is does not matter
     assert (one.value, other.value) == pytest.approx((1, 1))
 
 
 def test_mmd_is_of_latents_averaged_over_tokens_and_fvd_over_frames_too() -> None:
     predicted, true = latents(1, spread=0.5), latents(2)
-    found = distribution_of(summed(predicted), summed(true))
+    found = compare_distributions(summed(predicted), summed(true))
     pooled = [values.mean(dim=2).double().numpy() for values in (predicted, true)]
     assert found.mmd[1].value == pytest.approx(mmd(pooled[0][:, 1], pooled[1][:, 1], IDS).value, rel=1e-4)
     assert found.fvd == pytest.approx(frechet_distance(*(values.mean(axis=1) for values in pooled)), rel=1e-4)
-    assert distance_of_halves(summed(true)) > 0
+    assert frechet_distance_of_halves(summed(true)) > 0
 
 
 def test_one_clip_has_no_distribution_and_one_episode_no_interval() -> None:
     alone = LatentSums()
     alone.add(latents(1)[:1], IDS[:1])
-    found = distribution_of(alone, alone)
+    found = compare_distributions(alone, alone)
     assert all(math.isnan(one.value) for one in (*found.spread, *found.mmd))
     assert math.isnan(found.fvd)
     same = LatentSums()
     same.add(latents(1)[:3], ["only"] * 3)
-    assert spread_of(same, same)[0].value == pytest.approx(1)
-    assert math.isnan(distribution_of(same, same).mmd[0].value)
+    assert relative_spread(same, same)[0].value == pytest.approx(1)
+    assert math.isnan(compare_distributions(same, same).mmd[0].value)
 
 
 # ---- the Fréchet distance -------------------------------------------------------------------------------------------

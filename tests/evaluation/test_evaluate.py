@@ -14,8 +14,14 @@ import torch
 from vjepa2_ac import distributed
 from vjepa2_ac.distributed import own_share
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.evaluate import Contender, clips_of, evaluate
-from vjepa2_ac.evaluation.measure import VALIDATED, actions_before, measured, prediction_errors, with_other_actions
+from vjepa2_ac.evaluation.evaluate import EvaluatedModel, describe_clips, evaluate
+from vjepa2_ac.evaluation.measure import (
+    VALIDATION_PREDICTIONS,
+    measure_errors,
+    prediction_errors,
+    previous_clip_actions,
+    with_shuffled_actions,
+)
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
     L1,
@@ -29,7 +35,7 @@ from vjepa2_ac.evaluation.result import (
     one_step_over_persistence,
     over_persistence,
 )
-from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
@@ -40,10 +46,10 @@ PROBES = ProbeOptions(ranking_clips=6, samples=20, landscape_clips=3, nodes=5, e
 
 
 def evaluated(trained: object, base: object | None = None, *, size: int = 4, **changes: object) -> Evaluation:
-    contenders = [] if base is None else [Contender("base", "base", base)]  # type: ignore[arg-type]
-    contenders.append(Contender("adapter", "trained", trained))  # type: ignore[arg-type]
+    evaluated_models = [] if base is None else [EvaluatedModel("base", "base", base)]  # type: ignore[arg-type]
+    evaluated_models.append(EvaluatedModel("adapter", "trained", trained))  # type: ignore[arg-type]
     batch = clips_batch(actions=changes.pop("actions", None))  # type: ignore[arg-type]
-    return evaluate(contenders, again(batch, size), about(**changes), probes=PROBES)
+    return evaluate(evaluated_models, again(batch, size), about(**changes), probes=PROBES)
 
 
 def pair_of(found: Evaluation) -> tuple[PredictionErrors, PredictionErrors]:
@@ -61,7 +67,7 @@ def test_a_perfect_predictor_scores_zero_in_every_metric(oracle: Evaluation) -> 
             for one in over_persistence(oracle.models["adapter"].errors, mode, metric):
                 assert one.value == pytest.approx(0.0, abs=1e-5)
     assert [one.value for one in gain_over(*pair_of(oracle))] == pytest.approx([1.0] * (TIME - 1))
-    found = summarize(oracle, rows_of(oracle))
+    found = summarize(oracle, make_rows(oracle))
     assert found.predicts.statement.startswith("error 100 % lower than the base model's")
     assert found.uses_actions.conclusion == "yes"
 
@@ -88,7 +94,7 @@ def test_a_model_that_ignores_actions_has_the_action_ranking_error_of_chance() -
     assert ranking.change == Estimate(0.0, 0.0, 0.0)
     assert set(ranking.ranks) == {0.5}
     assert gap_of_actions(found.models["adapter"].errors, "shuffled") == Estimate(0.0, 0.0, 0.0)
-    assert summarize(found, rows_of(found)).uses_actions.conclusion == "no"
+    assert summarize(found, make_rows(found)).uses_actions.conclusion == "no"
 
 
 def test_a_difference_is_what_is_computed_by_hand() -> None:
@@ -102,12 +108,12 @@ def test_a_difference_is_what_is_computed_by_hand() -> None:
 
 def test_wrong_actions_give_the_errors_that_they_give(oracle: Evaluation) -> None:
     errors = oracle.models["adapter"].errors
-    zero = over_persistence(errors, "teacher_forced", way="zero")
+    zero = over_persistence(errors, "teacher_forced", actions="zero")
     assert [one.value for one in zero] == pytest.approx([1.0] * (TIME - 1), rel=1e-5), "nothing done, nothing moves"
     batch = clips_batch()
     others = batch.actions[[1, *range(11)]]
     expected = (others - batch.actions)[..., :DIM].abs().mean(dim=(0, 2)) * 100
-    shuffled = errors.of("teacher_forced", way="shuffled").mean(axis=0)
+    shuffled = errors.of("teacher_forced", actions="shuffled").mean(axis=0)
     assert shuffled.tolist() == pytest.approx(expected.tolist(), rel=1e-4)
 
 
@@ -115,7 +121,7 @@ def test_chosen_steps_alone_count(oracle: Evaluation) -> None:
     first = np.zeros((12, TIME - 1), bool)
     first[:, 0] = True
     errors = oracle.models["adapter"].errors
-    nothing = errors.of("teacher_forced", way="persistence")
+    nothing = errors.of("teacher_forced", actions="persistence")
     made_up = np.where(first, 2 * nothing, nothing / 4)
     errors = replace(errors, arrays={**errors.arrays, ("true", "teacher_forced", "l1"): made_up})
     for steps, value in ((first, 2.0), (~first, 0.25)):
@@ -144,10 +150,13 @@ def test_examples_are_the_best_the_worst_and_the_liveliest_with_their_errors() -
 
 
 def test_vectors_have_no_centimetres_and_too_few_numbers_no_landscape() -> None:
-    contenders = [Contender("model", "trained", Oracle())]
+    evaluated_models = [EvaluatedModel("model", "trained", Oracle())]
     vectors, narrow = (
         evaluate(
-            contenders, again(clips_batch(width=width), space=vector_actions(width, "change")), about(), probes=PROBES
+            evaluated_models,
+            again(clips_batch(width=width), space=vector_actions(width, "change")),
+            about(),
+            probes=PROBES,
         )
         for width in (4, 2)
     )
@@ -178,8 +187,11 @@ def test_each_model_is_measured_only_while_it_is_switched_on() -> None:
             assert not on
             return super().predict(*inputs, **more)
 
-    contenders = [Contender("base", "base", Watched(), switch), Contender("adapter", "trained", Unwatched())]
-    evaluate(contenders, again(clips_batch()), about(), probes=PROBES)
+    evaluated_models = [
+        EvaluatedModel("base", "base", Watched(), switch),
+        EvaluatedModel("adapter", "trained", Unwatched()),
+    ]
+    evaluate(evaluated_models, again(clips_batch()), about(), probes=PROBES)
 
 
 # ---- which steps move ----
@@ -187,7 +199,7 @@ def test_each_model_is_measured_only_while_it_is_switched_on() -> None:
 
 def of(*actions: list[float], space: ActionSpace = POSE_CHANGE) -> Clips:
     steps = np.array(actions)[None]
-    return clips_of(steps, [("a", 0)], space=space, seconds_per_step=0.5)
+    return describe_clips(steps, [("a", 0)], space=space, seconds_per_step=0.5)
 
 
 @pytest.mark.parametrize(
@@ -230,20 +242,20 @@ def test_errors_by_horizon_equal_a_case_computed_by_hand() -> None:
     latents[0, 1] = 1.0
     latents[0, 2] = torch.tensor([[3.0, 3.0], [5.0, 5.0]])
     batch = LatentBatch(latents, torch.zeros(1, 3, 7), torch.zeros(1, 2, 7), None, ("e",), (0,))
-    found = measured(Copier(), batch, VALIDATED, (L1, L2), batch.actions)
+    found = measure_errors(Copier(), batch, VALIDATION_PREDICTIONS, (L1, L2), batch.actions)
     assert found.of("rollout").tolist() == [[1.0, 4.0]], "from the first frame"
     assert found.of("teacher_forced").tolist() == [[1.0, 3.0]], "from the frame before"
     assert found.of("rollout", L2).tolist() == [[1.0, 17.0]]
-    for (way, mode, metric), values in found.arrays.items():
-        assert values.tolist() == found.arrays["true", mode, metric].tolist(), way
+    for (actions, mode, metric), values in found.arrays.items():
+        assert values.tolist() == found.arrays["true", mode, metric].tolist(), actions
     assert found.episode_ids == ("e",)
 
 
 def test_a_validation_has_the_errors_of_an_evaluation_of_the_same_clips() -> None:
     errors = prediction_errors(Halfway(), in_batches(clips_batch(), 4))
-    assert errors.arrays.keys() == {(way, mode, "l1") for way, mode in VALIDATED}
+    assert errors.arrays.keys() == {(actions, mode, "l1") for actions, mode in VALIDATION_PREDICTIONS}
     probes = ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0)
-    found = evaluate([Contender("model", "trained", Halfway())], again(clips_batch()), about(), probes=probes)
+    found = evaluate([EvaluatedModel("model", "trained", Halfway())], again(clips_batch()), about(), probes=probes)
     whole = found.models["model"].errors
     assert whole.episode_ids == errors.episode_ids
     for kind, values in errors.arrays.items():
@@ -255,7 +267,7 @@ def test_a_validation_has_the_errors_of_an_evaluation_of_the_same_clips() -> Non
 @pytest.mark.parametrize("size", [1, 3, 12])
 def test_other_actions_are_those_of_the_clip_before_whatever_the_batch(size: int) -> None:
     batch = clips_batch()
-    others = torch.cat([tried for _, tried in with_other_actions(in_batches(batch, size))])
+    others = torch.cat([tried for _, tried in with_shuffled_actions(in_batches(batch, size))])
     assert torch.equal(others, batch.actions[[1, *range(11)]]), "the first clip has those of the second"
 
 
@@ -275,8 +287,8 @@ def test_processes_that_share_clips_give_each_the_same_actions_whatever_clips_ar
             accelerator = SimpleNamespace(process_index=process, num_processes=processes)
             monkeypatch.setattr(distributed, "_sharing", accelerator)
             own = own_share(7, 2)
-            before = actions_before(own, range(7), read)
-            found += [others for _, others in with_other_actions(read(own), before)]
+            before = previous_clip_actions(own, range(7), read)
+            found += [others for _, others in with_shuffled_actions(read(own), before)]
         alone = rows(batch, readable).actions
         expected = alone.flip(1) if len(alone) == 1 else torch.cat([alone[1:2], alone[:-1]])
         assert torch.equal(torch.cat(found), expected), whole
@@ -284,5 +296,5 @@ def test_processes_that_share_clips_give_each_the_same_actions_whatever_clips_ar
 
 def test_a_clip_alone_gets_its_own_actions_backwards() -> None:
     batch = rows(clips_batch(), [0])
-    [(_, others)] = list(with_other_actions([batch]))
+    [(_, others)] = list(with_shuffled_actions([batch]))
     assert torch.equal(others, batch.actions.flip(1))

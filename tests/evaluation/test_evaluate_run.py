@@ -23,7 +23,7 @@ from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.reports.metrics_json import read_metrics
-from vjepa2_ac.reports.write import Evaluated, write_evaluation
+from vjepa2_ac.reports.write import WrittenEvaluation, write_evaluation
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.training.loop import train
 
@@ -56,13 +56,13 @@ def asked(**changes: Any) -> EvaluationOptions:
     return EvaluationOptions(**({"clips": 5, "probes": PROBES} | changes))
 
 
-def measure(subject: str, options: EvaluationOptions) -> Evaluated:
+def measure(subject: str, options: EvaluationOptions) -> WrittenEvaluation:
     """Evaluate and write the files, as the command does."""
     return write_evaluation(evaluate_subject(subject, options), options.out or Path(subject))
 
 
 @pytest.fixture(scope="module")
-def measured(config: Config) -> Evaluated:
+def measured(config: Config) -> WrittenEvaluation:
     """The run's evaluation, which is in its folder, too: to be read only."""
     with one_thread():
         return measure(config.run_dir, asked())
@@ -86,7 +86,7 @@ def figures_of(folder: Path | str) -> dict[str, Any]:
     return json.loads((Path(folder) / "metrics.json").read_text())
 
 
-def test_a_run_is_measured_against_its_base_with_everything_that_belongs_to_it(measured: Evaluated) -> None:
+def test_a_run_is_measured_against_its_base_with_everything_that_belongs_to_it(measured: WrittenEvaluation) -> None:
     evaluation = measured.evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     assert (evaluation.base, evaluation.trained) == ("base", "adapter")
@@ -166,7 +166,7 @@ def test_a_run_without_a_base_is_measured_alone_unless_a_base_is_asked_for(
 ) -> None:
     config = make_config(model__base="random", model__sizes=TINY_CONFIG, adapter__kind="none")
     folder, dataset = write_adapted_run(config), open_dataset(config.data)
-    assert [one.role for one in load_models(str(folder), config, asked(), dataset).contenders] == ["trained"]
+    assert [one.role for one in load_models(str(folder), config, asked(), dataset).evaluated_models] == ["trained"]
     with pytest.raises(InputError, match=r"--against base: a model without a base"):
         load_models(str(folder), config, asked(against=("base",)), dataset)
 

@@ -7,10 +7,10 @@ import pytest
 from evaluation_results import evaluation, page_of
 from vjepa2_ac.cli.progress import PlainConsole
 from vjepa2_ac.cli.tables import row_tables
-from vjepa2_ac.evaluation.evaluate import Contender, evaluate
+from vjepa2_ac.evaluation.evaluate import EvaluatedModel, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import L1, L2, Evaluation, Metric, gain_over, over_persistence, rank_difference
-from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import compare
@@ -21,7 +21,7 @@ WHOLE = evaluation(others=("runs/other",))
 
 
 def test_a_key_and_a_model_name_one_row_and_a_key_one_line() -> None:
-    rows = rows_of(WHOLE)
+    rows = make_rows(WHOLE)
     assert len({(row.key, row.model) for row in rows}) == len(rows)
     names = {row.key: (row.group, row.name, row.form, row.better) for row in rows}
     assert all((row.group, row.name, row.form, row.better) == names[row.key] for row in rows)
@@ -29,7 +29,7 @@ def test_a_key_and_a_model_name_one_row_and_a_key_one_line() -> None:
 
 
 def test_rows_are_the_estimates() -> None:
-    rows = {(row.key, row.model): row.estimate for row in rows_of(WHOLE)}
+    rows = {(row.key, row.model): row.estimate for row in make_rows(WHOLE)}
     base, adapter = (WHOLE.models[name] for name in ("base", "adapter"))
     assert rows["rollout.l1.over_persistence.3", "adapter"] == over_persistence(adapter.errors, "rollout")[2]
     assert rows["rollout.l1.gain_over_base.3", "adapter"] == gain_over(adapter.errors, base.errors)[2]
@@ -49,7 +49,7 @@ def test_rows_are_the_estimates() -> None:
 
 
 def test_console_page_and_file_show_the_same_rows(tmp_path: Path) -> None:
-    rows = rows_of(WHOLE)
+    rows = make_rows(WHOLE)
     console = PlainConsole(width=250)
     with console.capture() as capture:
         console.print(*row_tables(rows, "Held-out episodes"))
@@ -74,13 +74,13 @@ PROBES = ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0)
 
 
 def evaluated(trained: object, base: object, *more: Metric) -> Evaluation:
-    contenders = [Contender("base", "base", base), Contender("adapter", "trained", trained)]  # type: ignore[arg-type]
-    return evaluate(contenders, again(clips_batch()), about(), metrics=(L1, L2, *more), probes=PROBES)
+    evaluated_models = [EvaluatedModel("base", "base", base), EvaluatedModel("adapter", "trained", trained)]  # type: ignore[arg-type]
+    return evaluate(evaluated_models, again(clips_batch()), about(), metrics=(L1, L2, *more), probes=PROBES)
 
 
 def test_an_added_metric_appears_in_rows_verdict_and_comparison(tmp_path: Path) -> None:
     found = evaluated(Halfway(), Copier(), LARGER)
-    rows = {(row.key, row.model): row for row in rows_of(found)}
+    rows = {(row.key, row.model): row for row in make_rows(found)}
     ratio, gain = (rows[f"rollout.agreement.{what}.1", "adapter"] for what in ("over_persistence", "gain_over_base"))
     assert ratio.better == gain.better == "higher"
     assert gain.value > 0
@@ -96,7 +96,7 @@ def test_an_added_metric_appears_in_rows_verdict_and_comparison(tmp_path: Path) 
 
 def test_more_is_better_where_a_metric_says_so() -> None:
     better, worse = (evaluated(*pair, LARGER) for pair in ((Oracle(), Halfway()), (Copier(), Halfway())))
-    assert not summarize(better, rows_of(better)).predicts.reference, "it agrees with L1"
-    assert not summarize(worse, rows_of(worse)).predicts.reference
+    assert not summarize(better, make_rows(better)).predicts.reference, "it agrees with L1"
+    assert not summarize(worse, make_rows(worse)).predicts.reference
     mistaken = evaluated(Oracle(), Halfway(), SMALLER)
-    assert "(by height " in summarize(mistaken, rows_of(mistaken)).predicts.reference
+    assert "(by height " in summarize(mistaken, make_rows(mistaken)).predicts.reference

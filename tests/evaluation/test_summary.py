@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from evaluation_results import ranking_of
-from vjepa2_ac.evaluation.evaluate import clips_of
+from vjepa2_ac.evaluation.evaluate import describe_clips
 from vjepa2_ac.evaluation.result import (
     L1,
     L2,
@@ -24,15 +24,15 @@ from vjepa2_ac.evaluation.result import (
     ModelResult,
     PredictionErrors,
 )
-from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.evaluation.summary import (
     PLANNING,
     PREDICTION,
     RANKING,
     SENSITIVITY,
     Summary,
-    closed_loop,
-    not_measured,
+    closed_loop_verdict,
+    not_measured_verdict,
     summarize,
     with_closed_loop,
 )
@@ -54,8 +54,8 @@ def predicted(episodes: int = 8, **ways: dict[Metric, np.ndarray]) -> Prediction
     ids = tuple(f"episode {clip % episodes}" for clip in range(CLIPS))
     ways = {"persistence": dict.fromkeys((L1, L2), errors(1.0)), **ways}
     arrays = {
-        (way, mode, metric.name): values
-        for way, by_metric in ways.items()
+        (actions, mode, metric.name): values
+        for actions, by_metric in ways.items()
         for metric, values in by_metric.items()
         for mode in MODES
     }
@@ -77,14 +77,16 @@ def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
     actions = np.full((CLIPS, HORIZON, 7), 0.01)
     return Evaluation(
         about=about(frames=HORIZON + 1, seconds_per_step=0.5),
-        clips=clips_of(actions, list(zip(ids, range(CLIPS), strict=True)), space=POSE_CHANGE, seconds_per_step=0.5),
+        clips=describe_clips(
+            actions, list(zip(ids, range(CLIPS), strict=True)), space=POSE_CHANGE, seconds_per_step=0.5
+        ),
         models={each.name: each for each in models},
     )
 
 
 def summary_of(*models: ModelResult, episodes: int = 8, **changes: Any) -> Summary:
     measured = replace(evaluation(*models, episodes=episodes), **changes)
-    return summarize(measured, rows_of(measured))
+    return summarize(measured, make_rows(measured))
 
 
 @pytest.mark.parametrize(
@@ -155,9 +157,9 @@ def test_better_action_ranking_needs_a_lower_error_than_chance_and_the_base_mode
 
 def test_the_third_line_is_action_ranking_until_a_closed_loop_was_measured(tmp_path: Path) -> None:
     bare, measured = summary_of(model("model", 0.5)), summary_of(ranked("model", 0.5, 0.02, shuffled=0.9))
-    assert bare.ranks_actions == not_measured(RANKING, "`vjepa2-ac evaluate --ranking-clips 32`")
+    assert bare.ranks_actions == not_measured_verdict(RANKING, "`vjepa2-ac evaluate --ranking-clips 32`")
     shares = {name: share_of(count, 50) for name, count in {"m": 45, "random": 2, "oracle": 50}.items()}
-    plans = closed_loop(shares, "m", "oracle", 50, "reach")
+    plans = closed_loop_verdict(shares, "m", "oracle", 50, "reach")
     (tmp_path / "closed_loop" / "reach-B").mkdir(parents=True)
     file = tmp_path / "closed_loop" / "reach-B" / "closed_loop.json"
     file.write_text(json.dumps({"about": {"checkpoint": "step-8 (the newest)"}, "verdict": asdict(plans)}))
@@ -272,7 +274,9 @@ def test_a_better_landscape_needs_a_nearer_minimum_than_the_base_model_and_a_ran
 
 def test_predictions_that_are_not_finite_have_no_conclusion() -> None:
     adapter = model("adapter", 1.0)
-    broken = {way: math.nan * values for way, values in adapter.errors.arrays.items() if way[0] != "persistence"}
+    broken = {
+        actions: math.nan * values for actions, values in adapter.errors.arrays.items() if actions[0] != "persistence"
+    }
     adapter = replace(adapter, errors=replace(adapter.errors, arrays=adapter.errors.arrays | broken))
     summary = summary_of(model("base", 1.0), adapter)
     assert (summary.predicts.conclusion, summary.predicts.value) == ("not measured", None)
@@ -296,17 +300,17 @@ def by(l1: float, others: float, *, noise: float = 0.02) -> dict[Metric, np.ndar
 
 def with_errors(found: Evaluation, name: str, true: dict[Metric, np.ndarray]) -> Evaluation:
     before = found.models[name].errors
-    given = {(way, mode, metric.name): values for metric, values in true.items()
-             for way, mode in (("true", "teacher_forced"), ("true", "rollout"))}  # fmt: skip
+    given = {(actions, mode, metric.name): values for metric, values in true.items()
+             for actions, mode in (("true", "teacher_forced"), ("true", "rollout"))}  # fmt: skip
     changed = replace(found.models[name], errors=replace(before, arrays={**before.arrays, **given}))
     return replace(found, models={**found.models, name: changed})
 
 
 def test_another_metric_that_contradicts_l1_is_named() -> None:
     agreed = evaluation(model("base", 0.95), model("adapter", 0.8))
-    assert not summarize(agreed, rows_of(agreed)).predicts.reference
+    assert not summarize(agreed, make_rows(agreed)).predicts.reference
     denied = with_errors(agreed, "adapter", by(0.8, 1.25))
-    assert re.fullmatch(r"\(by L2 32 % worse \[\d+, \d+\]\)", summarize(denied, rows_of(denied)).predicts.reference)
+    assert re.fullmatch(r"\(by L2 32 % worse \[\d+, \d+\]\)", summarize(denied, make_rows(denied)).predicts.reference)
 
 
 @pytest.mark.parametrize(
@@ -325,7 +329,7 @@ def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
 ) -> None:
     counts = {"adapter": solved, "zero action": 0, "random": min(2, problems - 1), "oracle": oracle}
     shares = {name: share_of(count, problems) for name, count in counts.items()}
-    plans = closed_loop(shares, "adapter", "oracle", problems, "reach")
+    plans = closed_loop_verdict(shares, "adapter", "oracle", problems, "reach")
     assert plans.conclusion == conclusion
     assert plans.needs.startswith(needs)
     assert bool(plans.needs) == bool(needs)
@@ -336,7 +340,7 @@ def test_a_measured_plan_is_not_denied_by_the_use_of_the_actions() -> None:
     summary = summary_of(model("adapter", 0.5))
     assert summary.sentence.endswith("ignores the actions, so the model cannot be used for planning.")
     shares = {"adapter": share_of(45, 50), "random": share_of(0, 50), "oracle": share_of(50, 50)}
-    measured = replace(summary, plans=closed_loop(shares, "adapter", "oracle", 50, "reach"))
+    measured = replace(summary, plans=closed_loop_verdict(shares, "adapter", "oracle", 50, "reach"))
     assert measured.sentence == "The model predicts typical motion and ignores the actions."
 
 
@@ -354,7 +358,7 @@ def test_every_summary_fits_a_screen_and_has_whole_sentences(
     subject = f"runs/{'a-kitchen-with-a-name-that-is-long-enough-to-wrap-' * 2}"
     measured = replace(measured, about=replace(measured.about, subject=subject), copies=spread[0].distribution)
     measured = with_errors(measured, "adapter", by(level, abs(2 - level)))
-    summary = summarize(measured, rows_of(measured))
+    summary = summarize(measured, make_rows(measured))
     lines = str(summary).splitlines()
     assert len(lines) <= 18, "three of them are the long name and the clips"
     assert max(map(len, lines)) <= 90

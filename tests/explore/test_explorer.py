@@ -17,7 +17,7 @@ PATH = (UP, LEFT, CLOSE, CLOSE)
 def rollout(explorer: Explorer, teller: int, place: Place) -> torch.Tensor:
     first = explorer.moment(place.episode, place.start)
     start = Start(first.latents, first.state, explorer.spaces.state)
-    with explorer.contenders[teller].switched():
+    with explorer.evaluated_models[teller].prediction_context():
         return rolled_out(explorer.model(teller).rollout, start, np.array(place.actions))[-1]
 
 
@@ -32,7 +32,7 @@ def recorded_path(explorer: Explorer, steps: int) -> Place:
 
 def test_steps_one_by_one_are_a_rollout_of_base_and_adapter(recorded: Views) -> None:
     explorer, place = recorded.explorer, Place(0, 2, PATH)
-    assert [one.name for one in explorer.contenders] == ["base", "adapter"]
+    assert [one.name for one in explorer.evaluated_models] == ["base", "adapter"]
     for teller in range(2):
         torch.testing.assert_close(explorer.imagined(teller, place), rollout(explorer, teller, place))
     assert not torch.equal(explorer.imagined(0, place), explorer.imagined(1, place))

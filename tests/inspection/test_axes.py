@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from vjepa2_ac.evaluation.action_use import RolloutStart, start_of
+from vjepa2_ac.evaluation.action_use import RolloutStart, rollout_start
 from vjepa2_ac.inspection.axes import AxisFit, infer_axes
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.energy import Axes
@@ -30,7 +30,7 @@ class Turned(Oracle):
 
 def starts(**changes: object) -> list[RolloutStart]:
     batch = clips_batch(CLIPS, **changes)  # type: ignore[arg-type]
-    return [start_of(batch, clip, 1) for clip in range(CLIPS)]
+    return [rollout_start(batch, clip, 1) for clip in range(CLIPS)]
 
 
 def fitted(model: object, **changes: object) -> AxisFit:
@@ -68,7 +68,7 @@ def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are
 def test_mirrored_axes_and_one_episode_are_refused_by_name() -> None:
     assert fitted(Turned(0.0, mirrored=True)).problem is not None
     batch = clips_batch(2)
-    alone = infer_axes(Oracle(), [start_of(batch, clip, step) for clip in (0, 1) for step in range(TIME - 1)],
+    alone = infer_axes(Oracle(), [rollout_start(batch, clip, step) for clip in (0, 1) for step in range(TIME - 1)],
                        at_once=64)  # fmt: skip
     assert "1 episode" in (alone.problem or "")
 

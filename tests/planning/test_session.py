@@ -15,7 +15,7 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.request import EvaluationOptions, settle
+from vjepa2_ac.evaluation.request import EvaluationOptions, resolve_config
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.world_model import WorldModel, fingerprint
@@ -200,7 +200,7 @@ def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config
     of_run = Controller.of_run(load_subject(folder), taught)
     np.testing.assert_allclose(of_run.space.upper[0, :3], limits, rtol=1e-6)
     asked = EvaluationOptions(overrides=("planning.limits.xyz=data",))
-    assert settle(str(folder), asked).planning.limits.xyz == limits
+    assert resolve_config(str(folder), asked).planning.limits.xyz == limits
 
 
 def test_a_run_without_it_plans_as_before_and_its_limits_cannot_be_those_of_the_data(make_config, base_folder) -> None:

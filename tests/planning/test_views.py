@@ -13,7 +13,7 @@ from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.imagined import ImagineOptions, Seen, imagine_image
+from vjepa2_ac.evaluation.imagined import ImageObservation, ImagineOptions, imagine_image
 from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import load_to_plan
@@ -90,7 +90,7 @@ def test_an_image_of_two_views_is_imagined_view_by_view(tmp_path: Path) -> None:
     def film(pixels: np.ndarray, views: int) -> np.ndarray:
         config = parse_config(values | {"planning": {"views": views}}, where="test")
         session = Subject("tiny", config, model)
-        found = imagine_image(session, ImagineOptions(decoder, ("up",), steps=2), Seen(pixels, STATE))
+        found = imagine_image(session, ImagineOptions(decoder, ("up",), steps=2), ImageObservation(pixels, STATE))
         return np.concatenate([found.first[None], found.decoded_first[None], found.rollouts[0].frames])
 
     both = film(np.hstack(images), 2)

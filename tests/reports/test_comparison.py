@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import Contender, evaluate
+from vjepa2_ac.evaluation.evaluate import EvaluatedModel, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.summary import Conclusion
 from vjepa2_ac.reports.comparison import Comparison, compare
@@ -32,8 +32,10 @@ def written(
     **changes: object,
 ) -> Path:
     folder.mkdir()
-    contenders = [Contender("base", "base", base), Contender("adapter", "trained", model)]  # type: ignore[arg-type]
-    found = evaluate(contenders, again(clips_batch(clips, seed)), about(seed=ranking_seed, **changes), probes=probes)
+    evaluated_models = [EvaluatedModel("base", "base", base), EvaluatedModel("adapter", "trained", model)]  # type: ignore[arg-type]
+    found = evaluate(
+        evaluated_models, again(clips_batch(clips, seed)), about(seed=ranking_seed, **changes), probes=probes
+    )
     write_metrics(found, folder / METRICS_FILE)
     return folder
 

@@ -18,11 +18,11 @@ from PIL import Image, ImageSequence
 from browser import open_page
 from evaluation_results import decoded_strips, evaluation, page_of
 from vjepa2_ac.evaluation.result import Evaluation
-from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.evaluation.summary import PLANNING, Verdict, summarize
 from vjepa2_ac.reports import write
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
-from vjepa2_ac.reports.write import LONGEST_S, MOST_BYTES, MOST_CLIPS, bar_of, film_of, report_page
+from vjepa2_ac.reports.write import MAX_CLIPS, MAX_VIDEO_BYTES, MAX_VIDEO_S, bar_positions, make_video, report_page
 
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;]]>{}\u202e\x00\ud800é"
 SOLVED = Verdict(
@@ -86,7 +86,7 @@ def images(html: str) -> list[bytes]:
 @pytest.mark.usefixtures("without_figures")
 def test_the_first_screen_shows_the_summary_of_the_console_and_numbers_that_it_does_not_have(usual: Usual) -> None:
     for one, changes in ((usual[0], {}), (evaluation(episodes=2, clips=8), {"plans": SOLVED})):
-        summary = replace(summarize(one, rows_of(one)), **changes)
+        summary = replace(summarize(one, make_rows(one)), **changes)
         first = report_page(one, summary).partition("<details")[0]
         shown = " ".join(Page(re.sub("<[^>]*>", " ", first.partition("</style>")[2])).shown.split())
         assert not [word for word in str(summary).split() if word not in shown]
@@ -101,28 +101,28 @@ def test_the_first_screen_shows_the_summary_of_the_console_and_numbers_that_it_d
 def test_a_bar_shows_a_number_its_interval_and_its_baseline_in_their_order() -> None:
     for value, baseline in ((0.3, 0.0), (-0.3, 0.0), (0.3, 0.5), (0.7, 0.5)):
         verdict = Verdict(PLANNING, "yes", "", value, value - 0.04, value + 0.05, baseline=baseline)
-        bar = bar_of(verdict)
+        bar = bar_positions(verdict)
         assert 0 < min(bar.values()) < max(bar.values()) < 100
         assert bar["low"] < bar["point"] < bar["high"]
         assert (bar["against"] < bar["low"]) == (baseline < value)
-        assert len(set(bar_of(replace(verdict, low=None, high=None)).values())) == 2
-    assert not bar_of(replace(verdict, value=None))
+        assert len(set(bar_positions(replace(verdict, low=None, high=None)).values())) == 2
+    assert not bar_positions(replace(verdict, value=None))
 
 
 def test_the_video_shows_the_clip_with_the_median_error_and_is_short_and_small() -> None:
     one = decoded_strips(evaluation(frames=16), size=256)
     best = replace(one.decoded.strips[0], why="best")
     one = replace(one, decoded=replace(one.decoded, strips=(best, one.decoded.strips[1])))
-    film = film_of(one)
+    film = make_video(one)
     assert film.clip.why == "median"
     assert film.clip is one.decoded.strips[1]
     frames, times = [], []
     for file in images(f'{film.url}"{film.still}"'):
-        assert len(file) <= MOST_BYTES
+        assert len(file) <= MAX_VIDEO_BYTES
         for frame in ImageSequence.Iterator(Image.open(io.BytesIO(file))):
             frames.append(np.asarray(frame.convert("RGB"), dtype=float))
             times.append(frame.info.get("duration", 0))
-    assert sum(times) <= 1000 * LONGEST_S
+    assert sum(times) <= 1000 * MAX_VIDEO_S
     for place, name in enumerate(("truth", "base", "adapter")):
         for shown, true in zip(frames, [*film.clip.rows[name], film.clip.rows[name][-1]], strict=True):
             assert np.abs(shown[:256, place * 264 : place * 264 + 256] - true).mean() < 4
@@ -175,7 +175,7 @@ def test_the_page_stays_small_whatever_was_measured(usual: Usual, monkeypatch: p
     noise = rng.integers(0, 256, size=one.examples[0].frames.shape, dtype=np.uint8)
     html = page_of(replace(one, examples=(replace(one.examples[0], frames=noise),) * 6))
     assert len(html.encode()) < 3_000_000
-    assert html.count("data:image/webp") == MOST_CLIPS
+    assert html.count("data:image/webp") == MAX_CLIPS
 
 
 def test_what_was_not_measured_is_named_with_the_reason() -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vjepa2_ac.evaluation.evaluate import Contender, evaluate
+from vjepa2_ac.evaluation.evaluate import EvaluatedModel, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
 from worlds import Oracle, about, again, clips_batch
@@ -37,8 +37,12 @@ class Long(Oracle):
 
 def measured(folder: Path, *, with_base: bool) -> dict[str, Any]:
     """Return the content of the metrics.json of an evaluation, written into a folder."""
-    contenders = [Contender("base", "base", Long())] * with_base + [Contender("adapter", "trained", Short())]
-    path = write_metrics(evaluate(contenders, again(clips_batch()), about(), probes=PROBES), folder / METRICS_FILE)
+    evaluated_models = [EvaluatedModel("base", "base", Long())] * with_base + [
+        EvaluatedModel("adapter", "trained", Short())
+    ]
+    path = write_metrics(
+        evaluate(evaluated_models, again(clips_batch()), about(), probes=PROBES), folder / METRICS_FILE
+    )
     content: dict[str, Any] = json.loads(path.read_text())
     return content
 

@@ -18,7 +18,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject, load_models
-from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, settle
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, resolve_config
 from vjepa2_ac.export import CARD, export_run
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.model_setup import load_to_plan
@@ -59,7 +59,7 @@ def exported(run: str, overrides: list[str]) -> WorldModel:
 
 def evaluated(run: str, overrides: list[str]) -> WorldModel:
     asked = EvaluationOptions(overrides=tuple(overrides))
-    config = settle(run, asked)
+    config = resolve_config(run, asked)
     return load_models(run, config, asked, open_dataset(config.data)).world_model
 
 
@@ -91,10 +91,10 @@ def test_nothing_else_is_changed_on_the_way(run: str, base_folder: Path) -> None
     with pytest.raises(InputError, match="not the folder of a run"):
         load_to_plan(str(base_folder), overrides=["model.base=elsewhere"])
     asked = EvaluationOptions(overrides=(f"model.base={base_folder}", "planning.samples=30"))
-    config = settle(run, asked)
+    config = resolve_config(run, asked)
     assert (config.model.base, config.planning.samples) == (str(base_folder), 30)
     with pytest.raises(InputError, match=r"override: model\.dtype"):
-        settle(run, EvaluationOptions(overrides=("model.dtype=bfloat16",)))
+        resolve_config(run, EvaluationOptions(overrides=("model.dtype=bfloat16",)))
 
 
 STATE = "0.4,0,0.3,3.1,0,0.1,0.2"

@@ -13,6 +13,7 @@ from vjepa2_ac.evaluation.result import (
     L2,
     MODES,
     About,
+    ActionMode,
     ActionRanking,
     Clips,
     DecodedRollouts,
@@ -25,9 +26,8 @@ from vjepa2_ac.evaluation.result import (
     Mode,
     ModelResult,
     PredictionErrors,
-    Way,
 )
-from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import mean_of
 from vjepa2_ac.reports.write import report_page
@@ -57,11 +57,11 @@ def errors(rng: np.random.Generator, level: float, horizon: int, episode_of: np.
 
 
 def _predicted(
-    rng: np.random.Generator, way: Way, level: float, horizon: int, episode_of: np.ndarray
-) -> dict[tuple[Way, Mode, str], np.ndarray]:
+    rng: np.random.Generator, actions: ActionMode, level: float, horizon: int, episode_of: np.ndarray
+) -> dict[tuple[ActionMode, Mode, str], np.ndarray]:
     by_mode = {mode: errors(rng, level, horizon, episode_of) for mode in MODES}
-    of_l2 = {(way, mode, L2.name): values**2 * 1.6 for mode, values in by_mode.items()}
-    return {(way, mode, L1.name): values for mode, values in by_mode.items()} | of_l2
+    of_l2 = {(actions, mode, L2.name): values**2 * 1.6 for mode, values in by_mode.items()}
+    return {(actions, mode, L1.name): values for mode, values in by_mode.items()} | of_l2
 
 
 def ranking_of(ranks: np.ndarray, ids: tuple[str, ...]) -> ActionRanking:
@@ -113,7 +113,7 @@ def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, mo
 
 def page_of(one: Evaluation) -> str:
     """Return the report with the summary that the console shows."""
-    return report_page(one, summarize(one, rows_of(one)))
+    return report_page(one, summarize(one, make_rows(one)))
 
 
 def decoded_strips(one: Evaluation, size: int = 64) -> Evaluation:

@@ -9,8 +9,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
-from vjepa2_ac.evaluation.evaluate_run import Models, load_models
-from vjepa2_ac.evaluation.request import EvaluationOptions, settle
+from vjepa2_ac.evaluation.evaluate_run import LoadedModels, load_models
+from vjepa2_ac.evaluation.request import EvaluationOptions, resolve_config
 from vjepa2_ac.explore.explorer import Explorer, open_explorer
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.simulation.counterfactual import SimulatedFutures
@@ -20,9 +20,9 @@ QUICK = PlanningConfig(samples=12, iterations=2, planner={"name": "cem", "option
 
 def explorer_of(subject: Path, decoder: Path, asked: EvaluationOptions) -> tuple[Explorer, Config]:
     """Return an explorer as the command opens it, and its config."""
-    config = settle(str(subject), asked)
+    config = resolve_config(str(subject), asked)
 
-    def load(dataset: Dataset, decoder: TrainedDecoder) -> Models:
+    def load(dataset: Dataset, decoder: TrainedDecoder) -> LoadedModels:
         return load_models(str(subject), config, asked, dataset, decoder)
 
     return open_explorer(config, load_decoder(decoder), "test", load, SimulatedFutures.of), config

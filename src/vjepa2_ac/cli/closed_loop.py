@@ -201,11 +201,11 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     _require_benchmark(options)
 
     from vjepa2_ac.cli.tables import benchmark_notes, benchmark_table
-    from vjepa2_ac.evaluation.summary import closed_loop
+    from vjepa2_ac.evaluation.summary import closed_loop_verdict
     from vjepa2_ac.simulation.benchmark import write_benchmark
 
     benchmark, folder = _measure(options)
-    verdict = closed_loop(
+    verdict = closed_loop_verdict(
         {result.policy: result.success_rate for result in benchmark.results},
         model=benchmark.results[0].policy,
         oracle=benchmark.results[-1].policy,
@@ -261,12 +261,12 @@ def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
 
 def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse.Namespace) -> Summary:
     """Return a summary of the closed-loop verdict and, if `evaluate` measured this checkpoint, its other verdicts."""
-    from vjepa2_ac.evaluation.summary import PREDICTION, RANKING, SENSITIVITY, Summary, not_measured
+    from vjepa2_ac.evaluation.summary import PREDICTION, RANKING, SENSITIVITY, Summary, not_measured_verdict
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
     subject, trials = benchmark.subject, benchmark.trials
     how = _evaluate_command(options) or "`vjepa2-ac evaluate`"
-    predicts, uses, ranks = (not_measured(name, how) for name in (PREDICTION, SENSITIVITY, RANKING))
+    predicts, uses, ranks = (not_measured_verdict(name, how) for name in (PREDICTION, SENSITIVITY, RANKING))
     measured = f"{trials.task}, {trials.place}, {counted(trials.steps, 'step')} of {trials.seconds_per_step:.2f} s"
     summary = Summary(subject.name, measured, predicts, uses, ranks, verdict)
     if subject.chosen and (Path(subject.name) / METRICS_FILE).is_file():

@@ -18,7 +18,7 @@ _NAMED = ("none", "up", "left", "close")  # default actions of `imagine --image`
 if TYPE_CHECKING:
     from vjepa2_ac.decoding.imagine import Imagination
     from vjepa2_ac.evaluation.result import About
-    from vjepa2_ac.reports.write import Evaluated
+    from vjepa2_ac.reports.write import WrittenEvaluation
 
 
 def add_evaluate(commands: cli.Commands) -> None:
@@ -79,7 +79,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     The predictions are compared with those of the base model, with persistence, and with predictions for wrong actions.
     """
-    from vjepa2_ac.evaluation.request import ProbeOptions, settle
+    from vjepa2_ac.evaluation.request import ProbeOptions, resolve_config
 
     subject = options.subject
     if unused := [word for word in options.overrides if not is_of_moved(word)]:
@@ -87,13 +87,13 @@ def _evaluate(options: argparse.Namespace) -> None:
         fix = "For a second run use --against RUN, or call evaluate again. Other config keys cannot be changed"
         raise InputError(where="command line", found=" ".join(unused), needed=needed, fix=fix)
     request = cli.evaluation_options(options, probes=cli.record_of_options(ProbeOptions, options))
-    cli.require_subject(subject, settle(subject, request), options.words)
+    cli.require_subject(subject, resolve_config(subject, request), options.words)
     cli.say_places_elsewhere(subject)
 
     from vjepa2_ac.cli.tables import row_tables
     from vjepa2_ac.distributed import leave_processes
     from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
-    from vjepa2_ac.evaluation.rows import rows_of
+    from vjepa2_ac.evaluation.rows import make_rows
     from vjepa2_ac.reports.write import write_evaluation
 
     with cli.reporter() as reporter:
@@ -105,7 +105,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         if options.all:
             checkpoint, notes = evaluation.about.checkpoint, evaluation.notes
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
-            tables = row_tables(rows_of(evaluation), "Held-out episodes")
+            tables = row_tables(make_rows(evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
         cli.show(str(measured.summary), *_next(measured, options))
         film = "" if evaluation.decoded is None else "film and "
@@ -113,7 +113,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     leave_processes()
 
 
-def _next(measured: Evaluated, options: argparse.Namespace) -> list[str]:
+def _next(measured: WrittenEvaluation, options: argparse.Namespace) -> list[str]:
     """Return a line with the recommended next command; empty if there is none."""
     about, summary, settings = measured.evaluation.about, measured.summary, options.overrides
     config = options.data or f"{about.subject}/config.yaml"
@@ -207,22 +207,22 @@ def _require_one_start(options: argparse.Namespace) -> None:
 
 def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imagination:
     from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
-    from vjepa2_ac.evaluation.request import settle
+    from vjepa2_ac.evaluation.request import resolve_config
     from vjepa2_ac.simulation.counterfactual import simulated_outcome
 
     cli.say_places_elsewhere(options.subject)
     how = {"evaluation": cli.evaluation_options(options, out=out), "size_m": options.size / 100}
     request = cli.record_of_options(ImagineOptions, options, **how)
-    cli.require_subject(options.subject, settle(options.subject, request.evaluation), options.words)
+    cli.require_subject(options.subject, resolve_config(options.subject, request.evaluation), options.words)
     return imagine_clip(options.subject, request, simulate=simulated_outcome, reporter=reporter)
 
 
 def _of_image(options: argparse.Namespace) -> Imagination:
-    from vjepa2_ac.evaluation.imagined import ImagineOptions, Seen, imagine_image
+    from vjepa2_ac.evaluation.imagined import ImageObservation, ImagineOptions, imagine_image
     from vjepa2_ac.media.images import read_image
 
     cli.require_to_plan(options)
-    observation = Seen(read_image(options.image), options.state, options.extrinsics)
+    observation = ImageObservation(read_image(options.image), options.state, options.extrinsics)
     named = {"actions": options.actions or _NAMED, "size_m": options.size / 100}
     request = cli.record_of_options(ImagineOptions, options, **named)
     return imagine_image(cli.load_planning_session(options), request, observation)

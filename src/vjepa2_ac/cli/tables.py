@@ -13,8 +13,8 @@ from rich.table import Table
 from vjepa2_ac.cli.progress import ConsoleReporter, MetricsTable, console, show, wrapped
 from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import ACTIONS, Validation, one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.rows import Row, sections
-from vjepa2_ac.evaluation.summary import interval_of, percent
+from vjepa2_ac.evaluation.rows import Row, arrange_tables
+from vjepa2_ac.evaluation.summary import format_interval, format_percent
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE
 
@@ -44,7 +44,7 @@ def row_tables(rows: Sequence[Row], title: str) -> list[Table]:
     tables: list[Table] = []
     has_intervals = any(row.estimate.has_interval for row in rows)
     interval_note = "95 % interval over episodes" if has_intervals else "one episode: no interval"
-    shown = sections([row for row in rows if not row.detail])
+    shown = arrange_tables([row for row in rows if not row.detail])
     for columns, group in groupby(shown, lambda section: section.columns):
         sections_of_table = list(group)
         with_chance = any(chance for section in sections_of_table for _, chance, _ in section.lines)
@@ -217,7 +217,7 @@ class TrainingConsole(ConsoleReporter):
         rank = "not measured (needs validation.ranking_clips and clips in which the robot moves)"
         if found.ranking is not None:
             measured = found.ranking.rank
-            share = f"{percent(measured.value)} % {interval_of(measured)}".rstrip()
+            share = f"{format_percent(measured.value)} % {format_interval(measured)}".rstrip()
             rank = f"{share} (0 % is best, chance 50 %)"
         show(
             f"validation at step {step:,}, errors relative to persistence (1: copying the last frame)",

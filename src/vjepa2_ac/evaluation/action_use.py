@@ -53,7 +53,7 @@ class RolloutStart:
         return np.random.default_rng([seed, int.from_bytes(digest, "big")])
 
 
-def start_of(
+def rollout_start(
     batch: LatentBatch, row: int, step: int, *, end: int | None = None, action: Tensor | None = None
 ) -> RolloutStart:
     """Return frame `step` of a clip in a batch as a start.
@@ -76,7 +76,7 @@ def start_of(
     )
 
 
-def gathered_starts(starts: Sequence[RolloutStart], device: torch.device) -> list[RolloutStart]:
+def gather_starts(starts: Sequence[RolloutStart], device: torch.device) -> list[RolloutStart]:
     """Return the starts of all processes that share the work, on the device of this process."""
     return [_on(device, start) for start in gather_shared([_on("cpu", start) for start in starts])]
 
@@ -86,7 +86,7 @@ def _on(device: torch.device | str, start: RolloutStart) -> RolloutStart:
     return replace(start, **moved)
 
 
-def moves_of(batch: LatentBatch, row: int, space: ActionSpace, reach: float) -> tuple[RolloutStart, ...]:
+def select_moves(batch: LatentBatch, row: int, space: ActionSpace, reach: float) -> tuple[RolloutStart, ...]:
     """Return the largest move of a clip within reach, forwards and backwards in time, as two starts.
 
     A move is the change of the state between two frames of the clip, used as one action. If the arm is slow, the scene
@@ -102,7 +102,7 @@ def moves_of(batch: LatentBatch, row: int, space: ActionSpace, reach: float) -> 
         reach: Largest length of a move, in metres; not used for vectors.
     """
     if space.follows != "change":
-        return (start_of(batch, row, int(batch.actions[row].norm(dim=-1).argmax())),)
+        return (rollout_start(batch, row, int(batch.actions[row].norm(dim=-1).argmax())),)
     states = batch.states[row].cpu().numpy().astype(np.float64)
     state_space = vector_states(states.shape[1]) if space.position is None else POSE
     pairs = [(first, last) for first in range(len(states)) for last in range(first + 1, len(states))]
@@ -113,7 +113,7 @@ def moves_of(batch: LatentBatch, row: int, space: ActionSpace, reach: float) -> 
     moves = []
     for first, last in (ends, ends[::-1]):
         change = torch.from_numpy(state_space.differences(states[[first, last]])[0]).to(batch.actions)
-        moves.append(start_of(batch, row, first, end=last, action=change))
+        moves.append(rollout_start(batch, row, first, end=last, action=change))
     return tuple(moves)
 
 
@@ -153,7 +153,7 @@ def _predict(
     return model.predict(frames, actions[:, None], start.state.expand(count, 1, -1), camera)[:, 0].float()
 
 
-def alternatives(
+def draw_alternatives(
     true: Float[np.ndarray, " action_dim"],
     largest: Float[np.ndarray, " action_dim"],
     space: ActionSpace,
@@ -196,7 +196,7 @@ def rank_actions(
     seed: int,
     progress: Progress = no_progress,
 ) -> ActionRanking:
-    """Measure the action-ranking error: rank the true action of each move among `alternatives`.
+    """Measure the action-ranking error: rank the true action of each move among `draw_alternatives`.
 
     Args:
         model: The predictor.
@@ -210,7 +210,7 @@ def rank_actions(
     largest = np.abs([move.true for move in moves]).max(axis=0)
 
     def ranked(move: RolloutStart) -> tuple[float, ...]:
-        drawn = alternatives(move.true, largest, space, probes, move.generator(seed))
+        drawn = draw_alternatives(move.true, largest, space, probes, move.generator(seed))
         evaluated = np.concatenate([move.true[None], drawn])
         (true, *others), (_, *changes) = evaluate_actions(model, move, evaluated, at_once=probes.at_once)
         energies = np.reshape(others, (2, -1))
@@ -277,7 +277,7 @@ def grid_axes(true: Float[np.ndarray, " 3"], half: float, nodes: int) -> Float[n
     return true[:, None] + distance * (np.arange(nodes)[None] - true_node[:, None])
 
 
-def lowest(energy: Float[np.ndarray, ...]) -> Bool[np.ndarray, ...]:
+def minimum_mask(energy: Float[np.ndarray, ...]) -> Bool[np.ndarray, ...]:
     """Return a mask of the nodes with the lowest energy, up to rounding; all nodes if the energy is flat."""
     least = energy.min()
     return np.asarray(energy <= least + SAME_ENERGY * abs(least))
@@ -290,7 +290,7 @@ def _landscape(
     evaluated = np.tile(start.true, (nodes**3, 1))
     evaluated[:, _AXES] = _nodes_of(axes)
     energy = evaluate_actions(model, start, evaluated, at_once=at_once)[0].reshape(nodes, nodes, nodes)
-    minimum = evaluated[lowest(energy).ravel(), _AXES].mean(axis=0)
+    minimum = evaluated[minimum_mask(energy).ravel(), _AXES].mean(axis=0)
     return Landscape(
         episode_id=start.episode_id,
         start=start.first_step,

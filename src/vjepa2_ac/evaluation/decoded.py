@@ -26,8 +26,8 @@ from vjepa2_ac.decoding.decoder import TrainedDecoder, as_images, as_pixels
 from vjepa2_ac.distributed import gather_shared
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.distribution import frechet_distance
-from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips
-from vjepa2_ac.evaluation.measure import prediction
+from vjepa2_ac.evaluation.evaluate import ClipName, EvaluatedModel, FramesOfRow, RepeatableClips
+from vjepa2_ac.evaluation.measure import predict_frames
 from vjepa2_ac.evaluation.result import DecodedRollouts, DecodedStrip, Example
 from vjepa2_ac.intervals import Estimate, ratios
 from vjepa2_ac.media.image_similarity import masked_mean, moving_region, psnr, ssim_map
@@ -46,7 +46,7 @@ Encode = Callable[[Images], Float[Tensor, "batch horizon tokens dim"]]
 
 @torch.no_grad()
 def measure_decoded(
-    contenders: Sequence[Contender],
+    evaluated_models: Sequence[EvaluatedModel],
     clips: RepeatableClips,
     decoder: TrainedDecoder,
     examples: Sequence[Example] = (),
@@ -57,7 +57,7 @@ def measure_decoded(
     """Decode the rollouts of all models with the true actions, and measure them and the baselines in `NEIGHBOURS`.
 
     Args:
-        contenders: The models, in the order of the table.
+        evaluated_models: The models, in the order of the table.
         clips: The clips, which are read once.
         decoder: Decodes latents to images.
         examples: Clips whose images are returned, too.
@@ -66,13 +66,13 @@ def measure_decoded(
     """
     progress = reporter.task("decoded rollouts")
     example_of = {(example.episode_id, example.start): example for example in examples}
-    shown = [contender.name for contender in contenders if contender.role != "other"]
+    shown = [evaluated_model.name for evaluated_model in evaluated_models if evaluated_model.role != "other"]
     ids: list[str] = []
     values: dict[tuple[str, str], list[Float[np.ndarray, "batch horizon"]]] = {}  # by source and metric
     strips: dict[ClipName, DecodedStrip] = {}
     features: dict[str, list[Float[np.ndarray, "batch dim"]]] = {}  # by source
     for batch, frames_of_row in clips.read(None):
-        images = _decoded(batch, contenders, decoder, frames_of_row if clips.has_frames else None)
+        images = _decoded(batch, evaluated_models, decoder, frames_of_row if clips.has_frames else None)
         ids += batch.episode_ids
         for key, metric in _measured(images).items():
             values.setdefault(key, []).append(metric.double().cpu().numpy())
@@ -91,7 +91,7 @@ def measure_decoded(
         count = int((~np.isfinite(array[:, -1])).sum())
         if count and not (name.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # always identical to itself
             left_out[name] = f"{name}, at the last horizon: {count} {_LEFT_OUT}"
-    card, sources = decoder.card, (*NEIGHBOURS, *(contender.name for contender in contenders))
+    card, sources = decoder.card, (*NEIGHBOURS, *(evaluated_model.name for evaluated_model in evaluated_models))
     card_keys = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
     return DecodedRollouts(
         decoder={"folder": decoder.name, "size": card.shape.size} | {name: asdict(card)[name] for name in card_keys},
@@ -124,13 +124,16 @@ class _Images:
 
 
 def _decoded(
-    batch: LatentBatch, contenders: Sequence[Contender], trained: TrainedDecoder, frames_of_row: FramesOfRow | None
+    batch: LatentBatch,
+    evaluated_models: Sequence[EvaluatedModel],
+    trained: TrainedDecoder,
+    frames_of_row: FramesOfRow | None,
 ) -> _Images:
     decoder, latents = trained.decoder, batch.latents
     rollouts = {DECODED_TRUTH: latents[:, 1:], DECODED_PERSISTENCE: latents[:, :1].expand_as(latents[:, 1:])}
-    for contender in contenders:
-        with contender.switched():
-            rollouts[contender.name] = prediction(contender.model, batch)
+    for evaluated_model in evaluated_models:
+        with evaluated_model.prediction_context():
+            rollouts[evaluated_model.name] = predict_frames(evaluated_model.model, batch)
     with torch.autocast(latents.device.type, enabled=False):
         sources = {source: decoder.decode(rollout.float()) for source, rollout in rollouts.items()}
         first = decoder.decode(latents[:, :1].float())

@@ -91,11 +91,11 @@ class LatentSums:
         return np.asarray(self.pooled.mean(axis=1))
 
 
-def distribution_of(predicted: LatentSums, true: LatentSums) -> LatentDistribution:
+def compare_distributions(predicted: LatentSums, true: LatentSums) -> LatentDistribution:
     """Compare the distribution of predicted latents with that of the true latents of the same clips."""
     pairs = zip(predicted.pooled.swapaxes(0, 1), true.pooled.swapaxes(0, 1), strict=True)
     return LatentDistribution(
-        spread=spread_of(predicted, true),
+        spread=relative_spread(predicted, true),
         mmd=tuple(mmd(one, other, true.episode_ids) for one, other in pairs),
         fvd=frechet_distance(predicted.features, true.features),
         variance=tuple(predicted.variances().tolist()),
@@ -122,14 +122,14 @@ def frechet_distance(one: Float[np.ndarray, "clips dim"], other: Float[np.ndarra
     return float(np.square(means[0] - means[1]).sum() + np.square(left).sum() + np.square(right).sum() - 2 * common)
 
 
-def distance_of_halves(true: LatentSums) -> float:
+def frechet_distance_of_halves(true: LatentSums) -> float:
     """Return the Fréchet distance between the true clips of every second episode and the remaining true clips."""
     _, episode_of = np.unique(np.array(true.episode_ids), return_inverse=True)
     is_even = episode_of % 2 == 0
     return frechet_distance(true.features[is_even], true.features[~is_even])
 
 
-def spread_of(predicted: LatentSums, true: LatentSums) -> tuple[Estimate, ...]:
+def relative_spread(predicted: LatentSums, true: LatentSums) -> tuple[Estimate, ...]:
     """Return the spread at each horizon: trace of the covariance over clips, predicted divided by true; no intervals.
 
     The values are NaN for a single clip.

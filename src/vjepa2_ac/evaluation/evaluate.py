@@ -20,27 +20,28 @@ from vjepa2_ac.distributed import gather_shared
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_use import (
     RolloutStart,
-    gathered_starts,
+    gather_starts,
     measure_landscapes,
-    moves_of,
     rank_actions,
-    start_of,
+    rollout_start,
+    select_moves,
 )
-from vjepa2_ac.evaluation.distribution import LatentSums, distance_of_halves, distribution_of
+from vjepa2_ac.evaluation.distribution import LatentSums, compare_distributions, frechet_distance_of_halves
 from vjepa2_ac.evaluation.measure import (
-    VALIDATED,
+    VALIDATION_PREDICTIONS,
     Predictor,
-    joined,
-    measured,
-    no_clips,
-    prediction,
-    with_other_actions,
+    concatenate_errors,
+    measure_errors,
+    no_readable_clips,
+    predict_frames,
+    with_shuffled_actions,
 )
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
     L1,
     PERSISTENCE,
     About,
+    ActionMode,
     Clips,
     Evaluation,
     Example,
@@ -49,7 +50,6 @@ from vjepa2_ac.evaluation.result import (
     ModelResult,
     PredictionErrors,
     Role,
-    Way,
     registered_metrics,
 )
 from vjepa2_ac.model.distances import absolute_difference
@@ -62,13 +62,14 @@ FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  
 
 
 @dataclass(frozen=True)
-class Contender:
+class EvaluatedModel:
     """A model to measure."""
 
     name: str
     role: Role
     model: Predictor
-    switched: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext  # while it predicts
+    # Context in which the model predicts, for models that share weights.
+    prediction_context: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext
 
 
 @dataclass(frozen=True)
@@ -79,12 +80,12 @@ class RepeatableClips:
     read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]  # None: all of this process
     space: ActionSpace = POSE_CHANGE  # meaning of the actions
     has_frames: bool = True  # False for cached latents, which have small frames only
-    before: Float[Tensor, "1 time action_dim"] | None = None  # see `with_other_actions`
+    before: Float[Tensor, "1 time action_dim"] | None = None  # see `with_shuffled_actions`
     device: torch.device = _CPU  # device of the latents
 
 
 def evaluate(
-    contenders: Sequence[Contender],
+    evaluated_models: Sequence[EvaluatedModel],
     clips: RepeatableClips,
     about: About,
     *,
@@ -95,7 +96,7 @@ def evaluate(
     """Measure models on the same clips.
 
     Args:
-        contenders: The models, in the order of the table; one of them has the role "trained".
+        evaluated_models: The models, in the order of the table; one of them has the role "trained".
         clips: One or more clips.
         about: Description of the evaluation.
         metrics: Metrics of the errors, L1 first; None: all registered metrics.
@@ -103,37 +104,37 @@ def evaluate(
         reporter: Shows the progress of each part of the work.
     """
     probes, metrics = probes or ProbeOptions(), metrics or registered_metrics()
-    sums = _collect(contenders, clips, probes, metrics, reporter.task("measuring"))
-    known = clips_of(sums.actions, sums.names, space=clips.space, seconds_per_step=about.seconds_per_step)
+    sums = _collect(evaluated_models, clips, probes, metrics, reporter.task("measuring"))
+    known = describe_clips(sums.actions, sums.names, space=clips.space, seconds_per_step=about.seconds_per_step)
     width, starts = sums.actions.shape[-1], sums.starts
     is_moving = {name: bool(steps.any()) for name, steps in zip(sums.names, known.moving, strict=True)}
     moving = [start for start in starts if is_moving[start.episode_id, start.first_step]] or starts
     mapped = [moving[index] for index in spread_indices(len(moving), probes.landscape_clips)]
     models: dict[str, ModelResult] = {}
-    for contender in contenders:
-        model, name = contender.model, contender.name
+    for evaluated_model in evaluated_models:
+        model, name = evaluated_model.model, evaluated_model.name
         ranking, landscapes = None, None
-        with contender.switched():
+        with evaluated_model.prediction_context():
             if starts:
                 task = reporter.task(f"action ranking, {name}")
                 ranking = rank_actions(model, sums.moves, clips.space, probes, seed=about.seed, progress=task)
             if mapped and width >= 3:
                 task = reporter.task(f"energy landscapes, {name}")
                 landscapes = measure_landscapes(model, mapped, clips.space, probes, task)
-        distribution = distribution_of(sums.predicted[name], sums.true)
-        errors = joined(sums.errors[name])
-        models[name] = ModelResult(name, contender.role, errors, landscapes, ranking, distribution)
+        distribution = compare_distributions(sums.predicted[name], sums.true)
+        errors = concatenate_errors(sums.errors[name])
+        models[name] = ModelResult(name, evaluated_model.role, errors, landscapes, ranking, distribution)
     errors = next(result.errors for result in models.values() if result.role == "trained")
     note = f"No energy landscapes: an action has {width} numbers, and a landscape is over three."
     return Evaluation(
         about=about,
         clips=known,
         models=models,
-        examples=_examples(contenders, clips, known, errors, probes.examples),
+        examples=_examples(evaluated_models, clips, known, errors, probes.examples),
         notes=(note,) if mapped and width < 3 else (),
         metrics=metrics,
-        copies=distribution_of(sums.copies, sums.true),
-        fvd_of_halves=distance_of_halves(sums.true),
+        copies=compare_distributions(sums.copies, sums.true),
+        fvd_of_halves=frechet_distance_of_halves(sums.true),
     )
 
 
@@ -152,42 +153,46 @@ class _Collected:
 
 
 def _collect(
-    contenders: Sequence[Contender],
+    evaluated_models: Sequence[EvaluatedModel],
     clips: RepeatableClips,
     probes: ProbeOptions,
     metrics: Sequence[Metric],
     progress: Progress,
 ) -> _Collected:
-    batches = with_other_actions((batch for batch, _ in clips.read(None)), clips.before)
+    batches = with_shuffled_actions((batch for batch, _ in clips.read(None)), clips.before)
     first = list(itertools.islice(batches, 1))
     if not (
         origins := gather_shared([batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first])
     ):
-        raise no_clips()
-    predicted = {one.name: LatentSums(origins[0]) for one in contenders}
-    errors: dict[str, list[PredictionErrors]] = {one.name: [] for one in contenders}
+        raise no_readable_clips()
+    predicted = {one.name: LatentSums(origins[0]) for one in evaluated_models}
+    errors: dict[str, list[PredictionErrors]] = {one.name: [] for one in evaluated_models}
     true, copies = LatentSums(origins[0]), LatentSums(origins[0])
     actions, names = list[np.ndarray](), list[ClipName]()
     starts, moves = list[RolloutStart](), list[RolloutStart]()
     probed = {clips.names[index] for index in spread_indices(len(clips.names), probes.ranking_clips)}
 
-    def add(ids: Sequence[str], name: str, way: Way, mode: Mode, latents: torch.Tensor) -> None:
-        if (way, mode) == ("true", "rollout"):
+    def add(ids: Sequence[str], name: str, actions: ActionMode, mode: Mode, latents: torch.Tensor) -> None:
+        if (actions, mode) == ("true", "rollout"):
             predicted[name].add(latents, ids)
 
-    for batch, others in itertools.chain(first, batches):
+    for batch, shuffled_actions in itertools.chain(first, batches):
         true.add(batch.latents[:, 1:], batch.episode_ids)
         copies.add(batch.latents[:, :1].expand_as(batch.latents[:, 1:]), batch.episode_ids)
-        for contender in contenders:
-            watch = partial(add, batch.episode_ids, contender.name)
-            with contender.switched():
-                errors[contender.name].append(measured(contender.model, batch, VALIDATED, metrics, others, watch))
+        for evaluated_model in evaluated_models:
+            on_prediction = partial(add, batch.episode_ids, evaluated_model.name)
+            with evaluated_model.prediction_context():
+                errors[evaluated_model.name].append(
+                    measure_errors(
+                        evaluated_model.model, batch, VALIDATION_PREDICTIONS, metrics, shuffled_actions, on_prediction
+                    )
+                )
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             names.append(name)
             if name in probed:
                 largest = int(batch.actions[row][:, clips.space.sized].norm(dim=-1).argmax())
-                starts.append(start_of(batch, row, largest))
-                moves += moves_of(batch, row, clips.space, probes.reach_cm / 100)
+                starts.append(rollout_start(batch, row, largest))
+                moves += select_moves(batch, row, clips.space, probes.reach_cm / 100)
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
         progress(len(names), len(clips.names))
     names = gather_shared(names)
@@ -198,17 +203,21 @@ def _collect(
         copies=LatentSums.joined(gather_shared([copies])),
         actions=np.concatenate(gather_shared(actions)),
         names=names,
-        starts=gathered_starts(starts, clips.device),
-        moves=gathered_starts(moves, clips.device),
+        starts=gather_starts(starts, clips.device),
+        moves=gather_starts(moves, clips.device),
     )
 
 
 @torch.no_grad()
 def _examples(
-    contenders: Sequence[Contender], clips: RepeatableClips, known: Clips, errors: PredictionErrors, count: int
+    evaluated_models: Sequence[EvaluatedModel],
+    clips: RepeatableClips,
+    known: Clips,
+    errors: PredictionErrors,
+    count: int,
 ) -> tuple[Example, ...]:
     """Choose the example clips by their errors, and read them again with their frames."""
-    chosen = chosen_clips(errors, known.action_size.sum(axis=1), count)
+    chosen = select_example_clips(errors, known.action_size.sum(axis=1), count)
     if not chosen:
         return ()
     reasons = {(known.episode_ids[clip], known.starts[clip]): why for clip, why in chosen.items()}
@@ -217,9 +226,11 @@ def _examples(
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             true = batch.latents[row].float().cpu()
             predicted = {PERSISTENCE: true[:1]}
-            for contender in contenders:
-                with contender.switched():
-                    predicted[contender.name] = prediction(contender.model, batch.clip(row))[0].float().cpu()
+            for evaluated_model in evaluated_models:
+                with evaluated_model.prediction_context():
+                    predicted[evaluated_model.name] = (
+                        predict_frames(evaluated_model.model, batch.clip(row))[0].float().cpu()
+                    )
             errors_of = {
                 source: rearrange(
                     absolute_difference(values, true[1:]).mean(dim=-1),
@@ -241,7 +252,7 @@ GRIP = 0.05  # change of the gripper's closedness in a model step
 _IDLE_SHARE = 0.1  # for actions that are not poses: limit of the norm, as a share of its 95th percentile
 
 
-def clips_of(
+def describe_clips(
     actions: Float[np.ndarray, "clips horizon action_dim"],
     names: Sequence[ClipName],
     *,
@@ -273,7 +284,7 @@ def clips_of(
     return Clips(episode_ids, starts, size, moves | turns | grips, words)
 
 
-def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], count: int) -> dict[int, str]:
+def select_example_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], count: int) -> dict[int, str]:
     """Return the indices of the clips to show, with the reasons: most motion; best, worst and median relative error.
 
     The relative error is the L1 error divided by that of persistence.
@@ -284,7 +295,7 @@ def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], c
         count: Largest number of clips.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        trained, persistence = (errors.of("rollout", L1, way).mean(axis=1) for way in ("true", "persistence"))
+        trained, persistence = (errors.of("rollout", L1, actions).mean(axis=1) for actions in ("true", "persistence"))
         ratios = trained / persistence
     order = np.argsort(np.nan_to_num(ratios, nan=np.inf, posinf=np.inf), kind="stable")
     clips_by_reason = {

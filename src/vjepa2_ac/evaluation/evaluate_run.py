@@ -24,9 +24,9 @@ from vjepa2_ac.encoding.encode_dataset import use_finished_cache
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, measure_decoded
-from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
-from vjepa2_ac.evaluation.measure import actions_before
-from vjepa2_ac.evaluation.request import EvaluationOptions, settle
+from vjepa2_ac.evaluation.evaluate import ClipName, EvaluatedModel, FramesOfRow, RepeatableClips, evaluate
+from vjepa2_ac.evaluation.measure import previous_clip_actions
+from vjepa2_ac.evaluation.request import EvaluationOptions, resolve_config
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation
 from vjepa2_ac.model.lora import base_only
 from vjepa2_ac.model.world_model import WorldModel
@@ -44,11 +44,11 @@ _NO_BASE = "There is no base to compare with: it takes states or actions of othe
 
 
 @dataclass(frozen=True, eq=False)
-class Models:
+class LoadedModels:
     """A run or a model under evaluation, and the models that it is compared with."""
 
     subject: Subject
-    contenders: tuple[Contender, ...]  # all models; the base model first and the subject last
+    evaluated_models: tuple[EvaluatedModel, ...]  # all models; the base model first and the subject last
     notes: tuple[str, ...]  # notes on the models
 
     @property
@@ -56,58 +56,66 @@ class Models:
         """The model of the subject."""
         return self.subject.world_model
 
-    def put_on(self, device: torch.device) -> None:
+    def move_to(self, device: torch.device) -> None:
         """Move all predictors and the subject's encoder, which all models share, to a device; set eval mode."""
-        for each in self.contenders:
+        for each in self.evaluated_models:
             if isinstance(each.model, WorldModel):
                 each.model.predictor.to(device).eval()
         self.world_model.to(device).eval()
 
 
 def load_models(
-    name: str, config: Config, asked: EvaluationOptions, dataset: Dataset, decoder: TrainedDecoder | None = None
-) -> Models:
+    name: str, config: Config, options: EvaluationOptions, dataset: Dataset, decoder: TrainedDecoder | None = None
+) -> LoadedModels:
     """Load a run or a model, and the models to compare it with, on the CPU. Cheap checks come first.
 
     Args:
         name: The folder of a run; or a model, as in `model.base`.
-        config: The config that `settle` returned.
-        asked: The options; `checkpoint` and `against` are used.
+        config: The config that `resolve_config` returned.
+        options: The options; `checkpoint` and `against` are used.
         dataset: The data of the evaluation.
         decoder: The decoder, if latents will be decoded.
 
     Raises:
         InputError: A model cannot be loaded, or does not fit the data, the decoder, or the other models.
     """
-    subject = load_subject(name, asked.checkpoint, config=config)
+    subject = load_subject(name, options.checkpoint, config=config)
     world_model, is_of_run, is_base = subject.world_model, subject.checkpoint is not None, subject.is_base
     require_widths(world_model, dataset.widths, where=name)
     notes = list(subject.warnings)
     if decoder is not None:
         notes += decoder.require_fit(world_model, config.data, subject=name)
-    against = asked.against if asked.against is not None else (BASE,) * is_of_run
+    against = options.against if options.against is not None else (BASE,) * is_of_run
     against = tuple(other for other in against if other != BASE) if is_base else against  # measure the base model once
-    contenders: list[Contender] = []
+    evaluated_models: list[EvaluatedModel] = []
     if BASE in against and config.model.is_random:
-        if asked.against is not None:
+        if options.against is not None:
             found, needed = "a model without a base (model.base: random)", "a base to compare with"
             raise InputError(where="--against base", found=found, needed=needed, fix="Leave out --against base")
     elif BASE in against and not is_of_run:
         base_model = _load_like(name, world_model, config.model.base, config, dataset.widths)
-        contenders.append(Contender(BASE, "base", base_model))
+        evaluated_models.append(EvaluatedModel(BASE, "base", base_model))
     elif BASE in against and world_model.fresh_heads is not None:
         notes.append(_NO_BASE)
     elif BASE in against:
-        contenders.append(Contender(BASE, "base", world_model, partial(base_only, world_model)))
+        evaluated_models.append(EvaluatedModel(BASE, "base", world_model, partial(base_only, world_model)))
     is_adapter = world_model.adaptation is not None and world_model.adaptation.kind == "lora"
     subject_label = BASE if is_base else "adapter" if is_adapter else "model"
     for other in against:
         if other != BASE:
-            reserved = {each.name for each in contenders} | {subject_label, BASE, PERSISTENCE, TRUE_FRAMES, *NEIGHBOURS}
+            reserved = {each.name for each in evaluated_models} | {
+                subject_label,
+                BASE,
+                PERSISTENCE,
+                TRUE_FRAMES,
+                *NEIGHBOURS,
+            }
             label = Path(other).name if Path(other).name not in reserved else other
             other_model = _load_like(name, world_model, other, config, dataset.widths)
-            contenders.append(Contender(label, "other", other_model))
-    return Models(subject, (*contenders, Contender(subject_label, "trained", world_model)), tuple(notes))
+            evaluated_models.append(EvaluatedModel(label, "other", other_model))
+    return LoadedModels(
+        subject, (*evaluated_models, EvaluatedModel(subject_label, "trained", world_model)), tuple(notes)
+    )
 
 
 def _load_like(subject: str, world_model: WorldModel, other: str, config: Config, widths: Widths) -> WorldModel:
@@ -130,42 +138,42 @@ def _load_like(subject: str, world_model: WorldModel, other: str, config: Config
     return loaded
 
 
-def evaluate_subject(subject: str, asked: EvaluationOptions, *, reporter: Reporter = SILENT) -> Evaluation:
+def evaluate_subject(subject: str, options: EvaluationOptions, *, reporter: Reporter = SILENT) -> Evaluation:
     """Measure a run or a model on held-out episodes, in one process or shared by several. Cheap checks come first.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
-        asked: The options.
+        options: The options.
         reporter: Shows the progress of each part of the work.
 
     Raises:
         InputError: The subject, the data, the decoder, or a model to compare with cannot be used; the split is empty;
             or the output folder cannot be written.
     """
-    config = settle(subject, asked)
+    config = resolve_config(subject, options)
     with join_processes(config) as accelerator:
-        run_on_first(accelerator, partial(_require_places, subject, asked))
-        decoder = None if asked.decoder is None else load_decoder(asked.decoder)
+        run_on_first(accelerator, partial(_require_places, subject, options))
+        decoder = None if options.decoder is None else load_decoder(options.decoder)
         progress = reporter.task("looking through the data")
         dataset = run_first_per_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
-        chosen = validation_windows(dataset, asked.split, clips=asked.clips)
+        chosen = validation_windows(dataset, options.split, clips=options.clips)
         reporter.task(LOADING)
-        loaded = load_models(subject, config, asked, dataset, decoder)
+        loaded = load_models(subject, config, options, dataset, decoder)
         world_model, device = loaded.world_model, accelerator.device
         through_cache = use_finished_cache(config, dataset, world_model)
         if through_cache.config.is_cache and decoder is None:
             world_model.set_encoder_aside()
-        loaded.put_on(device)
+        loaded.move_to(device)
         with accelerator.autocast(), share_work(accelerator):
             clips = _clips(through_cache, chosen, config, world_model, device)
-            about = _about(loaded.subject, config, dataset, asked)
-            evaluation = evaluate(loaded.contenders, clips, about, probes=asked.probes, reporter=reporter)
+            about = _about(loaded.subject, config, dataset, options)
+            evaluation = evaluate(loaded.evaluated_models, clips, about, probes=options.probes, reporter=reporter)
             decoded = None
             if decoder is not None:
                 encode = partial(_encoded, world_model)
                 decoder.to(device)
                 decoded = measure_decoded(
-                    loaded.contenders, clips, decoder, evaluation.examples, encode=encode, reporter=reporter
+                    loaded.evaluated_models, clips, decoder, evaluation.examples, encode=encode, reporter=reporter
                 )
     is_of_run = loaded.subject.checkpoint is not None
     warnings = [f"In training, {text}." for text in warnings_of(Path(subject) / METRICS)] if is_of_run else []
@@ -180,11 +188,11 @@ def _encoded(
     return world_model.encode(pixels_to_input(pixels, world_model.image_size))
 
 
-def _require_places(subject: str, asked: EvaluationOptions) -> None:
+def _require_places(subject: str, options: EvaluationOptions) -> None:
     """Check that a run has the requested checkpoint, and that the output folder can be written."""
-    folder = asked.out or Path(subject)
+    folder = options.out or Path(subject)
     if is_run(subject):
-        select_checkpoint(Path(subject), asked.checkpoint)
+        select_checkpoint(Path(subject), options.checkpoint)
     with translate_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         check_local_writable(folder)
@@ -212,11 +220,11 @@ def _clips(
         for batch in read_windows(selected, batch_size=batch_size):
             yield encode(batch), partial(frames, batch)
 
-    before = actions_before(part, windows, partial(read_windows, batch_size=1))
+    before = previous_clip_actions(part, windows, partial(read_windows, batch_size=1))
     return RepeatableClips(tuple(by_name), read, dataset.spaces.action, not dataset.config.is_cache, before, device)
 
 
-def _about(subject: Subject, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:
+def _about(subject: Subject, config: Config, dataset: Dataset, options: EvaluationOptions) -> About:
     data = dataset.config
     return About(
         subject=subject.name,
@@ -225,7 +233,7 @@ def _about(subject: Subject, config: Config, dataset: Dataset, asked: Evaluation
         source=data.source,
         data=data.path,
         cameras=tuple(data.cameras),
-        split=asked.split,
+        split=options.split,
         frames=data.frames,
         stride=data.model_stride,
         seconds_per_step=data.model_stride / dataset.control_rate_hz,

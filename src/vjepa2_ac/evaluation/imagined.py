@@ -23,7 +23,7 @@ from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError, UserError, counted
 from vjepa2_ac.evaluation.evaluate_run import load_models
-from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
+from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, resolve_config
 from vjepa2_ac.planning.controller import Decision
 from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, named_actions, read_actions
 from vjepa2_ac.planning.decision import PlanResult
@@ -44,7 +44,7 @@ TRUE = "true"  # name of the recorded actions
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ImageObservation:
     """A camera image, and the state of the robot at the same time."""
 
     image: UInt8[np.ndarray, "height width 3"]
@@ -65,14 +65,14 @@ class ImagineOptions:
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, split
 
 
-def imagine_image(session: Subject, asked: ImagineOptions, seen: Seen) -> Imagination:
+def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservation) -> Imagination:
     """Predict and decode the frames after an image, for actions by name or from files.
 
     With `planning.views` above 1 the image contains the views of several cameras, as for a planner.
 
     Args:
         session: The model, and the config with the crop and the limits.
-        asked: Decoder, actions (names of directions, or files), number of steps, and their size.
+        options: Decoder, actions (names of directions, or files), number of steps, and their size.
         seen: The image and the state before the first action.
 
     Raises:
@@ -80,13 +80,13 @@ def imagine_image(session: Subject, asked: ImagineOptions, seen: Seen) -> Imagin
     """
     require_one_process()
     model, config = session.world_model, session.config
-    decoder = load_decoder(asked.decoder)
+    decoder = load_decoder(options.decoder)
     warnings = decoder.require_fit(model, config.data, subject=session.name)
     decoder.to(model.device)
     space = measured_space(config.data, len(seen.state))
     _require_directions(space, where="--state")
     limits = config.planning.limits
-    chosen = {name: _actions_by_name(name, asked.steps, asked.size_m, limits) for name in asked.actions}
+    chosen = {name: _actions_by_name(name, options.steps, options.size_m, limits) for name in options.actions}
     camera = None if seen.extrinsics is None else torch.as_tensor(seen.extrinsics, dtype=torch.float32).to(model.device)
     views = config.planning.views
     latents = encode_frames(model, seen.image[None], config.data.crop, views=views)
@@ -130,34 +130,34 @@ def _actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig)
 
 
 def imagine_clip(
-    subject: str, asked: ImagineOptions, *, simulate: Simulate | None = None, reporter: Reporter = SILENT
+    subject: str, options: ImagineOptions, *, simulate: Simulate | None = None, reporter: Reporter = SILENT
 ) -> Imagination:
     """Predict and decode a held-out clip with each model, for the recorded actions and for counterfactual actions.
 
     Args:
         subject: The folder of a run; or a model, with data in `evaluation`.
-        asked: The options.
+        options: The options.
         simulate: Simulates the outcome of other actions; if this fails, a note gives the reason.
         reporter: Shows the progress.
 
     Raises:
         InputError: Subject, data, decoder, clip or actions cannot be used.
     """
-    decoder = load_decoder(asked.decoder)
+    decoder = load_decoder(options.decoder)
     require_one_process()
-    config = settle(subject, asked.evaluation)
-    config = config.model_copy(update={"data": config.data.model_copy(update={"frames": asked.steps + 1})})
+    config = resolve_config(subject, options.evaluation)
+    config = config.model_copy(update={"data": config.data.model_copy(update={"frames": options.steps + 1})})
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     require_frames(config.data, to="show what is true")
-    window = _window(dataset, asked)
+    window = _window(dataset, options)
     reporter.task(LOADING)
-    models = load_models(subject, config, asked.evaluation, dataset, decoder)
-    models.put_on(accelerator.device)
+    models = load_models(subject, config, options.evaluation, dataset, decoder)
+    models.move_to(accelerator.device)
     decoder.to(accelerator.device)
     (batch,) = read_batches(dataset, [window], batch_size=1)
     size = models.world_model.image_size
-    chosen = _actions_of(asked, batch, dataset, limits=config.planning.limits)
+    chosen = _actions_of(options, batch, dataset, limits=config.planning.limits)
     assert batch.frames is not None  # noqa: S101  # `require_frames` refuses cached latents
     frames = to_display_frames(batch.frames[0].numpy(), size)
     truths: dict[str, tuple[Frames, np.ndarray | None]] = {AS_RECORDED: (frames[1:], None)}
@@ -173,8 +173,8 @@ def imagine_clip(
         latents = encode_batch(models.world_model, batch, device=accelerator.device)
         start, states = Start.of(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
         for name, actions in chosen.items():
-            for model in models.contenders:
-                with model.switched():
+            for model in models.evaluated_models:
+                with model.prediction_context():
                     rollout = rolled_out(model.model.rollout, start, actions, states if name == AS_RECORDED else None)
                 truth = truths.get(name, (None, None))
                 rollouts.append(Imagined(model.name, name, actions, shown(decoder.decoder, rollout), *truth))
@@ -193,33 +193,33 @@ def imagine_clip(
     )
 
 
-def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig) -> dict[str, np.ndarray]:
+def _actions_of(options: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig) -> dict[str, np.ndarray]:
     recorded = batch.actions[0].double().numpy()
     chosen: dict[str, np.ndarray] = {}
-    for word in asked.actions:
+    for word in options.actions:
         if word == TRUE:
             chosen[AS_RECORDED] = recorded
             continue
         _require_directions(dataset.spaces.state, where=f"--actions {word}", fix="Give --actions true")
         name = word if word in ACTION_NAMES else Path(word).name  # with its suffix, so that it equals no action name
-        chosen[word if name in chosen else name] = _actions_by_name(word, len(recorded), asked.size_m, limits)
+        chosen[word if name in chosen else name] = _actions_by_name(word, len(recorded), options.size_m, limits)
     return chosen
 
 
-def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
+def _window(dataset: Dataset, options: ImagineOptions) -> tuple[int, int]:
     """Return the episode and the first control step of the clip to show."""
-    lengths, clip, split = dataset.table.num_steps, dataset.config.clip_steps, asked.evaluation.split
-    if asked.episode is None:
+    lengths, clip, split = dataset.table.num_steps, dataset.config.clip_steps, options.evaluation.split
+    if options.episode is None:
         members = dataset.split_mask(split)[dataset.episodes]
         longest = int(lengths[dataset.episodes[members]].max(initial=0))
         if 0 < longest < clip:
             most = (longest - 1) // dataset.config.model_stride
-            found = f"{counted(asked.steps, 'model step')}, and the longest {split} episode has {most}"
+            found = f"{counted(options.steps, 'model step')}, and the longest {split} episode has {most}"
             raise InputError(where="--steps", found=found, needed=f"{most} at most")
         windows = validation_windows(dataset, split, clips=_SEARCHED)
         return max(windows, key=lambda window: _motion(dataset, *window))
-    episode = find_episode(dataset, asked.episode)
-    start, last = asked.start or 0, int(lengths[episode]) - clip
+    episode = find_episode(dataset, options.episode)
+    start, last = options.start or 0, int(lengths[episode]) - clip
     if not 0 <= start <= last:
         needed = f"0 to {last}: a clip takes {counted(clip, 'control step')}" if last >= 0 else "a longer episode"
         found, fix = f"{start}, in an episode of {counted(lengths[episode], 'step')}", "Lower --steps or --start"

@@ -21,17 +21,22 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.distributed import gather_shared
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.result import L1, MODES, Metric, Mode, PredictionErrors, Way
+from vjepa2_ac.evaluation.result import L1, MODES, ActionMode, Metric, Mode, PredictionErrors
 
 _Window = TypeVar("_Window")
-VALIDATED: tuple[tuple[Way, Mode], ...] = (  # rollouts take longest, so they are made with the true actions only
+VALIDATION_PREDICTIONS: tuple[
+    tuple[ActionMode, Mode], ...
+] = (  # rollouts take longest, so they are made with the true actions only
     *(("true", mode) for mode in MODES),
     *(("persistence", mode) for mode in MODES),
     ("zero", "teacher_forced"),
     ("shuffled", "teacher_forced"),
 )
 _MOST_FRAMES = 8  # frames of a clip: as in the training of the released weights, and short enough for large strides
-ONE_STEP: tuple[tuple[Way, Mode], ...] = (("true", "teacher_forced"), ("persistence", "teacher_forced"))
+ONE_STEP_PREDICTIONS: tuple[tuple[ActionMode, Mode], ...] = (
+    ("true", "teacher_forced"),
+    ("persistence", "teacher_forced"),
+)
 
 
 @runtime_checkable
@@ -66,13 +71,13 @@ class ClipSample:
 
 
 @torch.no_grad()
-def measured(
+def measure_errors(
     model: Predictor,
     batch: LatentBatch,
-    predictions: Sequence[tuple[Way, Mode]],
+    predictions: Sequence[tuple[ActionMode, Mode]],
     metrics: Sequence[Metric],
-    others: Float[Tensor, "batch time action_dim"] | None = None,
-    watch: Callable[[Way, Mode, Float[Tensor, "batch horizon tokens dim"]], None] | None = None,
+    shuffled_actions: Float[Tensor, "batch time action_dim"] | None = None,
+    on_prediction: Callable[[ActionMode, Mode, Float[Tensor, "batch horizon tokens dim"]], None] | None = None,
 ) -> PredictionErrors:
     """Return the errors of a model on a batch of clips.
 
@@ -81,33 +86,33 @@ def measured(
         batch: The clips.
         predictions: The predictions to make.
         metrics: The metrics of the errors.
-        others: The actions of other clips, required for predictions with shuffled actions.
-        watch: Called with each prediction, since predictions are not stored.
+        shuffled_actions: The actions of other clips, required for predictions with shuffled actions.
+        on_prediction: Called with each prediction, since predictions are not stored.
     """
-    arrays: dict[tuple[Way, Mode, str], Float[np.ndarray, "clips horizon"]] = {}
-    for way, mode in predictions:
-        predicted = prediction(model, batch, way, mode, others)
-        if watch is not None:
-            watch(way, mode, predicted)
+    arrays: dict[tuple[ActionMode, Mode, str], Float[np.ndarray, "clips horizon"]] = {}
+    for actions, mode in predictions:
+        predicted = predict_frames(model, batch, actions, mode, shuffled_actions)
+        if on_prediction is not None:
+            on_prediction(actions, mode, predicted)
         for metric in metrics:
             errors = metric.of(predicted, batch.latents[:, 1:])
-            arrays[way, mode, metric.name] = np.asarray(errors.cpu().numpy(), dtype=np.float64)
+            arrays[actions, mode, metric.name] = np.asarray(errors.cpu().numpy(), dtype=np.float64)
     return PredictionErrors(batch.episode_ids, arrays)
 
 
-def joined(parts: Sequence[PredictionErrors]) -> PredictionErrors:
+def concatenate_errors(parts: Sequence[PredictionErrors]) -> PredictionErrors:
     """Concatenate the errors of several batches.
 
     Raises:
         InputError: There are no batches.
     """
     if not parts:
-        raise no_clips()
+        raise no_readable_clips()
     arrays = {key: np.concatenate([part.arrays[key] for part in parts]) for key in parts[0].arrays}
     return PredictionErrors(tuple(name for part in parts for name in part.episode_ids), arrays)
 
 
-def no_clips() -> InputError:
+def no_readable_clips() -> InputError:
     """Return the error that none of the clips can be read."""
     fix = "Repair or fetch these episodes again, or add them to data.exclude"
     return InputError(where="data.path", found="none of the clips can be read: their episodes are broken", fix=fix)
@@ -121,13 +126,20 @@ def prediction_errors(
 ) -> PredictionErrors:
     """Measure a model with the predictions of a validation, batch by batch, so that no latents are stored.
 
-    If several processes share the work, each passes its batches, and `before` as for `with_other_actions`.
+    If several processes share the work, each passes its batches, and `before` as for `with_shuffled_actions`.
     """
-    pairs = with_other_actions(batches, before)
-    return joined(gather_shared([measured(model, batch, VALIDATED, metrics, others) for batch, others in pairs]))
+    pairs = with_shuffled_actions(batches, before)
+    return concatenate_errors(
+        gather_shared(
+            [
+                measure_errors(model, batch, VALIDATION_PREDICTIONS, metrics, shuffled_actions)
+                for batch, shuffled_actions in pairs
+            ]
+        )
+    )
 
 
-def actions_before(
+def previous_clip_actions(
     own: range, windows: Sequence[_Window], read: Callable[[list[_Window]], Iterator[Batch]]
 ) -> Float[Tensor, "1 time action_dim"] | None:
     """Return the actions of the clip before this process's first clip, which are the first clip's shuffled actions.
@@ -149,7 +161,7 @@ def actions_before(
     return next(islice(readable, 1, None), None)
 
 
-def with_other_actions(
+def with_shuffled_actions(
     batches: Iterable[LatentBatch], before: Float[Tensor, "1 time action_dim"] | None = None
 ) -> Iterator[tuple[LatentBatch, Float[Tensor, "batch time action_dim"]]]:
     """Yield each batch with the shuffled actions of its clips: those of the previous clip, for any batch size.
@@ -169,19 +181,23 @@ def with_other_actions(
         before = batch.actions[-1:]
 
 
-def prediction(
-    model: Predictor, batch: LatentBatch, way: Way = "true", mode: Mode = "rollout", others: Tensor | None = None
+def predict_frames(
+    model: Predictor,
+    batch: LatentBatch,
+    actions: ActionMode = "true",
+    mode: Mode = "rollout",
+    shuffled_actions: Tensor | None = None,
 ) -> Float[Tensor, "batch horizon tokens dim"]:
     """Return the predictions of all frames after the first.
 
     The states are the true ones for all actions, and can reveal the motion. The increase of the error with zero or
     shuffled actions is therefore a lower bound.
     """
-    seen = batch.latents[:, :1] if mode == "rollout" else batch.latents[:, :-1]
-    if way == "persistence":
-        return seen.expand_as(batch.latents[:, 1:])
-    actions = {"true": batch.actions, "zero": torch.zeros_like(batch.actions)}
-    actions |= {} if others is None else {"shuffled": others}
+    context = batch.latents[:, :1] if mode == "rollout" else batch.latents[:, :-1]
+    if actions == "persistence":
+        return context.expand_as(batch.latents[:, 1:])
+    action_tensors = {"true": batch.actions, "zero": torch.zeros_like(batch.actions)}
+    action_tensors |= {} if shuffled_actions is None else {"shuffled": shuffled_actions}
     extrinsics = None if batch.extrinsics is None else batch.extrinsics[:, :-1]
     predict = model.rollout if mode == "rollout" else model.predict
-    return predict(seen, actions[way], batch.states[:, :-1], extrinsics)
+    return predict(context, action_tensors[actions], batch.states[:, :-1], extrinsics)

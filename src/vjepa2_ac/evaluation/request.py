@@ -45,22 +45,22 @@ class EvaluationOptions:
     overrides: Sequence[str] = ()  # of the config: planning.…, and model.base=PATH for a run whose base model was moved
 
 
-def settle(subject: str, asked: EvaluationOptions) -> Config:
+def resolve_config(subject: str, options: EvaluationOptions) -> Config:
     """Return the config for an evaluation, with the overrides applied.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
-        asked: The options.
+        options: The options.
 
     Raises:
         InputError: The subject is not a run and there are no data, a setting is invalid, or a folder is missing.
     """
-    config = _config_of(subject, asked)
-    for override in asked.overrides:
+    config = _config_of(subject, options)
+    for override in options.overrides:
         if not (override.startswith("planning.") or (is_run(subject) and is_of_moved(override))):
             needed = "keys of planning, such as planning.samples=200; or, for a run, model.base=PATH"
             raise InputError(where="override", found=override, needed=needed)
-    config = parse_config(config_as_dict(config), asked.overrides, where="overrides")
+    config = parse_config(config_as_dict(config), options.overrides, where="overrides")
     return with_taught_limits(config, Path(subject)) if is_run(subject) else config
 
 
@@ -76,10 +76,10 @@ def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
         raise InputError(where="torchrun", found=counted(int(processes), "process"), needed=needed, fix=fix)
 
 
-def _config_of(subject: str, asked: EvaluationOptions) -> Config:
+def _config_of(subject: str, options: EvaluationOptions) -> Config:
     """Return the config of a run (with other data, if given), or the config of the data for a model."""
     run_config = read_run_config(Path(subject)) if is_run(subject) else None
-    if asked.data is None:
+    if options.data is None:
         if run_config is None:
             raise InputError(
                 where=subject,
@@ -88,8 +88,8 @@ def _config_of(subject: str, asked: EvaluationOptions) -> Config:
                 fix="To measure a model, name the data with --data CONFIG and a folder with --out",
             )
         return run_config
-    if asked.out is None:
+    if options.out is None:
         found, needed = "metrics.json of a run's own folder is for its own data", "a folder for what is found on these"
         raise InputError(where="--data without --out", found=found, needed=needed, fix="Add --out FOLDER")
-    require_stride(asked.data.data, to="evaluate")
-    return asked.data if run_config is None else run_config.model_copy(update={"data": asked.data.data})
+    require_stride(options.data.data, to="evaluate")
+    return options.data if run_config is None else run_config.model_copy(update={"data": options.data.data})

@@ -56,7 +56,7 @@ def registered_metrics() -> tuple[Metric, ...]:
 
 Mode = Literal["teacher_forced", "rollout"]
 Actions = Literal["true", "zero", "shuffled"]
-Way = Literal["true", "zero", "shuffled", "persistence"]  # actions of a prediction, or a copy of the given frame
+ActionMode = Literal["true", "zero", "shuffled", "persistence"]  # actions of a prediction, or a copy of the given frame
 Role = Literal["base", "trained", "other"]
 
 MODES: tuple[Mode, ...] = ("teacher_forced", "rollout")
@@ -90,8 +90,8 @@ class Clips:
     episode_ids: tuple[str, ...]
     starts: tuple[int, ...]  # first control step of each clip
     action_size: Float[np.ndarray, "clips horizon"]  # |dx, dy, dz| in cm; for vectors: the norm of the action
-    moving: Bool[np.ndarray, "clips horizon"]  # whether the robot moves in each step, by the rule in `moving_means`
-    moving_means: str  # the rule, as text
+    moving: Bool[np.ndarray, "clips horizon"]  # whether the robot moves in each step, by the rule in `moving_rule`
+    moving_rule: str  # the rule, as text
 
     def __len__(self) -> int:
         return len(self.episode_ids)
@@ -112,19 +112,21 @@ class PredictionErrors:
     """
 
     episode_ids: tuple[str, ...]
-    arrays: Mapping[tuple[Way, Mode, str], Float[np.ndarray, "clips horizon"]]  # key: way, mode, name of the metric
+    arrays: Mapping[
+        tuple[ActionMode, Mode, str], Float[np.ndarray, "clips horizon"]
+    ]  # key: actions, mode, name of the metric
 
-    def of(self, mode: Mode, metric: Metric = L1, way: Way = "true") -> Float[np.ndarray, "clips horizon"]:
+    def of(self, mode: Mode, metric: Metric = L1, actions: ActionMode = "true") -> Float[np.ndarray, "clips horizon"]:
         """Return the errors for a mode, a metric, and the actions of the prediction."""
-        return self.arrays[way, mode, metric.name]
+        return self.arrays[actions, mode, metric.name]
 
 
 @dataclass(frozen=True)
 class ActionRanking:
     """The action-ranking error: the fraction of alternative actions with a lower energy than the true action.
 
-    It is measured on moves (`action_use.moves_of`) as large as planned actions, forwards and backwards in time. Chance
-    is 0.5; a perfect model has 0. The errors of two models on the same moves can be compared in pairs.
+    It is measured on moves (`action_use.select_moves`) as large as planned actions, forwards and backwards in time.
+    Chance is 0.5; a perfect model has 0. The errors of two models on the same moves can be compared in pairs.
     """
 
     samples: int  # alternatives per move in the box, and the same number on the shell
@@ -338,9 +340,9 @@ Curve = tuple[Estimate, ...]  # at horizon 1, 2, ...; index h - 1
 Steps = Bool[np.ndarray, "clips horizon"]  # True for steps to include
 
 
-def over_persistence(errors: PredictionErrors, mode: Mode, metric: Metric = L1, way: Way = "true") -> Curve:
+def over_persistence(errors: PredictionErrors, mode: Mode, metric: Metric = L1, actions: ActionMode = "true") -> Curve:
     """Return the mean error relative to persistence's at each horizon: 1 is as good as persistence; 0 is perfect."""
-    return ratios(errors.of(mode, metric, way), errors.of(mode, metric, "persistence"), errors.episode_ids)
+    return ratios(errors.of(mode, metric, actions), errors.of(mode, metric, "persistence"), errors.episode_ids)
 
 
 def one_step_over_persistence(
@@ -374,7 +376,7 @@ def rank_difference(one: ActionRanking, other: ActionRanking) -> Estimate:
     return mean_of(one.ranks - other.ranks, one.episode_ids)
 
 
-def _one_step(errors: PredictionErrors, way: Way, steps: Steps | None = None) -> np.ndarray:
+def _one_step(errors: PredictionErrors, actions: ActionMode, steps: Steps | None = None) -> np.ndarray:
     """Return the mean teacher-forced L1 error of each clip, or the sum over the selected steps."""
-    values = errors.of("teacher_forced", L1, way)
+    values = errors.of("teacher_forced", L1, actions)
     return np.asarray(values.mean(axis=1) if steps is None else (values * steps).sum(axis=1))

@@ -74,7 +74,7 @@ class RowTable:
     lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, value by chance or of persistence, cells by column
 
 
-def sections(rows: Sequence[Row]) -> list[RowTable]:
+def arrange_tables(rows: Sequence[Row]) -> list[RowTable]:
     """Arrange rows as tables: rows with the same key form a line, with a column for each model."""
     by_key: dict[str, dict[str, Row]] = {}
     for row in rows:
@@ -96,7 +96,7 @@ def _section(title: str, lines: Sequence[Mapping[str, Row]]) -> RowTable:
     return RowTable(title, columns, tuple(cells))
 
 
-def rows_of(evaluation: Evaluation) -> list[Row]:
+def make_rows(evaluation: Evaluation) -> list[Row]:
     """Return every number of an evaluation."""
     rows = _Rows(evaluation)
     rows.add_errors()

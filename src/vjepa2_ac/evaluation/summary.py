@@ -70,7 +70,7 @@ class Verdict:
         if self.value is None or self.low is None or self.high is None:
             return ""
         if self.unit == "%":
-            return interval_of(Estimate(self.value, self.low, self.high))
+            return format_interval(Estimate(self.value, self.low, self.high))
         return f"[{self.low:z.1f}, {self.high:z.1f}]"
 
 
@@ -160,7 +160,7 @@ def _with_fixed_units(text: str) -> str:
 
 
 def summarize(evaluation: Evaluation, rows: Sequence[Row]) -> Summary:
-    """Return the summary of an evaluation from its rows (`rows.rows_of`)."""
+    """Return the summary of an evaluation from its rows (`rows.make_rows`)."""
     clips, model = evaluation.clips, evaluation.models[evaluation.trained]
     trained_rows = {row.key: row for row in rows if row.model == evaluation.trained}
     base_rows = {row.key: row for row in rows if row.model == evaluation.base}
@@ -212,7 +212,7 @@ def _are_too_few(number: int, what: str) -> str:
     return f"{counted(number, what)} {'is' if number == 1 else 'are'} {_TOO_FEW}"
 
 
-def not_measured(name: str, how: str) -> Verdict:
+def not_measured_verdict(name: str, how: str) -> Verdict:
     """Return a verdict "not measured", with the command that measures it."""
     return Verdict(name, "not measured", f"measured by {how}")
 
@@ -228,19 +228,19 @@ def with_closed_loop(summary: Summary, run: Path, checkpoint: str) -> Summary:
     return summary
 
 
-def percent(share: float) -> str:
+def format_percent(share: float) -> str:
     """Return a share in percent, with one decimal below 10 %."""
     return f"{100 * share:z.0f}" if abs(share) >= 0.0995 else f"{100 * share:z.1f}"
 
 
-def interval_of(share: Estimate) -> str:
+def format_interval(share: Estimate) -> str:
     """Return the interval of a share in percent, without the share's sign; empty without an interval."""
     form = "z.0f" if abs(share.value) >= 0.0995 else "z.1f"
     low, high = (share.low, share.high) if share.value >= 0 else (-share.high, -share.low)
     return f"[{100 * low:{form}}, {100 * high:{form}}]" if share.has_interval else ""
 
 
-def conclusion_of(gain: Estimate, same: float) -> Conclusion:
+def draw_conclusion(gain: Estimate, same: float) -> Conclusion:
     """Return yes or no if the interval of a gain is on one side of 0 or within `same` of 0, else inconclusive."""
     if max(abs(gain.low), abs(gain.high)) < same:
         return "no"
@@ -268,7 +268,7 @@ def _predicts(evaluation: Evaluation, rows: Mapping[str, Row], base_rows: Mappin
     if gain is not None:
         verdict = _verdict_on_gain(gain.estimate, _BASE, ahead)
         remarks = [
-            f"by {metric.label} {_amount(other.estimate, 'better', 'worse')} {interval_of(other.estimate)}".rstrip()
+            f"by {metric.label} {_amount(other.estimate, 'better', 'worse')} {format_interval(other.estimate)}".rstrip()
             for metric in evaluation.metrics
             if (other := rows.get(f"rollout.{metric.name}.gain_over_base.{horizon}"))
             and other.estimate.side(of=0.0) != gain.estimate.side(of=0.0)
@@ -297,18 +297,18 @@ def _blur(rows: Mapping[str, Row], base_rows: Mapping[str, Row], horizon: int) -
 def _verdict_on_gain(gain: Estimate, compared_with: str, ahead: str) -> Verdict:
     reference = "the base model's" if compared_with == _BASE else f"that of {compared_with}"
     statement = f"error {_amount(gain, 'lower', 'higher')} than {reference}, {ahead}"
-    return _verdict(PREDICTION, conclusion_of(gain, SAME_ERROR), statement, gain, compared_with)
+    return _verdict(PREDICTION, draw_conclusion(gain, SAME_ERROR), statement, gain, compared_with)
 
 
 def _amount(change: Estimate, positive: str, negative: str) -> str:
     """Return a relative change in percent, with one of two words for its sign."""
-    return f"{percent(abs(change.value))} % {positive if change.value >= 0 else negative}"
+    return f"{format_percent(abs(change.value))} % {positive if change.value >= 0 else negative}"
 
 
 def _uses_actions(rows: Mapping[str, Row], ranks_actions: Verdict) -> Verdict:
     """Conclude from the one-step error with shuffled actions; yes also requires action ranking better than chance."""
     cost, gap = (rows[f"{name}.shuffled"].estimate for name in ("cost_of_actions", "gap_of_actions"))
-    conclusion, reference, compared_with = conclusion_of(gap, SAME_ERROR), "", "shuffled actions"
+    conclusion, reference, compared_with = draw_conclusion(gap, SAME_ERROR), "", "shuffled actions"
     low, high = ranks_actions.low, ranks_actions.high
     if conclusion == "yes" and low is not None and high is not None and high >= CHANCE:
         conclusion, compared_with = "no" if low > CHANCE else "inconclusive", _CHANCE
@@ -321,14 +321,14 @@ def _ranks_actions(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Ver
     """Conclude from the action-ranking error: yes if it is below the base model's and below chance."""
     key = "ranking.rank"
     if key not in rows:
-        return not_measured(RANKING, "`vjepa2-ac evaluate --ranking-clips 32`")
+        return not_measured_verdict(RANKING, "`vjepa2-ac evaluate --ranking-clips 32`")
     rank = rows[key].estimate
-    statement = f"action-ranking error {percent(rank.value)} %"
-    conclusion, reference, compared_with = conclusion_of(rank.below(CHANCE), SAME_RANK), "chance 50 %", _CHANCE
+    statement = f"action-ranking error {format_percent(rank.value)} %"
+    conclusion, reference, compared_with = draw_conclusion(rank.below(CHANCE), SAME_RANK), "chance 50 %", _CHANCE
     if (difference := rows.get("ranking.difference_to_base")) is not None:
         if conclusion == "yes":
-            conclusion, compared_with = conclusion_of(difference.estimate.below(0.0), SAME_RANK), _BASE
-        reference = f"base model {percent(base_rows[key].value)} %, {reference}"
+            conclusion, compared_with = draw_conclusion(difference.estimate.below(0.0), SAME_RANK), _BASE
+        reference = f"base model {format_percent(base_rows[key].value)} %, {reference}"
     verdict = _verdict(RANKING, conclusion, statement, rank, compared_with)
     return replace(verdict, reference=f"({reference})", baseline=CHANCE)
 
@@ -342,11 +342,11 @@ def _landscape(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict
     if key not in rows:
         return None
     distance, chance, unit = rows[key].estimate, rows[key].chance or 0.0, rows[key].unit
-    conclusion, compared_with = conclusion_of(distance.below(chance), 0.0), _CHANCE
+    conclusion, compared_with = draw_conclusion(distance.below(chance), 0.0), _CHANCE
     references = [f"random point {_with_unit(chance, unit)}", f"sharpness {rows[sharpness].value:#.2g}"]
     if (difference := rows.get("landscapes.distance.difference_to_base")) is not None:
         if conclusion == "yes":
-            conclusion, compared_with = conclusion_of(difference.estimate.below(0.0), 0.0), _BASE
+            conclusion, compared_with = draw_conclusion(difference.estimate.below(0.0), 0.0), _BASE
         references.insert(0, f"base model {_with_unit(base_rows[key].value, unit)}")
         references[-1] += f", base model {base_rows[sharpness].value:#.2g}"
     statement = f"energy minimum {_with_unit(distance.value, unit)} from the true action"
@@ -358,7 +358,7 @@ def _with_unit(number: float, unit: str) -> str:
     return f"{number:.1f} {unit}".rstrip()
 
 
-def closed_loop(
+def closed_loop_verdict(
     shares: Mapping[str, Estimate], model: str, oracle: str, problems: int, task: str, conditions: str = ""
 ) -> Verdict:
     """Conclude from the success rates in closed loop: yes if the model's exceeds those of all policies but the oracle.
@@ -379,12 +379,14 @@ def closed_loop(
     conclusion: Conclusion = "yes" if share.low > best.high else "no" if is_not_better else "inconclusive"
     needs = ""
     if reference.value < CHANCE:
-        solved = f"The oracle solves only {percent(reference.value)} % of these problems"
+        solved = f"The oracle solves only {format_percent(reference.value)} % of these problems"
         needs = f"{solved}, so they cannot be used for comparison; raise --steps."
     elif problems < ENOUGH_EPISODES:
         needs = f"{_are_too_few(problems, 'problem')}; use --episodes 50."
-    others = ", ".join(f"{name} {percent(rate.value)} %" for name, rate in shares.items() if name != model)
-    statement = f"success rate {percent(share.value)} % on {counted(problems, f'{task} problem')} {conditions}".rstrip()
+    others = ", ".join(f"{name} {format_percent(rate.value)} %" for name, rate in shares.items() if name != model)
+    statement = (
+        f"success rate {format_percent(share.value)} % on {counted(problems, f'{task} problem')} {conditions}".rstrip()
+    )
     competitors = "the zero action and random actions"
     verdict = _verdict(PLANNING, "inconclusive" if needs else conclusion, statement, share, competitors)
     return replace(verdict, reference=f"({others})", needs=needs, baseline=best.value)

@@ -26,7 +26,7 @@ from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate_run import Models
+from vjepa2_ac.evaluation.evaluate_run import LoadedModels
 from vjepa2_ac.model.predictor import KeyValueCache
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.energy import EnergySlice, Goal, Scene, WorldModelCost, distance, energy_slices
@@ -84,7 +84,7 @@ class Explorer:
 
     def __init__(
         self,
-        models: Models,
+        models: LoadedModels,
         decoder: TrainedDecoder,
         dataset: Dataset,
         episodes: tuple[int, ...],
@@ -104,7 +104,7 @@ class Explorer:
         Raises:
             InputError: The data do not define which state follows from an action.
         """
-        self.world_model, self.contenders, self.notes = models.world_model, models.contenders, models.notes
+        self.world_model, self.evaluated_models, self.notes = models.world_model, models.evaluated_models, models.notes
         self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
         self.simulate = simulate
         if self.spaces.action.follows == "unknown":
@@ -112,7 +112,7 @@ class Explorer:
             needed = "data.actions: difference; or join_actions: sum or last"
             raise InputError(where="data.actions: recorded", found=found, needed=needed)
         self._pair = lru_cache(maxsize=256)(self._read_pair)
-        self._end = lru_cache(maxsize=_KEPT_STEPS * len(self.contenders))(self._imagine)
+        self._end = lru_cache(maxsize=_KEPT_STEPS * len(self.evaluated_models))(self._imagine)
 
     @property
     def spaces(self) -> Spaces:
@@ -238,7 +238,7 @@ class Explorer:
         """Return the predicted latents at the end of a path; without actions the true ones.
 
         Args:
-            teller: Index of the model in `contenders`.
+            teller: Index of the model in `evaluated_models`.
             place: The start frame and the actions.
         """
         return self._end(teller, place)[0]
@@ -257,13 +257,13 @@ class Explorer:
         cache, camera = cache.copy(), self.camera(place)
         action, state = (torch.as_tensor(x, dtype=torch.float32, device=self.device) for x in (values, states[-2]))
         inputs = before[None, None], action[None, None], state[None, None]
-        with self.autocast(), self.contenders[teller].switched():
+        with self.autocast(), self.evaluated_models[teller].prediction_context():
             predicted = self.model(teller).predict(*inputs, None if camera is None else camera[None, None], cache)
         return predicted[0, 0].float(), cache
 
     def model(self, teller: int) -> WorldModel:
-        """Return a model. Use it within `contenders[teller].switched()`, because models share weights."""
-        model = self.contenders[teller].model
+        """Return a model. Use it within its `prediction_context()`, because models share weights."""
+        model = self.evaluated_models[teller].model
         assert isinstance(model, WorldModel)  # noqa: S101  # `load_subject` loads no other
         return model
 
@@ -285,7 +285,7 @@ def open_explorer(
     config: Config,
     decoder: TrainedDecoder,
     split: Split,
-    load: Callable[[Dataset, TrainedDecoder], Models],
+    load: Callable[[Dataset, TrainedDecoder], LoadedModels],
     simulate: Callable[[Dataset], Simulate | None] = lambda _: None,
     reporter: Reporter = SILENT,
 ) -> Explorer:
@@ -309,7 +309,7 @@ def open_explorer(
     require_frames(config.data, to="show what is true")
     reporter.task(LOADING)
     models = load(dataset, decoder)
-    models.put_on(accelerator.device)
+    models.move_to(accelerator.device)
     decoder.to(accelerator.device)
     members = dataset.split_mask(split)[dataset.episodes]
     long_enough = dataset.table.num_steps[dataset.episodes] > config.data.model_stride
@@ -411,6 +411,6 @@ class Search:
         explorer = self._explorer
         state = torch.from_numpy(np.array(explorer.states(place)[-1], dtype=np.float32))
         scene = Scene(explorer.imagined(teller, place), state, explorer.camera(place))
-        with explorer.autocast(), explorer.contenders[teller].switched():
+        with explorer.autocast(), explorer.evaluated_models[teller].prediction_context():
             goals, config = Goal(goal[None]), self.config.energy
             yield WorldModelCost(explorer.model(teller), scene, goals, config, spaces=explorer.spaces)

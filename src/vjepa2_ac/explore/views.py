@@ -84,7 +84,7 @@ class Views:
         content = {
             "subject": self.subject,
             "notes": explorer.notes,
-            "tellers": [{"id": one.name, "label": one.name} for one in explorer.contenders],
+            "tellers": [{"id": one.name, "label": one.name} for one in explorer.evaluated_models],
             "truth": "recorded" if explorer.simulate is None else "simulated",
             "episodes": [
                 {"name": name, "full": explorer.name(index), "steps": explorer.steps(index)}
@@ -167,7 +167,7 @@ class Views:
         zero_action = (0.0,) * len(self.explorer.spaces.state)
         for attempt in range(2):
             began, place = time.perf_counter(), Place(0, 0, (zero_action,) * (attempt + 1))
-            for teller in range(len(self.explorer.contenders)):
+            for teller in range(len(self.explorer.evaluated_models)):
                 self.explorer.decoded(self.explorer.imagined(teller, place))
         return time.perf_counter() - began
 
@@ -193,8 +193,8 @@ class Views:
         images += [] if outcome is None else [Image("truth", outcome.pixels, f"what really happens, {known}")]
         images += [] if goal is None else [Image("goal", goal.pixels, "the goal frame")]
         tellers = []
-        for number, contender in enumerate(explorer.contenders):
-            latents, name = explorer.imagined(number, place), contender.name
+        for number, evaluated_model in enumerate(explorer.evaluated_models):
+            latents, name = explorer.imagined(number, place), evaluated_model.name
             images.append(Image(f"imagined-{name}", explorer.decoded(latents), f"what {name} imagines"))
             errors = None if outcome is None or not place.actions else mean_difference(latents, outcome.latents)
             if errors is not None:
@@ -242,7 +242,7 @@ class Views:
         return colour_errors(errors.float().reshape(grid, grid).cpu().numpy(), (size, size)).astype(np.uint8)
 
     def _searched(self, request: PageRequest, place: Place, progress: Progress, cancelled: Cancelled) -> bytes:
-        names = [contender.name for contender in self.explorer.contenders]
+        names = [evaluated_model.name for evaluated_model in self.explorer.evaluated_models]
         moment = self._goal(request)
         if moment is None or request.teller not in names:
             raise InputError(where=request.kind, found="no goal, or no model", needed="both")

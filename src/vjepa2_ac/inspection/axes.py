@@ -25,7 +25,7 @@ from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import counted
-from vjepa2_ac.evaluation.action_use import RolloutStart, start_of
+from vjepa2_ac.evaluation.action_use import RolloutStart, rollout_start
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.inspection.variants import load_named
 from vjepa2_ac.intervals import Estimate, bootstrapped, ratio
@@ -214,7 +214,7 @@ def calibrate_axes(
     with torch.no_grad():
         for batch in validation_batches(dataset, split, clips=pairs, batch_size=config.validation.batch_size):
             latents = encode(batch)
-            starts += [start_of(latents, row, 0) for row in range(len(batch.starts))]
+            starts += [rollout_start(latents, row, 0) for row in range(len(batch.starts))]
     fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("turning the axes"))
     data = config.data
     return fit, {

@@ -27,7 +27,7 @@ from vjepa2_ac.distributed import broadcast_object, make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_same_encoder, require_widths
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, EpisodeSource, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.evaluation.measure import ONE_STEP, ClipSample, Predictor, measured
+from vjepa2_ac.evaluation.measure import ONE_STEP_PREDICTIONS, ClipSample, Predictor, measure_errors
 from vjepa2_ac.evaluation.result import L1
 from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.model.checkpoints import load_base
@@ -150,8 +150,8 @@ def _read(
 
 
 def _measured(model: Predictor, latents: LatentBatch) -> VariantErrors:
-    result = measured(model, latents, ONE_STEP, (L1,))
-    errors = np.stack([result.of("teacher_forced", L1, kind).mean(axis=1) for kind, _ in ONE_STEP], axis=1)
+    result = measure_errors(model, latents, ONE_STEP_PREDICTIONS, (L1,))
+    errors = np.stack([result.of("teacher_forced", L1, kind).mean(axis=1) for kind, _ in ONE_STEP_PREDICTIONS], axis=1)
     return dict(zip(zip(latents.episode_ids, latents.starts, strict=True), errors, strict=True))
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from vjepa2_ac.errors import InputError, counted, shell_command
 from vjepa2_ac.evaluation.result import L1
 from vjepa2_ac.evaluation.rows import Row
-from vjepa2_ac.evaluation.summary import Verdict, percent
+from vjepa2_ac.evaluation.summary import Verdict, format_percent
 from vjepa2_ac.intervals import Estimate, bootstrapped
 from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
 from vjepa2_ac.runs.checkpoint import SAME_RANK, step_of
@@ -67,7 +67,7 @@ class Comparison:
             return f"Whether the errors differ is not measured: {self._too_few}"
         if not (side := gains[best].side(of=0.0)):
             return f"The errors of {best} and {first} do not differ significantly."
-        low, value, high = (percent(one) for one in sorted(map(abs, astuple(gains[best]))))
+        low, value, high = (format_percent(one) for one in sorted(map(abs, astuple(gains[best]))))
         change = f"{value} % {'lower' if side > 0 else 'higher'}"
         interval = f"95 % CI {low} to {high} %, n = {counted(measured.clips.episodes, 'episode')}"
         return f"The error of {best} is {change} than that of {first} ({interval})."

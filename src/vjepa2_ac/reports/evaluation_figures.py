@@ -77,7 +77,7 @@ def plot_comparison(comparison: Comparison, path: Path) -> Path:
 Draw = Callable[[Any, Evaluation], None]  # draws an evaluation on a Matplotlib figure
 
 
-def drawings(evaluation: Evaluation) -> Iterator[tuple[str, str, tuple[float, float], Draw]]:
+def evaluation_plots(evaluation: Evaluation) -> Iterator[tuple[str, str, tuple[float, float], Draw]]:
     """Yield the plots of an evaluation: part of the page, description, width and height in inches, draw function."""
     yield "errors", "Open-loop L1 error over persistence by horizon", (6.4, 3.6), draw_errors
     yield "actions", "One-step error with other actions", (6.4, 3.0), draw_use_of_actions

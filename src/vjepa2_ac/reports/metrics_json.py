@@ -18,8 +18,8 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from vjepa2_ac.errors import InputError, MissingFileError, shell_command
-from vjepa2_ac.evaluation.result import L1, About, Evaluation, Way
-from vjepa2_ac.evaluation.rows import Row, rows_of
+from vjepa2_ac.evaluation.result import L1, About, ActionMode, Evaluation
+from vjepa2_ac.evaluation.rows import Row, make_rows
 from vjepa2_ac.evaluation.summary import Summary, summarize
 from vjepa2_ac.storage import translate_read_errors, write_atomically
 from vjepa2_ac.storage.structured import describe_validation_error, format_json
@@ -82,7 +82,7 @@ class Metrics:
         return next((row for row in self.rows if row.key == key and row.model == name), None)
 
 
-def not_measured(one: Evaluation) -> dict[str, str]:
+def missing_parts(one: Evaluation) -> dict[str, str]:
     """Return the parts of an evaluation that were not measured, with the reasons."""
     model = one.models[one.trained]
     parts = {**vars(one), **vars(model), "base": one.base}
@@ -122,7 +122,7 @@ def read_metrics(folder: Path) -> Metrics:
 
 def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> dict[str, Any]:
     """Return all metrics as plain values; see docs/evaluation_reference.md for the meaning of each."""
-    one, clips, decoded, rows = evaluation, evaluation.clips, evaluation.decoded, rows_of(evaluation)
+    one, clips, decoded, rows = evaluation, evaluation.clips, evaluation.decoded, make_rows(evaluation)
     summary = summary or summarize(one, rows)
     named = list(zip(clips.episode_ids, clips.starts, strict=True))
     metrics = {
@@ -134,7 +134,7 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
         "clips": {
             "count": len(clips),
             "episodes": clips.episodes,
-            "moving_means": clips.moving_means,
+            "moving_means": clips.moving_rule,
             "fingerprint": hashlib.sha256(json.dumps(named).encode()).hexdigest()[:16],
             "named": named,
         },
@@ -148,7 +148,10 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
                 for metric in one.metrics
             },
             "one_step": {
-                name: {way: model.errors.of("teacher_forced", way=way).mean(1) for way in get_args(Way)}
+                name: {
+                    actions: model.errors.of("teacher_forced", actions=actions).mean(1)
+                    for actions in get_args(ActionMode)
+                }
                 for name, model in one.models.items()
             },
         },
@@ -158,7 +161,7 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
         },
         "decoded": None if decoded is None else {"decoder": decoded.decoder, "notes": decoded.notes},
         "notes": one.notes,
-        "not_measured": not_measured(one),
+        "not_measured": missing_parts(one),
     }
     plain: dict[str, Any] = to_jsonable_python(
         metrics, inf_nan_mode="null", fallback=lambda array: _rounded(array.tolist())

@@ -24,20 +24,20 @@ from markupsafe import Markup, escape
 from vjepa2_ac.episode import short_names
 from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import L1, Curve, DecodedStrip, Evaluation, Example, over_persistence
-from vjepa2_ac.evaluation.rows import Row, RowTable, rows_of, sections
-from vjepa2_ac.evaluation.summary import Summary, Verdict, interval_of, percent, summarize, with_closed_loop
+from vjepa2_ac.evaluation.rows import Row, RowTable, arrange_tables, make_rows
+from vjepa2_ac.evaluation.summary import Summary, Verdict, format_interval, format_percent, summarize, with_closed_loop
 from vjepa2_ac.media.figure import draw_strip, figure_to_svg, replace_hidden_characters
 from vjepa2_ac.media.images import encode_webp
-from vjepa2_ac.reports.evaluation_figures import decoded_strip, drawings, example_strip, plot_evaluation
-from vjepa2_ac.reports.metrics_json import METRICS_FILE, not_measured, write_csv, write_metrics
+from vjepa2_ac.reports.evaluation_figures import decoded_strip, evaluation_plots, example_strip, plot_evaluation
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, missing_parts, write_csv, write_metrics
 from vjepa2_ac.storage import write_atomically
 
 PLOT, REPORT = "evaluation.png", "report.html"
-MOST_CLIPS = 4  # largest number of example clips, and of decoded clips
+MAX_CLIPS = 4  # largest number of example clips, and of decoded clips
 _BYTES = 3_000_000  # largest size of all clips together
 _AT_AN_END = 10.0  # margin on both sides of a bar, in percent of its width
-LONGEST_S = 6.0  # longest duration of the video, in seconds
-MOST_BYTES = 600_000  # largest size of the video
+MAX_VIDEO_S = 6.0  # longest duration of the video, in seconds
+MAX_VIDEO_BYTES = 600_000  # largest size of the video
 _STEP_S, _FIRST_S, _LAST_S = 0.5, 1.2, 1.8  # display times of the middle, first and last frames
 _QUALITIES = (85, 70, 50, 30, 10)
 _THIN = 32  # width of an image divided by the width of a gap or the height of the progress bar
@@ -79,7 +79,7 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
     The same evaluation and summary give the same bytes. The page stays below 5 MB: numbers of clips, points of curves
     and episodes are limited, and images of clips have the best quality that fits.
     """
-    rows = rows_of(evaluation)
+    rows = make_rows(evaluation)
     environment = Environment(
         loader=PackageLoader("vjepa2_ac", "assets"),
         autoescape=True,
@@ -90,12 +90,15 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(
-        map(replace_hidden_characters, name.split("/"))
-    )
-    environment.filters |= {"quote": shlex.quote, "bar": bar_of, "percent": percent, "interval": interval_of}
-    environment.filters |= {"coded": coded, "count": counted}
-    environment.filters["figure"] = lambda row: f"{percent(row.value)} %" if row.better else f"{row.value:.2f}"
+    environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(replace_hidden_characters, name.split("/")))
+    environment.filters |= {
+        "quote": shlex.quote,
+        "bar": bar_positions,
+        "percent": format_percent,
+        "interval": format_interval,
+    }
+    environment.filters |= {"coded": code_markup, "count": counted}
+    environment.filters["figure"] = lambda row: f"{format_percent(row.value)} %" if row.better else f"{row.value:.2f}"
     environment.filters["baseline"] = lambda one: (
         f"{100 * one.baseline:.0f} %" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
     )
@@ -103,15 +106,15 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         evaluation=evaluation,
         verdicts=summary,
         tiles=_tiles(evaluation, rows, summary),
-        film=film_of(evaluation),
+        film=make_video(evaluation),
         parts=_parts(evaluation, rows),
-        missing=not_measured(evaluation),
+        missing=missing_parts(evaluation),
         short=short_names(evaluation.clips.episode_ids),
         style=Markup(resources.files("vjepa2_ac").joinpath("assets/report.css").read_text("utf-8")),  # noqa: S704
     )
 
 
-def coded(text: str) -> Markup:
+def code_markup(text: str) -> Markup:
     """Return a text as HTML; text between backticks becomes code."""
     parts = [escape(replace_hidden_characters(part)) for part in text.split("`")]
     if len(parts) % 2 == 0:  # an unpaired backtick
@@ -119,7 +122,7 @@ def coded(text: str) -> Markup:
     return Markup("").join(Markup("<code>{}</code>").format(part) if n % 2 else part for n, part in enumerate(parts))
 
 
-def bar_of(verdict: Verdict) -> dict[str, float]:
+def bar_positions(verdict: Verdict) -> dict[str, float]:
     """Return the positions of a verdict's number, interval and baseline on a bar, in percent of its width."""
     value = verdict.value
     if value is None:
@@ -136,11 +139,11 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
     for row in rows:
         of_part[next(name for name, (_, keys) in _PARTS.items() if re.match(keys, row.key))].append(row)
     images: dict[str, list[PageImage]] = {name: [] for name in _PARTS} | _clips(evaluation)
-    for part, described, (width, height), draw in drawings(evaluation):
+    for part, described, (width, height), draw in evaluation_plots(evaluation):
         images[part].append(PageImage(figure_to_svg(draw, width, height, evaluation), described))
     notes = {"decoded": () if evaluation.decoded is None else evaluation.decoded.notes}
     return [
-        PagePart(name, title, sections(of_part[name]), images[name], notes.get(name, ()))
+        PagePart(name, title, arrange_tables(of_part[name]), images[name], notes.get(name, ()))
         for name, (title, _) in _PARTS.items()
     ]
 
@@ -171,8 +174,8 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
 
 def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
     """Return images of the example clips and of their decoded frames, in the best quality within the size limit."""
-    examples = evaluation.examples[:MOST_CLIPS]
-    decoded = () if evaluation.decoded is None else evaluation.decoded.strips[:MOST_CLIPS]
+    examples = evaluation.examples[:MAX_CLIPS]
+    decoded = () if evaluation.decoded is None else evaluation.decoded.strips[:MAX_CLIPS]
     strips = [example_strip(evaluation, one) for one in examples] + [decoded_strip(evaluation, one) for one in decoded]
     urls = webp_urls([[draw_strip(strip)] for strip in strips], at_most=_BYTES)
     images: dict[str, list[PageImage]] = {"examples": [], "decoded": []}
@@ -184,7 +187,7 @@ def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
     return images
 
 
-class PageFilm(NamedTuple):
+class PageVideo(NamedTuple):
     """One clip as a video, with data: URLs."""
 
     url: str  # the animated image
@@ -193,7 +196,7 @@ class PageFilm(NamedTuple):
     clip: DecodedStrip
 
 
-def film_of(evaluation: Evaluation) -> PageFilm | None:
+def make_video(evaluation: Evaluation) -> PageVideo | None:
     """Return a video of the decoded clip with the median error, or of the first one; None: there are no decoded clips.
 
     Frame 0 is the true frame in all columns, since all models receive it.
@@ -207,10 +210,13 @@ def film_of(evaluation: Evaluation) -> PageFilm | None:
     columns = [strip.rows[name] for name in (true, *models)]
     times = range(len(columns[0]))
     frames = [_frame([column[time] for column in columns], time / times[-1]) for time in times]
-    step = min(_STEP_S, (LONGEST_S - _FIRST_S - _LAST_S) / max(len(times) - 2, 1))
+    step = min(_STEP_S, (MAX_VIDEO_S - _FIRST_S - _LAST_S) / max(len(times) - 2, 1))
     shown = [_FIRST_S, *[step] * (len(times) - 2), _LAST_S]
-    (url,), (still,) = webp_urls([frames], shown, at_most=MOST_BYTES), webp_urls([frames[-1:]], at_most=MOST_BYTES)
-    return PageFilm(url, still, ("true frames", *(f"predicted by {name}" for name in models)), strip)
+    (url,), (still,) = (
+        webp_urls([frames], shown, at_most=MAX_VIDEO_BYTES),
+        webp_urls([frames[-1:]], at_most=MAX_VIDEO_BYTES),
+    )
+    return PageVideo(url, still, ("true frames", *(f"predicted by {name}" for name in models)), strip)
 
 
 def _frame(images: Sequence[Frame], passed: float) -> Frame:
@@ -239,7 +245,7 @@ def webp_urls(films: Sequence[Sequence[Frame]], seconds: Sequence[float] = (1.0,
 
 
 @dataclass(frozen=True)
-class Evaluated:
+class WrittenEvaluation:
     """The result of an evaluation, and the files that were written."""
 
     evaluation: Evaluation
@@ -257,12 +263,12 @@ class Evaluated:
         return {name: over_persistence(one.errors, "rollout") for name, one in self.evaluation.models.items()}
 
 
-def write_evaluation(evaluation: Evaluation, folder: Path) -> Evaluated:
+def write_evaluation(evaluation: Evaluation, folder: Path) -> WrittenEvaluation:
     """Write metrics.json, metrics.csv, plot and report of an evaluation, each atomically.
 
     The summary includes the planning verdict of a closed-loop benchmark of the same checkpoint, if the run has one.
     """
-    rows, about = rows_of(evaluation), evaluation.about
+    rows, about = make_rows(evaluation), evaluation.about
     summary = summarize(evaluation, rows)
     if about.checkpoint:
         summary = with_closed_loop(summary, Path(about.subject), about.checkpoint)
@@ -273,4 +279,4 @@ def write_evaluation(evaluation: Evaluation, folder: Path) -> Evaluated:
         write_csv(rows, (folder / METRICS_FILE).with_suffix(".csv")),
         folder / REPORT,
     )
-    return Evaluated(evaluation, summary, files)
+    return WrittenEvaluation(evaluation, summary, files)

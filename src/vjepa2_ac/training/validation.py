@@ -13,8 +13,8 @@ from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.distributed import broadcast_object, gather_shared, own_share, share_work
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.action_use import RolloutStart, gathered_starts, moves_of, rank_actions
-from vjepa2_ac.evaluation.measure import actions_before, prediction_errors
+from vjepa2_ac.evaluation.action_use import RolloutStart, gather_starts, rank_actions, select_moves
+from vjepa2_ac.evaluation.measure import prediction_errors, previous_clip_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Validation, cost_of_actions, one_step_over_persistence, over_persistence
 from vjepa2_ac.reporter import Reporter
@@ -123,17 +123,17 @@ def _measure(run: Run) -> Validation:
     names = [(run.dataset.table.identity(episode), start) for episode, start in windows]
     chosen = {names[index] for index in spread_indices(len(names), run.config.validation.ranking_clips or 0)}
     encoded = _encoded(run, batches, chosen, moves)
-    errors = prediction_errors(run.world_model, encoded, before=actions_before(windows_range, windows, read))
+    errors = prediction_errors(run.world_model, encoded, before=previous_clip_actions(windows_range, windows, read))
     for name, reason in gather_shared(list(run.dataset.broken.reasons.items())):
         run.dataset.broken.record(name, reason)
     config, space = run.config.validation, run.dataset.spaces.action
-    moves = gathered_starts(moves, run.accelerator.device)
+    moves = gather_starts(moves, run.accelerator.device)
     missing = len(chosen) - len({(move.episode_id, move.first_step) for move in moves})
     replacements = (
         [window for window, name in zip(windows, names, strict=True) if name not in chosen] if missing else []
     )
     for batch in islice(read_batches(run.dataset, replacements, batch_size=1, allow_empty=True), missing):
-        moves += moves_of(encode(run, batch), 0, space, RANKING_REACH_CM / 100)
+        moves += select_moves(encode(run, batch), 0, space, RANKING_REACH_CM / 100)
     if not moves:
         return Validation(errors, None)
     probes = ProbeOptions(samples=config.ranking_samples, reach_cm=RANKING_REACH_CM, at_once=_AT_ONCE)
@@ -150,7 +150,7 @@ def _encoded(
             run.strip.seen(run.dataset, batch, latents)
         for row, name in enumerate(zip(latents.episode_ids, latents.starts, strict=True)):
             if name in chosen:
-                moves += moves_of(latents, row, run.dataset.spaces.action, RANKING_REACH_CM / 100)
+                moves += select_moves(latents, row, run.dataset.spaces.action, RANKING_REACH_CM / 100)
         yield latents
 
 
