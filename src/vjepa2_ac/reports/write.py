@@ -90,7 +90,9 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(replace_hidden_characters, name.split("/")))
+    environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(
+        map(replace_hidden_characters, name.split("/"))
+    )
     environment.filters |= {
         "quote": shlex.quote,
         "bar": bar_positions,
