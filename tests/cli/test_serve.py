@@ -1,4 +1,4 @@
-"""`vjepa2-ac serve`: a process that a robot drives, and wrong words that are told before it listens."""
+"""The command `serve`: a robot connects to the process, and invalid options raise before the server listens."""
 
 import json
 from pathlib import Path
@@ -29,10 +29,10 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
-def test_a_robot_drives_it_and_every_decision_is_recorded(workshop: Path, tmp_path: Path) -> None:
+def test_serve_answers_a_robot_and_records_every_decision(workshop: Path, tmp_path: Path) -> None:
     record = tmp_path / "record"
-    words = [str(workshop / "model"), "--goals", str(workshop / "goals"), "--key-file", str(workshop / "key")]
-    process, url = started(*words, "--record", str(record), *QUICK)
+    arguments = [str(workshop / "model"), "--goals", str(workshop / "goals"), "--key-file", str(workshop / "key")]
+    process, url = started(*arguments, "--record", str(record), *QUICK)
     with pytest.raises(UnreachableError, match="401"):
         PlanningClient(url)
     answers = []
@@ -43,14 +43,14 @@ def test_a_robot_drives_it_and_every_decision_is_recorded(workshop: Path, tmp_pa
         for step in range(3):
             message = {"observation/image": image(step), "observation/state": STATE + 0.01 * step, "prompt": "cup"}
             answers.append(client.infer(message))
-    assert "has left" in ended(process)
+    assert "robot disconnected" in ended(process)
     lines = [json.loads(line) for line in (record / "decisions.jsonl").read_text().splitlines()]
     assert [line["answer"]["actions"] for line in lines] == [answer["actions"].tolist() for answer in answers]
 
 
-def test_a_dry_run_of_poses_in_the_dialect_of_roboarena(workshop: Path) -> None:
-    words = ["--dry-run", "--actions", "pose", *QUICK, "data.stride=5"]
-    process, url = started(str(workshop / "model"), *words)
+def test_dry_run_with_poses_answers_roboarena_messages(workshop: Path) -> None:
+    arguments = ["--dry-run", "--actions", "pose", *QUICK, "data.stride=5"]
+    process, url = started(str(workshop / "model"), *arguments)
     with PlanningClient(url) as client:
         assert client.metadata["action_space"] == "cartesian_position"
         found = client.infer({
@@ -60,29 +60,29 @@ def test_a_dry_run_of_poses_in_the_dialect_of_roboarena(workshop: Path) -> None:
         })  # fmt: skip
         np.testing.assert_allclose(found["actions"], np.tile(STATE, (5, 1)), atol=1e-9)
         assert client.infer({"endpoint": "reset", "session_id": "two"}) == {"status": "reset"}
-    assert "DRY RUN" in ended(process)
+    assert "dry run: every action is zero" in ended(process)
 
 
-WRONG = {
-    "--host 0.0.0.0: an address that other machines can reach": ["--host", "0.0.0.0"],  # noqa: S104 - refused
+INVALID_OPTIONS = {
+    "--host 0.0.0.0: other machines can reach this address": ["--host", "0.0.0.0"],  # noqa: S104 - refused
     "--key-file": ["--key-file", "none"],
     "--extrinsics": ["--extrinsics", "1,2"],
     "planning.limits: workspace: the corner": ["planning.limits.workspace=[[0,0,0],[0,1,1]]"],
 }
 
 
-@pytest.mark.parametrize("error", WRONG)
-def test_wrong_words_are_told_before_anything_listens(
+@pytest.mark.parametrize("error", INVALID_OPTIONS)
+def test_invalid_option_raises_before_the_server_listens(
     error: str, workshop: Path, tmp_path: Path, capsys, monkeypatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["serve", str(workshop / "model"), *WRONG[error]]) == 2
+    assert main(["serve", str(workshop / "model"), *INVALID_OPTIONS[error]]) == 2
     found = capsys.readouterr()
     assert error in found.err.replace("\n", " ")
     assert "listening" not in found.out
 
 
-def test_a_model_that_cannot_serve_ends_it_with_a_sentence(workshop: Path, capsys) -> None:
+def test_model_that_needs_extrinsics_raises(workshop: Path, capsys) -> None:
     tiny_model(extrinsics=True).save_pretrained(workshop / "camera")
     assert main(["serve", str(workshop / "camera"), "--port", "0"]) == 2
     assert "predictor.use_extrinsics" in capsys.readouterr().err

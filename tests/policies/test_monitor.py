@@ -162,7 +162,7 @@ def test_settings_and_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         acting(path)
 
 
-def test_a_server_tells_an_alarm_in_its_answer_and_counts_it(tmp_path: Path) -> None:
+def test_server_reports_an_alarm_in_its_reply_and_counts_it(tmp_path: Path) -> None:
     config = QUICK.model_copy(update={"monitor": written(tmp_path, 1e-6)})
     session = Session(Controller(tiny_model(), config))
     answers = []
@@ -171,6 +171,6 @@ def test_a_server_tells_an_alarm_in_its_answer_and_counts_it(tmp_path: Path) -> 
         answers.append(unpack(session.answer(pack(asked))))
     assert "surprise" not in answers[0]
     assert answers[1]["surprise"]["is_alarm"]
-    assert any("departs" in note for note in answers[1]["notes"])
+    assert any("differs from the predicted frame" in note for note in answers[1]["notes"])
     assert session.counts.alarms == 1
     assert session.counts.surprise == answers[1]["surprise"]["score"]

@@ -1,4 +1,4 @@
-"""Who may reach a server: this machine, or whoever has the key."""
+"""Access to a server: only from this machine, or with the key."""
 
 import logging
 from pathlib import Path
@@ -11,32 +11,32 @@ from vjepa2_ac.serving.access import Access, is_loopback, read_key
 KEY = "correct-horse-battery-staple"
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.7", "robot.lab", ""])  # noqa: S104 - refused
-def test_an_address_that_others_reach_needs_a_key_or_a_clear_word(host: str) -> None:
-    with pytest.raises(InputError, match="whoever reaches it moves the robot"):
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.7", "robot.lab", ""])  # noqa: S104 - rejection
+def test_reachable_address_requires_a_key_or_insecure(host: str) -> None:
+    with pytest.raises(InputError, match="any of them could move the robot"):
         Access(host)
-    assert Access(host, KEY).why_not("192.168.1.7:8000", f"Api-Key {KEY}") is None
-    assert Access(host, is_insecure=True).why_not("192.168.1.7:8000", None) is None
+    assert Access(host, KEY).find_rejection("192.168.1.7:8000", f"Api-Key {KEY}") is None
+    assert Access(host, is_insecure=True).find_rejection("192.168.1.7:8000", None) is None
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
-def test_this_machine_needs_none(host: str) -> None:
+def test_loopback_address_requires_no_key(host: str) -> None:
     assert is_loopback(host)
-    assert Access(host).why_not("127.0.0.1:8000", None) is None
+    assert Access(host).find_rejection("127.0.0.1:8000", None) is None
 
 
 @pytest.mark.parametrize(
-    ("given", "status"),
+    ("authorization", "status"),
     [
         (f"Api-Key {KEY}", None), (f"api-key {KEY}", None), (f"Bearer {KEY}", None), (f"Api-Key  {KEY} ", None),
         (None, 401), ("", 401), (KEY, 401), (f"Basic {KEY}", 401), (f"Api-Key {KEY}x", 401), ("Api-Key", 401),
         (f"Api-Key {KEY[:-1]}", 401), ("Api-Key \udcff", 401), (f"Api-Key {KEY.upper()}", 401),
     ],
 )  # fmt: skip
-def test_the_key_is_the_whole_key(given: str | None, status: int | None) -> None:
-    refused = Access("127.0.0.1", KEY).why_not("localhost:8000", given)
-    assert (refused and refused[0]) == status
-    assert KEY not in str(refused)
+def test_only_the_exact_key_is_accepted(authorization: str | None, status: int | None) -> None:
+    rejection = Access("127.0.0.1", KEY).find_rejection("localhost:8000", authorization)
+    assert (rejection and rejection[0]) == status
+    assert KEY not in str(rejection)
 
 
 @pytest.mark.parametrize(
@@ -50,14 +50,14 @@ def test_the_key_is_the_whole_key(given: str | None, status: int | None) -> None
         ("evil.example:8000", False), ("localhost.evil.example", False), ("", False), ("127.0.0.1.evil.example", False),
     ],
 )  # fmt: skip
-def test_a_name_of_another_server_is_refused(name: str | None, is_known: bool) -> None:
-    """A page's own domain may point to this machine: its name is in Host."""
-    refused = Access("127.0.0.1", names=["Robot.example"]).why_not(name, None)
-    assert (refused is None) == is_known
-    assert is_known or refused[0] == 403
+def test_unknown_host_name_is_rejected(name: str | None, is_known: bool) -> None:
+    """A web page's domain may resolve to this machine; the header Host then contains its name."""
+    rejection = Access("127.0.0.1", names=["Robot.example"]).find_rejection(name, None)
+    assert (rejection is None) == is_known
+    assert is_known or rejection[0] == 403
 
 
-def test_a_key_is_the_first_line_of_its_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_key_is_the_first_line_of_its_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = tmp_path / "key"
     file.write_text(f"{KEY}\nmore\n")
     file.chmod(0o600)
@@ -66,13 +66,13 @@ def test_a_key_is_the_first_line_of_its_file(tmp_path: Path, caplog: pytest.LogC
     file.chmod(0o644)
     with caplog.at_level(logging.WARNING):
         assert read_key(file) == KEY
-    assert "can be read by other users" in caplog.text
+    assert "other users of this machine can read the key" in caplog.text
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"\n", b"short\n", b"two words are not a key\n", "schlüsselschlüssel".encode(), b"\0" * 20]
 )
-def test_a_file_without_a_good_key_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_file_without_a_valid_key_raises(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "key").write_bytes(content)
     with pytest.raises(InputError, match="--key-file"):
         read_key(tmp_path / "key")

@@ -1,5 +1,5 @@
-"""The example clients move stubs of the robots, which have the signatures of the real libraries."""
-# ruff: noqa: ARG002 - so have they
+"""The example clients move stubs of robots, which have the signatures of the real libraries."""
+# ruff: noqa: ARG002 - the stubs keep the parameters of the real libraries
 
 import contextlib
 import runpy
@@ -26,7 +26,7 @@ HAND = np.block(
 
 
 class Policy:
-    """openpi's WebsocketClientPolicy, without the socket; keeps what was answered."""
+    """A replacement of openpi's WebsocketClientPolicy without a socket, which stores the replies."""
 
     def __init__(self, **options: Any) -> None:
         limits = LimitsConfig(workspace=BOX, xyz=(0.03, 0.03, 0.03), rotation=0.1, gripper_mode="free")
@@ -34,20 +34,20 @@ class Policy:
             controller(limits=limits), {"cup": (SubGoal(image(50), "cup"),)}, SessionOptions("pose", **options)
         )
         self.answers: list[dict] = []
-        self.lasts = 100  # answers until the connection is lost
+        self.max_replies = 100  # number of replies before the connection is lost
 
     def infer(self, obs: dict) -> dict:
-        if len(self.answers) == self.lasts:
+        if len(self.answers) == self.max_replies:
             raise ConnectionError
         answer = self.session.answer(pack(obs))
         if isinstance(answer, str):
-            raise RuntimeError(f"Error in inference server:\n{answer}")  # noqa: TRY004 - as theirs
+            raise RuntimeError(f"Error in inference server:\n{answer}")  # noqa: TRY004 - as in openpi
         self.answers.append(unpack(answer))
         return self.answers[-1]
 
 
 class Gripper:
-    """franky's and libfranka's: `width`, `max_width`, `move`, `grasp`, `read_once`."""
+    """Stub of the grippers of franky and libfranka: `width`, `max_width`, `move`, `grasp`, `read_once`."""
 
     max_width = 0.08
 
@@ -65,14 +65,14 @@ class Gripper:
     def grasp(
         self, width: float, speed: float, force: float, epsilon_inner: float = 0.005, epsilon_outer: float = 0.005
     ) -> bool:
-        assert epsilon_outer == 1.0, "whatever is there may be grasped"
+        assert epsilon_outer == 1.0, "objects of any width may be grasped"
         self.calls.append("grasp")
         self.width = 0.03
         return True
 
 
 class Affine:
-    """franky's: from a matrix, or a translation and a quaternion (x, y, z, w)."""
+    """Stub of franky's Affine, from a matrix, or from a translation and a quaternion (x, y, z, w)."""
 
     def __init__(self, first: Any, quaternion: Any = None) -> None:
         self.matrix = np.asarray(first, dtype=float)
@@ -97,16 +97,16 @@ class Affine:
 
 
 class Franka:
-    """An arm that goes where it is told: franky's `Robot`."""
+    """Stub of franky's `Robot`, which reaches every target."""
 
     def __init__(self) -> None:
-        self.flange, self.ways = np.eye(4), []
+        self.flange, self.positions = np.eye(4), []
         self.flange[:3, :3] = Rotation.from_euler("xyz", [3.1, 0, 0.1]).as_matrix()
         self.flange[:3, 3] = 0.45, 0.0, 0.3
 
     def _go(self, tool: np.ndarray) -> None:
         self.flange = tool @ np.linalg.inv(HAND)
-        self.ways.append(self.flange[:3, 3].copy())
+        self.positions.append(self.flange[:3, 3].copy())
 
     @property
     def state(self) -> Any:
@@ -122,10 +122,10 @@ class CartesianMotion:
 
 
 class RobotEnv:
-    """DROID's, as far as the client uses it."""
+    """Stub of the parts of DROID's `RobotEnv` that the client uses."""
 
     def __init__(self) -> None:
-        self.state, self.ways = np.array([0.45, 0.0, 0.3, 3.1, 0.0, 0.1, 0.25]), []
+        self.state, self.positions = np.array([0.45, 0.0, 0.3, 3.1, 0.0, 0.1, 0.25]), []
 
     def get_observation(self) -> dict[str, Any]:
         bgra = np.concatenate([camera()[..., ::-1], np.full((48, 60, 1), 255, dtype=np.uint8)], axis=-1)
@@ -141,7 +141,7 @@ class RobotEnv:
     ) -> None:
         assert (action_space, gripper_action_space, blocking) == ("cartesian_position", "position", True)
         self.state = np.asarray(action)
-        self.ways.append(self.state[:3])
+        self.positions.append(self.state[:3])
 
 
 def camera() -> np.ndarray:
@@ -153,43 +153,43 @@ Drive = Callable[..., tuple[list[np.ndarray], Gripper | None]]
 
 @pytest.fixture(params=["franky", "droid"])
 def drive(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Drive:
-    """Return a function that drives a stub for four steps: where its flange went, and its gripper."""
+    """Return a function that drives a stub for four steps and returns the flange positions and the gripper."""
     franky = types.SimpleNamespace(Affine=Affine, CartesianMotion=CartesianMotion)
     monkeypatch.setitem(sys.modules, "franky", franky)  # type: ignore[arg-type]
     client = runpy.run_path(str(ROOT / f"examples/serve/{request.param}_client.py"))["drive"]
 
-    def driven(policy: Policy, goal: str = "cup") -> tuple[list[np.ndarray], Gripper | None]:
+    def drive_stub(policy: Policy, goal: str = "cup") -> tuple[list[np.ndarray], Gripper | None]:
         is_droid, gripper = request.param == "droid", Gripper()
         robot = RobotEnv() if is_droid else Franka()
-        words = (robot, policy, "left") if is_droid else (robot, gripper, policy, camera)
+        arguments = (robot, policy, "left") if is_droid else (robot, gripper, policy, camera)
         with contextlib.suppress(ConnectionError):
-            client(*words, goal, 4)
-        return robot.ways, None if is_droid else gripper
+            client(*arguments, goal, 4)
+        return robot.positions, None if is_droid else gripper
 
-    return driven
+    return drive_stub
 
 
-def test_a_client_sends_what_is_measured_and_goes_where_it_is_told(drive: Drive) -> None:
+def test_example_client_sends_the_measured_state_and_moves_to_the_targets(drive: Drive) -> None:
     policy = Policy()
-    ways, gripper = drive(policy)
-    assert len(ways) == len(policy.answers) == 4
+    positions, gripper = drive(policy)
+    assert len(positions) == len(policy.answers) == 4
     targets = np.array([answer["actions"][-1] for answer in policy.answers])
-    np.testing.assert_allclose(ways, targets[:, :3], atol=1e-7)
-    assert (abs(np.diff([[0.45, 0.0, 0.3], *ways], axis=0)) <= 0.03 + 1e-6).all()
+    np.testing.assert_allclose(positions, targets[:, :3], atol=1e-7)
+    assert (abs(np.diff([[0.45, 0.0, 0.3], *positions], axis=0)) <= 0.03 + 1e-6).all()
     assert [answer["goal"]["name"] for answer in policy.answers] == ["cup"] * 4
     assert policy.session.counts.episodes == 1
     moved = abs(np.diff([0.25, *targets[:, 6]])) > 0.05
     assert gripper is None or bool(gripper.calls) == bool(moved.any())
 
 
-def test_nobody_moves_after_an_error_or_in_a_dry_run(drive: Drive) -> None:
+def test_example_client_does_not_move_after_an_error_or_in_a_dry_run(drive: Drive) -> None:
     policy = Policy()
-    with pytest.raises(RuntimeError, match="names no goal"):
+    with pytest.raises(RuntimeError, match="unknown goal"):
         drive(policy, goal="plate")
     assert not policy.answers
-    policy.lasts = 1
-    ways, _ = drive(policy)
-    assert len(ways) == 1, "one step, and none after the error"
-    ways, gripper = drive(Policy(dry_run=True))
-    np.testing.assert_allclose(ways, np.tile([0.45, 0.0, 0.3], (4, 1)), atol=1e-9)
+    policy.max_replies = 1
+    positions, _ = drive(policy)
+    assert len(positions) == 1, "one step, and none after the error"
+    positions, gripper = drive(Policy(dry_run=True))
+    np.testing.assert_allclose(positions, np.tile([0.45, 0.0, 0.3], (4, 1)), atol=1e-9)
     assert gripper is None or not gripper.calls

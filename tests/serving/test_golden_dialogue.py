@@ -1,4 +1,4 @@
-"""What openpi's client sends, as it was recorded (tests/golden/openpi/make.py), is answered as our own client is."""
+"""Recorded messages of openpi's client (tests/golden/openpi/make.py) get the same replies as our client's."""
 
 import runpy
 
@@ -18,23 +18,27 @@ MADE = runpy.run_path(str(FOLDER / "make.py"))
 picture = MADE["picture"]
 
 
-def answers(messages: list[bytes]) -> list[dict | str]:
-    one: Session = session(goals={"cup": (SubGoal(picture(20), "cup"),)})
-    found = [one.answer(message) for message in messages]
-    return [unpack(answer) if isinstance(answer, bytes) else answer for answer in found]
+def get_replies(messages: list[bytes]) -> list[dict | str]:
+    served: Session = session(goals={"cup": (SubGoal(picture(20), "cup"),)})
+    replies = [served.answer(message) for message in messages]
+    return [unpack(reply) if isinstance(reply, bytes) else reply for reply in replies]
 
 
-def test_the_recorded_dialogue_is_answered_as_ours_is() -> None:
+def test_recorded_openpi_messages_get_the_same_replies_as_own_messages() -> None:
     assert [path.stem for path in FRAMES] == list(MADE["DIALOGUE"])
-    theirs = answers([path.read_bytes() for path in FRAMES])
-    ours = answers([pack(message) for message in MADE["DIALOGUE"].values()])
-    for path, one, other in zip(FRAMES, theirs, ours, strict=True):
-        if isinstance(other, str):
-            assert one == other, path.name
-            assert "degrees" in one
-        elif "actions" in other:
-            np.testing.assert_array_equal(one["actions"], other["actions"])
-            assert (one["why"], one["goal"], one["energy"]) == (other["why"], other["goal"], other["energy"]), path.name
-            assert one["why"] == "planned"
+    openpi_replies = get_replies([path.read_bytes() for path in FRAMES])
+    own_replies = get_replies([pack(message) for message in MADE["DIALOGUE"].values()])
+    for path, reply, expected in zip(FRAMES, openpi_replies, own_replies, strict=True):
+        if isinstance(expected, str):
+            assert reply == expected, path.name
+            assert "degrees" in reply
+        elif "actions" in expected:
+            np.testing.assert_array_equal(reply["actions"], expected["actions"])
+            assert (reply["why"], reply["goal"], reply["energy"]) == (
+                expected["why"],
+                expected["goal"],
+                expected["energy"],
+            ), path.name
+            assert reply["why"] == "planned"
         else:
-            assert one == other == {"status": "reset"}
+            assert reply == expected == {"status": "reset"}

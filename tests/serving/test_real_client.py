@@ -1,4 +1,4 @@
-"""The real, unmodified openpi-client of PyPI drives the server, from an environment of its own."""
+"""The unmodified openpi-client from PyPI drives the server from a separate environment."""
 
 import json
 import subprocess
@@ -28,7 +28,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
-def test_it_gets_the_controllers_actions_errors_and_a_new_episode(robot: Path) -> None:
+def test_openpi_client_receives_actions_errors_and_a_new_episode(robot: Path) -> None:
     own = controller()
     own.reset(image(100))
     expected = []
@@ -36,15 +36,15 @@ def test_it_gets_the_controllers_actions_errors_and_a_new_episode(robot: Path) -
         own.act(image(seed), STATE)
         expected.append(own.decision.plan.actions.double().tolist())
 
-    with serving(lambda: session(goals=CUP), Access("127.0.0.1", KEY), told={"policy": "vjepa2-ac"}) as running:
+    with serving(lambda: session(goals=CUP), Access("127.0.0.1", KEY), metadata={"policy": "vjepa2-ac"}) as running:
         host, port = running.url.removeprefix("ws://").split(":")
-        done = subprocess.run([robot, SCRIPT, host, port, KEY], capture_output=True, text=True, timeout=120, cwd="/")
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["metadata"] == "vjepa2-ac"
-    assert found["actions"] == [*expected, expected[0]]
-    assert found["why"] == ["planned"] * 4
-    assert found["error"].startswith("Error in inference server:\nstate: 3 numbers")
+        process = subprocess.run([robot, SCRIPT, host, port, KEY], capture_output=True, text=True, timeout=120, cwd="/")
+    assert process.returncode == 0, process.stderr
+    results = json.loads(process.stdout)
+    assert results["metadata"] == "vjepa2-ac"
+    assert results["actions"] == [*expected, expected[0]]
+    assert results["why"] == ["planned"] * 4
+    assert results["error"].startswith("Error in inference server:\nstate: 3 numbers")
     own.reset(image(50))
     own.act(image(3), STATE)
-    assert found["one_by_one"] == own.decision.plan.actions.double().tolist()
+    assert results["one_by_one"] == own.decision.plan.actions.double().tolist()

@@ -1,4 +1,4 @@
-"""The server: ready when it says so, one robot at a time, and never away while it plans."""
+"""The server: it listens once the model is loaded, serves one robot at a time, and stays responsive while it plans."""
 
 import asyncio
 import contextlib
@@ -46,38 +46,43 @@ def connect(running: Running, **how: object) -> Iterator[websockets.sync.client.
 
 
 class SlowSession:
-    """A session whose decisions take as long as a test wants, and which sees when nobody waits."""
+    """A session whose search ends when the test sets `go`, and which records when the client disconnects."""
 
     def __init__(self) -> None:
-        self.one, self.asked, self.go, self.left = session(), threading.Event(), threading.Event(), threading.Event()
-        plan, answer = self.one.controller.planner.plan, self.one.answer
+        self.session, self.is_planning, self.go, self.is_cancelled = (
+            session(),
+            threading.Event(),
+            threading.Event(),
+            threading.Event(),
+        )
+        plan, answer = self.session.controller.planner.plan, self.session.answer
 
         def slow_plan(*args: object) -> object:
-            self.asked.set()
+            self.is_planning.set()
             while not self.go.is_set():
                 if args[3]():
-                    self.left.set()
+                    self.is_cancelled.set()
                     break
                 time.sleep(0.005)
             return plan(*args)
 
-        self.one.controller.planner.plan = slow_plan
+        self.session.controller.planner.plan = slow_plan
         self.answer = answer
 
 
-def test_actions_through_the_socket_are_the_controllers_bit_for_bit() -> None:
+def test_actions_through_the_socket_equal_the_controllers_actions() -> None:
     own = controller()
     own.reset(image(100))
     with serving(session) as running, PlanningClient(running.url) as client:
         for step in range(3):
-            found = client.infer(request(step, goal_image=image(100)))
-            np.testing.assert_array_equal(found["actions"][0], own.act(image(step), STATE))
+            reply = client.infer(request(step, goal_image=image(100)))
+            np.testing.assert_array_equal(reply["actions"][0], own.act(image(step), STATE))
         with pytest.raises(InputError, match="frame: 32 x 24 pixels"):
             client.infer(request(3) | {"observation/image": image(3, 24, 32)})
         np.testing.assert_array_equal(client.infer(request(3))["actions"][0], own.act(image(3), STATE))
 
 
-def test_it_listens_when_the_model_is_loaded() -> None:
+def test_server_listens_only_after_the_model_is_loaded() -> None:
     stop, lines = asyncio.Event(), list[str]()
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -88,15 +93,15 @@ def test_it_listens_when_the_model_is_loaded() -> None:
         assert not lines
         return session(), {}
 
-    def told(line: str) -> None:
+    def print_status(line: str) -> None:
         lines.append(line)
         stop.set()
 
-    assert asyncio.run(PlanningServer(Access("127.0.0.1"), port, told).run(load, stop))
+    assert asyncio.run(PlanningServer(Access("127.0.0.1"), port, print_status).run(load, stop))
     assert lines == [f"listening on ws://127.0.0.1:{port}"]
 
 
-def test_a_port_that_is_taken_is_told_before_loading_and_after_it() -> None:
+def test_used_port_raises_before_and_after_loading() -> None:
     def load() -> tuple[Session, dict]:
         taken.append(socket.create_server(("127.0.0.1", port)))
         return session(), {}
@@ -105,13 +110,13 @@ def test_a_port_that_is_taken_is_told_before_loading_and_after_it() -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     for _ in range(2):
-        with pytest.raises(InputError, match=f"127.0.0.1:{port}: cannot be listened on"):
+        with pytest.raises(InputError, match=f"127.0.0.1:{port}: the server cannot listen"):
             asyncio.run(PlanningServer(Access("127.0.0.1"), port, print).run(load, asyncio.Event()))
     (own,) = taken
     own.close()
 
 
-def test_a_server_that_is_stopped_while_it_loads_does_not_listen() -> None:
+def test_server_stopped_while_loading_does_not_listen() -> None:
     async def stopped() -> bool:
         stop = asyncio.Event()
         asyncio.get_running_loop().call_later(0.1, stop.set)
@@ -122,18 +127,18 @@ def test_a_server_that_is_stopped_while_it_loads_does_not_listen() -> None:
     go.set()
 
 
-def test_a_second_robot_is_refused_by_the_name_of_the_first_until_that_leaves() -> None:
+def test_second_robot_is_rejected_until_the_first_disconnects() -> None:
     with serving(session) as running:
         first = PlanningClient(running.url)
         port = first._connection.local_address[1]
-        with pytest.raises(UnreachableError, match=f"HTTP 503: busy: a robot at 127.0.0.1:{port} is being served"):
+        with pytest.raises(UnreachableError, match=f"HTTP 503: busy: the robot at 127.0.0.1:{port} is connected"):
             PlanningClient(running.url)
         assert get(running, "/healzth")[0] == 404
         assert get(running, "/healthz")[0] == 200
         first.infer(request(0, goal_image=image(100)))
         first.close()
         wait_until(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
-        with PlanningClient(running.url) as second, pytest.raises(InputError, match="no goal in this episode"):
+        with PlanningClient(running.url) as second, pytest.raises(InputError, match="no goal was set in this episode"):
             second.infer(request(1))
 
 
@@ -144,48 +149,48 @@ def test_pings_are_answered_during_a_long_decision() -> None:
         async with websockets.asyncio.client.connect(url, compression=None, proxy=None) as connection:
             await connection.recv()
             await connection.send(pack(request(0, goal_image=image(100))))
-            await asyncio.to_thread(slow.asked.wait, 120)
+            await asyncio.to_thread(slow.is_planning.wait, 120)
             for _ in range(3):
                 await asyncio.wait_for(await connection.ping(), 120)
             slow.go.set()  # not before
             assert unpack(await connection.recv())["why"] == "planned"
 
-    with serving(lambda: slow.one) as running:
+    with serving(lambda: slow.session) as running:
         asyncio.run(drive(running.url))
 
 
-def test_a_client_that_leaves_ends_its_search_and_the_next_one_is_served() -> None:
+def test_disconnect_cancels_the_search_and_the_next_client_is_served() -> None:
     slow = SlowSession()
-    with serving(lambda: slow.one) as running:
+    with serving(lambda: slow.session) as running:
         with connect(running) as connection:
             connection.recv()
             connection.send(pack(request(0, goal_image=image(100))))
-            assert slow.asked.wait(120)
-        assert slow.left.wait(120)
+            assert slow.is_planning.wait(120)
+        assert slow.is_cancelled.wait(120)
         slow.go.set()
         wait_until(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
         with PlanningClient(running.url) as client:
             assert client.infer(request(1, goal_image=image(100)))["why"] == "planned"
 
 
-def test_a_server_that_ends_during_a_decision_does_not_wait_for_it() -> None:
+def test_server_shutdown_does_not_wait_for_a_decision() -> None:
     slow = SlowSession()
     with contextlib.ExitStack() as client:
-        with serving(lambda: slow.one) as running:
+        with serving(lambda: slow.session) as running:
             connection = client.enter_context(connect(running))
             connection.recv()
             connection.send(pack(request(0, goal_image=image(100))))
-            assert slow.asked.wait(120)
+            assert slow.is_planning.wait(120)
         assert not slow.go.is_set()
-        assert slow.left.is_set()
+        assert slow.is_cancelled.is_set()
         with pytest.raises(ConnectionClosed):
             connection.recv(timeout=120)
 
 
-def test_a_key_is_asked_of_robots_and_of_figures_and_of_nobody_who_asks_for_health() -> None:
+def test_key_is_required_for_robots_and_metrics_but_not_for_health_checks() -> None:
     with serving(session, Access("127.0.0.1", KEY)) as running:
         for key in (None, KEY + "x"):
-            with pytest.raises(UnreachableError, match="HTTP 401: this server needs the key"):
+            with pytest.raises(UnreachableError, match="HTTP 401: a valid key is required"):
                 PlanningClient(running.url, key)
         assert get(running, "/metrics")[0] == 401
         assert get(running, "/metrics", Authorization=f"Api-Key {KEY}")[0] == 200
@@ -197,7 +202,7 @@ def test_a_key_is_asked_of_robots_and_of_figures_and_of_nobody_who_asks_for_heal
         )
 
 
-def test_pages_in_a_browser_are_refused() -> None:
+def test_requests_from_web_pages_are_rejected() -> None:
     with serving(session) as running:
         for headers, status in (({"origin": "http://evil.example"}, 403), ({"origin": "null"}, 403)):
             with pytest.raises(InvalidStatus) as caught, connect(running, **headers):
@@ -208,12 +213,12 @@ def test_pages_in_a_browser_are_refused() -> None:
             assert unpack(connection.recv()) == {}
 
 
-def test_what_is_no_request_is_answered_by_a_sentence_and_the_next_one_is_served() -> None:
+def test_invalid_message_gets_an_error_and_the_next_request_is_served() -> None:
     good, rng = bytearray(pack(request(0, goal_image=image(100)))), random.Random(0)  # noqa: S311
     with serving(session) as running, connect(running) as connection:
         connection.recv()
         connection.send("a text")
-        assert connection.recv(timeout=120) == "a request is a binary message, in msgpack"
+        assert connection.recv(timeout=120) == "received a text message. Expected a binary message in msgpack"
         for _ in range(300):
             wrong = bytearray(good)
             for _ in range(rng.randint(1, 4)):
@@ -222,15 +227,15 @@ def test_what_is_no_request_is_answered_by_a_sentence_and_the_next_one_is_served
             answer = connection.recv(timeout=120)
             assert isinstance(answer, bytes) or (len(answer) < 1000 and "Traceback" not in answer)
         connection.send(bytes(good))
-        found = unpack(connection.recv(timeout=120))
-        assert found["why"] == "planned"
+        reply = unpack(connection.recv(timeout=120))
+        assert reply["why"] == "planned"
         figures = get(running, "/metrics")[1]
         assert "requests_failed_total 0" in figures
         assert 'decisions_total{why="planned"} ' in figures
         assert "decision_seconds_count" in figures
 
 
-def test_a_message_that_is_too_large_ends_the_connection_and_not_the_server() -> None:
+def test_too_large_message_closes_the_connection_but_not_the_server() -> None:
     with serving(session) as running:
         with connect(running) as connection:
             connection.recv()
@@ -244,33 +249,35 @@ def test_a_message_that_is_too_large_ends_the_connection_and_not_the_server() ->
             assert client.infer(request(0, goal_image=image(1)))["why"] == "planned"
 
 
-def test_a_server_ends_while_something_is_computed_that_nothing_cancels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(access, "END_S", 0.1)
-    one, asked, go = session(), threading.Event(), threading.Event()
-    one.answer = lambda *_: (asked.set(), go.wait(120))[1]
+def test_server_shutdown_does_not_wait_for_uncancellable_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access, "SHUTDOWN_TIMEOUT_S", 0.1)
+    served, is_answering, go = session(), threading.Event(), threading.Event()
+    served.answer = lambda *_: (is_answering.set(), go.wait(120))[1]
     with contextlib.ExitStack() as client:
-        with serving(lambda: one) as running:
+        with serving(lambda: served) as running:
             connection = client.enter_context(connect(running))
             connection.recv()
             connection.send(pack(request(0, endpoint="score")))
-            assert asked.wait(120)
+            assert is_answering.wait(120)
         assert not go.is_set()
         go.set()
 
 
-def test_a_client_waits_for_an_answer_as_long_as_it_says_and_no_longer() -> None:
+def test_client_timeout_raises_and_closes_the_connection() -> None:
     slow = SlowSession()
-    with serving(lambda: slow.one) as running:
+    with serving(lambda: slow.session) as running:
         client = PlanningClient(running.url, timeout_s=0.1)
-        with pytest.raises(UnreachableError, match=r"no answer within 0\.1 s.*connect again"):
+        with pytest.raises(UnreachableError, match=r"no reply within 0\.1 s.*connect again"):
             client.infer(request(0, goal_image=image(100)))
-        with pytest.raises(UnreachableError, match="the connection is lost"):  # not the late answer of before
+        with pytest.raises(
+            UnreachableError, match="the connection was lost"
+        ):  # the late reply to the first request is not returned
             client.infer(request(1))
-        assert slow.left.wait(120)
+        assert slow.is_cancelled.wait(120)
         slow.go.set()
 
 
 @pytest.mark.parametrize("deadline_s", [5.0, 300.0])
-def test_a_client_waits_longer_than_the_deadline_of_its_server(deadline_s: float) -> None:
-    with serving(session, told={"deadline_s": deadline_s}) as running, PlanningClient(running.url) as client:
+def test_client_timeout_is_longer_than_the_servers_deadline(deadline_s: float) -> None:
+    with serving(session, metadata={"deadline_s": deadline_s}) as running, PlanningClient(running.url) as client:
         assert client._timeout_s == max(120.0, 2 * deadline_s)

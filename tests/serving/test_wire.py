@@ -1,4 +1,4 @@
-"""The wire format: what is sent arrives, and nothing else does any harm."""
+"""The wire format: messages survive encoding and decoding, and invalid messages are rejected at low cost."""
 
 import contextlib
 import math
@@ -35,12 +35,12 @@ def array_of(dtype: object = "<f4", shape: object = (2,), data: object = b"\0" *
 
 
 @given(MESSAGES)
-def test_what_is_sent_arrives(message) -> None:
+def test_message_survives_encoding_and_decoding(message) -> None:
     found = unpack(pack(message))
     np.testing.assert_equal(found, dict(message))
 
 
-def test_arrays_are_of_the_same_type_and_can_be_written_to() -> None:
+def test_decoded_arrays_keep_their_type_and_are_writable() -> None:
     found = unpack(pack({"a": np.arange(6, dtype=np.float32).reshape(2, 3)[:, ::2], "n": np.float64(0.1)}))
     assert found["a"].dtype == np.float32
     assert found["a"].flags.writeable
@@ -105,7 +105,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_what_is_no_message_is_a_sentence_and_costs_nothing(name: str) -> None:
+def test_hostile_message_raises_without_allocating_memory(name: str) -> None:
     message = HOSTILE[name]
     tracemalloc.start()
     try:
@@ -117,9 +117,9 @@ def test_what_is_no_message_is_a_sentence_and_costs_nothing(name: str) -> None:
     assert len(str(caught.value)) < 200
 
 
-def test_a_message_that_is_too_large_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(wire, "MOST_BYTES", 1000)
-    with pytest.raises(WireError, match=r"a message of 1,0.. bytes; 1,000 at most"):
+def test_too_large_message_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire, "MAX_MESSAGE_BYTES", 1000)
+    with pytest.raises(WireError, match=r"the message has 1,0.. bytes. Expected at most 1,000"):
         unpack(pack({"a": np.zeros(1000, dtype=np.uint8)}))
 
 
@@ -134,7 +134,7 @@ GOOD = pack({
     st.lists(st.tuples(st.integers(0, len(GOOD) - 1), st.integers(0, 255)), min_size=1, max_size=6),
     st.integers(0, len(GOOD)),
 )
-def test_a_message_with_wrong_bytes_is_read_or_refused(changes, cut) -> None:
+def test_mutated_message_is_decoded_or_raises_wire_error(changes, cut) -> None:
     message = bytearray(GOOD)
     for place, value in changes:
         message[place] = value
@@ -148,12 +148,12 @@ def test_a_message_with_wrong_bytes_is_read_or_refused(changes, cut) -> None:
 
 @settings(max_examples=1000)
 @given(st.binary(max_size=200))
-def test_any_bytes_are_read_or_refused(message) -> None:
+def test_arbitrary_bytes_are_decoded_or_raise_wire_error(message) -> None:
     with contextlib.suppress(WireError):
         assert isinstance(unpack(message), dict)
 
 
-def test_what_cannot_be_sent_is_an_error_here() -> None:
+def test_unsupported_value_raises_in_pack() -> None:
     for wrong in (np.array(["a"]), np.array([None]), object(), np.array([1j])):
         with pytest.raises(TypeError, match="cannot be sent"):
             pack({"a": wrong})

@@ -42,7 +42,7 @@ class Running:
 def in_a_thread(
     serve: Callable[[asyncio.Event, Callable[[str], None]], Awaitable[object]], until: str
 ) -> Iterator[list[str]]:
-    """Run a server as long as the context lasts; yield the lines that it says, once one begins as told."""
+    """Run a server as long as the context lasts; yield its status lines, once one starts with `until`."""
     lines: list[str] = []
     begun, of_loop, failed = threading.Event(), [], []
 
@@ -79,11 +79,13 @@ def in_a_thread(
 
 
 @contextmanager
-def serving(load: Callable[[], Session], access: Access | None = None, told: dict | None = None) -> Iterator[Running]:
+def serving(
+    load: Callable[[], Session], access: Access | None = None, metadata: dict | None = None
+) -> Iterator[Running]:
     """Serve robots as long as the context lasts."""
 
     def serve(stop: asyncio.Event, tell: Callable[[str], None]) -> Awaitable[object]:
-        return PlanningServer(access or Access("127.0.0.1"), 0, tell).run(lambda: (load(), told or {}), stop)
+        return PlanningServer(access or Access("127.0.0.1"), 0, tell).run(lambda: (load(), metadata or {}), stop)
 
     with in_a_thread(serve, "listening on ") as lines:
         yield Running(lines[0].removeprefix("listening on "))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from vjepa2_ac.evaluation.summary import Summary, Verdict
-    from vjepa2_ac.serving.about import KeptGoals
+    from vjepa2_ac.serving.metadata import NamedGoals
     from vjepa2_ac.serving.session import Session
     from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
 
@@ -92,12 +92,12 @@ def _serve(options: argparse.Namespace) -> int:
         raise InputError(where=f"--goals {options.goals}", found="no such folder", needed="a folder with goals")
     cli.require_to_plan(options)
 
-    from vjepa2_ac.serving.about import read_kept_goals
+    from vjepa2_ac.serving.metadata import read_named_goals
     from vjepa2_ac.serving.server import serve
 
     if options.record is not None:
         cli.require_new_place(options.record)
-    goals = None if options.goals is None else read_kept_goals(options.goals)
+    goals = None if options.goals is None else read_named_goals(options.goals)
     ended = serve(lambda: _loaded(options, goals), access, options.port, cli.show)
     if not ended:  # the planning thread still searches or loads; its result is not needed, so do not wait for it
         sys.stdout.flush()
@@ -106,13 +106,13 @@ def _serve(options: argparse.Namespace) -> int:
     return 0
 
 
-def _loaded(options: argparse.Namespace, goals: KeptGoals | None) -> tuple[Session, Mapping[str, Any]]:
+def _loaded(options: argparse.Namespace, goals: NamedGoals | None) -> tuple[Session, Mapping[str, Any]]:
     """Load the model and make a first decision; return the session and the metadata for clients."""
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.goals import require_ends
     from vjepa2_ac.policies.score import is_blind, ranking_of_run
-    from vjepa2_ac.serving.about import in_words, metadata_of, warm_up
+    from vjepa2_ac.serving.metadata import describe_server, make_metadata, warm_up
     from vjepa2_ac.serving.recording import Recorder
     from vjepa2_ac.serving.request import IMAGE_KEYS
     from vjepa2_ac.serving.session import Session, SessionOptions
@@ -131,9 +131,9 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None) -> tuple[Sessi
     for sequence in (goals or {}).values():
         require_ends(sequence, first=1)
     session = Session(controller, goals or {}, how)
-    about = metadata_of(loaded, session)
+    about = make_metadata(loaded, session)
     Work.begin("the first decision")
-    cli.show(in_words(about, options.subject), f"a first decision took {warm_up(controller):.1f} s")
+    cli.show(describe_server(about, options.subject), f"a first decision took {warm_up(controller):.1f} s")
     Work.begin("")
     if options.record is not None:
         server = {**about, "overrides": options.overrides, "config": options.config, **loaded.as_dict()}

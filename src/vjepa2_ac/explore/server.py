@@ -16,7 +16,14 @@ from typing import Any
 from vjepa2_ac.errors import InputError, UserError, require_library
 from vjepa2_ac.explore.views import MOST_BYTES, PageRequest, Views, packed, read_request
 from vjepa2_ac.planning.planner import SearchCancelledError
-from vjepa2_ac.serving.access import Access, ends, listening_on, single_header, until_signalled, url_of
+from vjepa2_ac.serving.access import (
+    Access,
+    format_url,
+    get_single_header,
+    run_until_signal,
+    translate_listen_errors,
+    wait_for_shutdown,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -73,14 +80,14 @@ class ExploreServer:
         """
         library = require_library("websockets.asyncio.server", where="explore", called="websockets", extra="explore")
         how = {"process_request": self._respond, "max_size": MOST_BYTES, "compression": None, "server_header": None}
-        with listening_on(self._access, self._port):
+        with translate_listen_errors(self._access, self._port):
             server = await library.serve(self._serve_client, self._access.host, self._port, **how)
-        ready(f"{url_of(server, 'http')}/")
+        ready(f"{format_url(server, 'http')}/")
         try:
             await stop.wait()
         finally:
             server.close()
-            await ends(server.wait_closed())
+            await wait_for_shutdown(server.wait_closed())
             self._computing.shutdown(wait=False, cancel_futures=True)
 
     def _respond(self, connection: Any, request: Any) -> Any:
@@ -88,11 +95,11 @@ class ExploreServer:
 
         Only the page of this server may open a websocket: the header `Origin` must name the host of the request.
         """
-        path, host, status = request.path.partition("?")[0], single_header(request, "Host"), http.HTTPStatus
-        if self._access.why_not(host, None) is not None:
+        path, host, status = request.path.partition("?")[0], get_single_header(request, "Host"), http.HTTPStatus
+        if self._access.find_rejection(host, None) is not None:
             return connection.respond(status.FORBIDDEN, "the page is for this machine only, under its own names\n")
         if path == "/socket":
-            is_same_origin = single_header(request, "Origin") == f"http://{host}"
+            is_same_origin = get_single_header(request, "Origin") == f"http://{host}"
             return None if is_same_origin else connection.respond(status.FORBIDDEN, "not this server's page\n")
         if path not in _FILES:
             return connection.respond(status.NOT_FOUND, "no such page\n")
@@ -180,4 +187,4 @@ def serve_page(views: Views, port: int, ready: Callable[[str], None]) -> None:
         InputError: As for `ExploreServer.run`.
     """
     server = ExploreServer(views, port)
-    until_signalled(lambda stop: server.run(stop, ready))
+    run_until_signal(lambda stop: server.run(stop, ready))

@@ -1,1 +1,1 @@
-"""Serving: the planner behind a websocket, in the protocol of openpi. Wire format and session know no sockets."""
+"""Serve the planner over a websocket with the protocol of openpi. Only `server` and `client` use sockets."""

@@ -21,8 +21,8 @@ from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)
 
-LEAST_KEY = 16  # minimum number of characters of a key
-END_S = 1.5  # seconds that a stopping server waits for connections and computations
+MIN_KEY_CHARACTERS = 16  # minimum number of characters of a key
+SHUTDOWN_TIMEOUT_S = 1.5  # seconds that a stopping server waits for connections and computations
 _Result = TypeVar("_Result")
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:]+))(?::[0-9]*)?|([0-9a-f:]+)")  # [address]:port, name:port, address
 _SCHEMES = ("api-key", "bearer")  # openpi's clients send api-key
@@ -43,12 +43,12 @@ class Access:
 
     def __post_init__(self) -> None:
         if not is_loopback(self.host) and self.key is None and not self.is_insecure:
-            found = "an address that other machines can reach, and no key: whoever reaches it moves the robot"
-            needed = "--key-file FILE with a key that clients send; or --host 127.0.0.1"
-            fix = "--insecure serves without a key, in a network where everybody may move the robot"
+            found = "other machines can reach this address, and no key is set, so any of them could move the robot"
+            needed = "--key-file FILE with the key that clients send, or --host 127.0.0.1"
+            fix = "Use --insecure only in a network in which every machine may move the robot"
             raise InputError(where=f"--host {self.host}", found=found, needed=needed, fix=fix)
 
-    def why_not(self, host: str | None, authorization: str | None) -> tuple[int, str] | None:
+    def find_rejection(self, host: str | None, authorization: str | None) -> tuple[int, str] | None:
         """Return the HTTP status and the reason for which a request is rejected; None if it is accepted.
 
         Args:
@@ -57,9 +57,9 @@ class Access:
             authorization: The header `Authorization`.
         """
         if not self._is_known(host):
-            return 403, "this server is not known by that name (--allow-host NAME)"
+            return 403, "unknown host name in the request; start the server with --allow-host NAME to accept it"
         if self.key is not None and not self._has_key(authorization):
-            return 401, "this server needs the key of its --key-file, as `Authorization: Api-Key KEY`"
+            return 401, "a valid key is required; send the header `Authorization: Api-Key KEY`"
         return None
 
     def _is_known(self, host: str | None) -> bool:
@@ -89,20 +89,26 @@ def read_key(path: Path) -> str:
         mode = path.stat().st_mode
     except (OSError, UnicodeDecodeError) as error:
         found = error.strerror if isinstance(error, OSError) else "characters that are not ASCII"
-        raise InputError(where=f"--key-file {path}", found=str(found), needed="a file with a key") from None
+        raise InputError(
+            where=f"--key-file {path}", found=str(found), needed="a text file with a key in the first line"
+        ) from None
     key = text.partition("\n")[0].strip()
-    if len(key) < LEAST_KEY or not key.isprintable() or " " in key:
-        found = f"a first line of {len(key)} characters"
-        fix = f"Make one: python -c 'import secrets; print(secrets.token_urlsafe())' > {shlex.quote(str(path))}"
-        needed = f"a key of {LEAST_KEY} characters or more, without spaces"
+    if len(key) < MIN_KEY_CHARACTERS or not key.isprintable() or " " in key:
+        found = f"the first line is no valid key ({len(key)} characters)"
+        fix = f"Create a key: python -c 'import secrets; print(secrets.token_urlsafe())' > {shlex.quote(str(path))}"
+        needed = f"a key of at least {MIN_KEY_CHARACTERS} printable ASCII characters without spaces"
         raise InputError(where=f"--key-file {path}", found=found, needed=needed, fix=fix)
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        logger.warning("%s can be read by other users of this machine: chmod 600 %s", path, shlex.quote(str(path)))
+        logger.warning(
+            "other users of this machine can read the key in %s. Restrict the access: chmod 600 %s",
+            path,
+            shlex.quote(str(path)),
+        )
     return key
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address can be reached from this machine only. Of the names only `localhost` counts as such."""
+    """Return whether only this machine can reach an address. `localhost` is the only name that is accepted."""
     address = _address(host)
     return host == "localhost" or (address is not None and address.is_loopback)
 
@@ -114,14 +120,14 @@ def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return None
 
 
-def single_header(request: Any, name: str) -> str | None:
+def get_single_header(request: Any, name: str) -> str | None:
     """Return the value of a header; None if the request does not contain it exactly once."""
     values = request.headers.get_all(name)
     return values[0] if len(values) == 1 else None
 
 
 @contextmanager
-def listening_on(access: Access, port: int) -> Iterator[None]:
+def translate_listen_errors(access: Access, port: int) -> Iterator[None]:
     """Convert an OSError within the context into an error that names the address.
 
     Raises:
@@ -130,33 +136,33 @@ def listening_on(access: Access, port: int) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        where, fix = f"{access.host}:{port}", "Choose another port: --port 0 takes a free one"
-        raise InputError(where=where, found=f"cannot be listened on: {error.strerror or error}", fix=fix) from None
+        where, fix = f"{access.host}:{port}", "Choose another port, or --port 0 for a free one"
+        raise InputError(where=where, found=f"the server cannot listen ({error.strerror or error})", fix=fix) from None
 
 
-def url_of(server: Any, scheme: str) -> str:
+def format_url(server: Any, scheme: str) -> str:
     """Return the URL at which a server listens."""
     host, port = server.sockets[0].getsockname()[:2]
     return f"{scheme}://{f'[{host}]' if ':' in str(host) else host}:{port}"
 
 
-async def ends(*ending: Awaitable[Any]) -> bool:
-    """Wait for awaitables, at most `END_S` seconds; return whether all have finished."""
-    _, pending = await asyncio.wait([asyncio.ensure_future(item) for item in ending], timeout=END_S)
+async def wait_for_shutdown(*awaitables: Awaitable[Any]) -> bool:
+    """Wait for awaitables, at most `SHUTDOWN_TIMEOUT_S` seconds; return whether all have finished."""
+    _, pending = await asyncio.wait([asyncio.ensure_future(item) for item in awaitables], timeout=SHUTDOWN_TIMEOUT_S)
     return not pending
 
 
-def until_signalled(run: Callable[[asyncio.Event], Coroutine[Any, Any, _Result]]) -> _Result:
+def run_until_signal(run: Callable[[asyncio.Event], Coroutine[Any, Any, _Result]]) -> _Result:
     """Run a coroutine with an event that SIGTERM and SIGINT set, and return its result.
 
     Outside the main thread, signals are not handled.
     """
 
-    async def running() -> _Result:
+    async def run_with_signals() -> _Result:
         stop, loop = asyncio.Event(), asyncio.get_running_loop()
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGTERM, signal.SIGINT):
                 loop.add_signal_handler(number, stop.set)
         return await run(stop)
 
-    return asyncio.run(running())
+    return asyncio.run(run_with_signals())

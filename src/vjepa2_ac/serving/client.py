@@ -6,10 +6,10 @@ from contextlib import ExitStack
 from typing import Any
 
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
-from vjepa2_ac.serving.wire import MOST_BYTES, pack, require_msgpack, unpack
+from vjepa2_ac.serving.wire import MAX_MESSAGE_BYTES, pack, require_msgpack, unpack
 
-_HELLO_S = 30.0  # timeout for the metadata after connecting; a server only listens once its model is loaded
-_ANSWER_S = 120.0  # default timeout for a reply
+_METADATA_TIMEOUT_S = 30.0  # timeout for the metadata after connecting; a server only listens once its model is loaded
+_REPLY_TIMEOUT_S = 120.0  # default timeout for a reply
 
 
 class PlanningClient(ExitStack):
@@ -17,7 +17,7 @@ class PlanningClient(ExitStack):
 
     Example:
         >>> with PlanningClient("ws://127.0.0.1:8000") as client:
-        >>>     answer = client.infer({"observation/image": image, "observation/state": state, "goal/image": goal})
+        >>>     reply = client.infer({"observation/image": image, "observation/state": state, "goal/image": goal})
     """
 
     def __init__(self, url: str, key: str | None = None, *, timeout_s: float | None = None) -> None:
@@ -39,16 +39,18 @@ class PlanningClient(ExitStack):
         headers = {} if key is None else {"Authorization": f"Api-Key {key}"}
         try:
             self._connection = self.enter_context(
-                library.connect(url, compression=None, max_size=MOST_BYTES, additional_headers=headers, proxy=None)
+                library.connect(
+                    url, compression=None, max_size=MAX_MESSAGE_BYTES, additional_headers=headers, proxy=None
+                )
             )
-            self.metadata = unpack(self._connection.recv(timeout=_HELLO_S))
+            self.metadata = unpack(self._connection.recv(timeout=_METADATA_TIMEOUT_S))
         except Exception as error:
             self.close()
             body = getattr(getattr(error, "response", None), "body", None)  # the server's reason for a rejection
             found = f"{_reason(error)}: {body.decode(errors='replace').strip()}" if body else _reason(error)
-            raise UnreachableError(where=url, found=found, needed="a server (`vjepa2-ac serve`)") from None
+            raise UnreachableError(where=url, found=found, needed="a running server (`vjepa2-ac serve`)") from None
         deadline_s = self.metadata.get("deadline_s")
-        self._timeout_s = timeout_s or max(_ANSWER_S, 2 * deadline_s if isinstance(deadline_s, float) else 0.0)
+        self._timeout_s = timeout_s or max(_REPLY_TIMEOUT_S, 2 * deadline_s if isinstance(deadline_s, float) else 0.0)
 
     def infer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Send a request and return the server's reply (docs/serving_reference.md).
@@ -63,10 +65,10 @@ class PlanningClient(ExitStack):
             answer = self._connection.recv(timeout=self._timeout_s)
         except TimeoutError:
             self.close()
-            found, fix = f"no answer within {self._timeout_s:g} s", "See the server's log, and connect again"
+            found, fix = f"no reply within {self._timeout_s:g} s", "Check the server's log and connect again"
             raise UnreachableError(where=self.url, found=found, fix=fix) from None
         except Exception as error:
-            raise UnreachableError(where=self.url, found=f"the connection is lost: {_reason(error)}") from None
+            raise UnreachableError(where=self.url, found=f"the connection was lost ({_reason(error)})") from None
         if isinstance(answer, str):
             raise InputError(where=self.url, found=answer)
         return unpack(answer)

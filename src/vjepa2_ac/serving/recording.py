@@ -18,9 +18,9 @@ from vjepa2_ac.storage.structured import format_json, to_plain, utc_now
 
 logger = logging.getLogger(__name__)
 
-ABOUT, DECISIONS, IMAGES = "server.json", "decisions.jsonl", "images"
+SERVER_FILE, DECISIONS_FILE, IMAGES_FOLDER = "server.json", "decisions.jsonl", "images"
 FORMAT = 2  # incremented at changes that require changes of readers
-MOST_BYTES = 2 * 10**9  # default size limit of a recording
+MAX_RECORDING_BYTES = 2 * 10**9  # default size limit of a recording
 
 
 class Recorder:
@@ -30,29 +30,29 @@ class Recorder:
         InputError: The folder is not empty, or cannot be written.
     """
 
-    def __init__(self, folder: Path, about: Mapping[str, Any], most_bytes: int = MOST_BYTES) -> None:
+    def __init__(self, folder: Path, about: Mapping[str, Any], max_bytes: int = MAX_RECORDING_BYTES) -> None:
         """Create the folder and write the description of the server.
 
         Args:
             folder: A new or empty folder.
             about: Description of the server: model, config, options.
-            most_bytes: Size limit of the folder in bytes.
+            max_bytes: Size limit of the folder in bytes.
         """
-        self.folder, self._left = folder, most_bytes
+        self.folder, self._bytes_left = folder, max_bytes
         self._goals: tuple[np.ndarray, ...] = ()  # images of the current goals, then the mask
         self._episode = 0
-        self._is_on = True
+        self._is_active = True
         require_new_folder(folder)
         with translate_write_errors(folder):
-            (folder / IMAGES).mkdir(parents=True, exist_ok=True)
-            write_atomically(folder / ABOUT, format_json({"format": FORMAT, **about}))
+            (folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
+            write_atomically(folder / SERVER_FILE, format_json({"format": FORMAT, **about}))
 
-    def goal(self, goals: Sequence[SubGoal], mask: np.ndarray | None) -> None:
+    def set_goals(self, goals: Sequence[SubGoal], mask: np.ndarray | None) -> None:
         """Set the goals of the next decisions, and start a new episode of the recording."""
         masks = () if mask is None else (np.repeat(np.uint8(255) * (mask > 0)[..., None], 3, axis=-1),)
         self._goals, self._episode = (*(goal.image for goal in goals), *masks), self._episode + 1
 
-    def decision(self, frame: np.ndarray, state: np.ndarray, answer: Mapping[str, Any]) -> None:
+    def write_decision(self, frame: np.ndarray, state: np.ndarray, answer: Mapping[str, Any]) -> None:
         """Record a decision: the observation and the reply.
 
         Args:
@@ -60,23 +60,25 @@ class Recorder:
             state: The measured state.
             answer: The reply to the robot.
         """
-        if not self._is_on:
+        if not self._is_active:
             return
         try:
             line = {"time": utc_now(), "episode": self._episode, "frame": self._image(frame), "state": to_plain(state)}
             line |= {"goals": [self._image(image) for image in self._goals], "answer": to_plain(answer)}
             text = json.dumps(line, allow_nan=False) + "\n"
             self._count(len(text.encode()))
-            with (self.folder / DECISIONS).open("a") as file:
+            with (self.folder / DECISIONS_FILE).open("a") as file:
                 file.write(text)
         except OSError as error:
-            self._is_on = False
-            logger.warning("the record in %s ends here, the server continues: %s", self.folder, error.strerror or error)
+            self._is_active = False
+            logger.warning(
+                "recording to %s has stopped, the server continues: %s", self.folder, error.strerror or error
+            )
 
     def _image(self, pixels: np.ndarray) -> str:
         """Write an image unless the folder contains it already; return its name in the folder."""
         digest = hashlib.sha256(repr(pixels.shape).encode() + np.ascontiguousarray(pixels).tobytes()).hexdigest()[:24]
-        name = f"{IMAGES}/{digest}.png"
+        name = f"{IMAGES_FOLDER}/{digest}.png"
         if not (self.folder / name).exists():
             data = encode_png(pixels)
             self._count(len(data))
@@ -84,6 +86,6 @@ class Recorder:
         return name
 
     def _count(self, size: int) -> None:
-        if size > self._left:
-            raise OSError("it has its largest size")
-        self._left -= size
+        if size > self._bytes_left:
+            raise OSError("the size limit is reached")
+        self._bytes_left -= size

@@ -19,17 +19,17 @@ from vjepa2_ac.storage.structured import parse_record
 IMAGE_KEYS = ("observation/exterior_image_1_left", "observation/exterior_image_0_left", "observation/image")
 """Keys of the camera image (DROID, RoboArena, generic); the first one that a message contains is used."""
 
-MOST_GOALS = 32  # goal images of one request
-MOST_STEPS = 10_000  # model steps of one goal
-_Steps = Annotated[int, Field(ge=0, le=MOST_STEPS)]
+MAX_GOALS = 32  # goal images of one request
+MAX_STEPS = 10_000  # model steps of one goal
+_Steps = Annotated[int, Field(ge=0, le=MAX_STEPS)]
 
 _STATE, _POSE, _GRIPPER = "observation/state", "observation/cartesian_position", "observation/gripper_position"
-_GOAL = "goal/"
-_MAIN_KEYS = ("goal/image", "goal/images", "goal/name")
-_FURTHER_KEYS = ("goal/rules", "goal/mask")
+_GOAL_PREFIX = "goal/"
+_GOAL_KEYS = ("goal/image", "goal/images", "goal/name")
+_GOAL_OPTIONS = ("goal/rules", "goal/mask")
 _ENDPOINTS = ("infer", "reset", "score")
 _CHUNKS, _FORM, _FORMS = "policy/chunks", "policy/form", get_args(ChunkForm)
-MOST_CHUNKS, MOST_CHUNK_STEPS = 1024, 256  # action chunks of one request, and control steps of a chunk
+MAX_CHUNKS, MAX_CHUNK_STEPS = 1024, 256  # action chunks of one request, and control steps of a chunk
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class GoalRule:
 
 
 @dataclass(frozen=True, eq=False)
-class GivenGoal:
+class GoalRequest:
     """The goal of a request: images with rules, or the name of a goal that is stored on the server."""
 
     goals: tuple[SubGoal, ...] = ()
@@ -68,8 +68,8 @@ class Request:
     """One message of a client."""
 
     episode: str | None = None  # the message's session_id; a new one starts an episode
-    begins: bool = False  # whether the message starts an episode (reset)
-    goal: GivenGoal | None = None  # None: the previous goal
+    is_new_episode: bool = False  # whether the message starts an episode (reset)
+    goal: GoalRequest | None = None  # None: the previous goal
     frame: UInt8[np.ndarray, "height width 3"] | None = None  # None: a reset, which requests no action
     state: Float[np.ndarray, " dim"] | None = None  # None: a reset
     chunks: Float[np.ndarray, "chunks steps dim"] | None = None  # action chunks of a policy, at control rate
@@ -89,23 +89,23 @@ def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_K
     """
     endpoint, reset, episode = message.get("endpoint", "infer"), message.get("reset", False), message.get("session_id")
     if not isinstance(endpoint, str) or endpoint not in _ENDPOINTS:
-        raise _wrong("endpoint", endpoint, " or ".join(_ENDPOINTS))
+        raise _make_error("endpoint", endpoint, " or ".join(_ENDPOINTS))
     if not isinstance(reset, bool):
-        raise _wrong("reset", reset, "True or False")
+        raise _make_error("reset", reset, "True or False")
     if episode is not None and not isinstance(episode, str):
-        raise _wrong("session_id", episode, "a text, another one for each episode")
+        raise _make_error("session_id", episode, "a string that differs between episodes")
     goal = _goal(message)
     if endpoint == "reset":
-        return Request(episode, begins=True, goal=goal)
+        return Request(episode, is_new_episode=True, goal=goal)
     key = next((key for key in image_keys if key in message), None)
     if key is None:
-        raise _missing(message, f"the picture of the camera, as {' or '.join(image_keys)}")
+        raise _make_missing_key_error(message, f"the camera image under the key {' or '.join(image_keys)}")
     chunks, form = message.get(_CHUNKS), message.get(_FORM, "targets")
     if not isinstance(form, str) or form not in _FORMS:
-        raise _wrong(_FORM, form, " or ".join(_FORMS))
+        raise _make_error(_FORM, form, " or ".join(_FORMS))
     if (chunks is not None or endpoint == "score") and not _is_chunks(chunks):
-        needed = f"floats, up to {MOST_CHUNKS} chunks x up to {MOST_CHUNK_STEPS} control steps x numbers of a state"
-        raise _wrong(_CHUNKS, chunks, needed)
+        needed = f"a float array [chunks up to {MAX_CHUNKS}, control steps up to {MAX_CHUNK_STEPS}, numbers of a state]"
+        raise _make_error(_CHUNKS, chunks, needed)
     frame, state = _image(message[key], key), _state(message)
     chunks = None if chunks is None else chunks.astype(np.float64)
     return Request(episode, reset, goal, frame, state, chunks, cast("ChunkForm", form), endpoint == "score")
@@ -113,12 +113,12 @@ def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_K
 
 def _is_chunks(value: Any) -> bool:
     is_array = isinstance(value, np.ndarray) and value.ndim == 3 and value.dtype.kind == "f" and value.size > 0
-    return is_array and len(value) <= MOST_CHUNKS and value.shape[1] <= MOST_CHUNK_STEPS
+    return is_array and len(value) <= MAX_CHUNKS and value.shape[1] <= MAX_CHUNK_STEPS
 
 
 def _image(value: Any, where: str) -> np.ndarray:
     if not isinstance(value, np.ndarray) or value.ndim != 3 or value.shape[2] != 3 or value.dtype != np.uint8:
-        raise _wrong(where, value, "an RGB image: height x width x 3, uint8")
+        raise _make_error(where, value, "an RGB image [height, width, 3] of type uint8")
     return value
 
 
@@ -126,11 +126,13 @@ def _state(message: Mapping[str, Any]) -> np.ndarray:
     if _STATE in message:
         return _numbers(message[_STATE], _STATE)
     if _POSE not in message or _GRIPPER not in message:
-        raise _missing(message, f"the measured state, as {_STATE}, or as {_POSE} with {_GRIPPER}")
+        raise _make_missing_key_error(
+            message, f"the measured state under the key {_STATE}, or under {_POSE} and {_GRIPPER}"
+        )
     pose, gripper = _numbers(message[_POSE], _POSE), _numbers(message[_GRIPPER], _GRIPPER)
     if pose.shape != (6,) or gripper.shape != (1,):
         found = f"{pose.size} and {gripper.size} numbers"
-        needed = "six (x, y, z in metres; roll, pitch, yaw in radians, extrinsic xyz), and one (0 open, 1 closed)"
+        needed = "6 numbers (x, y, z in metres; roll, pitch, yaw in radians, extrinsic xyz) and 1 (0 open, 1 closed)"
         raise InputError(where=f"{_POSE}, {_GRIPPER}", found=found, needed=needed)
     return np.concatenate([pose, gripper])
 
@@ -143,32 +145,36 @@ def _numbers(value: Any, where: str) -> np.ndarray:
             return np.atleast_1d(value).astype(np.float64)
     elif all(type(number) in (int, float) for number in numbers):
         return np.array(numbers, dtype=np.float64)
-    raise _wrong(where, value, "a row of numbers")
+    raise _make_error(where, value, "a one-dimensional array of numbers")
 
 
-def _goal(message: Mapping[str, Any]) -> GivenGoal | None:
+def _goal(message: Mapping[str, Any]) -> GoalRequest | None:
     """Return the goal of a request; without goal keys the prompt is the name of the goal."""
-    goal_keys = sorted(key for key in message if key.startswith(_GOAL))
+    goal_keys = sorted(key for key in message if key.startswith(_GOAL_PREFIX))
     for key in goal_keys:
-        if key not in {*_MAIN_KEYS, *_FURTHER_KEYS}:
-            raise _wrong("request", key, ", ".join(sorted((*_MAIN_KEYS, *_FURTHER_KEYS))))
-    main_keys = [key for key in _MAIN_KEYS if key in message]
+        if key not in {*_GOAL_KEYS, *_GOAL_OPTIONS}:
+            raise _make_error("request", key, "one of " + ", ".join(sorted((*_GOAL_KEYS, *_GOAL_OPTIONS))))
+    main_keys = [key for key in _GOAL_KEYS if key in message]
     if len(main_keys) > 1 or (goal_keys and not main_keys):
-        raise InputError(where="goal", found=", ".join(goal_keys), needed="one of goal/image, goal/images, goal/name")
+        raise InputError(
+            where="goal", found=", ".join(goal_keys), needed="exactly one of goal/image, goal/images, goal/name"
+        )
     if main_keys and main_keys != ["goal/name"]:
-        return GivenGoal(
-            _in_order(_images(message, main_keys[0]), message.get("goal/rules")), _mask(message.get("goal/mask"))
+        return GoalRequest(
+            _make_sub_goals(_images(message, main_keys[0]), message.get("goal/rules")), _mask(message.get("goal/mask"))
         )
     if len(goal_keys) > 1:
         found = ", ".join(goal_keys)
-        raise InputError(where="goal", found=found, needed="goal/name alone: the server knows the rest")
+        raise InputError(
+            where="goal", found=found, needed="only goal/name, because a named goal has its own rules and mask"
+        )
     key = "goal/name" if main_keys else "prompt"
     name = message.get(key)
     if name is None and not main_keys:
         return None
     if not isinstance(name, str):
-        raise _wrong(key, name, "a text: the name of a goal")
-    return GivenGoal(name=name)
+        raise _make_error(key, name, "a string: the name of a goal")
+    return GoalRequest(name=name)
 
 
 def _images(message: Mapping[str, Any], key: str) -> tuple[np.ndarray, ...]:
@@ -176,17 +182,18 @@ def _images(message: Mapping[str, Any], key: str) -> tuple[np.ndarray, ...]:
     if key == "goal/image":
         return (_image(value, key),)
     images = list(value) if isinstance(value, np.ndarray) and value.ndim == 4 else value
-    if not isinstance(images, list) or not 1 <= len(images) <= MOST_GOALS:
-        raise _wrong(key, value, f"1 to {MOST_GOALS} images of one size, in order")
+    if not isinstance(images, list) or not 1 <= len(images) <= MAX_GOALS:
+        raise _make_error(key, value, f"1 to {MAX_GOALS} images of the same size, in order")
     return tuple(_image(image, f"{key}[{index}]") for index, image in enumerate(images))
 
 
-def _in_order(images: Sequence[np.ndarray], rules: Any) -> tuple[SubGoal, ...]:
+def _make_sub_goals(images: Sequence[np.ndarray], rules: Any) -> tuple[SubGoal, ...]:
     """Combine goal images with their rules; without rules the defaults of `GoalRule` apply."""
-    needed = f"a map for each of {counted(len(images), 'image')}: {', '.join(field.name for field in fields(GoalRule))}"
+    keys = ", ".join(field.name for field in fields(GoalRule))
+    needed = f"a map with the keys {keys} for each of {counted(len(images), 'image')}"
     rules = [{}] * len(images) if rules is None else rules
     if not isinstance(rules, list) or len(rules) != len(images) or not all(map(_is_rule, rules)):
-        raise _wrong("goal/rules", rules, needed)
+        raise _make_error("goal/rules", rules, needed)
     goals = []
     for index, (image, values) in enumerate(zip(images, rules, strict=True)):
         rule = parse_record(GoalRule, values, where=f"goal/rules[{index}]", needed=needed)
@@ -201,17 +208,19 @@ def _is_rule(value: Any) -> bool:
 
 def _mask(value: Any) -> np.ndarray | None:
     if value is not None and (not isinstance(value, np.ndarray) or value.ndim != 2 or value.dtype.kind not in "bu"):
-        needed = "height x width, of the goal's size, bool or whole numbers: 0 where the image does not count"
-        raise _wrong("goal/mask", value, needed)
+        needed = (
+            "a bool or integer array [height, width] of the goal's size, with 0 where the goal image does not count"
+        )
+        raise _make_error("goal/mask", value, needed)
     return value
 
 
-def _missing(message: Mapping[str, Any], needed: str) -> InputError:
+def _make_missing_key_error(message: Mapping[str, Any], needed: str) -> InputError:
     found = f"the keys {', '.join(sorted(map(repr, message)))}" if message else "an empty map"
     return InputError(where="request", found=found, needed=needed)
 
 
-def _wrong(where: str, value: Any, needed: str) -> InputError:
+def _make_error(where: str, value: Any, needed: str) -> InputError:
     if isinstance(value, np.ndarray):
         return InputError(where=where, found=f"an array of shape {value.shape} and type {value.dtype}", needed=needed)
     text = repr(value)

@@ -13,13 +13,20 @@ from functools import partial
 from typing import Any
 
 from vjepa2_ac.errors import require_library
-from vjepa2_ac.serving.access import Access, ends, listening_on, single_header, until_signalled, url_of
-from vjepa2_ac.serving.session import GoneError, Session
-from vjepa2_ac.serving.wire import MOST_BYTES, pack
+from vjepa2_ac.serving.access import (
+    Access,
+    format_url,
+    get_single_header,
+    run_until_signal,
+    translate_listen_errors,
+    wait_for_shutdown,
+)
+from vjepa2_ac.serving.session import ClientDisconnectedError, Session
+from vjepa2_ac.serving.wire import MAX_MESSAGE_BYTES, pack
 
-_OPEN_S = 10.0  # timeout of a handshake
-_PING_S = 20.0  # interval of pings, and the timeout of their replies
-_WAITING = 2  # messages of a client that are received before the previous ones are answered
+_HANDSHAKE_TIMEOUT_S = 10.0  # timeout of a handshake
+_PING_INTERVAL_S = 20.0  # interval of pings, and the timeout of their replies
+_MAX_QUEUED_MESSAGES = 2  # messages of a client that are received before the previous ones are answered
 
 Load = Callable[[], tuple[Session, Mapping[str, Any]]]
 """Loads the model and makes a first decision; returns the session, and the metadata that is sent on connect."""
@@ -28,15 +35,15 @@ Load = Callable[[], tuple[Session, Mapping[str, Any]]]
 class PlanningServer:
     """A websocket server that plans for one robot at a time."""
 
-    def __init__(self, access: Access, port: int, tell: Callable[[str], None]) -> None:
+    def __init__(self, access: Access, port: int, print_status: Callable[[str], None]) -> None:
         """Create a server; nothing is loaded yet.
 
         Args:
             access: Listening address and access rules.
             port: The port; 0: a free one.
-            tell: Prints a status line.
+            print_status: Prints a status line.
         """
-        self._access, self._port, self._tell = access, port, tell
+        self._access, self._port, self._print_status = access, port, print_status
         self._planning = ThreadPoolExecutor(1, "planning")
         self._robot: str | None = None  # address of the connected robot
         self._rejected: Counter[str] = Counter()  # number of rejected connections by HTTP status
@@ -55,18 +62,18 @@ class PlanningServer:
             InputError: The model cannot be loaded, or the server cannot listen on the address.
         """
         library = require_library("websockets.asyncio.server", where="serve", called="websockets", extra="serve")
-        with listening_on(self._access, self._port):
+        with translate_listen_errors(self._access, self._port):
             server = await library.serve(
                 self._serve_robot,
                 self._access.host,
                 self._port,
                 start_serving=False,  # only binds the address
                 process_request=self._handle_http,
-                max_size=MOST_BYTES,
-                max_queue=_WAITING,
-                open_timeout=_OPEN_S,
-                ping_interval=_PING_S,
-                ping_timeout=_PING_S,
+                max_size=MAX_MESSAGE_BYTES,
+                max_queue=_MAX_QUEUED_MESSAGES,
+                open_timeout=_HANDSHAKE_TIMEOUT_S,
+                ping_interval=_PING_INTERVAL_S,
+                ping_timeout=_PING_INTERVAL_S,
                 compression=None,
                 server_header=None,
             )
@@ -76,15 +83,15 @@ class PlanningServer:
             await _first_of(loading, stopping)
             if not stop.is_set():
                 self._session, self._metadata = loading.result()
-                with listening_on(self._access, self._port):  # another program may listen on the port by now
+                with translate_listen_errors(self._access, self._port):  # another program may listen on the port by now
                     await server.start_serving()
-                self._tell(f"listening on {url_of(server, 'ws')}")
+                self._print_status(f"listening on {format_url(server, 'ws')}")
                 await stopping
         finally:
             server.close()  # disconnects the clients, which cancels their searches
-            last = asyncio.wrap_future(self._planning.submit(int))
+            pending_work = asyncio.wrap_future(self._planning.submit(int))
             self._planning.shutdown(wait=False)
-            has_ended = await ends(server.wait_closed(), last)
+            has_ended = await wait_for_shutdown(server.wait_closed(), pending_work)
         return has_ended
 
     def _handle_http(self, connection: Any, request: Any) -> Any:
@@ -93,17 +100,17 @@ class PlanningServer:
         Health checks need no key. A robot is rejected while another one is connected.
         """
         path, status = request.path.partition("?")[0], http.HTTPStatus
-        host, authorization = (single_header(request, name) for name in ("Host", "Authorization"))
+        host, authorization = (get_single_header(request, name) for name in ("Host", "Authorization"))
         if path in {"/healthz", "/readyz"}:
             return connection.respond(status.OK, "OK\n")
-        rejection = self._access.why_not(host, authorization)
+        rejection = self._access.find_rejection(host, authorization)
         if rejection is None and path == "/metrics":
             return connection.respond(status.OK, self._metrics())
         if rejection is None and path != "/":
-            return connection.respond(status.NOT_FOUND, "no such page\n")
+            return connection.respond(status.NOT_FOUND, "not found\n")
         if rejection is None and request.headers.get_all("Upgrade"):
             if request.headers.get_all("Origin"):
-                rejection = status.FORBIDDEN.value, "a page in a browser moves no robot"
+                rejection = status.FORBIDDEN.value, "connections from web pages are not accepted"
             elif self._robot is not None:
                 rejection = status.SERVICE_UNAVAILABLE.value, _busy(self._robot)
         if rejection is None:
@@ -113,39 +120,41 @@ class PlanningServer:
 
     async def _serve_robot(self, connection: Any) -> None:
         """Serve a robot until it disconnects."""
-        if self._robot is not None:  # two robots connected at the same time
+        if self._robot is not None:  # two robots have connected at the same time
             await connection.close(1013, _busy(self._robot)[:100])
             return
         self._robot = _name(connection)
-        left = asyncio.ensure_future(connection.wait_closed())
+        disconnected = asyncio.ensure_future(connection.wait_closed())
         closed = require_library("websockets.exceptions", where="serve", called="websockets", extra="serve")
-        self._tell(f"{self._robot} is here")
+        self._print_status(f"robot connected: {self._robot}")
         try:
-            await asyncio.wrap_future(self._planning.submit(self._session.begin))
+            await asyncio.wrap_future(self._planning.submit(self._session.reset))
             with contextlib.suppress(closed.ConnectionClosed):
                 await connection.send(pack(self._metadata))
                 async for message in connection:
                     if isinstance(message, str):
-                        await connection.send("a request is a binary message, in msgpack")
-                    elif (answer := await self._answer(message, left)) is not None:
+                        await connection.send("received a text message. Expected a binary message in msgpack")
+                    elif (answer := await self._answer(message, disconnected)) is not None:
                         await connection.send(answer)
-            self._tell(f"{self._robot} has left")
+            self._print_status(f"robot disconnected: {self._robot}")
         finally:
             self._robot = None
-            left.cancel()
+            disconnected.cancel()
 
-    async def _answer(self, message: bytes, left: asyncio.Future[None]) -> bytes | str | None:
+    async def _answer(self, message: bytes, disconnected: asyncio.Future[None]) -> bytes | str | None:
         """Return the reply to a message; None if the robot has disconnected, which cancels its search."""
-        gone = threading.Event()
-        answering = asyncio.wrap_future(self._planning.submit(lambda: self._session.answer(message, gone.is_set)))
+        is_disconnected = threading.Event()
+        answering = asyncio.wrap_future(
+            self._planning.submit(lambda: self._session.answer(message, is_disconnected.is_set))
+        )
         try:
-            await _first_of(answering, left)
+            await _first_of(answering, disconnected)
         finally:
             if not answering.done():
-                gone.set()
+                is_disconnected.set()
         try:
             return await answering
-        except GoneError:
+        except ClientDisconnectedError:
             return None
 
     def _metrics(self) -> str:
@@ -153,7 +162,7 @@ class PlanningServer:
         counts = self._session.counts
         values = {
             "robots": int(self._robot is not None),
-            "requests_refused_total": counts.refused,
+            "requests_refused_total": counts.rejected,
             "requests_failed_total": counts.failed,
             "episodes_total": counts.episodes,
             "alarms_total": counts.alarms,
@@ -166,13 +175,13 @@ class PlanningServer:
         return "".join(f"vjepa2_ac_{name} {value}\n" for name, value in values.items())
 
 
-def serve(load: Load, access: Access, port: int, tell: Callable[[str], None]) -> bool:
+def serve(load: Load, access: Access, port: int, print_status: Callable[[str], None]) -> bool:
     """Run a planning server until SIGTERM or SIGINT; return whether the planning thread has ended, too.
 
     Raises:
         InputError: As for `PlanningServer.run`.
     """
-    return until_signalled(partial(PlanningServer(access, port, tell).run, load))
+    return run_until_signal(partial(PlanningServer(access, port, print_status).run, load))
 
 
 async def _first_of(*futures: asyncio.Future[Any]) -> None:
@@ -180,7 +189,7 @@ async def _first_of(*futures: asyncio.Future[Any]) -> None:
 
 
 def _busy(robot: str) -> str:
-    return f"busy: a robot at {robot} is being served, and one server moves one robot"
+    return f"busy: the robot at {robot} is connected, and a server accepts one robot at a time"
 
 
 def _name(connection: Any) -> str:

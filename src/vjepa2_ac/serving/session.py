@@ -1,4 +1,4 @@
-"""Answer the requests of one robot with a controller, independently of the network.
+"""Answer the requests of one robot with a controller. This module does not use the network.
 
 On any error the robot does not move. An invalid request is answered with a sentence, which openpi's clients raise as an
 error. A decision without a plan is answered with the zero action. No action is sent twice, and each planned action is
@@ -27,7 +27,7 @@ from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
 from vjepa2_ac.planning.search_space import Workspace, is_allowed
 from vjepa2_ac.policies.score import changes_of_chunks
 from vjepa2_ac.serving.recording import Recorder
-from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, Request, read_request
+from vjepa2_ac.serving.request import IMAGE_KEYS, GoalRequest, Request, read_request
 from vjepa2_ac.serving.wire import WireError, pack, unpack
 from vjepa2_ac.spaces import StateSpace, apply_action, euler_from_matrices, matrices_from_euler
 from vjepa2_ac.storage.structured import to_plain
@@ -37,10 +37,10 @@ logger = logging.getLogger(__name__)
 ActionForm = Literal["delta", "pose"]
 Clock = Callable[[], float]  # seconds since an arbitrary time
 
-_MOST_NAMES = 20  # names of goals in an error message
-LATE = "past the deadline"
-_ALARM = "what the camera sees departs from what was predicted: look at the robot"
-_BAR = 0.05  # share of the height; an image that is black at top and bottom over this share is padded
+_MAX_NAMES = 20  # names of goals in an error message
+DEADLINE_EXCEEDED = "past the deadline"
+_ALARM = "the camera image differs from the predicted frame; check the robot"
+_BAR_HEIGHT = 0.05  # share of the height; an image that is black at top and bottom over this share is padded
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Counts:
     """Counters of a session, for the metrics page of the server."""
 
     decisions: Counter[str] = field(default_factory=Counter)  # number of decisions by reason
-    refused: int = 0  # invalid requests
+    rejected: int = 0  # invalid requests
     failed: int = 0  # requests that ended in an internal error
     episodes: int = 0
     alarms: int = 0  # frames whose surprise was above the threshold
@@ -68,7 +68,7 @@ class Counts:
     seconds: float = 0.0  # total duration of all decisions
 
 
-class GoneError(Exception):
+class ClientDisconnectedError(Exception):
     """The client has disconnected, so that no reply is needed."""
 
 
@@ -100,61 +100,63 @@ class Session:
         self.recorder: Recorder | None = None  # records every decision
         self._clock = clock
         self._episode: str | None = None
-        self._has_begun = False  # whether this robot has started an episode
+        self._has_episode = False  # whether this robot has started an episode
         self._goal: str | None = None  # fingerprint of the current goal
         self._names: tuple[str, ...] = ()  # names of its sub-goals
         self._notes: list[str] = []  # notes for the client in this episode
         self._last_ms: float | None = None
         if self.options.actions == "pose" and not controller.spaces.state.is_pose:
-            found = "a model whose states are not poses"
-            raise InputError(where="--actions pose", found=found, needed="--actions delta, or a model of poses")
+            found = "the states of the model are not poses"
+            raise InputError(where="--actions pose", found=found, needed="--actions delta, or a model with pose states")
 
-    def begin(self) -> None:
+    def reset(self) -> None:
         """Reset the state of the session for another robot."""
-        self._episode, self._has_begun, self._last_ms = None, False, None
+        self._episode, self._has_episode, self._last_ms = None, False, None
 
-    def answer(self, message: bytes, is_gone: Callable[[], bool] = lambda: False) -> bytes | str:
+    def answer(self, message: bytes, is_disconnected: Callable[[], bool] = lambda: False) -> bytes | str:
         """Return the reply to a message: an encoded map, or the text of an error.
 
         Args:
             message: The received bytes.
-            is_gone: Returns whether the client has disconnected.
+            is_disconnected: Returns whether the client has disconnected.
 
         Raises:
-            GoneError: The client disconnected during the search.
+            ClientDisconnectedError: The client disconnected during the search.
         """
-        began = self._clock()
+        start_time = self._clock()
         try:
             request = read_request(unpack(message), self.options.image_keys)
-            reply = self._answered(request, began, is_gone)
+            reply = self._handle(request, start_time, is_disconnected)
         except (WireError, InputError) as error:
-            self.counts.refused += 1
+            self.counts.rejected += 1
             return str(error)
-        except GoneError:
+        except ClientDisconnectedError:
             raise
         except Exception:
             self.counts.failed += 1
-            logger.exception("a request could not be answered")
-            return "the server failed at this request; its log says more"
-        self._last_ms = 1e3 * (self._clock() - began)
+            logger.exception("an internal error occurred while a request was processed")
+            return "internal error; the server's log contains the details"
+        self._last_ms = 1e3 * (self._clock() - start_time)
         return pack(reply)
 
-    def _answered(self, request: Request, began: float, is_gone: Callable[[], bool]) -> dict[str, Any]:
-        if request.begins or not self._has_begun or request.episode not in (None, self._episode):
-            self._episode, self._has_begun, self._goal, self._notes = request.episode or self._episode, True, None, []
+    def _handle(self, request: Request, start_time: float, is_disconnected: Callable[[], bool]) -> dict[str, Any]:
+        if request.is_new_episode or not self._has_episode or request.episode not in (None, self._episode):
+            self._episode, self._has_episode, self._goal, self._notes = request.episode or self._episode, True, None, []
             self.counts.episodes += 1
-        until = began + self.options.deadline_s
+        deadline = start_time + self.options.deadline_s
         try:
-            return self._carried_out(request, began, lambda: is_gone() or self._clock() > until)
+            return self._execute(request, start_time, lambda: is_disconnected() or self._clock() > deadline)
         except SearchCancelledError:
-            if is_gone():
-                raise GoneError from None
+            if is_disconnected():
+                raise ClientDisconnectedError from None
             if request.frame is None or request.state is None or request.is_score:
-                fix = "Send fewer goals or chunks, or raise --deadline"
-                raise InputError(where="request", found=f"no answer: {LATE}", fix=fix) from None
-            return self._sent(request.frame, request.state, (None, LATE), (began, began))
+                fix = "Send fewer goals or chunks, or increase --deadline"
+                raise InputError(
+                    where="request", found=f"not finished within the deadline of {self.options.deadline_s:g} s", fix=fix
+                ) from None
+            return self._make_reply(request.frame, request.state, (None, DEADLINE_EXCEEDED), (start_time, start_time))
 
-    def _carried_out(self, request: Request, began: float, cancelled: Cancelled) -> dict[str, Any]:
+    def _execute(self, request: Request, start_time: float, cancelled: Cancelled) -> dict[str, Any]:
         """Set the goal of a request if it is new, then decide or score, and return the reply.
 
         Raises:
@@ -162,22 +164,22 @@ class Session:
         """
         if request.goal is not None and (fingerprint := request.goal.fingerprint) != self._goal:
             self._goal, self._notes = None, []  # after an invalid goal there is no goal
-            self._set(request.goal, cancelled)
+            self._set_goal(request.goal, cancelled)
             self._goal = fingerprint
         if request.frame is None or request.state is None:
             return {"status": "reset"}
         if self._goal is None:
-            needed = f"a goal first: goal/image, goal/images or goal/name{self._known_names()}"
-            raise InputError(where="request", found="no goal in this episode", needed=needed)
-        changes, planning_began, observation = self._changes(request), self._clock(), (request.frame, request.state)
+            needed = f"goal/image, goal/images or goal/name{self._known_names()}"
+            raise InputError(where="request", found="no goal was set in this episode", needed=needed)
+        changes, planning_start, observation = self._changes(request), self._clock(), (request.frame, request.state)
         if request.is_score and changes is not None:  # the robot does not move, and no decision is counted
             scores = self.controller.score(*observation, changes, cancelled=cancelled)
             return {**scores.as_dict(is_blind=self.options.is_blind), "goal": scores.goal}
         self.controller.act(*observation, samples=changes, cancelled=cancelled)
-        decision, why = self._checked(request.state)
-        self._note(request.frame)
-        self._watch(decision)
-        return self._sent(*observation, (decision, why), (began, planning_began))
+        decision, why = self._check_limits(request.state)
+        self._check_frame(request.frame)
+        self._count_surprise(decision)
+        return self._make_reply(*observation, (decision, why), (start_time, planning_start))
 
     def _changes(self, request: Request) -> Float[np.ndarray, "chunks model_steps dim"] | None:
         """Convert the action chunks of a request into changes per model step; None if there are none."""
@@ -186,46 +188,46 @@ class Session:
         steps, space = self.options.control_steps, self.controller.spaces.state
         return changes_of_chunks(request.chunks, request.state, form=request.form, control_steps=steps, space=space)
 
-    def _sent(
+    def _make_reply(
         self,
         frame: np.ndarray,
         state: np.ndarray,
-        decided: tuple[Decision | None, str],
-        began: tuple[float, float],
+        decision_and_reason: tuple[Decision | None, str],
+        start_times: tuple[float, float],
     ) -> dict[str, Any]:
         """Return the reply to a request for an action; count and record it.
 
         Args:
             frame: The camera image.
             state: The measured state.
-            decided: The decision, if there is one, and its reason.
-            began: Start times of the request and of the planning.
+            decision_and_reason: The decision, or None, and its reason.
+            start_times: Start times of the request and of the planning.
         """
-        reply, now = self._message(decided[0], state, why := decided[1]), self._clock()
-        reply["server_timing"], reply["policy_timing"] = ({"infer_ms": 1e3 * (now - start)} for start in began)
+        reply, now = self._format_decision(decision_and_reason[0], state, why := decision_and_reason[1]), self._clock()
+        reply["server_timing"], reply["policy_timing"] = ({"infer_ms": 1e3 * (now - start)} for start in start_times)
         if self._last_ms is not None:
             reply["server_timing"]["prev_total_ms"] = self._last_ms
         self.counts.decisions[why] += 1
-        self.counts.seconds += now - began[0]
+        self.counts.seconds += now - start_times[0]
         if self.recorder is not None:
-            self.recorder.decision(frame, state, reply)
+            self.recorder.write_decision(frame, state, reply)
         return reply
 
-    def _checked(self, state: np.ndarray) -> tuple[Decision, str]:
-        """Return the decision and its reason; the plan is removed if the limits do not allow to send it."""
+    def _check_limits(self, state: np.ndarray) -> tuple[Decision, str]:
+        """Return the decision and its reason. The plan is removed if it violates the limits."""
         decision, controller = self.controller.decision, self.controller
         if decision is None:
-            raise ValueError("a controller that acted has decided")
+            raise ValueError("the controller has no decision after `act`")
         if decision.plan is None:
             return decision, decision.why
         changes = decision.plan.actions.double().numpy()
-        reason = why_not_sent(state, changes, controller.config.limits, controller.spaces.state)
+        reason = find_limit_violation(state, changes, controller.config.limits, controller.spaces.state)
         if not reason:
             return decision, decision.why
-        logger.error("a planned action is not sent: %s", reason)
+        logger.error("a planned action was not sent: %s", reason)
         return replace(decision, plan=None, states=None), f"not sent: {reason}"
 
-    def _message(self, decision: Decision | None, state: np.ndarray, why: str) -> dict[str, Any]:
+    def _format_decision(self, decision: Decision | None, state: np.ndarray, why: str) -> dict[str, Any]:
         """Return the reply for a decision. Only arrays with one row per action are arrays, because clients slice these.
 
         Without a decision, or without a plan in it, the action is zero.
@@ -258,35 +260,35 @@ class Session:
         states if the data's actions follow the target, else changes.
         """
         if self.options.actions == "pose":
-            return waypoints(state, changes[0], self.options.control_steps)
+            return interpolate_waypoints(state, changes[0], self.options.control_steps)
         if self.controller.spaces.action.follows == "target":
             return np.asarray(state + np.cumsum(changes, axis=0))
         return changes
 
-    def _set(self, goal: GivenGoal, cancelled: Cancelled) -> None:
+    def _set_goal(self, goal: GoalRequest, cancelled: Cancelled) -> None:
         if goal.name is not None and goal.name not in self.goals:
-            needed = f"the name of one{self._known_names()}"
-            raise InputError(where="goal", found=f"{goal.name!r}, which names no goal", needed=needed)
+            needed = f"the name of a goal{self._known_names()}"
+            raise InputError(where="goal", found=f"unknown goal {goal.name!r}", needed=needed)
         goals = goal.goals if goal.name is None else self.goals[goal.name]
         self.controller.follow(goals, mask=goal.mask, cancelled=cancelled)
         self._names = tuple(sub_goal.name for sub_goal in goals)
         if self.recorder is not None:
-            self.recorder.goal(goals, goal.mask)
+            self.recorder.set_goals(goals, goal.mask)
 
     def _known_names(self) -> str:
         names = list(self.goals)
-        more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-        return f" (this server keeps {', '.join(names[:_MOST_NAMES])}{more})" if names else ""
+        more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+        return f" (this server has {', '.join(names[:_MAX_NAMES])}{more})" if names else ""
 
-    def _watch(self, decision: Decision) -> None:
+    def _count_surprise(self, decision: Decision) -> None:
         if (surprise := decision.surprise) is not None:
             self.counts.surprise = surprise.score
             self.counts.alarms += surprise.is_alarm
             if surprise.is_alarm:
-                logger.warning("surprise %.4g: what is seen departs from what was predicted", surprise.score)
+                logger.warning("surprise %.4g: %s", surprise.score, _ALARM)
 
-    def _note(self, frame: np.ndarray) -> None:
-        text = "black bars at the top and the bottom of the picture: send whole frames, not padded ones"
+    def _check_frame(self, frame: np.ndarray) -> None:
+        text = "black bars at the top and bottom of the image; send whole frames without padding"
         if has_black_bars(frame) and text not in self._notes:
             self._notes.append(text)
             logger.warning(text)
@@ -294,11 +296,11 @@ class Session:
 
 def has_black_bars(frame: np.ndarray) -> bool:
     """Return whether an image is padded with black bars at the top and bottom, as by openpi's `resize_with_pad`."""
-    rows = max(1, int(_BAR * len(frame)))
+    rows = max(1, int(_BAR_HEIGHT * len(frame)))
     return not frame[:rows].any() and not frame[-rows:].any() and bool(frame.any())
 
 
-def waypoints(
+def interpolate_waypoints(
     state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], steps: int
 ) -> Float[np.ndarray, "steps 7"]:
     """Return evenly spaced poses from a state to its target, which is the last one.
@@ -324,7 +326,7 @@ def waypoints(
 _ROUNDING = 1e-6  # tolerance, because the search uses float32 limits
 
 
-def why_not_sent(
+def find_limit_violation(
     state: Float[np.ndarray, " dim"], changes: Float[np.ndarray, "steps dim"], limits: LimitsConfig, space: StateSpace
 ) -> str:
     """Return the reason for which planned changes must not be sent to a robot; empty if they may be sent.
@@ -336,16 +338,16 @@ def why_not_sent(
         space: The meaning of the numbers of a state.
     """
     if not np.isfinite(changes).all():
-        return "a number that is not finite"
+        return "a number is not finite"
     if not space.is_pose:
         largest = np.array(limits.axes if isinstance(limits.axes, tuple) else (0.0,))
-        return "more than planning.limits.axes" if (abs(changes) > largest + _ROUNDING).any() else ""
+        return "a change exceeds planning.limits.axes" if (abs(changes) > largest + _ROUNDING).any() else ""
     if not is_allowed(changes[:, :3], limits, _ROUNDING):
-        return "more than planning.limits.xyz or l1"
+        return "a translation exceeds planning.limits.xyz or l1"
     if (abs(changes[:, 3:6]) > min(limits.rotation + _ROUNDING, math.pi)).any():
-        return "more than planning.limits.rotation"
+        return "a rotation exceeds planning.limits.rotation"
     if abs(changes[:, 6]).max() > 1.0:  # opening and closing are changes of 1, independently of the limit
-        return "more than a gripper can change"
+        return "a gripper change exceeds 1"
     box, targets = Workspace.of(limits, space), state[:3] + np.cumsum(changes[:, :3], axis=0)
     is_out = box is not None and changes[:, :3].any() and (abs(box.way_back(targets)) > _ROUNDING).any()
-    return "out of planning.limits.workspace" if is_out else ""
+    return "a target is outside planning.limits.workspace" if is_out else ""

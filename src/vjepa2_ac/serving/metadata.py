@@ -18,12 +18,12 @@ from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.serving.session import Session
 
 PROTOCOL = 2  # incremented at changes that require changes of clients
-_MOST_NAMES = 60  # names of goals in the metadata
+_MAX_NAMES = 60  # names of goals in the metadata
 _SIZE = 180, 320  # height and width of each view in the first decision
-_SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])  # a reachable pose, for the first decision
+_REACHABLE_POSE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])  # for the first decision
 
 
-def metadata_of(loaded: Subject, session: Session) -> dict[str, Any]:
+def make_metadata(loaded: Subject, session: Session) -> dict[str, Any]:
     """Return the metadata that clients receive on connect, as plain values without local paths."""
     planning, options, model = loaded.config.planning, session.options, loaded.as_dict()["model"]
     sections = (getattr(loaded.config.data, name) for name in loaded.config.data.format_sections())
@@ -45,27 +45,32 @@ def metadata_of(loaded: Subject, session: Session) -> dict[str, Any]:
         "checkpoint": loaded.chosen,
         "use_extrinsics": loaded.world_model.sizes.predictor.use_extrinsics,
         "image_keys": list(options.image_keys),
-        "goals": sorted(session.goals)[:_MOST_NAMES],
+        "goals": sorted(session.goals)[:_MAX_NAMES],
         "warnings": list(loaded.warnings),
         "action_space": action_space(session),
     }
 
 
 def action_space(session: Session) -> str:
-    """Return the name of the action space, in the terms of RoboArena."""
+    """Return the name of the action space, as RoboArena calls it."""
     space = session.controller.spaces
     if session.options.actions == "pose":
         return "cartesian_position"
     return "cartesian_delta" if space.state.is_pose else f"vector_{space.action.follows}"
 
 
-def in_words(about: Mapping[str, Any], subject: str) -> str:
-    """Return a line that describes the server, for its console."""
-    limits = about["limits"]
-    box = "no workspace box" if limits["workspace"] is None else f"workspace {limits['workspace']}"
-    goals = f"goals: {', '.join(about['goals'])}" if about["goals"] else "no goals of its own"
-    dry = "; DRY RUN: every action is zero" if about["dry_run"] else ""
-    return f"{subject}: {about['action_space']}, xyz within {limits['xyz']} m a step, {box}; {goals}{dry}"
+def describe_server(metadata: Mapping[str, Any], subject: str) -> str:
+    """Return a description of the server for its console."""
+    limits = metadata["limits"]
+    lines = [
+        f"model: {subject}",
+        f"action space: {metadata['action_space']}",
+        f"limits: at most {limits['xyz']} m per step in x, y, z; workspace box {limits['workspace'] or 'none'}",
+        f"goals by name: {', '.join(metadata['goals']) or 'none'}",
+    ]
+    if metadata["dry_run"]:
+        lines.append("dry run: every action is zero")
+    return "\n".join(lines)
 
 
 def warm_up(controller: Controller) -> float:
@@ -74,27 +79,27 @@ def warm_up(controller: Controller) -> float:
     Raises:
         InputError: The model returns no finite energy.
     """
-    began, rng = time.perf_counter(), np.random.default_rng(0)
+    start_time, rng = time.perf_counter(), np.random.default_rng(0)
     height, width = _SIZE
     goal, frame = rng.integers(0, 256, (2, height, width * controller.config.views, 3), dtype=np.uint8)
     space, box = controller.spaces.state, controller.config.limits.workspace
-    state = _SOMEWHERE.copy() if space.is_pose else np.zeros(len(space))
+    state = _REACHABLE_POSE.copy() if space.is_pose else np.zeros(len(space))
     if space.is_base_pose and box is not None:
         state[:3] = np.mean(box, axis=0)
     controller.reset(goal)
     controller.act(frame, state)
     if controller.decision is None or controller.decision.why == "no finite energy":
-        found = "no finite energy for any action: the model is broken"
-        raise InputError(where="serve", found=found, fix="Another checkpoint may not be: --checkpoint")
-    return time.perf_counter() - began
+        found = "the model returned no finite energy for any action"
+        raise InputError(where="serve", found=found, fix="Choose another checkpoint: --checkpoint")
+    return time.perf_counter() - start_time
 
 
-KeptGoals = Mapping[str, tuple[SubGoal, ...]]
+NamedGoals = Mapping[str, tuple[SubGoal, ...]]
 
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
 
 
-def read_kept_goals(folder: Path) -> KeptGoals:
+def read_named_goals(folder: Path) -> NamedGoals:
     """Read the named goals in a folder.
 
     The folder contains goals.json, which makes it one sequence of goals; or it contains images and folders with a
@@ -122,6 +127,6 @@ def read_kept_goals(folder: Path) -> KeptGoals:
             require_contrast([image], where=str(path))
             goals[path.stem] = (SubGoal(image, name=path.stem),)
     if not goals:
-        needed = f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)"
-        raise InputError(where=f"--goals {folder}", found="no goal", needed=needed)
+        needed = f"images (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` writes them)"
+        raise InputError(where=f"--goals {folder}", found="no goals", needed=needed)
     return goals
