@@ -36,7 +36,7 @@ WITHIN = """
 data: poses < index < selection files transforms < idle windows < sources < clips < dataset < loader convert
 data.sources: tfrecord parquet latent_files indexed_source < rlds_shards lerobot_meta < rlds_episode < rlds \
     droid_raw lerobot npz latents
-serving: wire access < client request recording < session < about server
+serving: wire access < client request recording < session < metadata server
 model: model_files distances compilation low_rank < attention < blocks < encoder predictor < world_model < lora \
     checkpoints < adapter_folder
 evaluation: request result < measure distribution rows < action_use summary < evaluate < decoded < evaluate_run \
