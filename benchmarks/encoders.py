@@ -120,7 +120,7 @@ def published() -> dict[str, tuple[EncoderSizes, tuple[str, ...]]]:
     """Return the published encoders by name: sizes, and the downloads that have them, whatever they were trained at."""
     found: dict[str, tuple[EncoderSizes, tuple[str, ...]]] = {}
     for one in sorted(PUBLISHED, key=lambda one: one.encoder.width):
-        if one.holds != "encoder":
+        if one.model_kind != "encoder":
             continue
         sizes = one.encoder.sizes(one.family, "tubelet")
         name = f"{'2.1' if one.family == 'v2.1' else '2.0'} {one.encoder.name}"

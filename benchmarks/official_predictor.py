@@ -27,7 +27,7 @@ from torch.nn.functional import layer_norm
 from vjepa2_ac.config import AdapterConfig, ModelSizes, TrainingConfig
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.blocks import NORM_EPSILON
-from vjepa2_ac.model.checkpoints import official_name
+from vjepa2_ac.model.checkpoints import to_official_name
 from vjepa2_ac.model.lora import lora_layers
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.step import Objective
@@ -167,7 +167,7 @@ def _share_adapters(ours: Objective, official: Official) -> list[tuple[str, Tens
         second.data.copy_(torch.randn(second.shape, generator=generator) * 0.01)
     pairs = []
     for name, layer in lora_layers(cast("WorldModel", ours.world_model)).items():
-        fused, third = official_name(f"{name}.weight", "predictor")
+        fused, third = to_official_name(f"{name}.weight", "predictor")
         other = theirs[fused.removesuffix(".weight")]
         part = slice(None) if third is None else third  # q, k and v share the first matrix of a fused layer
         first, second = other.lora_A["default"].weight, other.lora_B["default"].weight

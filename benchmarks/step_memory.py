@@ -42,7 +42,7 @@ def memory_of_way(options: argparse.Namespace, dtype: str, setting: Setting, way
     step = bench.step(setting, way)
     bench.keep_only(way)
     if not setting.encoder and way not in {OFFICIAL, OFFICIAL_FULL}:
-        bench.model.set_encoder_aside()  # as a run from a cache does
+        bench.model.remove_encoder()  # as a run from a cache does
     return peak_gb(step, options.device)
 
 

@@ -138,5 +138,5 @@ def _save_fresh_predictor(folder: Path, seed: int) -> None:
     """Write the frozen encoder that all share with a predictor of fresh weights, which starts close to copying."""
     if not folder.exists():
         model = load_base(ModelConfig(base=BUILTIN, dtype="float32"), seed=0)
-        model.predictor = WorldModel.random(model.sizes, seed=1000 + seed, at_persistence=True).predictor
+        model.predictor = WorldModel.random(model.sizes, seed=1000 + seed, near_persistence=True).predictor
         model.save_pretrained(folder)

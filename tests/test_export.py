@@ -21,7 +21,7 @@ from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.export import CARD, Exported, export_run
 from vjepa2_ac.model.checkpoints import load_official
-from vjepa2_ac.model.lora import base_only
+from vjepa2_ac.model.lora import use_base_weights
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
 from vjepa2_ac.reports.write import PLOT
@@ -71,7 +71,7 @@ def assert_predicts_as(found: WorldModel, run: Path) -> None:
     model = load_subject(run).world_model
     expected = predictions(model)
     assert (predictions(found) - expected).abs().max() <= 1e-5 * expected.abs().max()
-    with base_only(model):
+    with use_base_weights(model):
         assert (predictions(model) - expected).abs().max() > 1e-3, "training changed nothing: this compares nothing"
 
 

@@ -150,7 +150,7 @@ def fake_model(sizes: ModelSizes, dtype: torch.dtype, *, encoder: bool) -> World
         model = WorldModel.empty(sizes)
         add_adapter(model, AdapterConfig(), seed=0)
         if not encoder:
-            model.set_encoder_aside()
+            model.remove_encoder()
     for part in model.modules():
         for name, old in part._parameters.items():
             if old is not None:

@@ -21,7 +21,7 @@ from vjepa2_ac.evaluation.summary import with_closed_loop
 from vjepa2_ac.model.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.checkpoints import to_official
 from vjepa2_ac.model.lora import merge_adapter, trainable_report
-from vjepa2_ac.model.world_model import widths_as_text, widths_of_model
+from vjepa2_ac.model.world_model import describe_model_widths, get_model_widths
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state, write_torch
@@ -159,8 +159,8 @@ def _card(run: Subject, checkpoint: Path, folder: Path, metrics: Metrics | None)
         measured=measured,
         plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
         base=model.adaptation,
-        heads=None if model.fresh_heads is None else widths_of_model(model.sizes),
-        takes=widths_as_text(model.sizes),
+        heads=None if model.new_input_heads is None else get_model_widths(model.sizes),
+        takes=describe_model_widths(model.sizes),
         steps=read_state(checkpoint).step,
         trained=trainable_report(model),
         version=__version__,

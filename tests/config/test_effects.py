@@ -118,7 +118,7 @@ def config_of(source: str, path: str | Path, run_dir: Path, **data: Any) -> Conf
     return parse_config({"run_dir": str(run_dir), "data": data, "model": {"base": "base"}}, where="")
 
 
-def knobs_of(config: Config) -> set[str]:
+def parse_adapter_config(config: Config) -> set[str]:
     """Return the knobs that a config of its form of data has."""
     foreign = set(DataConfig.kinds.values()) - {type(config.data)}
     names = ("replay.", *(f"data.{name}." for kind in foreign for name in kind.format_sections()))  # see test_replay.py
@@ -196,7 +196,7 @@ def test_a_knob_that_changes_makes_strangers_of_what_it_affects_and_of_nothing_e
     usual, own = keys_of(config), tuple(f"data.{name}." for name in config.data.format_sections())
     assert None not in usual.values()
     changed: dict[str, set[str]] = {}
-    for key in knobs_of(config) - {"data.source", "data.path"} - ONLY_REMOTE:
+    for key in parse_adapter_config(config) - {"data.source", "data.path"} - ONLY_REMOTE:
         found = keys_of(with_other(config, key, key, source))
         if None not in found.values():  # else refused, not mistaken
             changed[key] = {name for name in usual if found[name] != usual[name]}
@@ -234,7 +234,9 @@ def test_settings_of_a_later_start_are_kept_in_the_run_unless_they_decide_it(tmp
     open_run_folder(config, "name")
     file, written, kept = tmp_path / "run/config.yaml", config_as_yaml(config), 0
     keys = [
-        key for key in knobs_of(config) - {"run_dir", "data.source"} if Affects.RUN not in collect_effects(Config)[key]
+        key
+        for key in parse_adapter_config(config) - {"run_dir", "data.source"}
+        if Affects.RUN not in collect_effects(Config)[key]
     ]
     for section in {key.partition(".")[0] for key in keys}:
         start = config
@@ -254,7 +256,7 @@ def test_a_run_goes_on_only_where_no_knob_that_decides_it_has_changed(tmp_path: 
     (tmp_path / "run").mkdir()
     (tmp_path / "run/config.yaml").write_text(config_as_yaml(config))
     check_run_folder(config)
-    for key in knobs_of(config):
+    for key in parse_adapter_config(config):
         other = with_other(config, key, key, "rlds")
         if key in {"run_dir", "data.source"} or not changed_keys(config, other):
             continue

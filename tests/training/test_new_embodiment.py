@@ -16,7 +16,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.export import export_run
-from vjepa2_ac.model.world_model import widths_of_model
+from vjepa2_ac.model.world_model import get_model_widths
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.training.loop import train
@@ -57,7 +57,7 @@ def test_from_recordings_to_a_model_of_its_own(
     if widths.state != 7:
         assert f"state encoder: {widths.state} numbers instead of the base's 7: newly initialised" in fresh
     assert any("Base compared with persistence: skipped" in note for note in reporter.notes)
-    assert widths_of_model(load_subject(folder).world_model.sizes) == widths
+    assert get_model_widths(load_subject(folder).world_model.sizes) == widths
 
     evaluation = evaluate_subject(str(folder), QUICK)
     assert list(evaluation.models) == ["adapter" if kind == "lora" else "model"]

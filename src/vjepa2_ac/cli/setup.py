@@ -197,13 +197,14 @@ def _download(options: argparse.Namespace) -> None:
         for model in PUBLISHED:
             parameters = f"{model.encoder.parameters / 1e6:,.0f} M"
             encoder = f"{model.encoder.name} ({parameters}), {model.image_size} px, key {model.key}"
-            cli.show(f"{model.name:<22}{model.holds}, {encoder}, {model.size}, {model.licence}")
+            cli.show(f"{model.name:<22}{model.model_kind}, {encoder}, {model.size}, {model.licence}")
         cli.show("The licence is that of Meta's repository. `download` checks the size: Meta publishes no hashes.")
         return
     known = find_published(options.name or OFFICIAL)
     path, url = options.to or Path("checkpoints") / known.file, options.url or known.url
     cli.show(
-        f"{known.name}: {known.holds}, V-JEPA {known.family.removeprefix('v')}, {known.image_size} px, {known.size}"
+        f"{known.name}: {known.model_kind}, V-JEPA {known.family.removeprefix('v')}, {known.image_size} px,"
+        f" {known.size}"
     )
     cli.show(f"Licence {known.licence}; from {url}; its size is checked")
     with cli.reporter() as reporter:

@@ -26,7 +26,7 @@ from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.media.figure import RolloutStrip, StripRow, draw_strip, render_frames, schedule_loop
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import write_gif, write_video
-from vjepa2_ac.model.lora import base_only
+from vjepa2_ac.model.lora import use_base_weights
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import checkpoint_name
@@ -291,8 +291,8 @@ class ImaginedStrip:
             return Imagined(name, AS_RECORDED, actions, shown(decoder, rolled))
 
         rollouts, adaptation = [rollout("model now")], world_model.adaptation
-        if adaptation is not None and adaptation.kind == "lora" and world_model.fresh_heads is None:
-            with base_only(world_model):
+        if adaptation is not None and adaptation.kind == "lora" and world_model.new_input_heads is None:
+            with use_base_weights(world_model):
                 rollouts.insert(0, rollout("base"))
         decoded = shown(decoder, latents[0])
         return Imagination(

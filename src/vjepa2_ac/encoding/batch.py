@@ -20,7 +20,7 @@ from vjepa2_ac.data.transforms import Crop, crop_frames, pixels_to_input, split_
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.encoder import ENCODE_CHUNK
-from vjepa2_ac.model.world_model import WorldModel, heads_to_replace, widths_as_text
+from vjepa2_ac.model.world_model import WorldModel, describe_model_widths, find_heads_to_replace
 
 
 @torch.no_grad()
@@ -102,7 +102,7 @@ def get_encoding(world_model: WorldModel, config: Config) -> Encoding:
         "normalisation": 1,  # version; increase it if `transforms.pixels_to_input` or the feature normalisation changes
         "model.dtype": config.model.dtype,
         "training.precision": config.training.precision,
-        **world_model.encoder_beyond_tensors,
+        **world_model.encoder_properties,
     }
     return Encoding(parts, world_model.image_size, world_model.num_tokens, world_model.latent_dim)
 
@@ -130,9 +130,9 @@ def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> No
     Raises:
         InputError: The widths differ.
     """
-    if heads_to_replace(world_model.sizes, widths):
+    if find_heads_to_replace(world_model.sizes, widths):
         found = f"data with states of {widths.state} and actions of {widths.action} numbers"
-        needed = f"{widths_as_text(world_model.sizes)}, which this model takes"
+        needed = f"{describe_model_widths(world_model.sizes)}, which this model takes"
         fix = "Choose other data, or train on these: `train` then replaces the model's input heads"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
 

@@ -263,7 +263,7 @@ class EncoderOnDevice:
     @classmethod
     def from_model(cls, config: Config, model: WorldModel, device: torch.device) -> EncoderOnDevice:
         """Move the encoder of a model, and only the encoder, to a device."""
-        model.present_encoder.to(device)
+        model.loaded_encoder.to(device)
         return cls(model, device, partial(autocast, config.training, device))
 
     @torch.no_grad()

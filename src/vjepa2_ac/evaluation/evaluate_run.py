@@ -28,7 +28,7 @@ from vjepa2_ac.evaluation.evaluate import ClipName, EvaluatedModel, FramesOfRow,
 from vjepa2_ac.evaluation.measure import previous_clip_actions
 from vjepa2_ac.evaluation.request import EvaluationOptions, resolve_config
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation
-from vjepa2_ac.model.lora import base_only
+from vjepa2_ac.model.lora import use_base_weights
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
@@ -95,10 +95,10 @@ def load_models(
     elif BASE in against and not is_of_run:
         base_model = _load_like(name, world_model, config.model.base, config, dataset.widths)
         evaluated_models.append(EvaluatedModel(BASE, "base", base_model))
-    elif BASE in against and world_model.fresh_heads is not None:
+    elif BASE in against and world_model.new_input_heads is not None:
         notes.append(_NO_BASE)
     elif BASE in against:
-        evaluated_models.append(EvaluatedModel(BASE, "base", world_model, partial(base_only, world_model)))
+        evaluated_models.append(EvaluatedModel(BASE, "base", world_model, partial(use_base_weights, world_model)))
     is_adapter = world_model.adaptation is not None and world_model.adaptation.kind == "lora"
     subject_label = BASE if is_base else "adapter" if is_adapter else "model"
     for other in against:
@@ -162,7 +162,7 @@ def evaluate_subject(subject: str, options: EvaluationOptions, *, reporter: Repo
         world_model, device = loaded.world_model, accelerator.device
         through_cache = use_finished_cache(config, dataset, world_model)
         if through_cache.config.is_cache and decoder is None:
-            world_model.set_encoder_aside()
+            world_model.remove_encoder()
         loaded.move_to(device)
         with accelerator.autocast(), share_work(accelerator):
             clips = _clips(through_cache, chosen, config, world_model, device)

@@ -21,13 +21,13 @@ from vjepa2_ac.errors import InputError, quiet_imports
 from vjepa2_ac.model.lora import (
     FIX,
     NEEDED,
-    adaptation_of,
-    knobs_of,
     lora_config,
     lora_weights,
+    parse_adapter_config,
+    require_adaptation,
     set_trainable,
-    train_everything,
-    wrap,
+    train_all_weights,
+    wrap_predictor,
 )
 from vjepa2_ac.model.world_model import WorldModel, fit_heads
 from vjepa2_ac.storage.structured import parse_record, read_json_object
@@ -73,10 +73,10 @@ def save_trained(model: WorldModel, folder: str | Path) -> None:
         OSError: The disk is full, or another system error.
         ValueError: The model is not adapted.
     """
-    folder, adaptation, sizes, heads = Path(folder), adaptation_of(model), model.sizes.predictor, None
-    if model.fresh_heads is not None:
-        heads = Heads(sizes.action_dim, sizes.state_dim, model.fresh_heads.seed)
-    card = Card(adaptation.kind, adaptation.base, adaptation.encoder, model.encoder_in_words, heads)
+    folder, adaptation, sizes, heads = Path(folder), require_adaptation(model), model.sizes.predictor, None
+    if model.new_input_heads is not None:
+        heads = Heads(sizes.action_dim, sizes.state_dim, model.new_input_heads.seed)
+    card = Card(adaptation.kind, adaptation.base, adaptation.encoder, model.encoder_description, heads)
     folder.mkdir(parents=True, exist_ok=True)
     if card.kind == "lora":
         save_tensors(lora_weights(model), folder / LORA_WEIGHTS)
@@ -103,14 +103,14 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
     folder = Path(folder)
     is_new, card = model.adaptation is None, read_card(folder, model)
     heads = card.fresh_heads
-    if heads is not None and is_new and model.fresh_heads is None:
+    if heads is not None and is_new and model.new_input_heads is None:
         fit_heads(model, Widths(heads.state_dim, heads.action_dim), heads.seed)
     if card.kind == "lora":
         _load_lora(model, folder)
     else:
         weights = _read_weights(folder / FULL_WEIGHTS, model.predictor.state_dict())
         if is_new:
-            train_everything(model)
+            train_all_weights(model)
         model.predictor.load_state_dict(weights)
     if is_new or trainable is not None:
         set_trainable(model, bool(trainable))
@@ -118,15 +118,15 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
 
 def _load_lora(model: WorldModel, folder: Path) -> None:
     path = folder / ADAPTER_FILE
-    config = knobs_of(read_json_object(path, needed=NEEDED, fix=FIX), where=str(path))
+    config = parse_adapter_config(read_json_object(path, needed=NEEDED, fix=FIX), where=str(path))
     if model.adaptation is None:
         try:
-            wrap(model, config)
+            wrap_predictor(model, config)
         except InputError as error:
             where = f"{path}: {error.where}"
             raise InputError(where=where, found=error.found, needed=error.needed, fix=error.fix) from None
     else:
-        existing = knobs_of(lora_config(model).to_dict(), where=str(folder))
+        existing = parse_adapter_config(lora_config(model).to_dict(), where=str(folder))
         for name in AdapterConfig.model_fields.keys() - {"dropout"}:
             if (found := getattr(config, name)) != (needed := getattr(existing, name)):
                 found, needed = f"an adapter with {name} {found}", f"{needed}, as the model has"
@@ -146,7 +146,7 @@ def read_card(folder: Path, model: WorldModel) -> Card:
     encoder = model.adaptation.encoder if model.adaptation else model.encoder_fingerprint()
     for part, found, needed, trained_on, this in (
         ("predictor", own, card.base_predictor, "", ""),
-        ("encoder", encoder, card.encoder, f": {card.encoder_in_words}", f": {model.encoder_in_words}"),
+        ("encoder", encoder, card.encoder, f": {card.encoder_in_words}", f": {model.encoder_description}"),
     ):
         if found != needed:
             own, others = f"{found[:12]}{this}", f"{needed[:12]}{trained_on}"

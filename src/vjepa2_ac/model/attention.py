@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
 
-from vjepa2_ac.model.compilation import compiled, has_triton
+from vjepa2_ac.model.compilation import compile_function, has_triton
 
 THETA = 10_000
 
@@ -223,4 +223,4 @@ def _flex_attention(is_compiled: bool) -> Callable[..., Any]:
     from torch.nn.attention.flex_attention import flex_attention
 
     attend: Callable[..., Any] = flex_attention
-    return compiled(attend, way_out="training.attention=per_step", dynamic=False) if is_compiled else attend
+    return compile_function(attend, override="training.attention=per_step", dynamic=False) if is_compiled else attend

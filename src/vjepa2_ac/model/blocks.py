@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from vjepa2_ac.model.attention import Attend, AttentionKind, RotaryTables, block_causal_attention, rotate
-from vjepa2_ac.model.compilation import When, compiled
+from vjepa2_ac.model.compilation import When, compile_function
 
 NORM_EPSILON = 1e-6
 INIT_STD = 0.02
@@ -103,7 +103,8 @@ class Block(nn.Module):
         """
         before, after = _before_attention, _after_attention
         if self.compiled == "always" or (self.compiled == "with gradients" and torch.is_grad_enabled()):
-            before, after = compiled(before, way_out=_PLAIN), compiled(after, way_out=_PLAIN)
+            before = compile_function(before, override=_PLAIN)
+            after = compile_function(after, override=_PLAIN)
         query, key, value = before(self, tokens, tables)
         kept = (
             torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None

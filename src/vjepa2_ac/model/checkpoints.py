@@ -1,7 +1,7 @@
 """Load the base model of a config, and read and write all checkpoint formats.
 
 Supported are Meta's `.pt` of both families, a transformers folder, also from the Hub, and a folder of this project. An
-encoder in any format is described by `FoundEncoder`, from which a network is filled. Tensors that do not match the
+encoder in any format is described by `EncoderSource`, from which a network is filled. Tensors that do not match the
 network are errors.
 """
 
@@ -31,16 +31,16 @@ from vjepa2_ac.model.model_files import (
     CONFIG,
     ENCODER_NEEDED,
     FORMAT,
-    HEADS,
+    PUBLISHED_HEADS,
     EncoderOrigin,
     check_sizes,
     find_base,
     find_encoder_path,
-    published_as,
+    find_published_file,
     read_encoder_origin,
     read_sizes,
 )
-from vjepa2_ac.model.world_model import ENCODER, WorldModel, widths_as_text, widths_of_model
+from vjepa2_ac.model.world_model import ENCODER, WorldModel, describe_model_widths, get_model_widths
 from vjepa2_ac.storage.paths import BUILTIN
 from vjepa2_ac.storage.structured import parse_record, read_json_object
 from vjepa2_ac.storage.tensors import check_tensors, open_safetensors, require_finite, require_floats
@@ -99,9 +99,9 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     encoder = None if config.encoder is None else find_encoder(config.encoder)
     if config.is_random:
         if encoder is None:
-            return WorldModel.random(config.sizes.model_sizes, seed, dtype, at_persistence=True)
-        model = _on_encoder(encoder, sizes_with(encoder, config.sizes.model_sizes), dtype)
-        model.draw_predictor(torch.Generator().manual_seed(seed), dtype, at_persistence=True)
+            return WorldModel.random(config.sizes.model_sizes, seed, dtype, near_persistence=True)
+        model = _on_encoder(encoder, get_sizes_with_encoder(encoder, config.sizes.model_sizes), dtype)
+        model.draw_predictor(torch.Generator().manual_seed(seed), dtype, near_persistence=True)
         return model
     path = find_base(config.base)
     file = None if path.is_dir() else MetaFile.open(path)
@@ -124,7 +124,7 @@ def base_sizes(config: ModelConfig) -> ModelSizes:
         InputError: The folder is not a world model; or `model.encoder` is not an encoder.
     """
     if config.encoder is not None:
-        return expected_sizes(config.encoder, config.sizes.model_sizes)
+        return get_expected_sizes(config.encoder, config.sizes.model_sizes)
     if config.is_random:
         return config.sizes.model_sizes
     is_there = config.base.startswith(BUILTIN) or Path(config.base).exists()
@@ -160,12 +160,12 @@ def to_official(model: WorldModel) -> dict[str, Any]:
     """
     if model.predictor is not model.base_predictor:
         raise ValueError("an adapter is on: merge_adapter first")
-    if not model.sizes.predictor.use_states or widths_of_model(model.sizes) != POSE_WIDTHS:
-        found = f"a model that takes {widths_as_text(model.sizes)}"
+    if not model.sizes.predictor.use_states or get_model_widths(model.sizes) != POSE_WIDTHS:
+        found = f"a model that takes {describe_model_widths(model.sizes)}"
         needed = f"states and actions of {POSE_WIDTHS.state} numbers: Meta's code has no other predictor"
         fix = "Export it with --to merged (WorldModel.save_pretrained), which `model.base` takes"
         raise InputError(where="the official format", found=found, needed=needed, fix=fix)
-    encoder = to_official_names(model.present_encoder.state_dict(), model.sizes.encoder.family)
+    encoder = to_official_names(model.loaded_encoder.state_dict(), model.sizes.encoder.family)
     return {
         "encoder": encoder,
         "target_encoder": dict(encoder),
@@ -174,7 +174,7 @@ def to_official(model: WorldModel) -> dict[str, Any]:
     }
 
 
-def _of_meta(file: MetaFile, encoder: FoundEncoder | None, given: ModelSizes, dtype: torch.dtype) -> WorldModel:
+def _of_meta(file: MetaFile, encoder: EncoderSource | None, given: ModelSizes, dtype: torch.dtype) -> WorldModel:
     """Return a model with the predictor in a file and an encoder; None: the encoder in the file."""
     found = encoder or encoder_in_file(file, None, given.encoder.frame, given.encoder.heads)
     predictor = file.tensors("predictor")
@@ -184,10 +184,10 @@ def _of_meta(file: MetaFile, encoder: FoundEncoder | None, given: ModelSizes, dt
         fix += " predictor (configs/scratch_vitb.yaml)"
         raise InputError(where=f"model.base: {file.path}", found=said, fix=fix)
     model = _on_encoder(found, _sizes(file, predictor, found, given), dtype)
-    fill(
+    load_weights(
         model.predictor,
         predictor,
-        partial(official_name, part="predictor"),
+        partial(to_official_name, part="predictor"),
         dtype,
         where=f"{file.path}: predictor",
         fix="Check model.base, model.sizes, and model.encoder: the predictor's latents are of one encoder",
@@ -207,25 +207,25 @@ def _of_meta(file: MetaFile, encoder: FoundEncoder | None, given: ModelSizes, dt
     return model
 
 
-def _on_encoder(found: FoundEncoder, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
+def _on_encoder(found: EncoderSource, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
     """Return a model with this encoder, and a predictor without weights."""
     model = WorldModel.empty(sizes)
     fix = f"Get the original file. {FIX}"
-    fill(model.present_encoder, found.weights(), found.rename, dtype, where=found.where, fix=fix)
-    if found.is_cut:
-        model.present_encoder.reset_last_norm()
+    load_weights(model.loaded_encoder, found.weights(), found.rename, dtype, where=found.where, fix=fix)
+    if found.is_truncated:
+        model.loaded_encoder.reset_last_norm()
     model.encoder_origin = found.origin
     return model
 
 
-def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: FoundEncoder, given: ModelSizes) -> ModelSizes:
+def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: EncoderSource, given: ModelSizes) -> ModelSizes:
     """Return the sizes of the tensors; heads, image size and extrinsics are taken from `given`."""
     own = given.predictor
     try:
         width, hidden = len(predictor["action_encoder.weight"]), len(predictor["predictor_blocks.0.mlp.fc1.weight"])
-        depth = depth_of(predictor, "predictor_blocks")
+        depth = count_blocks(predictor, "predictor_blocks")
     except KeyError as missing:
-        raise file.lacks(f"tensor {missing}", part="predictor") from None
+        raise file.missing_error(f"tensor {missing}", part="predictor") from None
     fields = {
         "image_size": given.image_size,
         "patch_size": encoder.patch_size,
@@ -249,7 +249,7 @@ def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: FoundEncode
 
 
 @dataclass(frozen=True, eq=False)
-class FoundEncoder:
+class EncoderSource:
     """An encoder in a file or folder, whose values are not read yet."""
 
     where: str  # for messages
@@ -259,9 +259,9 @@ class FoundEncoder:
     origin: EncoderOrigin
     weights: Callable[[], Mapping[str, Tensor]]  # mapped, by the file's names
     rename: Rename
-    is_cut: bool = False  # without its last blocks: then the last norm has no trained weights
+    is_truncated: bool = False  # without its last blocks: then the last norm has no trained weights
 
-    def up_to(self, layer: int) -> FoundEncoder:
+    def truncate(self, layer: int) -> EncoderSource:
         """Return the same encoder without the blocks after a layer.
 
         Raises:
@@ -278,10 +278,10 @@ class FoundEncoder:
             blocks = {name: (tensor, _BLOCK.search(name)) for name, tensor in self.weights().items()}
             return {name: tensor for name, (tensor, block) in blocks.items() if not block or int(block[1]) < layer}
 
-        return replace(self, sizes=self.sizes.model_copy(update={"depth": layer}), weights=weights, is_cut=True)
+        return replace(self, sizes=self.sizes.model_copy(update={"depth": layer}), weights=weights, is_truncated=True)
 
 
-def find_encoder(config: EncoderConfig) -> FoundEncoder:
+def find_encoder(config: EncoderConfig) -> EncoderSource:
     """Find the encoder of a config without reading its weights; download it first if it is on the Hub.
 
     Raises:
@@ -298,10 +298,10 @@ def find_encoder(config: EncoderConfig) -> FoundEncoder:
     if config.heads not in {None, found.sizes.heads}:
         said = f"{found.sizes.heads} attention heads, and model.encoder.heads says {config.heads}"
         raise InputError(where=found.where, found=said, fix="Leave out model.encoder.heads")
-    return found if config.layer is None else found.up_to(config.layer)
+    return found if config.layer is None else found.truncate(config.layer)
 
 
-def sizes_with(found: FoundEncoder, given: ModelSizes) -> ModelSizes:
+def get_sizes_with_encoder(found: EncoderSource, given: ModelSizes) -> ModelSizes:
     """Return the sizes of a model with this encoder, at the given image size.
 
     Raises:
@@ -318,21 +318,21 @@ def sizes_with(found: FoundEncoder, given: ModelSizes) -> ModelSizes:
     return sizes
 
 
-def expected_sizes(config: EncoderConfig, given: ModelSizes) -> ModelSizes:
+def get_expected_sizes(config: EncoderConfig, given: ModelSizes) -> ModelSizes:
     """Return the sizes of a model with this encoder; for a published file that is not downloaded yet, from its name.
 
     Raises:
         InputError: See `find_encoder`.
     """
-    known = published_as(Path(config.path).name)
+    known = find_published_file(Path(config.path).name)
     if known is None or Path(config.path).exists():
-        return sizes_with(find_encoder(config), given)
+        return get_sizes_with_encoder(find_encoder(config), given)
     encoder = known.encoder.sizes(known.family, config.frame).model_dump()
     encoder["depth"] = min(encoder["depth"], config.layer or encoder["depth"])
     return parse_record(ModelSizes, given.model_dump() | {"encoder": encoder}, where=f"model.encoder: {config.path}")
 
 
-def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: int | None) -> FoundEncoder:
+def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: int | None) -> EncoderSource:
     """Return the encoder in one of Meta's files.
 
     Args:
@@ -350,21 +350,21 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
         logger.info("%s: the encoder under %s (there are: %s)", file.path, key, ", ".join(there))
     if key not in there:
         fix = f"Set model.encoder.key to one of {', '.join(there)}, or leave it out" if there else FIX
-        raise file.lacks(key or "encoder", fix)
+        raise file.missing_error(key or "encoder", fix)
     tensors = file.tensors(key)
     family: Family = "v2.1" if any(name.startswith(_ONLY_2_1) for name in tensors) else "v2"
     try:
         width, *_, patch_size = tensors["patch_embed.proj.weight"].shape
-        hidden, depth = tensors["blocks.0.mlp.fc1.weight"].shape[0], depth_of(tensors, "blocks")
+        hidden, depth = tensors["blocks.0.mlp.fc1.weight"].shape[0], count_blocks(tensors, "blocks")
     except (KeyError, ValueError) as missing:
-        raise file.lacks(f"tensor {missing}", part=key) from None
-    heads = HEADS.get(width, heads)
+        raise file.missing_error(f"tensor {missing}", part=key) from None
+    heads = PUBLISHED_HEADS.get(width, heads)
     if heads is None:
         said = f"an encoder of width {width}, which is none of the published ones: the tensors do not show its heads"
         fix = "Set model.encoder.heads to those it was trained with: others give other latents without an error"
         raise InputError(where=str(file.path), found=said, fix=fix)
-    known = published_as(file.path.name)
-    return FoundEncoder(
+    known = find_published_file(file.path.name)
+    return EncoderSource(
         where=f"{file.path}: {key}",
         sizes=EncoderSizes(
             width=width,
@@ -378,7 +378,7 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
         image_size=known.image_size if known else None,
         origin=EncoderOrigin(file.path.name, key, known.licence if known else ""),
         weights=lambda: tensors,
-        rename=partial(official_name, part=family),
+        rename=partial(to_official_name, part=family),
     )
 
 
@@ -399,7 +399,7 @@ class _TransformersConfig(BaseModel):
     layer_norm_eps: Annotated[float, Field(ge=0.99e-6, le=1.01e-6)] = 1e-6
 
 
-def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> FoundEncoder:
+def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> EncoderSource:
     """Return the encoder in a folder of transformers or of this project; `name` is the value from the config."""
     card = read_json_object(folder / CONFIG, needed=ENCODER_NEEDED, fix=FIX)
     if config.key is not None:
@@ -408,18 +408,19 @@ def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> FoundEncode
     if card.get("format") != FORMAT:
         return _of_transformers(folder, card, config.frame, name)
     model = read_sizes(folder)
-    return FoundEncoder(
+    return EncoderSource(
         where=str(folder / ENCODER),
         sizes=model.encoder.model_copy(update={"frame": config.frame}),
         patch_size=model.patch_size,
         image_size=model.image_size,
-        origin=read_encoder_origin(folder) or EncoderOrigin(name, heads_are_told=False),  # so it stays the same encoder
+        origin=read_encoder_origin(folder)
+        or EncoderOrigin(name, has_heads_in_fingerprint=False),  # keeps the fingerprint
         weights=partial(_mapped, [folder / ENCODER]),
         rename=lambda ours: (ours, None),
     )
 
 
-def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, name: str) -> FoundEncoder:
+def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, name: str) -> EncoderSource:
     """Return the encoder of a plain or a classification model of transformers, without masked predictor and head."""
     fields = parse_record(_TransformersConfig, card, where=str(folder / CONFIG), needed=ENCODER_NEEDED, fix=FIX)
     tensors = _mapped(sorted(folder.glob("*.safetensors")))
@@ -427,7 +428,7 @@ def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, na
     if prefix is None:
         found = "no tensor of an encoder in *.safetensors"
         raise InputError(where=str(folder), found=found, needed=ENCODER_NEEDED, fix=FIX)
-    return FoundEncoder(
+    return EncoderSource(
         where=str(folder),
         sizes=EncoderSizes(
             width=fields.hidden_size,
@@ -491,20 +492,20 @@ class MetaFile:
         """
         part = self.parts.get(key)
         if not isinstance(part, dict) or not part or not all(isinstance(value, Tensor) for value in part.values()):
-            raise self.lacks(key if key not in self.parts else f"weights under {key!r}")
+            raise self.missing_error(key if key not in self.parts else f"weights under {key!r}")
         named = {_PREFIXES.sub("", str(name)): value for name, value in part.items()}
         named.pop(_IGNORED, None)
         require_floats(named, where=f"{self.path}: {key}", fix=FIX)
         return named
 
-    def lacks(self, what: str, fix: str = FIX, *, part: str | None = None) -> InputError:
+    def missing_error(self, what: str, fix: str = FIX, *, part: str | None = None) -> InputError:
         """Return the error for a missing part, or a missing tensor in a part, with the names that exist."""
         names = ", ".join(list(self.parts if part is None else self.tensors(part))[:8])
         found = f"no {what} (keys: {names})" if part is None else f"no {what} in {part} (its tensors: {names})"
         return InputError(where=str(self.path), found=found, needed=_PARTS, fix=fix)
 
 
-def official_name(name: str, part: Part) -> tuple[str, int | None]:
+def to_official_name(name: str, part: Part) -> tuple[str, int | None]:
     """Return Meta's name of one of our tensors, and which third of a fused tensor it is (None: the whole tensor)."""
     for pattern, replacement in _NAMES[part]:
         name = re.sub(pattern, replacement, name)
@@ -512,7 +513,7 @@ def official_name(name: str, part: Part) -> tuple[str, int | None]:
     return fused, None if fused == name else _SPLIT.index(name.split(".attn.")[1][0])
 
 
-def fill(
+def load_weights(
     network: nn.Module, weights: Mapping[str, Tensor], rename: Rename, dtype: torch.dtype, *, where: str, fix: str
 ) -> None:
     """Load memory-mapped weights into a network on the meta device, cast each as it is read, and freeze them.
@@ -540,11 +541,11 @@ def to_official_names(weights: Mapping[str, Tensor], part: Part) -> dict[str, Te
     """Return our weights with Meta's names, and q, k and v fused."""
     pieces: dict[str, list[Tensor]] = {}
     for name, value in weights.items():  # q, k and v in this order, as everywhere
-        pieces.setdefault(official_name(name, part)[0], []).append(value.detach())
+        pieces.setdefault(to_official_name(name, part)[0], []).append(value.detach())
     return {f"module.{name}": own[0] if len(own) == 1 else torch.cat(own) for name, own in pieces.items()}
 
 
-def depth_of(names: Mapping[str, object], blocks: str) -> int:
+def count_blocks(names: Mapping[str, object], blocks: str) -> int:
     """Return the number of blocks that have tensors.
 
     Raises:

@@ -23,23 +23,23 @@ import torch
 from vjepa2_ac.errors import InputError
 
 BACKEND = "inductor"
-VARIANTS = 64  # that PyTorch may compile of one function: its default is 8
+MAX_VARIANTS = 64  # that PyTorch may compile of one function: its default is 8
 
 When = Literal["never", "with gradients", "always"]  # blocks are compiled
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def compiled(function: Function, *, way_out: str, dynamic: bool | None = None) -> Function:
+def compile_function(function: Function, *, override: str, dynamic: bool | None = None) -> Function:
     """Return the compiled function, the same object for all callers; compilation happens at the first call.
 
-    The compiled function raises `InputError` if it was already compiled for `VARIANTS` kinds of input.
+    The compiled function raises `InputError` if it was already compiled for `MAX_VARIANTS` kinds of input.
 
     Args:
         function: The function, compiled as one graph.
-        way_out: The setting that disables compilation, for the error message.
+        override: The setting that disables compilation, for the error message.
         dynamic: False: compile for each size separately; None: PyTorch decides.
     """
-    return cast("Function", _compiled(function, BACKEND, way_out, dynamic))
+    return cast("Function", _compiled(function, BACKEND, override, dynamic))
 
 
 @lru_cache(maxsize=1)
@@ -76,11 +76,11 @@ def require_compiler(device: str, *, where: str) -> None:
 
 
 @cache
-def _compiled(function: Callable[..., Any], backend: str, way_out: str, dynamic: bool | None) -> Callable[..., Any]:
+def _compiled(function: Callable[..., Any], backend: str, override: str, dynamic: bool | None) -> Callable[..., Any]:
     from torch._dynamo import config
     from torch._dynamo.exc import FailOnRecompileLimitHit
 
-    config.recompile_limit = max(config.recompile_limit, VARIANTS)
+    config.recompile_limit = max(config.recompile_limit, MAX_VARIANTS)
     # fullgraph: otherwise the limit is only a warning
     whole = torch.compile(function, backend=backend, fullgraph=True, dynamic=dynamic)
 
@@ -90,7 +90,7 @@ def _compiled(function: Callable[..., Any], backend: str, way_out: str, dynamic:
             return whole(*args, **kwargs)
         except FailOnRecompileLimitHit as error:
             found = f"more than {config.recompile_limit} sizes of batches and clips, each of which is compiled anew"
-            fix = f"Set {way_out}, or use fewer sizes"
-            raise InputError(where=way_out.partition("=")[0], found=found, fix=fix) from error
+            fix = f"Set {override}, or use fewer sizes"
+            raise InputError(where=override.partition("=")[0], found=found, fix=fix) from error
 
     return call

@@ -22,7 +22,7 @@ from vjepa2_ac.config.model import PEFT_NAMES
 from vjepa2_ac.errors import InputError, quiet_imports
 from vjepa2_ac.model.low_rank import LowRankLayer, low_rank_linear
 from vjepa2_ac.model.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.world_model import Adaptation, WorldModel, base_weights, require_trained
+from vjepa2_ac.model.world_model import Adaptation, WorldModel, base_weights, require_trained_heads
 from vjepa2_ac.storage.structured import parse_record, short_repr
 
 with quiet_imports():
@@ -113,14 +113,18 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     if model.adaptation is not None:
         raise ValueError("this model has been adapted already: merge_adapter first, or load_trained into it")
     if config.kind == "none":
-        train_everything(model)
+        train_all_weights(model)
         return
-    if model.fresh_heads is not None:
-        require_trained(tuple(dict.fromkeys(name.split(".")[0] for name in model.fresh_heads.replaced)), config)
+    if model.new_input_heads is not None:
+        require_trained_heads(
+            tuple(dict.fromkeys(name.split(".")[0] for name in model.new_input_heads.replaced)), config
+        )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)  # of initialisations that are drawn by PEFT
-        wrap(model, config, start=config.peft.get("init_lora_weights", True))
-    knobs_of(lora_config(model).to_dict(), where="adapter.peft")  # check that the saved adapter can be loaded
+        wrap_predictor(model, config, start=config.peft.get("init_lora_weights", True))
+    parse_adapter_config(
+        lora_config(model).to_dict(), where="adapter.peft"
+    )  # check that the saved adapter can be loaded
     layers = lora_layers(model)
     if config.peft.get("init_lora_weights", True) is True:
         _draw_first_matrices(layers, torch.Generator().manual_seed(seed))
@@ -168,7 +172,7 @@ def lora_layers(model: WorldModel) -> dict[str, Any]:
     return {name: layer for name, layer in model.base_predictor.named_modules() if isinstance(layer, LoraLayer)}
 
 
-def adaptation_of(model: WorldModel) -> Adaptation:
+def require_adaptation(model: WorldModel) -> Adaptation:
     """Return how a model was adapted.
 
     Raises:
@@ -179,7 +183,7 @@ def adaptation_of(model: WorldModel) -> Adaptation:
     return model.adaptation
 
 
-def train_everything(model: WorldModel) -> None:
+def train_all_weights(model: WorldModel) -> None:
     """Train every weight of the predictor that has an input."""
     start = {name: value.detach().to("cpu", copy=True) for name, value in model.predictor.state_dict().items()}
     model.adaptation = Adaptation("none", model.predictor_fingerprint(), model.encoder_fingerprint(), start)
@@ -187,7 +191,7 @@ def train_everything(model: WorldModel) -> None:
     set_trainable(model, trainable=True)
 
 
-def wrap(model: WorldModel, config: AdapterConfig, start: bool | str = True) -> None:
+def wrap_predictor(model: WorldModel, config: AdapterConfig, start: bool | str = True) -> None:
     """Add a LoRA adapter to the predictor of a model; raises the errors of `with_adapter`."""
     base = model.predictor_fingerprint()
     checkpointing = model.base_predictor.gradient_checkpointing
@@ -267,7 +271,7 @@ def _added(model: WorldModel) -> Iterator[nn.Parameter]:
             yield value
 
 
-def knobs_of(values: Mapping[str, Any], *, where: str) -> AdapterConfig:
+def parse_adapter_config(values: Mapping[str, Any], *, where: str) -> AdapterConfig:
     """Return the adapter config for a saved adapter, from its options of PEFT's LoraConfig.
 
     The file may be untrusted, and PEFT never reads it. Layers are selected by name, never by a regular expression, and
@@ -340,7 +344,7 @@ def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig
 
 
 @contextmanager
-def base_only(model: WorldModel) -> Iterator[None]:
+def use_base_weights(model: WorldModel) -> Iterator[None]:
     """Make the model predict as its base model within the block.
 
     New input layers (`fit_heads`) get their initial values, with which the model is no base model for comparison.
@@ -367,24 +371,25 @@ def merge_adapter(model: WorldModel) -> None:
     Raises:
         ValueError: The model is not adapted.
     """
-    adaptation = adaptation_of(model)
+    adaptation = require_adaptation(model)
     never_trained = model.base_predictor.predictor_norm.weight  # beside an adapter
     dtype = (adaptation.start or {}).get("predictor_norm.weight", never_trained).dtype
     if adaptation.kind == "lora":
         with torch.autocast(model.device.type, enabled=False):  # or its type would be computed in
             model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
     model.predictor.to(dtype).requires_grad_(False)
-    model.adaptation = model.fresh_heads = None
+    model.adaptation = model.new_input_heads = None
 
 
-def unadapted_copy(model: WorldModel) -> WorldModel:
+def copy_with_merged_adapter(model: WorldModel) -> WorldModel:
     """Return a copy for inference that shares the encoder and has a predictor with the adapter merged into it.
 
     The original model is not changed.
     """
     own = WorldModel.empty(model.sizes)
     own.encoder, own.predictor = model.encoder, copy.deepcopy(model.predictor)
-    own.adaptation, own.fresh_heads = model.adaptation, model.fresh_heads
+    own.adaptation, own.new_input_heads = model.adaptation, model.new_input_heads
+    own.encoder_origin = model.encoder_origin  # part of the encoder's fingerprint
     if own.adaptation is not None:
         merge_adapter(own)
     return own.eval()

@@ -12,7 +12,7 @@ import math
 import urllib.error
 import urllib.request
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from vjepa2_ac import storage
@@ -30,6 +30,7 @@ FORMAT = "vjepa2-ac world model 1"
 CONFIG = "config.json"
 ENCODER_NEEDED = "an encoder of V-JEPA 2 or 2.1: Meta's .pt, a transformers folder, or a model of this project"
 
+_HEADS_KEY = "heads_are_told"  # in config.json, for `EncoderOrigin.has_heads_in_fingerprint`
 _TINY = f"{BUILTIN}sim-tiny"
 NEEDED_MODEL = "a folder written by `vjepa2-ac export` or WorldModel.save_pretrained"
 _FIX = "Of a run, `vjepa2-ac export RUN FOLDER` makes one"
@@ -134,8 +135,12 @@ def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
         InputError: The record of the origin is damaged.
     """
     origin = read_json_object(folder / CONFIG, needed=NEEDED_MODEL).get("encoder_origin")
+    if origin is None:
+        return None
+    if isinstance(origin, dict) and _HEADS_KEY in origin:
+        origin["has_heads_in_fingerprint"] = origin.pop(_HEADS_KEY)
     where, needed = f"{folder / CONFIG}: encoder_origin", "file, key and licence of an encoder"
-    return None if origin is None else parse_record(EncoderOrigin, origin, where=where, needed=needed)
+    return parse_record(EncoderOrigin, origin, where=where, needed=needed)
 
 
 @dataclass(frozen=True)
@@ -165,7 +170,7 @@ VIT_H = EncoderShape("ViT-H", 1280, 32, 16, 5120)
 VIT_g = EncoderShape("ViT-g", 1408, 40, 22, 6144)
 VIT_G = EncoderShape("ViT-G", 1664, 48, 26, 8192)
 
-HEADS: Mapping[int, int] = {one.width: one.heads for one in (VIT_B, VIT_L, VIT_H, VIT_g, VIT_G)}
+PUBLISHED_HEADS: Mapping[int, int] = {one.width: one.heads for one in (VIT_B, VIT_L, VIT_H, VIT_g, VIT_G)}
 """Width of an encoder -> number of attention heads, which tensors do not determine."""
 
 
@@ -176,7 +181,13 @@ class EncoderOrigin:
     file: str  # name of the file or repository
     key: str = ""  # key of the weights in the file; "" for a folder
     licence: str = ""  # "" if it is not known
-    heads_are_told: bool = True  # whether the number of heads is part of the fingerprint
+    has_heads_in_fingerprint: bool = True  # whether the number of heads is part of the encoder's fingerprint
+
+    def as_dict(self) -> dict[str, str | bool]:
+        """Return the origin as plain values, with the keys of config.json."""
+        values = asdict(self)
+        values[_HEADS_KEY] = values.pop("has_heads_in_fingerprint")
+        return values
 
     def __str__(self) -> str:
         key = f", {self.key}" if self.key else ""
@@ -205,7 +216,7 @@ class Published:
     licence: str = "MIT"  # of Meta's repository; Meta's server sends none with the file
 
     @property
-    def holds(self) -> str:
+    def model_kind(self) -> str:
         """The kind of model in the file."""
         return "world model" if self.name == OFFICIAL else "encoder"
 
@@ -248,7 +259,7 @@ PUBLISHED: tuple[Published, ...] = (
 )
 
 
-def published_as(file_name: str) -> Published | None:
+def find_published_file(file_name: str) -> Published | None:
     """Return the published file with exactly this name, Meta's or ours; None if there is none."""
     return next((one for one in PUBLISHED if file_name in {one.remote, one.file}), None)
 

@@ -189,7 +189,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         for module in self.modules():
             initialise(module, generator)
 
-    def start_at_persistence(self, generator: Generator) -> None:
+    def initialise_near_persistence(self, generator: Generator) -> None:
         """Initialise the predictor close to persistence: the input layer is a rotation, the output layer its inverse.
 
         Without this initialisation a tiny predictor spends most of its training on learning to copy. A predictor

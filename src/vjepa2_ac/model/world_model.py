@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -23,7 +23,7 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.blocks import initialise
 from vjepa2_ac.model.encoder import ENCODE_CHUNK, Encoder
-from vjepa2_ac.model.model_files import CONFIG, FORMAT, HEADS, EncoderOrigin, read_encoder_origin, read_sizes
+from vjepa2_ac.model.model_files import CONFIG, FORMAT, PUBLISHED_HEADS, EncoderOrigin, read_encoder_origin, read_sizes
 from vjepa2_ac.model.predictor import LatentDynamics, new_predictor, normalise_latents
 from vjepa2_ac.storage import folder_writer
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
@@ -50,14 +50,14 @@ class Fingerprints(NamedTuple):
 
 
 @dataclass(frozen=True)
-class FreshHeads:
+class NewInputHeads:
     """New input layers of the predictor (`fit_heads`), for states or actions of other widths than the base model's."""
 
     replaced: dict[str, Tensor]  # the weights of the base model's layers, by their names in the predictor
     seed: int  # seed of the new layers
 
 
-class AbsentEncoder(nn.Module):
+class RemovedEncoder(nn.Module):
     """A placeholder for a removed encoder."""
 
     def __init__(self, fingerprint: str) -> None:
@@ -77,11 +77,11 @@ class WorldModel(LatentDynamics):
     def __init__(self, sizes: ModelSizes) -> None:
         super().__init__()
         self.sizes = sizes
-        self.encoder: Encoder | AbsentEncoder = Encoder(sizes)
+        self.encoder: Encoder | RemovedEncoder = Encoder(sizes)
         self.predictor: nn.Module = new_predictor(sizes)
         self.predictor.requires_grad_(False)
         self.adaptation: Adaptation | None = None
-        self.fresh_heads: FreshHeads | None = None
+        self.new_input_heads: NewInputHeads | None = None
         self.merged_from: Fingerprints | None = None  # fingerprints before an adapter was merged
         self.encoder_origin: EncoderOrigin | None = None  # None if the encoder was loaded together with the predictor
 
@@ -92,27 +92,27 @@ class WorldModel(LatentDynamics):
         seed: int,
         dtype: torch.dtype = torch.float32,
         *,
-        at_persistence: bool = False,
+        near_persistence: bool = False,
         device: torch.device | str = "cpu",
     ) -> WorldModel:
         """Return a randomly initialised model, with the same weights for the same sizes, seed and device type.
 
-        Weights are drawn as in the released recipe; with `at_persistence` the predictor starts close to persistence.
+        Weights are drawn as in the released recipe; with `near_persistence` the predictor starts close to persistence.
         They are drawn on the device: the full size takes half a minute on one CPU core, and no noticeable time on a
         GPU.
         """
         model = cls.empty(sizes).to_empty(device=device)
         generator = torch.Generator(device).manual_seed(seed)
-        model.present_encoder.initialise(generator)
-        model.draw_predictor(generator, dtype, at_persistence=at_persistence)
+        model.loaded_encoder.initialise(generator)
+        model.draw_predictor(generator, dtype, near_persistence=near_persistence)
         return model.to(dtype)
 
-    def draw_predictor(self, generator: torch.Generator, dtype: torch.dtype, *, at_persistence: bool = False) -> None:
+    def draw_predictor(self, generator: torch.Generator, dtype: torch.dtype, *, near_persistence: bool = False) -> None:
         """Initialise the predictor on the generator's device; it may be on the meta device before."""
         predictor = self.base_predictor.to_empty(device=generator.device)
         predictor.initialise(generator)
-        if at_persistence:
-            predictor.start_at_persistence(generator)
+        if near_persistence:
+            predictor.initialise_near_persistence(generator)
         predictor.to(dtype)
 
     @classmethod
@@ -152,8 +152,8 @@ class WorldModel(LatentDynamics):
             raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_trained saves it alone")
         card: dict[str, Any] = {"format": FORMAT, "sizes": self.sizes.model_dump(mode="json")}
         if self.encoder_origin is not None:
-            card["encoder_origin"] = asdict(self.encoder_origin)
-        encoder = self.present_encoder
+            card["encoder_origin"] = self.encoder_origin.as_dict()
+        encoder = self.loaded_encoder
         predictor: Any = self.predictor
         with folder_writer(Path(folder), CONFIG) as fresh:
             (fresh / PREDICTOR).parent.mkdir()
@@ -179,7 +179,7 @@ class WorldModel(LatentDynamics):
         return self.sizes.encoder.width
 
     @property
-    def present_encoder(self) -> Encoder:
+    def loaded_encoder(self) -> Encoder:
         """The encoder.
 
         Raises:
@@ -189,10 +189,10 @@ class WorldModel(LatentDynamics):
             return self.encoder
         raise ValueError("the encoder was set aside: latents come from a cache")
 
-    def set_encoder_aside(self) -> None:
+    def remove_encoder(self) -> None:
         """Remove the encoder's weights permanently, because latents come from a cache. The fingerprint is kept."""
         if isinstance(self.encoder, Encoder):
-            self.encoder = AbsentEncoder(self.encoder_fingerprint())
+            self.encoder = RemovedEncoder(self.encoder_fingerprint())
 
     @torch.no_grad()
     def encode(
@@ -207,20 +207,20 @@ class WorldModel(LatentDynamics):
         Raises:
             ValueError: The frames have another size than `image_size`; or the encoder was removed.
         """
-        features = normalise_latents(self.present_encoder(frames.flatten(0, 1), chunk))
+        features = normalise_latents(self.loaded_encoder(frames.flatten(0, 1), chunk))
         return rearrange(features, "(batch time) tokens dim -> batch time tokens dim", batch=len(frames))
 
     def encoder_fingerprint(self) -> str:
         """Return a hash of the encoder's tensors and other properties, which is part of the key of cached latents."""
-        if isinstance(self.encoder, AbsentEncoder):
+        if isinstance(self.encoder, RemovedEncoder):
             return self.encoder.fingerprint
-        tensors, beyond = fingerprint(self.encoder.state_dict()), self.encoder_beyond_tensors
+        tensors, beyond = fingerprint(self.encoder.state_dict()), self.encoder_properties
         if not beyond:  # the same for all files with these tensors
             return tensors
         return hashlib.sha256(json.dumps([tensors, beyond], sort_keys=True).encode()).hexdigest()
 
     @property
-    def encoder_beyond_tensors(self) -> dict[str, str | int]:
+    def encoder_properties(self) -> dict[str, str | int]:
         """The properties on which latents depend, but which the tensors do not determine.
 
         Empty for tubelets of V-JEPA 2 with the published number of heads, and for a model created with its encoder.
@@ -228,12 +228,12 @@ class WorldModel(LatentDynamics):
         sizes, origin, beyond = self.sizes.encoder, self.encoder_origin, dict[str, str | int]()
         if sizes.family != "v2":
             beyond |= {"encoder.family": sizes.family, "encoder.frame": sizes.frame}
-        if origin is not None and origin.heads_are_told and HEADS.get(sizes.width) != sizes.heads:
+        if origin is not None and origin.has_heads_in_fingerprint and PUBLISHED_HEADS.get(sizes.width) != sizes.heads:
             beyond["encoder.heads"] = sizes.heads
         return beyond
 
     @property
-    def encoder_in_words(self) -> str:
+    def encoder_description(self) -> str:
         """A description of the encoder and its origin, for cards."""
         sizes, frame = self.sizes.encoder, ""
         if sizes.family != "v2":
@@ -252,7 +252,7 @@ class WorldModel(LatentDynamics):
 
     def predictor_fingerprint(self) -> str:
         """Return a hash of the base model's predictor, independent of an adapter and of new input layers."""
-        replaced = {} if self.fresh_heads is None else self.fresh_heads.replaced
+        replaced = {} if self.new_input_heads is None else self.new_input_heads.replaced
         return fingerprint(base_weights(self.base_predictor) | replaced)
 
 
@@ -278,7 +278,7 @@ def base_weights(predictor: nn.Module) -> dict[str, Tensor]:
     }
 
 
-def heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
+def find_heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
     """Return the names of the input layers that do not fit states and actions of these widths.
 
     States of any width fit a model without states.
@@ -291,7 +291,7 @@ def heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
     return tuple(name for name, does in fits.items() if not does)
 
 
-def require_trained(heads: tuple[str, ...], config: AdapterConfig) -> None:
+def require_trained_heads(heads: tuple[str, ...], config: AdapterConfig) -> None:
     """Check that new input layers are trained.
 
     Raises:
@@ -317,10 +317,10 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
     Raises:
         ValueError: The model is adapted, or has new input layers already.
     """
-    heads = heads_to_replace(model.sizes, widths)
+    heads = find_heads_to_replace(model.sizes, widths)
     if not heads:
         return []
-    if model.adaptation is not None or model.fresh_heads is not None:
+    if model.adaptation is not None or model.new_input_heads is not None:
         raise ValueError("heads are replaced once, and before the model is adapted")
     predictor = model.base_predictor
     replaced: dict[str, Tensor] = {}
@@ -329,18 +329,18 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
         own, width = getattr(predictor, name), widths.action if name == "action_encoder" else widths.state
         replaced |= {f"{name}.{key}": value.detach().cpu() for key, value in own.state_dict().items()}
         head = nn.Linear(width, own.out_features)
-        initialise(head, torch.Generator().manual_seed(seed_of(seed, name)))
+        initialise(head, torch.Generator().manual_seed(derive_seed(seed, name)))
         setattr(predictor, name, head.to(own.weight.device, own.weight.dtype).requires_grad_(False))
         lines.append(f"{_as_text([name])}: {width} numbers instead of the base's {own.in_features}: newly initialised")
     dims = {"action_dim": widths.action}
     dims |= {"state_dim": widths.state} if model.sizes.predictor.use_states else {}
     predictor.config.update(dims)
     model.sizes = model.sizes.model_copy(update={"predictor": model.sizes.predictor.model_copy(update=dims)})
-    model.fresh_heads = FreshHeads(replaced, seed)
+    model.new_input_heads = NewInputHeads(replaced, seed)
     return lines
 
 
-def widths_of_model(sizes: ModelSizes) -> Widths:
+def get_model_widths(sizes: ModelSizes) -> Widths:
     """Return the widths of a model's states and actions.
 
     For a model without states the width of a state is that of an action, because a plan adds actions to states.
@@ -349,14 +349,14 @@ def widths_of_model(sizes: ModelSizes) -> Widths:
     return Widths(state=own.state_dim if own.use_states else own.action_dim, action=own.action_dim)
 
 
-def widths_as_text(sizes: ModelSizes) -> str:
+def describe_model_widths(sizes: ModelSizes) -> str:
     """Describe the states and actions that a model accepts, for messages."""
     own = sizes.predictor
     states = f"states of {own.state_dim}" if own.use_states else "any states"
     return f"{states} and actions of {own.action_dim} numbers"
 
 
-def seed_of(*parts: object) -> int:
+def derive_seed(*parts: object) -> int:
     """Return a seed derived from these values, for example from the seed of the config and a step."""
     digest = hashlib.blake2b("/".join(map(str, parts)).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") >> 1

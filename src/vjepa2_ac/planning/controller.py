@@ -19,7 +19,13 @@ from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import require_image
-from vjepa2_ac.model.world_model import Fingerprints, WorldModel, heads_to_replace, widths_as_text, widths_of_model
+from vjepa2_ac.model.world_model import (
+    Fingerprints,
+    WorldModel,
+    describe_model_widths,
+    find_heads_to_replace,
+    get_model_widths,
+)
 from vjepa2_ac.planning.cameras import Cameras, Fault
 from vjepa2_ac.planning.energy import Axes, ChunkScores, EnergyFunction, Goal, Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, require_ends, timed
@@ -187,7 +193,7 @@ class Controller:
             seed=config.seed if seed is None else seed,
             crop=config.data.crop,
             extrinsics=extrinsics,
-            spaces=spaces_of(config.data, widths_of_model(subject.world_model.sizes)),
+            spaces=spaces_of(config.data, get_model_widths(subject.world_model.sizes)),
         )
 
     @property
@@ -502,9 +508,9 @@ def _require_camera_pose(model: WorldModel, extrinsics: np.ndarray | None, views
 
 
 def _require_spaces(model: WorldModel, spaces: Spaces) -> None:
-    if heads_to_replace(model.sizes, spaces.widths):
+    if find_heads_to_replace(model.sizes, spaces.widths):
         needed = f"{spaces.widths.state} and {spaces.widths.action}, as the spaces of the data that it was trained on"
-        raise InputError(where="model", found=widths_as_text(model.sizes), needed=needed)
+        raise InputError(where="model", found=describe_model_widths(model.sizes), needed=needed)
     if spaces.action.follows == "unknown":
         found = "commands whose effect on the state is not known"
         fix = "To plan, train with data.actions: difference, or with join_actions: sum or last"

@@ -11,7 +11,7 @@ import torch
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_weight_dtype
 from vjepa2_ac.model.compilation import require_compiler
-from vjepa2_ac.model.lora import merge_adapter, unadapted_copy
+from vjepa2_ac.model.lora import copy_with_merged_adapter, merge_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint import SELECTED
@@ -67,7 +67,7 @@ def prepare_for_planning(world_model: WorldModel, config: PlanningConfig) -> Wor
         InputError: `planning.compile` is `blocks`, and there is no compiler.
     """
     if world_model.adaptation is not None:
-        world_model = unadapted_copy(world_model)
+        world_model = copy_with_merged_adapter(world_model)
     if config.compile == "blocks":
         require_compiler(world_model.device.type, where="planning.compile")
     world_model.set_compiled("always" if config.compile == "blocks" else "never")

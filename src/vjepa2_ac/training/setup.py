@@ -28,7 +28,7 @@ from vjepa2_ac.model.adapter_folder import read_card
 from vjepa2_ac.model.checkpoints import base_sizes, load_base
 from vjepa2_ac.model.compilation import require_compiler
 from vjepa2_ac.model.lora import add_adapter, trainable_report
-from vjepa2_ac.model.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
+from vjepa2_ac.model.world_model import WorldModel, find_heads_to_replace, fit_heads, require_trained_heads
 from vjepa2_ac.registry import TRAINING_HOOKS
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import ADAPTER, CHECKPOINTS, RunState, newest_checkpoint, written_state
@@ -139,7 +139,7 @@ def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, r
     world_model.set_attention(config.training.attention)
     world_model.set_compiled("with gradients" if config.training.compile == "blocks" else "never")
     if dataset.config.is_cache:
-        world_model.set_encoder_aside()
+        world_model.remove_encoder()
 
 
 def _check_heads(config: Config, dataset: Dataset) -> None:
@@ -149,17 +149,17 @@ def _check_heads(config: Config, dataset: Dataset) -> None:
         InputError: A new input layer would not be trained; or `data.stride` is auto, although the base model cannot
             predict from this data.
     """
-    heads, widths = heads_to_replace(base_sizes(config.model), dataset.widths), dataset.widths
+    heads, widths = find_heads_to_replace(base_sizes(config.model), dataset.widths), dataset.widths
     if heads and config.data.stride == "auto":
         found = f"auto, for states of {widths.state} and actions of {widths.action} numbers"
         needed = "widths that the base was trained with: it is measured at each candidate stride"
         raise InputError(where="data.stride", found=found, needed=needed, fix="Set it to a number of control steps")
-    require_trained(heads, config.adapter)
+    require_trained_heads(heads, config.adapter)
 
 
 def _fit_heads(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
     """Replace the input layers of a base model that do not fit the widths of the data, and report the new layers."""
-    heads = heads_to_replace(world_model.sizes, dataset.widths)
+    heads = find_heads_to_replace(world_model.sizes, dataset.widths)
     for line in fit_heads(world_model, dataset.widths, config.seed):
         reporter.note(line)
     if config.data.states != "vector" or config.adapter.kind == "none" or config.model.is_random:

@@ -26,7 +26,7 @@ from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.low_rank import CastMatrices
 from vjepa2_ac.model.predictor import KeyValueCache, LatentDynamics
-from vjepa2_ac.model.world_model import WorldModel, seed_of
+from vjepa2_ac.model.world_model import WorldModel, derive_seed
 from vjepa2_ac.registry import LOSSES
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.training.optim import learning_rate_at, trained_parameters
@@ -121,7 +121,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
         InputError: The loss or a gradient is not finite; names the clips. The weights are unchanged.
     """
     # The random numbers of a step (dropout) follow from its number: no generator state needs to be saved.
-    torch.manual_seed(seed_of(run.config.seed, step, run.accelerator.process_index))
+    torch.manual_seed(derive_seed(run.config.seed, step, run.accelerator.process_index))
     learning_rate = learning_rate_at(step, run.config.training)
     for group in run.optimizer.param_groups:
         group["lr"] = learning_rate

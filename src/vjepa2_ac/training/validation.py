@@ -169,7 +169,7 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
     config, error = run.config, one_step_over_persistence(validation.errors).value
     if error < 1.0 or config.training.allow_weak_base or config.model.is_random:
         return validation
-    if run.world_model.fresh_heads is not None:
+    if run.world_model.new_input_heads is not None:
         reporter.note(_BASE_NOT_CHECKED)
         return validation
     description = f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame"

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter_folder import ADAPTER_FILE, CARD, load_trained, save_trained
-from vjepa2_ac.model.lora import add_adapter, knobs_of
+from vjepa2_ac.model.lora import add_adapter, parse_adapter_config
 from vjepa2_ac.model.world_model import WorldModel
 
 Fresh = Callable[..., WorldModel]
@@ -42,7 +42,7 @@ def rewrite(folder: Path, changes: dict[str, Any], file: str = ADAPTER_FILE) -> 
 
 
 def test_what_this_program_writes_names_its_layers_and_holds_no_pattern_of_the_users(folder: Path) -> None:
-    read = knobs_of(json.loads((folder / ADAPTER_FILE).read_text()), where="it")
+    read = parse_adapter_config(json.loads((folder / ADAPTER_FILE).read_text()), where="it")
     ranks = {f"blocks.{index}.mlp.fc1": 6 for index in range(2)}
     resolved = {"rank_pattern": ranks, "alpha_pattern": {"blocks.0.mlp.fc1": 3.5}}
     assert read == KNOBS.model_copy(update={"targets": ("fc1", "q"), "peft": resolved})

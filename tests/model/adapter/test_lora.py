@@ -14,7 +14,14 @@ from model_fixtures import tiny_inputs, tiny_model
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter_folder import load_trained, save_trained
-from vjepa2_ac.model.lora import add_adapter, base_only, merge_adapter, trainable_report
+from vjepa2_ac.model.lora import (
+    add_adapter,
+    copy_with_merged_adapter,
+    merge_adapter,
+    trainable_report,
+    use_base_weights,
+)
+from vjepa2_ac.model.model_files import EncoderOrigin
 from vjepa2_ac.model.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.world_model import WorldModel
 
@@ -161,7 +168,7 @@ def test_switched_off_it_is_the_base_and_switched_on_what_it_was(
     model = trained(config, dtype)
     base = predict(fresh(dtype=torch.float32 if config.kind == "none" else dtype), inputs)
     before, adapted, count = copies(model), predict(model, inputs), trainable_report(model).trained
-    with base_only(model):
+    with use_base_weights(model):
         switched_off = predict(model, inputs)
     rounding = 0.05 if (config.kind, dtype) == ("none", torch.bfloat16) else 0  # float32 arithmetic on rounded weights
     torch.testing.assert_close(switched_off, base, rtol=0, atol=rounding)
@@ -225,6 +232,14 @@ def test_merging_under_autocast_is_merging(trained: Fresh) -> None:
         merge_adapter(other)
     for name, value in model.predictor.state_dict().items():
         assert torch.equal(value, other.predictor.state_dict()[name]), name
+
+
+def test_merged_copy_has_the_encoder_fingerprint_of_the_original(trained: Fresh) -> None:
+    model = trained(LORA)
+    model.encoder_origin = EncoderOrigin("encoder.pt", has_heads_in_fingerprint=True)
+    merged = copy_with_merged_adapter(model)
+    assert merged.encoder_origin == model.encoder_origin
+    assert merged.encoder_fingerprint() == model.encoder_fingerprint()
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of the libraries' own loaders

@@ -23,7 +23,7 @@ from vjepa2_ac.model.world_model import WorldModel
 
 FILES = GOLDEN / "encoders"
 V2, V21 = FILES / "vjepa2_pretrained.pt", FILES / "vjepa2_1_distilled.pt"
-HEADS = {V2: 3, V21: 4}
+PUBLISHED_HEADS = {V2: 3, V21: 4}
 
 
 class Golden(NamedTuple):
@@ -42,7 +42,7 @@ def golden(request: pytest.FixtureRequest) -> Golden:
 
 def model_of(path: Path | str, size: int = 96, dtype: str = "float32", **encoder: Any) -> WorldModel:
     """Return a model with the encoder of a file, and a small fresh predictor."""
-    known = {"heads": HEADS[path]} if path in HEADS else {}
+    known = {"heads": PUBLISHED_HEADS[path]} if path in PUBLISHED_HEADS else {}
     config = {
         "base": "random",
         "encoder": {"path": str(path), **known, **encoder},
@@ -55,7 +55,7 @@ def model_of(path: Path | str, size: int = 96, dtype: str = "float32", **encoder
 def test_features_and_latents_equal_the_official_ones_at_every_size(golden: Golden) -> None:
     for size in map(int, golden.facts["sizes_px"]):
         model, io = model_of(golden.path, size), golden.io
-        assert_equal_to_rounding(model.present_encoder(io[f"frames.{size}"]), io[f"tubelet.{size}"])
+        assert_equal_to_rounding(model.loaded_encoder(io[f"frames.{size}"]), io[f"tubelet.{size}"])
         assert_equal_to_rounding(model.encode(io[f"frames.{size}"][None])[0], io[f"latents.{size}"])
 
 
@@ -63,14 +63,14 @@ def test_the_image_path_equals_the_official_one_at_every_size() -> None:
     io = load_file(V21.with_suffix(".io.safetensors"))
     for size in (96, 80, 256):
         model = model_of(V21, size, frame="image")
-        assert_equal_to_rounding(model.present_encoder(io[f"frames.{size}"]), io[f"image.{size}"])
+        assert_equal_to_rounding(model.loaded_encoder(io[f"frames.{size}"]), io[f"image.{size}"])
 
 
 def test_another_key_is_another_encoder(golden: Golden) -> None:
     name = next(name for name in golden.io if name.startswith("other_key_tubelet."))
     size = int(name.rpartition(".")[2])
     model = model_of(golden.path, size, key="encoder")
-    assert_equal_to_rounding(model.present_encoder(golden.io[f"frames.{size}"]), golden.io[name])
+    assert_equal_to_rounding(model.loaded_encoder(golden.io[f"frames.{size}"]), golden.io[name])
     usual = model_of(golden.path, size)
     assert model.encoder_fingerprint() != usual.encoder_fingerprint()
     assert usual.encoder_origin is not None
@@ -129,7 +129,7 @@ def test_transformers_own_class_reads_and_computes_the_same(tmp_path: Path) -> N
     frames = load_file(V2.with_suffix(".io.safetensors"))["frames.96"]
     with torch.no_grad():
         found = theirs(frames[:, None].expand(-1, 2, -1, -1, -1), skip_predictor=True).last_hidden_state
-    assert_equal_to_rounding(model_of(folder).present_encoder(frames), found)
+    assert_equal_to_rounding(model_of(folder).loaded_encoder(frames), found)
 
 
 def test_the_same_from_the_hub_and_then_without_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,7 +207,7 @@ def with_another_tensor(whole: dict[str, Any]) -> None:
 )
 def test_a_file_that_is_not_a_whole_encoder_is_refused(tmp_path: Path, change: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        model_of(rewrite(V21, change, tmp_path / "changed.pt"), heads=HEADS[V21])
+        model_of(rewrite(V21, change, tmp_path / "changed.pt"), heads=PUBLISHED_HEADS[V21])
 
 
 @pytest.mark.parametrize(
@@ -256,9 +256,9 @@ def test_two_encoders_of_the_same_tensors_and_other_latents_are_two() -> None:
     assert model_of(V21, heads=2).encoder_fingerprint() != usual
     published = WorldModel.empty(ModelSizes(encoder=EncoderSizes(width=1024, depth=1, heads=16)))
     published.encoder_origin = EncoderOrigin("vitl.pt")
-    assert not published.encoder_beyond_tensors, "as of the AC file that holds it"
+    assert not published.encoder_properties, "as of the AC file that holds it"
     untold = WorldModel.empty(ModelSizes(encoder=EncoderSizes(width=48, depth=1, heads=3)))
-    assert not untold.encoder_beyond_tensors, "of a model of before"
+    assert not untold.encoder_properties, "of a model of before"
 
 
 def test_the_encoder_of_a_model_stays_the_same_encoder_under_another_predictor() -> None:
@@ -276,14 +276,14 @@ def test_an_earlier_layer_gives_the_features_after_that_block_from_a_smaller_net
     whole, frames = model_of(golden.path), golden.io["frames.96"]
     depth, seen = whole.sizes.encoder.depth, list[Tensor]()
     layer = 2 * depth // 3
-    hook = whole.present_encoder.vit.layer[layer - 1].register_forward_hook(
+    hook = whole.loaded_encoder.vit.layer[layer - 1].register_forward_hook(
         lambda _, __, out: seen.append(out[0] if isinstance(out, tuple) else out)
     )
     whole.encode(frames[None])
     hook.remove()
     expected = torch.nn.functional.layer_norm(seen[0], seen[0].shape[-1:], eps=1e-6)
     cut = model_of(golden.path, layer=layer)
-    assert len(cut.present_encoder.vit.layer) == cut.sizes.encoder.depth == layer < depth
+    assert len(cut.loaded_encoder.vit.layer) == cut.sizes.encoder.depth == layer < depth
     assert_equal_to_rounding(cut.encode(frames[None])[0], expected)
     assert cut.encoder_fingerprint() != whole.encoder_fingerprint()
     cut.save_pretrained(tmp_path / "cut")

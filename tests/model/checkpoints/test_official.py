@@ -19,7 +19,7 @@ from official_files import assert_equal_to_rounding, rewrite
 from paths import GOLDEN
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints import load_official, official_name, to_official
+from vjepa2_ac.model.checkpoints import load_official, to_official, to_official_name
 from vjepa2_ac.model.world_model import WorldModel
 
 
@@ -91,7 +91,7 @@ def check_gradients(model: WorldModel, io: dict[str, Tensor], norm: float) -> No
     fused: dict[str, dict[int | None, Tensor]] = {}
     for name, value in model.predictor.named_parameters():
         if value.grad is not None:
-            official, third = official_name(name, "predictor")
+            official, third = to_official_name(name, "predictor")
             fused.setdefault(official, {})[third] = value.grad
     whole = {n: g[None] if None in g else torch.cat([g[0], g[1], g[2]]) for n, g in fused.items()}
     expected = {name.removeprefix("grad."): value for name, value in io.items() if name.startswith("grad.")}

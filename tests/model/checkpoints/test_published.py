@@ -13,7 +13,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.cli import main
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.model import model_files
-from vjepa2_ac.model.model_files import PUBLISHED, VIT_B, Published, download, find_published, published_as
+from vjepa2_ac.model.model_files import PUBLISHED, VIT_B, Published, download, find_published, find_published_file
 from vjepa2_ac.storage.retries import RetryPolicy
 
 
@@ -22,7 +22,7 @@ def test_every_name_of_a_file_leads_to_it_and_no_two_files_collide() -> None:
     for one in PUBLISHED:
         for name in (one.name, one.file, one.remote, one.remote.removesuffix(".pt")):
             assert find_published(name) is one
-        assert one in {published_as(one.file), published_as(one.remote)}
+        assert one in {find_published_file(one.file), find_published_file(one.remote)}
     with pytest.raises(InputError, match=r"no published checkpoint of this name.*--list"):
         find_published("VJEPA2_1_VITG_384")
 

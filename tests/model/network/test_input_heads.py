@@ -14,7 +14,7 @@ from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.lora import add_adapter, merge_adapter
 from vjepa2_ac.model.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model
+from vjepa2_ac.model.world_model import WorldModel, find_heads_to_replace, fit_heads, get_model_widths
 
 TINY = ModelSizes.model_validate(
     {
@@ -23,8 +23,10 @@ TINY = ModelSizes.model_validate(
         "predictor": {"width": 24, "depth": 2, "heads": 2},
     }
 )
-HEADS = ("action_encoder", "state_encoder")
-LORA = AdapterConfig(rank=2, alpha=4.0, dropout=0.0, modules_to_save=HEADS)  # with more, float32 is ill-conditioned
+PUBLISHED_HEADS = ("action_encoder", "state_encoder")
+LORA = AdapterConfig(
+    rank=2, alpha=4.0, dropout=0.0, modules_to_save=PUBLISHED_HEADS
+)  # with more, float32 is ill-conditioned
 EVERYTHING = AdapterConfig(kind="none")
 both_kinds = pytest.mark.parametrize("config", [LORA, EVERYTHING], ids=["lora", "none"])
 widths = pytest.mark.parametrize("widths", [Widths(14, 14), Widths(8, 7)], ids=str)
@@ -59,14 +61,14 @@ def trained(widths: Widths, config: AdapterConfig) -> WorldModel:
 def test_only_heads_that_do_not_fit_are_replaced_and_each_is_told(widths: Widths) -> None:
     model, before = base(), base().predictor.state_dict()
     lines = fit_heads(model, widths, seed=0)
-    replaced = {name: width for name, width in zip(HEADS, widths[::-1], strict=True) if width != 7}
+    replaced = {name: width for name, width in zip(PUBLISHED_HEADS, widths[::-1], strict=True) if width != 7}
     expected = [f"{name.replace('_', ' ')}: {width} numbers instead" for name, width in replaced.items()]
     assert [line.partition(" of")[0] for line in lines] == expected
-    assert heads_to_replace(TINY, widths) == tuple(replaced)
+    assert find_heads_to_replace(TINY, widths) == tuple(replaced)
     for name, value in model.predictor.state_dict().items():
-        if name.split(".")[0] not in heads_to_replace(TINY, widths):
+        if name.split(".")[0] not in find_heads_to_replace(TINY, widths):
             assert torch.equal(value, before[name]), name
-    assert widths_of_model(model.sizes) == widths
+    assert get_model_widths(model.sizes) == widths
     assert (model.predictor.config.state_dim, model.predictor.config.action_dim) == widths
     assert predict(model, widths).shape == (1, 3, 4, 24)
 
@@ -95,7 +97,7 @@ def test_what_was_trained_comes_back_onto_the_plain_base(tmp_path: Path, config:
     load_trained(resumed, tmp_path, trainable=True)
     assert torch.equal(predict(resumed, widths), predict(model, widths))
     names = [name for name, value in resumed.predictor.named_parameters() if value.requires_grad]
-    assert all(any(head in name for name in names) for head in HEADS)
+    assert all(any(head in name for name in names) for head in PUBLISHED_HEADS)
 
 
 @both_kinds
@@ -106,10 +108,10 @@ def test_merged_it_is_a_base_of_its_own_that_folders_keep(
     model = trained(widths, config)
     before = predict(model, widths)
     merge_adapter(model)
-    assert model.fresh_heads is None
+    assert model.new_input_heads is None
     model.save_pretrained(tmp_path)
     loaded = load_base(ModelConfig(base=str(tmp_path), dtype="float32"), seed=0)
-    assert widths_of_model(loaded.sizes) == widths
+    assert get_model_widths(loaded.sizes) == widths
     assert fit_heads(loaded, widths, seed=3) == []
     torch.testing.assert_close(predict(loaded, widths), before, atol=1e-5, rtol=1e-5)
     alone = ActionConditionedPredictor.from_pretrained(tmp_path / "predictor")

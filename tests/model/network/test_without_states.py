@@ -14,7 +14,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.attention import TokenLayout, rotary_tables
 from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model
+from vjepa2_ac.model.world_model import WorldModel, find_heads_to_replace, fit_heads, get_model_widths
 
 STEPS, GRID = 4, 3
 LORA = AdapterConfig(rank=2, alpha=4.0)
@@ -86,10 +86,10 @@ def test_an_adapter_on_the_missing_layer_is_refused() -> None:
 @pytest.mark.parametrize("width", [1, 7, 14])
 def test_states_of_any_width_fit_and_other_actions_get_a_fresh_head(width: int, tmp_path: Path) -> None:
     model = tiny_model(states=False)
-    assert heads_to_replace(model.sizes, Widths(width, 7)) == ()
+    assert find_heads_to_replace(model.sizes, Widths(width, 7)) == ()
     assert fit_heads(model, Widths(width, 7), seed=0) == []
     assert len(fit_heads(model, Widths(width, 14), seed=0)) == 1
-    assert widths_of_model(model.sizes) == Widths(14, 14)
+    assert get_model_widths(model.sizes) == Widths(14, 14)
     add_adapter(model, LORA.model_copy(update={"modules_to_save": ("action_encoder",)}), seed=0)
     save_trained(model, tmp_path / "adapter")
     load_trained(tiny_model(states=False), tmp_path / "adapter")

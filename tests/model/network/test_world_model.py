@@ -74,8 +74,8 @@ def test_a_folder_that_is_not_a_whole_model_is_named(
 def test_a_model_whose_encoder_is_set_aside_predicts_as_before_and_knows_which_one_it_was(
     model: WorldModel, fresh: Fresh, inputs, tmp_path: Path
 ) -> None:
-    model.set_encoder_aside()
-    model.set_encoder_aside()  # once more changes nothing
+    model.remove_encoder()
+    model.remove_encoder()  # once more changes nothing
     whole = fresh(seed=0)
     assert model.encoder_fingerprint() == whole.encoder_fingerprint()
     assert sum(p.numel() for p in model.parameters()) == sum(p.numel() for p in whole.predictor.parameters())
@@ -137,7 +137,7 @@ def likeness_to_the_input(model: WorldModel) -> Tensor:
 
 @pytest.mark.parametrize(("width", "least"), [(48, 0.95), (64, 0.95), (32, 0.7)])
 def test_a_predictor_that_starts_at_persistence_begins_close_to_copying(width: int, least: float) -> None:
-    copying = WorldModel.random(sizes(width), seed=0, at_persistence=True)
+    copying = WorldModel.random(sizes(width), seed=0, near_persistence=True)
     released = WorldModel.random(sizes(width), seed=0)
     assert likeness_to_the_input(copying) > least
     assert likeness_to_the_input(released) < 0.3
