@@ -13,7 +13,7 @@ import numpy as np
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.rollout import ClosedLoopResult, Policy, Trials, run_trials
-from vjepa2_ac.simulation.worlds import OtherWorld, find_trials, record_world
+from vjepa2_ac.simulation.worlds import ExternalEnvironment, find_trials, record_world
 
 ROOT = Path(__file__).resolve().parents[1]
 STRIDE, EVERY = 4, 2  # control steps of a model step, and from one recorded frame to the next
@@ -82,7 +82,7 @@ def record(folder: Path, task: str, when: str) -> None:
     path = Path(data_of(folder, task, when).path)
     if len(list(path.glob("*.npz"))) < count:
         print(f"recording {path}", flush=True)
-        with OtherWorld(TASKS[task].command(when)) as world:
+        with ExternalEnvironment(TASKS[task].command(when)) as world:
             record_world(world, path, range(first, first + count), every=EVERY)
 
 
@@ -92,7 +92,7 @@ def problems(folder: Path, task: str, seed: int, goals: int, when: str = "after"
     path = folder / "problems" / f"{task}{word}-{seed}-{goals}.pickle"
     if not path.exists():
         options = BenchmarkOptions(episodes=goals, seed=seed, sub_goals="every-step")
-        with OtherWorld(TASKS[task].command(when)) as world:
+        with ExternalEnvironment(TASKS[task].command(when)) as world:
             found = find_trials(world, options, STRIDE)
         path.parent.mkdir(exist_ok=True)
         path.with_suffix(".part").write_bytes(pickle.dumps(found))
@@ -105,7 +105,7 @@ def closed_loop(
 ) -> dict[str, Any]:
     """Return how a policy fares before or after the change; by `Trials` of the expert's own problems."""
     trials, expert = problems(folder, task, seed, goals, when)
-    with OtherWorld(TASKS[task].command(when)) as world:
+    with ExternalEnvironment(TASKS[task].command(when)) as world:
         return figures_of(run_trials(world, policy, trials), expert)
 
 

@@ -14,7 +14,7 @@ from vjepa2_ac import Controller, UserError, load_model, load_run
 from vjepa2_ac.config import PlanningConfig
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.simulation.domains import named_domain
-from vjepa2_ac.simulation.rollout import put
+from vjepa2_ac.simulation.rollout import set_scene
 from vjepa2_ac.simulation.tasks import arm_for, make_problem
 from vjepa2_ac.spaces import apply_action
 
@@ -30,8 +30,8 @@ def main(subject: str = "builtin:sim-tiny", *, samples: int = 100, steps: int = 
         controller = Controller(load_model(subject), planning)
     problem = make_problem("reach", named_domain("A"), seed=0, index=0)  # a start and a goal
     arm = arm_for("reach", named_domain("A"))
-    goal = put(arm, problem.goal, None).image()  # height x width x 3, uint8, RGB
-    put(arm, problem.start, None)
+    goal = set_scene(arm, problem.goal, None).image()  # height x width x 3, uint8, RGB
+    set_scene(arm, problem.start, None)
 
     controller.reset(goal)
     frames = [arm.image()]

@@ -14,7 +14,7 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
 from vjepa2_ac.config import LimitsConfig
 from vjepa2_ac.media.video import write_gif
-from vjepa2_ac.simulation.benchmark import BenchmarkOptions, demonstrated_goals, film_frames, with_goals
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, demonstrated_goals, video_frames, with_goals
 from vjepa2_ac.simulation.rollout import ArmEnvironment, Image, Observation, Trial, run_trials
 from vjepa2_ac.simulation.tasks import arm_for
 
@@ -56,7 +56,7 @@ def main(url: str, film: str, episodes: str = "4", seed: str = "3") -> None:
         print(
             f"problem {number}: {100 * episode.distances_m[-1]:.1f} cm left, {'lifted' if episode.success else 'not'}"
         )
-    frames = list(film_frames(result))
+    frames = list(video_frames(result))
     write_gif(film, frames, seconds=[0.2] * len(frames))
 
 

@@ -83,7 +83,7 @@ def test_the_simulated_truth_is_what_happens_whatever_was_done_before(live: View
     explorer, place = live.explorer, Place(0, 4, (UP, LEFT, UP))
     folder = explorer.dataset.config.path
     arm = resimulate(folder, explorer.dataset.source.read(explorer.episodes[0]), 4)
-    expected = arm.under(np.array(place.actions), explorer.stride)
+    expected = arm.simulate(np.array(place.actions), explorer.stride)
     for before in ((), (LEFT,), (UP, LEFT), (UP, LEFT, UP, LEFT)):
         live.explorer.truth(Place(0, 4, before))
         true = live.explorer.truth(place)

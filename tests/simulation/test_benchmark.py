@@ -12,7 +12,7 @@ from tiny_models import tiny_model, vector_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.media.video import read_header
 from vjepa2_ac.planning.model_setup import load_to_plan
-from vjepa2_ac.simulation.benchmark import FILM, JOINT_FIELDS, BenchmarkOptions, film_frames, run_benchmark
+from vjepa2_ac.simulation.benchmark import JOINT_FIELDS, VIDEO_FILE, BenchmarkOptions, run_benchmark, video_frames
 from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 
 SMALL = [
@@ -57,7 +57,7 @@ def test_the_film_shows_images_and_goal(model: str) -> None:
     result = run_benchmark(load_to_plan(model, overrides=SMALL), options).results[0]
     filmed, other = result.episodes
     assert other.frames is None
-    frames = list(film_frames(result))
+    frames = list(video_frames(result))
     assert frames[0].shape[1] == 640
     for frame, image in ((frames[0], filmed.frames[0]), (frames[-1], filmed.frames[-1])):
         np.testing.assert_array_equal(frame[60:420:2, :640:2], image)
@@ -93,7 +93,9 @@ def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     assert reported["policies"]["tiny"]["why_counts"] == {"planned": 4}
     starts = [one["by_episode"]["distance_cm"][0][0] for one in reported["policies"].values()]
     assert starts == starts[:1] * 4  # the same problems for all
-    assert read_header(tmp_path / FILM, where="film").num_frames == 4 + 1 + 4  # the first and the last image are held
+    assert (
+        read_header(tmp_path / VIDEO_FILE, where="film").num_frames == 4 + 1 + 4
+    )  # the first and the last image are held
 
 
 def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(

@@ -64,14 +64,14 @@ def test_what_is_simulated_again_is_what_was_recorded_in_states_and_images(name:
         source = RldsSource(DataConfig(path=str(recorded(name)), camera=tuple(cameras)))
         episode = source.read(index, camera)
         for step in (0, len(episode.states) - 1):
-            seen = resimulate(recorded(name), episode, step, camera).under(np.zeros((0, 7)), STRIDE)
+            seen = resimulate(recorded(name), episode, step, camera).simulate(np.zeros((0, 7)), STRIDE)
             np.testing.assert_allclose(seen.states[0], episode.states[step], atol=1e-6, rtol=0)
             np.testing.assert_array_equal(seen.frames[0], episode.read_frames([step])[0])
 
 
 def test_the_hand_goes_where_the_name_says_in_states_and_in_images(start: Resimulation) -> None:
     names = ("none", "up", "down", "left", "right")
-    none, up, down, left, right = (start.under(named_actions(name, 2), STRIDE) for name in names)
+    none, up, down, left, right = (start.simulate(named_actions(name, 2), STRIDE) for name in names)
     assert down.states[-1, 2] < none.states[-1, 2] - 0.001  # in `push` it is at the table already
     assert up.states[-1, 2] - none.states[-1, 2] > 0.08
     assert left.states[-1, 1] - right.states[-1, 1] > 0.15
@@ -89,9 +89,9 @@ def test_the_hand_goes_where_the_name_says_in_states_and_in_images(start: Resimu
 
 
 def test_the_start_is_the_recorded_one_and_no_outcome_depends_on_another(start: Resimulation) -> None:
-    first = start.under(named_actions("forward", 1), STRIDE)
-    start.under(named_actions("down", 2), STRIDE)
-    again = start.under(named_actions("forward", 1), STRIDE)
+    first = start.simulate(named_actions("forward", 1), STRIDE)
+    start.simulate(named_actions("down", 2), STRIDE)
+    again = start.simulate(named_actions("forward", 1), STRIDE)
     assert first.frames.shape == (2, 180, 320, 3)
     np.testing.assert_array_equal(first.frames, again.frames)
     np.testing.assert_array_equal(first.states, again.states)

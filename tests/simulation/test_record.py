@@ -12,7 +12,7 @@ from synthetic import measured_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, CameraPlace, DomainRanges
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, CameraPlacement, DomainRanges
 from vjepa2_ac.simulation.motion import MotionRecipe
 from vjepa2_ac.simulation.policies import play
 from vjepa2_ac.simulation.record import (
@@ -90,7 +90,7 @@ def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_w
 
 def blocks_of(task: str, seed: int, *, script: bool, steps: int = 41) -> np.ndarray:
     seen, rng = [], np.random.default_rng(seed)
-    play(arm_for(task, DOMAIN_A), task, steps, rng, script=script, look=lambda arm: seen.append(arm.block))
+    play(arm_for(task, DOMAIN_A), task, steps, rng, script=script, on_step=lambda arm: seen.append(arm.block))
     return np.array(seen)
 
 
@@ -122,7 +122,7 @@ def test_measurements_follow_commands_that_are_held_for_a_model_step() -> None:
 SPECS = [
     RecordingSpec("A", 5, seed=3),
     RecordingSpec("random", 5, seed=4, cameras=3),
-    RecordingSpec(replace(DOMAIN_B, lag_s=0.1 + 0.2, camera=CameraPlace(1 / 3, 20.0, 1.2)), 5, task="push"),
+    RecordingSpec(replace(DOMAIN_B, lag_s=0.1 + 0.2, camera=CameraPlacement(1 / 3, 20.0, 1.2)), 5, task="push"),
     RecordingSpec("B", 5, task="place"),
     RecordingSpec(DomainRanges(lag_s=(0.05, 0.06)), 5, recipe=MotionRecipe(drift_m=(0.0, 0.01, 0.0))),
 ]

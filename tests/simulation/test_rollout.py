@@ -13,14 +13,14 @@ from vjepa2_ac.simulation.arm import SimulatedArm
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions, Planning, demonstrate, demonstrated_goals, run_task
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.motion import HIGH, forward_kinematics
-from vjepa2_ac.simulation.policies import Oracle, RandomActions, ZeroActions, farthest, shortened
+from vjepa2_ac.simulation.policies import Oracle, RandomActions, ZeroActions, largest_action, shorten_to_limits
 from vjepa2_ac.simulation.rollout import (
     ArmEnvironment,
     ClosedLoopResult,
     EpisodeResult,
     Observation,
     Trial,
-    run,
+    run_trial,
 )
 from vjepa2_ac.simulation.tasks import GRASP_M, HOLDING, RELEASED, STEPS, TaskName, arm_for, make_problem
 from vjepa2_ac.spaces import actions_from_states
@@ -71,7 +71,7 @@ def test_the_oracle_solves_it_and_zero_and_random_actions_do_not(task: TaskName,
     assert oracle.why_counts == {"scripted": 3 * STEPS[task]}
     assert not oracle.unreachable.any()
     for episode in oracle.episodes:
-        assert (np.abs(episode.actions) <= farthest(LIMITS)).all()
+        assert (np.abs(episode.actions) <= largest_action(LIMITS)).all()
         if task != "reach":
             assert episode.blocks.shape == (STEPS[task] + 1, 4)
             np.testing.assert_allclose(episode.blocks[0], episode.trial.problem.block_start, atol=1e-9)
@@ -102,7 +102,7 @@ def test_moving_objects_start_every_episode_where_they_start_for_every_policy(ta
 
 def test_an_episode_starts_at_the_start_and_shows_the_goal(arm: SimulatedArm) -> None:
     trial, policy = trial_of(1, steps=2), Scripted(way(0.05), way(0.0, 0.05))
-    result = run(ArmEnvironment(arm), policy, trial, keep_frames=True)
+    result = run_trial(ArmEnvironment(arm), policy, trial, keep_frames=True)
     moved = actions_from_states(np.stack([trial.problem.start, result.states[0]]))  # -pi and pi are one angle
     np.testing.assert_allclose(moved, 0.0, atol=1e-3)
     arm.set_state(trial.problem.goal)
@@ -116,7 +116,7 @@ def test_an_episode_starts_at_the_start_and_shows_the_goal(arm: SimulatedArm) ->
 
 def test_joints_are_observed_moved_and_kept_within_their_limits(arm: SimulatedArm) -> None:
     policy = Scripted(0.1 * np.eye(8)[0], 9.0 * np.eye(8)[1])
-    result = run(ArmEnvironment(arm), policy, trial_of(1, steps=2, stride=60))
+    result = run_trial(ArmEnvironment(arm), policy, trial_of(1, steps=2, stride=60))
     before, after = (observation.joints for observation in policy.seen)
     np.testing.assert_allclose(after - before, 0.1 * np.eye(8)[0], atol=1e-3)
     np.testing.assert_allclose(result.states[1][:6], forward_kinematics(after[:7]), atol=1e-6)
@@ -127,19 +127,19 @@ def test_joints_are_observed_moved_and_kept_within_their_limits(arm: SimulatedAr
 def test_what_is_no_action_is_refused(arm: SimulatedArm) -> None:
     for action in (np.zeros(6), np.full(7, np.nan)):
         with pytest.raises(ValueError, match="no action of 7 or 8 finite numbers"):
-            run(ArmEnvironment(arm), Scripted(action), trial_of(1, steps=1))
+            run_trial(ArmEnvironment(arm), Scripted(action), trial_of(1, steps=1))
     with pytest.raises(ValueError, match="none of the simulated arm"):
         Oracle(LIMITS).reset(Trial(0, 1, 1), UNSEEN)
 
 
 def test_a_command_out_of_reach_moves_the_arm_part_of_the_way_and_is_counted(arm: SimulatedArm) -> None:
     script = Scripted(way(0.0, 0.0, 1.6), way(0.0, 0.0, 0.05))
-    result = run(ArmEnvironment(arm), script, trial_of(1, steps=2, stride=30))
+    result = run_trial(ArmEnvironment(arm), script, trial_of(1, steps=2, stride=30))
     risen = result.states[:, 2] - result.states[0, 2]
     assert 0.15 < risen[1] < 1.0
     np.testing.assert_allclose(result.states[1, :2], result.states[0, :2], atol=2e-3)
     assert 1 <= result.unreachable <= 2
-    assert run(ArmEnvironment(arm), Scripted(way(0.0, 0.0, 0.05)), trial_of(1, 1)).unreachable == 0
+    assert run_trial(ArmEnvironment(arm), Scripted(way(0.0, 0.0, 0.05)), trial_of(1, 1)).unreachable == 0
 
 
 def test_a_planner_acts_within_its_limits_and_some_episodes_are_filmed(arm: SimulatedArm) -> None:
@@ -192,12 +192,12 @@ def test_success_counts_at_the_end_and_passing_is_separate() -> None:
 
 def test_actions_are_shortened_in_their_direction_and_fixed_axes_left_out() -> None:
     limits = LimitsConfig(xyz=(0.05, 0.1, 0.0), rotation=0.2, gripper=0.5)
-    cut = shortened(np.array([0.1, 0.1, 0.3, 0.1, 0.4, 0.0, -0.8]), limits)
+    cut = shorten_to_limits(np.array([0.1, 0.1, 0.3, 0.1, 0.4, 0.0, -0.8]), limits)
     np.testing.assert_allclose(cut, [0.05, 0.05, 0.0, 0.05, 0.2, 0.0, -0.5], atol=1e-9)
-    assert (np.abs(cut) <= farthest(limits)).all()
+    assert (np.abs(cut) <= largest_action(limits)).all()
     small = np.array([0.01, 0.02, 0.0, 0.1, 0.0, 0.0, 0.1])
-    np.testing.assert_array_equal(shortened(small, limits), small)
-    assert shortened(np.ones(7), LimitsConfig(gripper_mode="held"))[6] == 0.0
+    np.testing.assert_array_equal(shorten_to_limits(small, limits), small)
+    assert shorten_to_limits(np.ones(7), LimitsConfig(gripper_mode="held"))[6] == 0.0
 
 
 def test_random_actions_are_those_of_the_trial_within_the_limits_and_over_all_of_them() -> None:
@@ -208,8 +208,8 @@ def test_random_actions_are_those_of_the_trial_within_the_limits_and_over_all_of
         draws.append(np.stack([policy.act(Observation(UNSEEN, trial.problem.start)) for _ in range(50)]))
     np.testing.assert_array_equal(draws[0], draws[2])
     assert (draws[0] != draws[1]).any()
-    assert (np.abs(draws[0]) <= farthest(LIMITS)).all()
-    assert np.abs(draws[0])[:, [0, 1, 2, 6]].max(axis=0) == pytest.approx(farthest(LIMITS)[[0, 1, 2, 6]], rel=0.2)
+    assert (np.abs(draws[0]) <= largest_action(LIMITS)).all()
+    assert np.abs(draws[0])[:, [0, 1, 2, 6]].max(axis=0) == pytest.approx(largest_action(LIMITS)[[0, 1, 2, 6]], rel=0.2)
     assert not draws[0][:, 3:6].any()
 
 
@@ -265,7 +265,7 @@ def test_a_planner_is_given_the_goals_of_the_trial() -> None:
     planner = controller(horizon=1)
     arm = arm_for("pick", DOMAIN_A)
     goals = demonstrated_goals(trial_with_goals("pick", DOMAIN_A, 0), arm, USUAL, "every-step")
-    episode = run(ArmEnvironment(arm), Planning(planner), trial_with_goals("pick", DOMAIN_A, 0, goals=goals))
+    episode = run_trial(ArmEnvironment(arm), Planning(planner), trial_with_goals("pick", DOMAIN_A, 0, goals=goals))
     closes = [goal.gripper for goal in goals].index("close")
     assert not episode.actions[:closes, 6].any()
     assert planner.decision is not None

@@ -25,7 +25,13 @@ from vjepa2_ac.simulation import worlds
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.policies import ZeroActions
 from vjepa2_ac.simulation.rollout import Image, Observation, Trial, run_trials
-from vjepa2_ac.simulation.worlds import OtherWorld, WorldProcess, find_trials, record_world, run_world_benchmark
+from vjepa2_ac.simulation.worlds import (
+    EnvironmentProcess,
+    ExternalEnvironment,
+    find_trials,
+    record_world,
+    run_world_benchmark,
+)
 from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 
 SMALL = ["planning.samples=6", "planning.iterations=2", "planning.planner.options.elites=3"]
@@ -62,7 +68,7 @@ def test_a_policy_that_knows_the_goal_reaches_it_in_any_world() -> None:
         def _change(self, observation: Observation) -> np.ndarray:
             return np.append(self.place - observation.state[:3], np.zeros(4))
 
-    with OtherWorld(command()) as world:
+    with ExternalEnvironment(command()) as world:
         trials, shown = find_trials(world, BenchmarkOptions(episodes=4, seed=5), 4)
         again, shown_again = find_trials(world, BenchmarkOptions(episodes=4, seed=5), 4)
         result = run_trials(world, Homing(), trials)
@@ -72,7 +78,7 @@ def test_a_policy_that_knows_the_goal_reaches_it_in_any_world() -> None:
 
 
 def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    with OtherWorld(command()) as world:
+    with ExternalEnvironment(command()) as world:
         assert record_world(world, tmp_path, range(2)) == (2, 2)
         first = {file.name: file.stat().st_mtime_ns for file in tmp_path.iterdir()}
         assert record_world(world, tmp_path, range(4)) == (3, 3), "play solves nothing"
@@ -101,7 +107,7 @@ def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) 
 )
 def test_what_a_world_does_wrong_is_said(model: str, world: str, said: str) -> None:
     subject = load_to_plan(model, overrides=SMALL)
-    with pytest.raises(InputError, match=said), OtherWorld(world) as opened:
+    with pytest.raises(InputError, match=said), ExternalEnvironment(world) as opened:
         run_world_benchmark(subject, opened, BenchmarkOptions(episodes=2, films=0))
 
 
@@ -136,9 +142,9 @@ def test_a_real_world_is_driven_by_its_expert(name: str, tmp_path: Path) -> None
         pytest.skip(f"no environment of {name} (docs/worlds.md): make worlds/{name}")
     task = {"robosuite": ["Lift"], "libero": ["libero_object", "--near"], "metaworld": ["reach-v3"]}[name]
     words = shlex.join([str(python), str(ROOT / "examples" / "worlds" / f"{name}.py"), *task])
-    with OtherWorld(words) as world:
+    with ExternalEnvironment(words) as world:
         elsewhere, far = world.reset(seed=3, options={"stride": 4})
-    with OtherWorld(words) as world:
+    with ExternalEnvironment(words) as world:
         for _ in range(2):
             first, info = world.reset(seed=3, options={"stride": 4})
             np.testing.assert_array_equal(first.image, elsewhere.image)
@@ -187,7 +193,7 @@ def fail(command: str, timeout_s: float | None = None) -> str:
     """Return the error of the first answer that is refused."""
 
     def reset_often() -> None:
-        with OtherWorld(command, timeout_s) as world:
+        with ExternalEnvironment(command, timeout_s) as world:
             for seed in range(3):
                 world.reset(seed=seed, options={"stride": 1})
 
@@ -218,7 +224,7 @@ def test_a_line_without_end_is_refused_at_a_bounded_size(program: Program, monke
 
 @pytest.mark.usefixtures("short_wait")
 def test_a_world_that_does_not_read_its_requests_is_refused(program: Program) -> None:
-    with WorldProcess(program(first=f"{HELLO}time.sleep(1000)"), 0.01) as world:
+    with EnvironmentProcess(program(first=f"{HELLO}time.sleep(1000)"), 0.01) as world:
         world.exchange()
         errors = []
         for _ in range(30):  # some 4 kB each: a pipe holds 64 kB
@@ -263,7 +269,7 @@ def test_a_wrong_answer_is_one_error_that_names_the_command(
 def test_an_answer_that_no_request_asked_for_is_refused(program: Program, tmp_path: Path) -> None:
     go_on, said = tmp_path / "go on", tmp_path / "said"
     wait = f"while not os.path.exists({str(go_on)!r}): time.sleep(0.01)"
-    with OtherWorld(program(f"say()\n    {wait}\n    say()\n    open({str(said)!r}, 'w')")) as world:
+    with ExternalEnvironment(program(f"say()\n    {wait}\n    say()\n    open({str(said)!r}, 'w')")) as world:
         world.reset(seed=0, options={"stride": 1})
         go_on.touch()
         wait_until(said.exists)
@@ -274,7 +280,7 @@ def test_an_answer_that_no_request_asked_for_is_refused(program: Program, tmp_pa
 @pytest.mark.parametrize("task", ["../../../out", "/out", "a\0b\nc\x1b[2J", ".."])
 def test_no_task_leaves_the_folder_of_its_recordings(program: Program, tmp_path: Path, task: str) -> None:
     folder = tmp_path / "a" / "b" / "set"
-    with OtherWorld(program(first=f"about['task'] = {task!r}\n{HELLO}")) as world:
+    with ExternalEnvironment(program(first=f"about['task'] = {task!r}\n{HELLO}")) as world:
         record_world(world, folder, range(1))
     (file,) = folder.iterdir()
     assert {path.name for path in tmp_path.iterdir()} == {"a", "world.py"}
@@ -298,8 +304,8 @@ STUBBORN = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\nabout['child'] = subp
 STUBBORN += f"\nabout['pid'] = os.getpid()\n{HELLO}"  # and it lives on at the end of its input
 OPENER = """
 import sys
-from vjepa2_ac.simulation.worlds import WorldProcess
-with WorldProcess(sys.argv[1]) as world:
+from vjepa2_ac.simulation.worlds import EnvironmentProcess
+with EnvironmentProcess(sys.argv[1]) as world:
     about = world.exchange()
     print(about["pid"], about["child"], flush=True)
     sys.stdin.read()
@@ -327,6 +333,6 @@ def test_world_and_its_children_end_when_we_are_killed(program: Program) -> None
 @pytest.mark.usefixtures("short_wait")
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads /proc")
 def test_a_world_that_ignores_the_end_of_its_input_is_killed_with_its_children(program: Program) -> None:
-    with WorldProcess(program(first=STUBBORN, end="time.sleep(1000)"), 0.1) as world:
+    with EnvironmentProcess(program(first=STUBBORN, end="time.sleep(1000)"), 0.1) as world:
         about = world.exchange()
     wait_until(lambda: not any(map(is_running, [about["pid"], about["child"]])))

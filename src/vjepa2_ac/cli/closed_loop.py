@@ -187,9 +187,9 @@ def _record(options: argparse.Namespace) -> int:
 def _record_world(options: argparse.Namespace, target: Path) -> int:
     _refuse(options, _OF_RECORD, needed="the simulated arm: a world has one camera, and one process")
 
-    from vjepa2_ac.simulation.worlds import OtherWorld, record_world
+    from vjepa2_ac.simulation.worlds import ExternalEnvironment, record_world
 
-    with OtherWorld(options.world, options.world_timeout) as world, cli.reporter() as reporter:
+    with ExternalEnvironment(options.world, options.world_timeout) as world, cli.reporter() as reporter:
         seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
         solved, shown = record_world(world, target, seeds, reporter.task("recording"))
     done = f"the expert solved {solved} of {shown}, the others are random exploration"
@@ -237,9 +237,9 @@ def _require_benchmark(options: argparse.Namespace) -> None:
 
 def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
     """Run the closed-loop benchmark; return its result and the folder for its files."""
-    from vjepa2_ac.simulation.benchmark import BenchmarkOptions, require_to_act, run_benchmark
+    from vjepa2_ac.simulation.benchmark import BenchmarkOptions, require_measured_inputs, run_benchmark
     from vjepa2_ac.simulation.domains import load_mujoco
-    from vjepa2_ac.simulation.worlds import OtherWorld, run_world_benchmark
+    from vjepa2_ac.simulation.worlds import ExternalEnvironment, run_world_benchmark
 
     chosen = cli.record_of_options(BenchmarkOptions, options)
     chosen, name = replace(chosen, films=min(chosen.films, chosen.episodes)), f"{chosen.task}-{chosen.domain}"
@@ -247,10 +247,10 @@ def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
         if options.world is None:
             load_mujoco()
         else:
-            env = stack.enter_context(OtherWorld(options.world, options.world_timeout))
+            env = stack.enter_context(ExternalEnvironment(options.world, options.world_timeout))
             name = re.sub(r"\W+", "-", f"{env.about.task} {env.about.world}", flags=re.ASCII).strip("-")[:200]
         subject, reporter = cli.load_planning_session(options), stack.enter_context(cli.reporter())
-        require_to_act(subject, world=options.world is not None)
+        require_measured_inputs(subject, world=options.world is not None)
         home = Path(options.subject) if is_run(options.subject) else Path()
         folder = options.out or home / "closed_loop" / name
         cli.make_folder(folder)

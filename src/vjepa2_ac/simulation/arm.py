@@ -196,7 +196,7 @@ class _Circles:
         data.mocap_pos[self._mocap_ids, :2] = self._middles_m + self._radii_m[:, None] * directions
 
 
-Look = Callable[[SimulatedArm], None]  # called at every control step, at the time of its measurements
+StepCallback = Callable[[SimulatedArm], None]  # called at every control step, at the time of its measurements
 
 _GRIP_STAYS = 0.05  # smaller changes of the gripper command are ignored, so that the gripping force is constant
 _MOVED, _FINGERS, _BLOCK = slice(0, 9), slice(7, 9), slice(9, 16)  # parts of qpos

@@ -48,7 +48,7 @@ from vjepa2_ac.simulation.rollout import (
     Policy,
     Trial,
     Trials,
-    run,
+    run_trial,
     run_trials,
 )
 from vjepa2_ac.simulation.tasks import STEPS, SUCCESS_M, TaskName, arm_for, make_problem
@@ -93,7 +93,7 @@ class Planning:
         return action - state if spaces.action.follows == "target" else action
 
 
-def require_to_act(subject: Subject, *, world: bool) -> None:
+def require_measured_inputs(subject: Subject, *, world: bool) -> None:
     """Check that a model needs only measured inputs, and that the length of its model step is known.
 
     Args:
@@ -118,13 +118,13 @@ def require_to_act(subject: Subject, *, world: bool) -> None:
         raise InputError(where="--world", found=found, needed="a model of poses: environments measure nothing else")
 
 
-def policy_of(subject: Subject, arm: SimulatedArm | None) -> Planning:
+def make_policy(subject: Subject, arm: SimulatedArm | None) -> Planning:
     """Return the policy of a model for the simulated arm, or for a third-party environment if `arm` is None.
 
     Raises:
-        InputError: As for `require_to_act`.
+        InputError: As for `require_measured_inputs`.
     """
-    require_to_act(subject, world=arm is None)
+    require_measured_inputs(subject, world=arm is None)
     name = Path(subject.name).name or subject.name
     if name in {ZeroActions.name, RandomActions.name, Oracle.name}:  # names of the reference policies in tables
         name = f"model {name}"
@@ -135,7 +135,7 @@ def policy_of(subject: Subject, arm: SimulatedArm | None) -> Planning:
 
 # ---- the problems ----
 
-FILM = "closed_loop.mp4"
+VIDEO_FILE = "closed_loop.mp4"
 FORMAT = 2  # incremented at changes that require changes of readers
 
 SubGoals = Literal["none", "demonstration", "every-step"]
@@ -242,14 +242,14 @@ def run_benchmark(subject: Subject, options: BenchmarkOptions, reporter: Reporte
         import_pyav()
     planning = subject.config.planning
     arm = arm_for(options.task, options.world, views=planning.views)
-    model = policy_of(subject, arm)
+    model = make_policy(subject, arm)
     trials = replace(options, stride=subject.config.data.model_stride).trials()
     if options.sub_goals != "none":
         reporter.task("demonstrations of all problems")
         goals = [demonstrated_goals(trial, arm, planning.limits, options.sub_goals) for trial in trials.trials]
         trials = with_goals(trials, goals)
     policies = (model, ZeroActions(), RandomActions(planning.limits, options.seed), Oracle(planning.limits))
-    results = try_policies(ArmEnvironment(arm), policies, trials, options.films, reporter)
+    results = run_policies(ArmEnvironment(arm), policies, trials, options.films, reporter)
     return ClosedLoopBenchmark(subject, trials, results)
 
 
@@ -277,7 +277,7 @@ def demonstrate(trial: Trial, arm: SimulatedArm, limits: LimitsConfig) -> Episod
     task: TaskName = "reach" if trial.problem is None else trial.problem.task
     steps = max(trial.steps, STEPS[task])
     free = limits.model_copy(update={"gripper_mode": "free", "gripper": LimitsConfig().gripper})
-    episode = run(ArmEnvironment(arm), Oracle(free), replace(trial, steps=steps), keep_frames=True)
+    episode = run_trial(ArmEnvironment(arm), Oracle(free), replace(trial, steps=steps), keep_frames=True)
     if not episode.success:
         where = f"demonstration of problem {trial.seed} ({task})"
         left = f"{100 * episode.distances_m[-1]:.1f} cm from its goal after {counted(steps, 'model step')}"
@@ -301,7 +301,7 @@ def with_goals(trials: Trials, goals: Sequence[Sequence[SubGoal]]) -> Trials:
     return replace(trials, trials=tuple(replace(trial, goals=tuple(made)) for trial, made in pairs))
 
 
-def try_policies(
+def run_policies(
     environment: Environment, policies: Sequence[Policy], trials: Trials, films: int, reporter: Reporter
 ) -> tuple[ClosedLoopResult, ...]:
     """Run several policies in the same trials; store frames for a video for the first policy only."""
@@ -335,7 +335,7 @@ def write_benchmark(benchmark: ClosedLoopBenchmark, folder: Path, verdict: Mappi
     if all(episode.frames is None for episode in model.episodes):
         return (file,)
     rate_hz = 1.0 / benchmark.trials.seconds_per_step
-    return file, write_video(folder / FILM, film_frames(model), rate_hz=rate_hz)
+    return file, write_video(folder / VIDEO_FILE, video_frames(model), rate_hz=rate_hz)
 
 
 def _metrics(result: ClosedLoopResult) -> dict[str, Any]:
@@ -360,7 +360,7 @@ def _rounded(numbers: Float[np.ndarray, "episodes _"]) -> list[list[float]]:
 _HOLD = 4  # repetitions of the first and the last image of an episode
 
 
-def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
+def video_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
     """Yield the frames of the video, one per model step; the first and the last frame of an episode are repeated."""
     trials, steps = result.trials, result.trials.steps
     for number, episode in enumerate(result.episodes, start=1):

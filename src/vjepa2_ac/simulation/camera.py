@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from vjepa2_ac.simulation.domains import ARM_GROUP, STATIC_GROUP, CameraPlace, Domain, load_mujoco
+from vjepa2_ac.simulation.domains import ARM_GROUP, STATIC_GROUP, CameraPlacement, Domain, load_mujoco
 
 FRAME_SIZE = 180, 320  # height and width, as in DROID's RLDS data
 
@@ -143,7 +143,7 @@ class RayCamera:
     ) -> None:
         self._caster, self._colours = Caster(model), _Colours(model, domain.texture_seed)
         look = domain.look
-        lamp = CameraPlace(look.light_azimuth_deg, look.light_elevation_deg, _LAMP_M, look_at_m=(0.0, 0.0, 0.0))
+        lamp = CameraPlacement(look.light_azimuth_deg, look.light_elevation_deg, _LAMP_M, look_at_m=(0.0, 0.0, 0.0))
         self._lamp_pose, self._ambient = lamp.pose(), look.ambient
         self._lamp = self._lamp_pose[:3, 3]
         self._height, self._width = size

@@ -21,7 +21,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_images, encode_jpeg
 from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
 from vjepa2_ac.simulation.arm import SimulatedArm
-from vjepa2_ac.simulation.record import JPEG_QUALITY, RecordingSpec, arm_of, carry_out, read_simulation
+from vjepa2_ac.simulation.record import JPEG_QUALITY, RecordingSpec, execute_episode, make_arm, read_simulation
 from vjepa2_ac.simulation.rollout import send_action
 from vjepa2_ac.storage.paths import SIMULATION_FILE
 
@@ -58,7 +58,7 @@ class Resimulation:
     arm: SimulatedArm
     done: Actions | None = None  # actions from the start to the arm's current state; None: the arm is in another state
 
-    def under(self, actions: Float[np.ndarray, "steps 7"], stride: int) -> Outcome:
+    def simulate(self, actions: Float[np.ndarray, "steps 7"], stride: int) -> Outcome:
         """Carry out actions from the start, each relative to the measured state, and return the outcome.
 
         Args:
@@ -67,7 +67,7 @@ class Resimulation:
         """
         arm = self.arm
         self.done = None
-        carry_out(arm, self.number, self.spec, until=self.start)
+        execute_episode(arm, self.number, self.spec, until=self.start)
 
         def observe() -> tuple[Any, ...]:
             return arm.image(self.camera), arm.silhouette(self.camera), arm.state
@@ -112,8 +112,8 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
     eye = (
         RECORDED_CAMERAS[camera] if simulation.cameras == 3 else "exterior_1"
     )  # a recording with one camera repeats its image
-    again = Resimulation(simulation, number, start, eye, arm_of(number, simulation))
-    off = np.abs(again.under(np.zeros((0, 7)), 1).states[0] - np.asarray(episode.states[start], dtype=np.float64))
+    again = Resimulation(simulation, number, start, eye, make_arm(number, simulation))
+    off = np.abs(again.simulate(np.zeros((0, 7)), 1).states[0] - np.asarray(episode.states[start], dtype=np.float64))
     off[3:6] = np.minimum(off[3:6], np.abs(2 * np.pi - off[3:6]))  # -pi and pi are the same angle
     if off.max() > _STATE_TOLERANCE:
         found = f"simulated again, the state differs by up to {off.max():.2g}"
@@ -135,7 +135,7 @@ def simulated_outcome(dataset: Dataset, episode: int, start: int) -> Callable[[n
     arm = _of_dataset(dataset, episode, start)
 
     def outcome(actions: np.ndarray) -> tuple[Any, Any]:
-        simulated = arm.under(actions, dataset.config.model_stride)
+        simulated = arm.simulate(actions, dataset.config.model_stride)
         return simulated.frames, simulated.silhouettes
 
     return outcome
@@ -179,7 +179,7 @@ class SimulatedFutures:
         simulation = self._resimulated(episode, step)
         is_next, simulation.done = bool(actions) and simulation.done == actions[:-1], None
         if not is_next:
-            carry_out(simulation.arm, simulation.number, simulation.spec, until=step)
+            execute_episode(simulation.arm, simulation.number, simulation.spec, until=step)
         reached = True
         for action in actions[-1:] if is_next else actions:
             if cancelled():

@@ -23,7 +23,7 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class CameraPlace:
+class CameraPlacement:
     """Position of a camera that looks at `look_at_m`. Azimuth 0 is in front of the robot, 90 degrees at its left."""
 
     azimuth_deg: float
@@ -42,13 +42,13 @@ class CameraPlace:
         pose[:3, 3] = np.array(self.look_at_m) + self.distance_m * outward
         return pose
 
-    def turned(self, angle_deg: float) -> CameraPlace:
+    def turned(self, angle_deg: float) -> CameraPlacement:
         """Return the position with a larger azimuth."""
         return replace(self, azimuth_deg=self.azimuth_deg + angle_deg)
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """Colours (RGB, 0 to 1) and light of a scene."""
 
     arm: Rgb
@@ -67,8 +67,8 @@ class Domain:
     """A world: camera, appearance, mounting and lag of the arm, and objects on the table."""
 
     name: str
-    camera: CameraPlace
-    look: Look
+    camera: CameraPlacement
+    look: Appearance
     base_yaw_deg: float = 0.0  # rotation of the robot's base about z; changes the direction of an action in the image
     lag_s: float = 0.08  # time constant with which the measured pose follows the commanded one
     clutter_seed: int = 0  # selects the objects on the table, and their positions
@@ -103,8 +103,8 @@ class DomainRanges:
 
 DOMAIN_A = Domain(
     name="A",
-    camera=CameraPlace(azimuth_deg=50.0, elevation_deg=27.0, distance_m=1.35),
-    look=Look(
+    camera=CameraPlacement(azimuth_deg=50.0, elevation_deg=27.0, distance_m=1.35),
+    look=Appearance(
         arm=(0.93, 0.93, 0.91),
         joints=(0.22, 0.24, 0.28),
         hand=(0.95, 0.45, 0.10),
@@ -117,8 +117,8 @@ DOMAIN_A = Domain(
 
 DOMAIN_B = Domain(
     name="B",
-    camera=CameraPlace(azimuth_deg=93.0, elevation_deg=32.0, distance_m=1.30, look_at_m=(0.40, 0.0, 0.34)),
-    look=Look(
+    camera=CameraPlacement(azimuth_deg=93.0, elevation_deg=32.0, distance_m=1.30, look_at_m=(0.40, 0.0, 0.34)),
+    look=Appearance(
         arm=(0.20, 0.28, 0.42),
         joints=(0.90, 0.78, 0.30),
         hand=(0.75, 0.12, 0.18),
@@ -158,12 +158,14 @@ def sample_domain(rng: np.random.Generator, ranges: DomainRanges = DomainRanges(
     def draw(bounds: Range) -> float:
         return float(rng.uniform(*bounds))
 
-    centre = np.array(CameraPlace(0.0, 0.0, 1.0).look_at_m)
+    centre = np.array(CameraPlacement(0.0, 0.0, 1.0).look_at_m)
     jitter = rng.uniform(-ranges.look_at_jitter_m, ranges.look_at_jitter_m, size=3)
     x, y, z = (float(value) for value in centre + jitter)
     return Domain(
         name="random",
-        camera=CameraPlace(draw(ranges.azimuth_deg), draw(ranges.elevation_deg), draw(ranges.distance_m), (x, y, z)),
+        camera=CameraPlacement(
+            draw(ranges.azimuth_deg), draw(ranges.elevation_deg), draw(ranges.distance_m), (x, y, z)
+        ),
         look=replace(
             _sample_colours(rng),
             light_azimuth_deg=draw(ranges.light_azimuth_deg),
@@ -178,14 +180,14 @@ def sample_domain(rng: np.random.Generator, ranges: DomainRanges = DomainRanges(
     )
 
 
-def _sample_colours(rng: np.random.Generator) -> Look:
+def _sample_colours(rng: np.random.Generator) -> Appearance:
     def colour(value: Range, saturation: Range) -> Rgb:
         return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(*value))
 
     light, dark = (0.80, 1.0), (0.12, 0.30)
     bright_arm = bool(rng.uniform() < 0.5)
     ground = (0.25, 0.50) if bright_arm else (0.60, 0.90)
-    return Look(
+    return Appearance(
         arm=colour(light if bright_arm else dark, (0.0, 0.35)),
         joints=colour(dark if bright_arm else light, (0.0, 0.4)),
         hand=colour((0.75, 1.0) if bright_arm else (0.4, 0.8), (0.6, 0.95)),
@@ -208,7 +210,14 @@ SUBSTEPS = 32  # physics steps per control step
 MOVING = "moving"  # prefix of the names of moving bodies
 
 _SCENE = "assets/simulation/arm.xml"
-_COLOURED = ("arm", "joints", "hand", "table", "floor", "wall")  # classes of geoms, which are also fields of `Look`
+_COLOURED = (
+    "arm",
+    "joints",
+    "hand",
+    "table",
+    "floor",
+    "wall",
+)  # classes of geoms, which are also fields of `Appearance`
 
 
 def load_mujoco() -> Any:

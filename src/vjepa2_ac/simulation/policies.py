@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import ACTION_DIM
-from vjepa2_ac.simulation.arm import Block, Look, SimulatedArm, State
+from vjepa2_ac.simulation.arm import Block, SimulatedArm, State, StepCallback
 from vjepa2_ac.simulation.motion import Motion, MotionRecipe, OutOfReachError
-from vjepa2_ac.simulation.rollout import Action, Image, Observation, Trial, put, states_along
+from vjepa2_ac.simulation.rollout import Action, Image, Observation, Trial, set_scene, states_along
 from vjepa2_ac.simulation.tasks import GRASP_M, RELEASED, TaskName, TaskProblem, make_problem
 from vjepa2_ac.spaces import apply_action
 
@@ -36,7 +36,7 @@ class ZeroActions:
 
     def act(self, observation: Observation) -> State:
         """Return the next action, within the limits."""
-        return shortened(self._change(observation), self._limits)
+        return shorten_to_limits(self._change(observation), self._limits)
 
     def _change(self, observation: Observation) -> State:
         """Return the desired change of the state, before it is shortened to the limits."""
@@ -62,7 +62,7 @@ class RandomActions(ZeroActions):
         self._rng = np.random.default_rng([self._seed, trial.seed])
 
     def _change(self, observation: Observation) -> State:
-        return np.asarray(self._rng.uniform(-1.0, 1.0, size=len(observation.state)) * farthest(self._limits))
+        return np.asarray(self._rng.uniform(-1.0, 1.0, size=len(observation.state)) * largest_action(self._limits))
 
 
 class Oracle(ZeroActions):
@@ -103,18 +103,18 @@ class Expert:
         return None
 
 
-def farthest(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
+def largest_action(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
     """Return the largest absolute value of each number of an action; 0 if the number is fixed."""
     gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
     return np.array([*limits.xyz_m, *[limits.rotation] * 3, gripper])
 
 
-def shortened(change: Float[np.ndarray, " 7"], limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
+def shorten_to_limits(change: Float[np.ndarray, " 7"], limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
     """Shorten a change of the state to the limits of one model step, without changing its direction.
 
     Position, rotation and gripper are scaled independently. Fixed axes are set to zero.
     """
-    reach = farthest(limits)
+    reach = largest_action(limits)
     change = np.where(reach > 0, change, 0.0)
     for part in (slice(0, 3), slice(3, 6), slice(6, 7)):
         beyond = np.abs(change[part]) / np.where(reach[part] > 0, reach[part], 1.0)
@@ -146,9 +146,9 @@ def _push_change(problem: TaskProblem, state: State, block: Block) -> State:
     if (goal - block[:2]) @ direction < _NEAR_M:  # at the goal, or past it
         return change
     to_block = block[:2] - state[:2]
-    beside = to_block - direction * (to_block @ direction)
+    sideways = to_block - direction * (to_block @ direction)
     ahead = direction * ((problem.goal[:2] - state[:2]) @ direction)
-    change[:2], change[2], change[6] = ahead + beside, problem.goal[2] - state[2], 1.0 - state[6]
+    change[:2], change[2], change[6] = ahead + sideways, problem.goal[2] - state[2], 1.0 - state[6]
     change[:3] *= min(1.0, _PUSH_M / float(np.linalg.norm(change[:3])))
     return change
 
@@ -216,7 +216,13 @@ _AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # bounds of the flange's (x, y)
 
 
 def play(
-    arm: SimulatedArm, task: TaskName, steps: int, rng: np.random.Generator, *, script: bool, look: Look | None = None
+    arm: SimulatedArm,
+    task: TaskName,
+    steps: int,
+    rng: np.random.Generator,
+    *,
+    script: bool,
+    on_step: StepCallback | None = None,
 ) -> Motion:
     """Carry out a demonstration of `steps` control steps with a block, and return its motion.
 
@@ -229,7 +235,7 @@ def play(
         steps: Number of control steps; 0: only set the start.
         rng: The only source of randomness.
         script: Whether an oracle with noise solves the problem; otherwise actions are random play.
-        look: Called with the arm at every control step.
+        on_step: Called with the arm at every control step.
 
     Raises:
         UnreachableError: MuJoCo is not installed.
@@ -238,7 +244,7 @@ def play(
     problem = make_problem(task, arm.domain, int(rng.integers(2**31)), 0)
     limits = LimitsConfig(xyz=(recipe.reach_m,) * 3)
     oracle, unseen = Oracle(limits), np.zeros((1, 1, 3), dtype=np.uint8)
-    put(arm, problem.start, problem.block_start, problem.mark)
+    set_scene(arm, problem.start, problem.block_start, problem.mark)
     oracle.reset(Trial(0, steps, recipe.stride, problem), unseen)
     motion = Motion(np.empty((steps, 7)), np.empty(steps), np.empty((steps, 7)), np.empty(steps))
     joints, grip = arm.joints, float(problem.start[6])
@@ -246,14 +252,14 @@ def play(
         if step % recipe.stride == 0:
             if script:
                 noise = np.append(rng.normal(0.0, _NOISE_M, size=3), np.zeros(4))
-                action = shortened(oracle.act(Observation(unseen, arm.state, arm.block)) + noise, limits)
+                action = shorten_to_limits(oracle.act(Observation(unseen, arm.state, arm.block)) + noise, limits)
             else:
                 action = _play_action(arm, problem, limits, rng)
-            joints, grip = _sent(arm, action)
+            joints, grip = _command_of(arm, action)
         motion.commanded_joints[step], motion.commanded_gripper[step] = joints, grip
         motion.joints[step], motion.gripper[step] = arm.joints, arm.closedness
-        if look:
-            look(arm)
+        if on_step:
+            on_step(arm)
         arm.command_joints(joints, grip)
     return motion
 
@@ -273,14 +279,14 @@ def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, 
         change[:3] = rng.uniform(-1.0, 1.0, size=3) * limits.xyz_m
     if problem.task != "push" and rng.uniform() < 0.25:
         change[6] = rng.choice([-1.0, 1.0]) * limits.gripper
-    change = shortened(change, limits)
+    change = shorten_to_limits(change, limits)
     target = turn @ (state[:3] + change[:3])
     low, high = np.append(_AREA[0], _LOWEST_M), np.append(_AREA[1], _HIGHEST_M)
     change[:3] = turn.T @ np.clip(target, low, high) - state[:3]
-    return shortened(change, limits)
+    return shorten_to_limits(change, limits)
 
 
-def _sent(arm: SimulatedArm, action: Float[np.ndarray, " 7"]) -> tuple[np.ndarray, float]:
+def _command_of(arm: SimulatedArm, action: Float[np.ndarray, " 7"]) -> tuple[np.ndarray, float]:
     """Return the commanded joints and closedness for an action, or for its largest reachable part."""
     joints, target = arm.joints, apply_action(arm.state, action)
     for state in [target, *reversed(states_along(arm.state, action)[:-1])]:

@@ -24,7 +24,7 @@ from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.process import safe_imports
-from vjepa2_ac.simulation.arm import Look, SimulatedArm
+from vjepa2_ac.simulation.arm import SimulatedArm, StepCallback
 from vjepa2_ac.simulation.domains import Domain, DomainRanges, load_mujoco, named_domain, sample_domain
 from vjepa2_ac.simulation.droid_writer import CAMERAS, DroidEpisode, write_droid_rlds
 from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
@@ -79,7 +79,7 @@ class RecordingSpec:
         return DomainRanges() if self.domain == "random" else named_domain(self.domain)
 
 
-def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
+def make_arm(index: int, spec: RecordingSpec) -> SimulatedArm:
     """Return an arm in the domain of an episode, with contacts if there is a task.
 
     Raises:
@@ -91,28 +91,28 @@ def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
     return arm_for(spec.task or "reach", world)
 
 
-def carry_out(
-    arm: SimulatedArm, index: int, spec: RecordingSpec, *, until: int | None = None, look: Look | None = None
+def execute_episode(
+    arm: SimulatedArm, index: int, spec: RecordingSpec, *, until: int | None = None, on_step: StepCallback | None = None
 ) -> Motion:
     """Carry out an episode and return its motion.
 
     Args:
-        arm: An arm from `arm_of`.
+        arm: An arm from `make_arm`.
         index: Number of the episode.
         spec: The options of the recording.
         until: Control step whose measured state arm and block have afterwards; None: after the last one.
-        look: Called with the arm at every control step.
+        on_step: Called with the arm at every control step.
     """
     rng = _stream(index, spec, _MOTION)
     if spec.task is not None:  # contacts depend on all earlier steps, so these are simulated, too
-        return play(arm, spec.task, spec.steps if until is None else until, rng, script=index % 2 == 0, look=look)
+        return play(arm, spec.task, spec.steps if until is None else until, rng, script=index % 2 == 0, on_step=on_step)
     arm.reset_clock()
     motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
     measured = slice(None if until is None else until + 1)
     for joints, closedness in zip(motion.joints[measured], motion.gripper[measured], strict=True):
         arm.set_joints(joints, float(closedness))
-        if look:
-            look(arm)
+        if on_step:
+            on_step(arm)
     return motion
 
 
@@ -185,14 +185,14 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
         InputError: The domain is unknown.
         UnreachableError: MuJoCo is not installed.
     """
-    arm = arm_of(index, spec)
+    arm = make_arm(index, spec)
     images: dict[str, list[bytes]] = {feature: [] for feature in CAMERAS[: spec.cameras]}
 
     def take(arm: SimulatedArm) -> None:
         for feature, jpegs in images.items():
             jpegs.append(encode_jpeg(arm.image(_SIMULATED_CAMERAS[feature]), quality=JPEG_QUALITY))
 
-    motion = carry_out(arm, index, spec, look=take)
+    motion = execute_episode(arm, index, spec, on_step=take)
     folder = episode_folder(index, spec.seed, arm.domain.name)
     return DroidEpisode(
         file_path=f"{folder}/trajectory.h5",

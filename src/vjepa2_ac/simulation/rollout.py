@@ -98,7 +98,7 @@ class Step(NamedTuple):
     why: str = ""
 
 
-def steps_of(environment: Environment, policy: Policy, trial: Trial) -> Iterator[Step]:
+def iterate_steps(environment: Environment, policy: Policy, trial: Trial) -> Iterator[Step]:
     """Run a policy in a trial, and yield the start and each model step.
 
     Raises:
@@ -156,7 +156,7 @@ class EpisodeResult:
         return bool(self.reached[1:].any())
 
 
-def run(
+def run_trial(
     environment: Environment,
     policy: Policy,
     trial: Trial,
@@ -174,10 +174,10 @@ def run(
         progress: Called with the number of finished model steps.
 
     Raises:
-        ValueError: As for `steps_of`.
+        ValueError: As for `iterate_steps`.
     """
     steps = list[Step]()
-    for step in steps_of(environment, policy, trial):
+    for step in iterate_steps(environment, policy, trial):
         if steps:
             progress(len(steps))
         steps.append(step)
@@ -221,8 +221,8 @@ class ArmEnvironment:
             ValueError: The task has a block, but the arm has none.
         """
         self._problem, self._stride, arm = options["problem"], options["stride"], self.arm
-        goal_image = put(arm, self._problem.goal, self._problem.block_goal, self._problem.mark).image()
-        put(arm, self._problem.start, self._problem.block_start, self._problem.mark)
+        goal_image = set_scene(arm, self._problem.goal, self._problem.block_goal, self._problem.mark).image()
+        set_scene(arm, self._problem.start, self._problem.block_start, self._problem.mark)
         observation, info = self._observe()
         return observation, info | {"goal_image": goal_image}
 
@@ -253,7 +253,7 @@ class ArmEnvironment:
         return Observation(arm.image(), state, None if problem.block_goal is None else block, joints), info
 
 
-def put(arm: SimulatedArm, state: State, block: Block | None, mark: Mark | None = None) -> SimulatedArm:
+def set_scene(arm: SimulatedArm, state: State, block: Block | None, mark: Mark | None = None) -> SimulatedArm:
     """Set arm, block, mark and moving objects to the start of an episode; return the arm.
 
     The arm is set to its rest pose first, so that its redundant joint does not depend on earlier episodes.
@@ -271,7 +271,7 @@ def send_action(arm: SimulatedArm, action: State, stride: int) -> bool:
     The target is relative to the *measured* state. If the arm cannot reach it, the arm moves as far as possible along
     the straight line to it.
     """
-    target = target_of(arm.state, action)
+    target = target_state(arm.state, action)
     with suppress(OutOfReachError):
         arm.command(target, stride)
         return True
@@ -283,7 +283,7 @@ def send_action(arm: SimulatedArm, action: State, stride: int) -> bool:
     return False
 
 
-def target_of(state: State, action: State) -> State:
+def target_state(state: State, action: State) -> State:
     """Return the state after an action, with its closedness clipped to 0 .. 1."""
     target = np.asarray(apply_action(state, action))
     target[6] = np.clip(target[6], 0.0, 1.0)
@@ -388,12 +388,12 @@ def run_trials(
         progress: Called with the number of finished decisions, from 0 on.
 
     Raises:
-        ValueError: As for `run`.
+        ValueError: As for `run_trial`.
     """
     total, episodes = len(trials.trials) * trials.steps, list[EpisodeResult]()
     progress(0, total)
     for trial in trials.trials:
         first = len(episodes) * trials.steps
         report = lambda step, first=first: progress(first + step, total)  # noqa: E731
-        episodes.append(run(environment, policy, trial, keep_frames=len(episodes) < films, progress=report))
+        episodes.append(run_trial(environment, policy, trial, keep_frames=len(episodes) < films, progress=report))
     return ClosedLoopResult(trials, policy.name, tuple(episodes))

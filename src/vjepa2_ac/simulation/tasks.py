@@ -37,7 +37,7 @@ at least 1.5 cm from its edge. Place has further conditions: see `TaskProblem.su
 STEPS: dict[TaskName, int] = {"reach": 8, "push": 8, "pick": 12, "place": 18}
 """Default number of model steps per episode; for place the paper's 4 + 10 + 4 steps of pick-and-place."""
 
-REACH_WAY_M, PUSH_WAY_M, LIFT_M, PLACE_WAY_M = (0.12, 0.25), (0.10, 0.16), (0.10, 0.14), (0.10, 0.20)
+REACH_DISTANCE_M, PUSH_DISTANCE_M, LIFT_M, PLACE_DISTANCE_M = (0.12, 0.25), (0.10, 0.16), (0.10, 0.14), (0.10, 0.20)
 """Ranges of the distance from start to goal: of the flange (reach), of the block (push, place), of its lift (pick)."""
 
 GRASP_M = FINGERTIP_M - 0.02  # height of the flange above the centre of the block when grasping it
@@ -50,8 +50,8 @@ _FLANGE_AREA = np.array([[0.32, -0.26], [0.62, 0.26]])  # lower and upper bounds
 _BLOCK_AREA = np.array([[0.36, -0.26], [0.64, 0.26]])
 _PUSHING_M = 0.17  # height of the flange while pushing, with the fingertips 2 cm above the table
 _GRASP_AREA = _FLANGE_AREA * 0.8 + 0.2 * _FLANGE_AREA.mean(axis=0)  # area in which a block is picked up or put down
-_LIES_M = 0.01  # tolerance of the height of a block that is on the table
-_MOST_TURNED_RAD = 0.4  # largest rotation of block and hand from straight ahead
+_ON_TABLE_M = 0.01  # tolerance of the height of a block that is on the table
+_MAX_TURN_RAD = 0.4  # largest rotation of block and hand from straight ahead
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class TaskProblem:
         near = self.distance_m(state, block) < SUCCESS_M[self.task]
         if self.task != "place" or block is None or self.block_goal is None:
             return near
-        return near and bool(abs(block[2] - self.block_goal[2]) < _LIES_M and state[6] < RELEASED)
+        return near and bool(abs(block[2] - self.block_goal[2]) < _ON_TABLE_M and state[6] < RELEASED)
 
 
 def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskProblem:
@@ -126,7 +126,7 @@ def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskP
         seed: Seed of all problems.
         index: Number of the problem.
     """
-    drawn = _DRAWN[task](np.random.default_rng([seed, index, list(_DRAWN).index(task)]))
+    drawn = _DRAW_PROBLEM[task](np.random.default_rng([seed, index, list(_DRAW_PROBLEM).index(task)]))
     poses = poses_in_base(downward_poses(_with(drawn.flange, drawn.turn)), domain)
     first, last = np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
     if drawn.blocks is None:
@@ -137,7 +137,7 @@ def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskP
 
 
 @dataclass(frozen=True)
-class _Drawn:
+class _WorldProblem:
     """Start and goal of a problem in the world frame."""
 
     flange: Float[np.ndarray, "2 3"]
@@ -146,55 +146,55 @@ class _Drawn:
     blocks: Float[np.ndarray, "2 4"] | None = None
 
 
-def _reach(rng: np.random.Generator) -> _Drawn:
+def _reach(rng: np.random.Generator) -> _WorldProblem:
     recipe = MotionRecipe()
     low, high = np.array(recipe.low_m), np.array(recipe.high_m)
     start = rng.uniform(low, high)
-    while not REACH_WAY_M[0] <= np.linalg.norm((goal := rng.uniform(low, high)) - start) <= REACH_WAY_M[1]:
+    while not REACH_DISTANCE_M[0] <= np.linalg.norm((goal := rng.uniform(low, high)) - start) <= REACH_DISTANCE_M[1]:
         pass
     turn, closedness = rng.uniform(-recipe.max_turn_rad, recipe.max_turn_rad), float(rng.integers(2))
-    return _Drawn(np.stack([start, goal]), turn, (closedness, closedness))
+    return _WorldProblem(np.stack([start, goal]), turn, (closedness, closedness))
 
 
-def _push(rng: np.random.Generator) -> _Drawn:
+def _push(rng: np.random.Generator) -> _WorldProblem:
     """Draw a problem of pushing forwards with the fingers' broad side, or sideways with one finger's outer side."""
     while True:
-        turn = rng.uniform(-_MOST_TURNED_RAD, _MOST_TURNED_RAD)
+        turn = rng.uniform(-_MAX_TURN_RAD, _MAX_TURN_RAD)
         side = int(rng.integers(-1, 2))  # right, ahead, left
         angle = turn + side * np.pi / 2
         ahead = np.array([np.cos(angle), np.sin(angle)])
         touching = BLOCK_M / 2 + (FINGER_OUTSIDE_M if side else FINGER_HALF_M)
-        before, way = rng.uniform(0.03, 0.07), rng.uniform(*PUSH_WAY_M)
+        before, way = rng.uniform(0.03, 0.07), rng.uniform(*PUSH_DISTANCE_M)
         block = rng.uniform(*_BLOCK_AREA)
         blocks = np.stack([block, block + way * ahead])
         flange = blocks - ahead * np.array([[touching + before], [touching]])
         if _inside(blocks, _BLOCK_AREA) and _inside(flange, _FLANGE_AREA):
-            return _Drawn(_with(flange, _PUSHING_M), turn, (1.0, 1.0), _with(_with(blocks, BLOCK_M / 2), turn))
+            return _WorldProblem(_with(flange, _PUSHING_M), turn, (1.0, 1.0), _with(_with(blocks, BLOCK_M / 2), turn))
 
 
-def _pick(rng: np.random.Generator) -> _Drawn:
-    turn = rng.uniform(-_MOST_TURNED_RAD, _MOST_TURNED_RAD)
+def _pick(rng: np.random.Generator) -> _WorldProblem:
+    turn = rng.uniform(-_MAX_TURN_RAD, _MAX_TURN_RAD)
     block = np.append(rng.uniform(*_GRASP_AREA), BLOCK_M / 2)
     lifted = block + np.append(rng.uniform(-0.03, 0.03, size=2), rng.uniform(*LIFT_M))
     above = block + np.append(rng.uniform(-0.04, 0.04, size=2), GRASP_M + rng.uniform(0.07, 0.12))
     flange = np.stack([above, lifted + np.array([0.0, 0.0, GRASP_M])])
-    return _Drawn(flange, turn, (0.0, HOLDING), _with(np.stack([block, lifted]), turn))
+    return _WorldProblem(flange, turn, (0.0, HOLDING), _with(np.stack([block, lifted]), turn))
 
 
-def _place(rng: np.random.Generator) -> _Drawn:
+def _place(rng: np.random.Generator) -> _WorldProblem:
     while True:
-        turn, angle = rng.uniform(-_MOST_TURNED_RAD, _MOST_TURNED_RAD), rng.uniform(-np.pi, np.pi)
+        turn, angle = rng.uniform(-_MAX_TURN_RAD, _MAX_TURN_RAD), rng.uniform(-np.pi, np.pi)
         block = rng.uniform(*_GRASP_AREA)
-        places = np.stack([block, block + rng.uniform(*PLACE_WAY_M) * np.array([np.cos(angle), np.sin(angle)])])
+        places = np.stack([block, block + rng.uniform(*PLACE_DISTANCE_M) * np.array([np.cos(angle), np.sin(angle)])])
         if _inside(places, _GRASP_AREA):
             break
     blocks = _with(places, BLOCK_M / 2)
     above = np.append(rng.uniform(-0.04, 0.04, size=2), GRASP_M + rng.uniform(0.07, 0.12))
     flange = blocks + np.stack([above, [0.0, 0.0, GRASP_M + rng.uniform(0.07, 0.10)]])
-    return _Drawn(flange, turn, (0.0, 0.0), _with(blocks, turn))
+    return _WorldProblem(flange, turn, (0.0, 0.0), _with(blocks, turn))
 
 
-_DRAWN: dict[TaskName, Callable[[np.random.Generator], _Drawn]] = {
+_DRAW_PROBLEM: dict[TaskName, Callable[[np.random.Generator], _WorldProblem]] = {
     "reach": _reach,
     "push": _push,
     "pick": _pick,

@@ -38,8 +38,8 @@ from vjepa2_ac.simulation.benchmark import (
     BenchmarkOptions,
     ClosedLoopBenchmark,
     goals_of_episode,
-    policy_of,
-    try_policies,
+    make_policy,
+    run_policies,
 )
 from vjepa2_ac.simulation.policies import Expert, RandomActions, ZeroActions
 from vjepa2_ac.simulation.rollout import (
@@ -51,9 +51,9 @@ from vjepa2_ac.simulation.rollout import (
     Step,
     Trial,
     Trials,
-    run,
-    steps_of,
-    target_of,
+    iterate_steps,
+    run_trial,
+    target_state,
 )
 from vjepa2_ac.spaces import POSE, actions_from_states
 from vjepa2_ac.storage import atomic_writer, translate_write_errors
@@ -67,10 +67,10 @@ _MOST_SHOWN = 200  # bytes of an invalid line in an error message
 _ERROR_BYTES, _ERROR_LINES = 64 << 10, 5  # stored bytes and displayed lines of the error output
 _KEEPER = "import os, sys; world = int(sys.stdin.readline()); sys.stdin.read(); os.killpg(world, 9)"
 PROTOCOL = "docs/worlds.md has the protocol; examples/worlds programs that follow it"
-TRIES = 2  # at most this many times the required number of problems are tried with the expert
+TRIALS_PER_PROBLEM = 2  # at most this many times the required number of problems are tried with the expert
 
 
-class WorldProcess(ExitStack):
+class EnvironmentProcess(ExitStack):
     """A program that answers each line of its input with one line; `close` ends it and all processes of its group.
 
     A second process, the keeper, kills the group when this process dies, even by SIGKILL, because the keeper's input is
@@ -186,7 +186,7 @@ def _shown(line: bytes) -> str:
 
 
 @dataclass(frozen=True)
-class AboutWorld:
+class EnvironmentInfo:
     """The first message of a program, which describes its environment."""
 
     world: Annotated[str, Field(max_length=200)]  # name and version of the environment
@@ -197,12 +197,12 @@ class AboutWorld:
     expert: bool = False  # whether the environment has a scripted expert
 
 
-class OtherWorld(WorldProcess):
+class ExternalEnvironment(EnvironmentProcess):
     """A third-party environment that runs as a program; `close` ends it. It implements `rollout.Environment`.
 
     Args:
         command: The program and its arguments in shell syntax, such as PYTHON examples/worlds/robosuite.py Lift.
-        timeout_s: As for `WorldProcess`.
+        timeout_s: As for `EnvironmentProcess`.
 
     Raises:
         InputError: The program cannot be started, or its first message is invalid.
@@ -212,7 +212,9 @@ class OtherWorld(WorldProcess):
         super().__init__(command, timeout_s)
         self._image_shape: tuple[int, ...] | None = None  # image shape of the first observation
         try:
-            self.about = parse_record(AboutWorld, self.exchange(), where=self.where, needed="what it is", fix=PROTOCOL)
+            self.about = parse_record(
+                EnvironmentInfo, self.exchange(), where=self.where, needed="what it is", fix=PROTOCOL
+            )
         except BaseException:
             self.close()
             raise
@@ -232,7 +234,7 @@ class OtherWorld(WorldProcess):
         Raises:
             InputError: As for `reset`.
         """
-        target = None if action is None else target_of(self._state, action)
+        target = None if action is None else target_state(self._state, action)
         words = None if target is None else target.tolist()
         observation, info = self._ask(do="step", target=words, steps=self._stride)
         info.setdefault("target", observation.state if target is None else target)
@@ -275,7 +277,7 @@ def _image(encoded: dict[str, Any]) -> Image:
 
 
 def run_world_benchmark(
-    subject: Subject, world: OtherWorld, options: BenchmarkOptions, reporter: Reporter = SILENT
+    subject: Subject, world: ExternalEnvironment, options: BenchmarkOptions, reporter: Reporter = SILENT
 ) -> ClosedLoopBenchmark:
     """Run a model, zero actions and random actions on problems that the expert of an environment solves.
 
@@ -292,16 +294,16 @@ def run_world_benchmark(
     """
     if options.films:
         import_pyav()
-    model = policy_of(subject, None)
+    model = make_policy(subject, None)
     progress = reporter.task(f"{world.about.task}: {Expert.name}")
     trials, expert_result = find_trials(world, options, subject.config.data.model_stride, progress)
     policies = (model, ZeroActions(), RandomActions(subject.config.planning.limits, options.seed))
-    results = try_policies(world, policies, trials, options.films, reporter)
+    results = run_policies(world, policies, trials, options.films, reporter)
     return ClosedLoopBenchmark(subject, trials, (*results, expert_result))
 
 
 def find_trials(
-    world: OtherWorld, options: BenchmarkOptions, stride: int, progress: Progress = no_progress
+    world: ExternalEnvironment, options: BenchmarkOptions, stride: int, progress: Progress = no_progress
 ) -> tuple[Trials, ClosedLoopResult]:
     """Return the required number of trials that the expert solves, and its results; other trials are left out.
 
@@ -314,8 +316,8 @@ def find_trials(
         raise world.refused(found, needed)
     steps = options.steps or -(-about.steps // stride)
     trials, episodes, left_out = list[Trial](), list[EpisodeResult](), list[int]()
-    for seed in range(options.seed, options.seed + TRIES * options.episodes):
-        episode = run(world, Expert(), Trial(seed, steps, stride), keep_frames=True)
+    for seed in range(options.seed, options.seed + TRIALS_PER_PROBLEM * options.episodes):
+        episode = run_trial(world, Expert(), Trial(seed, steps, stride), keep_frames=True)
         if not episode.success:
             left_out.append(seed)
         else:
@@ -345,50 +347,57 @@ def find_trials(
 # ---- recording of the expert, and of random play ----
 
 REST_S = 0.5  # an episode ends this long after success
-OFF_M, OFF_S, EVERY_S = 0.02, 0.3, 1.5  # standard deviation per axis, duration and period of a disturbance
-HELD_S, WIDER_M, GRIPS = (
+DISTURBANCE_M, DISTURBANCE_S, DISTURBANCE_PERIOD_S = (
+    0.02,
+    0.3,
+    1.5,
+)  # standard deviation per axis, duration and period of a disturbance
+TARGET_DURATION_S, BOX_MARGIN_M, GRIPPER_CHANGE_SHARE = (
     (0.3, 1.0),
     0.05,
     0.3,
 )  # play: duration of a target, margin of the box, share of gripper changes
-LOOK = 4  # control steps between two expert positions from which the box of random play is computed
+POSITION_STRIDE = 4  # control steps between two expert positions from which the box of random play is computed
 DISTURBED, PLAY = 1, 2  # kind of an episode by the remainder of its seed divided by three
 
 
 class _DisturbedExpert(Expert):
     """Periodically commands a pose a few centimetres off for a short time; otherwise the expert acts."""
 
-    def __init__(self, world: OtherWorld, seed: int, every: int) -> None:
+    def __init__(self, world: ExternalEnvironment, seed: int, every: int) -> None:
         self._rng, self._steps = np.random.default_rng([seed, 0]), itertools.count(0, every)
         self._every, rate_hz = every, world.about.rate_hz
-        self._period, self._length = max(1, round(EVERY_S * rate_hz)), round(OFF_S * rate_hz)
+        self._period, self._length = max(1, round(DISTURBANCE_PERIOD_S * rate_hz)), round(DISTURBANCE_S * rate_hz)
 
     def act(self, observation: Observation) -> Action | None:
         phase = next(self._steps) % self._period
         if phase < self._every:
             self._target = observation.state.copy()
-            self._target[:3] += OFF_M * self._rng.normal(size=3)
+            self._target[:3] += DISTURBANCE_M * self._rng.normal(size=3)
         return None if phase >= self._length else _action_to(self._target, observation)
 
 
 class _Play(Expert):
     """Moves to random positions in a box around the expert's positions, and sometimes opens or closes the gripper."""
 
-    def __init__(self, world: OtherWorld, seed: int, every: int) -> None:
+    def __init__(self, world: ExternalEnvironment, seed: int, every: int) -> None:
         self._rng, self._steps = np.random.default_rng([seed, 1]), itertools.count(0, every)
         self._rate_hz, self._until = world.about.rate_hz, 0.0
-        expert = steps_of(world, Expert(), Trial(seed, world.about.steps // LOOK, LOOK))
+        expert = iterate_steps(world, Expert(), Trial(seed, world.about.steps // POSITION_STRIDE, POSITION_STRIDE))
         points = [step.observation.state[:3] for step in expert]
-        self._low, self._high = np.min(points, axis=0) - [WIDER_M, WIDER_M, 0.0], np.max(points, axis=0) + WIDER_M
+        self._low, self._high = (
+            np.min(points, axis=0) - [BOX_MARGIN_M, BOX_MARGIN_M, 0.0],
+            np.max(points, axis=0) + BOX_MARGIN_M,
+        )
 
     def act(self, observation: Observation) -> Action | None:
         step = next(self._steps)
         if step == 0:
             self._target = observation.state.copy()
         if step >= self._until:
-            self._until = step + self._rng.uniform(*HELD_S) * self._rate_hz
+            self._until = step + self._rng.uniform(*TARGET_DURATION_S) * self._rate_hz
             self._target[:3] = self._rng.uniform(self._low, self._high)
-            self._target[6] = self._rng.integers(2) if self._rng.uniform() < GRIPS else self._target[6]
+            self._target[6] = self._rng.integers(2) if self._rng.uniform() < GRIPPER_CHANGE_SHARE else self._target[6]
         return _action_to(self._target, observation)
 
 
@@ -397,7 +406,7 @@ def _action_to(target: State, observation: Observation) -> Action:
 
 
 def record_world(
-    world: OtherWorld, folder: Path, seeds: Sequence[int], progress: Progress = no_progress, *, every: int = 1
+    world: ExternalEnvironment, folder: Path, seeds: Sequence[int], progress: Progress = no_progress, *, every: int = 1
 ) -> tuple[int, int]:
     """Record the episodes of some seeds; existing files are kept.
 
@@ -431,12 +440,12 @@ def record_world(
     return solved, sum(seed % 3 != PLAY for seed in seeds)
 
 
-def _record(world: OtherWorld, file: Path, seed: int, every: int) -> None:
+def _record(world: ExternalEnvironment, file: Path, seed: int, every: int) -> None:
     about, kind = world.about, seed % 3
     policies = {DISTURBED: _DisturbedExpert, PLAY: _Play}
     policy = policies[kind](world, seed, every) if kind else Expert()
     steps, rested = list[Step](), -every
-    for step in steps_of(world, policy, Trial(seed, -(-about.steps // every), every)):
+    for step in iterate_steps(world, policy, Trial(seed, -(-about.steps // every), every)):
         steps.append(step)
         rested = rested + every if step.info["success"] else 0
         if kind != PLAY and rested >= REST_S * about.rate_hz:
