@@ -257,8 +257,8 @@ def train(
     """
     from vjepa2_ac.training import loop
 
-    told = _Told(note, on_step)
-    return loop.train(config, told, check_only=check_only, allow_config_change=allow_config_change)
+    reporter = _CallbackReporter(note, on_step)
+    return loop.train(config, reporter, check_only=check_only, allow_config_change=allow_config_change)
 
 
 def evaluate(
@@ -312,8 +312,8 @@ def evaluate(
     return write_evaluation(evaluate_subject(str(subject), asked), asked.out or Path(subject))
 
 
-class _Told(Reporter):
-    """Calls functions of the user."""
+class _CallbackReporter(Reporter):
+    """Passes messages and metrics to the callbacks of `train`."""
 
     def __init__(self, note: Callable[[str], None], on_step: Callable[[int, dict[str, float]], None] | None) -> None:
         self._note, self._on_step = note, on_step
@@ -321,15 +321,15 @@ class _Told(Reporter):
     def note(self, text: str) -> None:
         self._note(text)
 
-    def stepped(self, step: int, metrics: dict[str, float]) -> None:
+    def on_step(self, step: int, metrics: dict[str, float]) -> None:
         if self._on_step is not None:
             self._on_step(step, metrics)
 
-    def validated(self, step: int, found: Validation) -> None:
+    def on_validation(self, step: int, validation: Validation) -> None:
         from vjepa2_ac.evaluation.result import over_persistence
 
-        by_horizon = ", ".join(f"{ratio.value:.3f}" for ratio in over_persistence(found.errors, "rollout"))
-        ranking = f"; action-ranking error {100 * found.ranking.rank.value:.1f} %" if found.ranking else ""
+        by_horizon = ", ".join(f"{ratio.value:.3f}" for ratio in over_persistence(validation.errors, "rollout"))
+        ranking = f"; action-ranking error {100 * validation.ranking.rank.value:.1f} %" if validation.ranking else ""
         self._note(f"Validation at step {step}: error over persistence by horizon {by_horizon}{ranking}")
 
 

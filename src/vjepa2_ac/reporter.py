@@ -1,4 +1,4 @@
-"""The reporter: what long work tells its user, as messages and as the progress of one task after another."""
+"""The reporter: interface through which long operations show messages and their progress."""
 
 from __future__ import annotations
 
@@ -7,32 +7,32 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from vjepa2_ac.episode import Progress
 
-INDEXING, LOADING = "looking through the data set", "loading the model"  # tasks of many
+INDEXING, LOADING = "indexing the data set", "loading the model"  # titles of common tasks
 
 
 class Reporter:
-    """Shows nothing; others show what they like of it. In a run it is silent in all processes but the first."""
+    """Shows nothing; subclasses override methods. In a run with several processes only the first one shows output."""
 
     def note(self, text: str) -> None:
         """Show a message."""
 
     def task(self, title: str, unit: str = "") -> Progress:  # noqa: ARG002
-        """Begin another task, which ends the one before; return the function that receives its progress.
+        """Begin a task, which ends the previous task; return the function that receives its progress.
 
         Args:
-            title: What is done.
-            unit: Of the total; it is then shown how many are done per second.
+            title: Description of the task.
+            unit: Unit of the total, such as "clips"; if set, the rate per second is shown.
         """
         return lambda _done, _total: None
 
-    def started(self, done: int, total: int) -> None:
-        """A training loop begins after `done` of `total` optimizer steps."""
+    def on_start(self, done: int, total: int) -> None:
+        """Called before the training loop, after `done` of `total` optimizer steps."""
 
-    def stepped(self, step: int, metrics: dict[str, float]) -> None:
-        """An optimizer step is done."""
+    def on_step(self, step: int, metrics: dict[str, float]) -> None:
+        """Called after each optimizer step."""
 
-    def validated(self, step: int, found: Any) -> None:
-        """Held-out clips were measured after `step` optimizer steps."""
+    def on_validation(self, step: int, validation: Any) -> None:
+        """Called after each validation."""
 
 
 SILENT = Reporter()

@@ -43,11 +43,11 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     reporter = TrainingConsole()
-    reporter.validated(10, Validation(errors(), ranking_of(np.array([0.1, 0.2]), ("a", "b"))))
-    reporter.started(10, 100)
+    reporter.on_validation(10, Validation(errors(), ranking_of(np.array([0.1, 0.2]), ("a", "b"))))
+    reporter.on_start(10, 100)
     for step in (11, 12, 13, 14):
         now[0] += 4.5
-        reporter.stepped(step, FIGURES)
+        reporter.on_step(step, FIGURES)
     title, one_step, rollout, ranked, *lines = written.getvalue().splitlines()
     assert title.startswith("validation at step 10, errors relative to persistence")
     assert one_step == "  one-step error        0.250; with zero actions 1.000, with shuffled actions 1.000"
@@ -85,9 +85,9 @@ def test_lines_have_at_most_100_columns_and_commands_stay_in_one_piece(name: str
 def test_a_terminal_has_one_bar_with_the_same_words(monkeypatch: pytest.MonkeyPatch) -> None:
     written = shown_on(monkeypatch, terminal=True)
     reporter = TrainingConsole()
-    reporter.started(0, 2)
-    reporter.stepped(1, FIGURES)
-    reporter.stepped(2, FIGURES)
+    reporter.on_start(0, 2)
+    reporter.on_step(1, FIGURES)
+    reporter.on_step(2, FIGURES)
     reporter.__exit__()
     last = [line for line in written.getvalue().splitlines() if "training" in line][-1]
     assert "2/2" in last

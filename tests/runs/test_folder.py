@@ -122,7 +122,7 @@ def test_a_run_holds_its_folder_while_it_trains_and_gives_it_back(make_config, r
             train(make_config(training__steps=2), other)
         refused.append(step)
 
-    other, reporter.stepped = type(reporter)(), try_to_train_too
+    other, reporter.on_step = type(reporter)(), try_to_train_too
     train(make_config(training__steps=2), reporter)
     assert refused == [1, 2]
     assert other.notes == [], "refused before anything was loaded"

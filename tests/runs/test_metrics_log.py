@@ -74,13 +74,13 @@ class FullDisk:
 
 
 def full_from(disk: FullDisk, reporter, at: int):
-    stepped = reporter.stepped
+    stepped = reporter.on_step
 
     def step_on(step: int, metrics: dict) -> None:
         stepped(step, metrics)
         disk.is_full = step >= at
 
-    reporter.stepped = step_on
+    reporter.on_step = step_on
     return reporter
 
 

@@ -69,7 +69,7 @@ class SilentReporter(Reporter):
         reported = self.tasks[title] = []
         return lambda done, total: reported.append((done, total))
 
-    def stepped(self, step: int, figures: object) -> None:
+    def on_step(self, step: int, figures: object) -> None:
         del figures
         self.steps.append(step)
         self.actions.get(step, lambda: None)()

@@ -48,7 +48,7 @@ def test_throughput_counts_clips_tokens_and_flops_per_second() -> None:
 
 def test_every_row_of_training_says_how_the_run_and_the_machine_are(make_config, reporter) -> None:
     stepped: dict[int, dict[str, float]] = {}
-    reporter.stepped = lambda step, metrics: stepped.update({step: metrics})
+    reporter.on_step = lambda step, metrics: stepped.update({step: metrics})
     constant = {"training__schedule": "warmup_stable_decay", "training__log_every": 2}
     folder = train(make_config(training__steps=3, **constant), reporter)
     rows = [row for row in read_metrics_log(folder / "metrics.jsonl") if row["kind"] == "train"]

@@ -38,7 +38,7 @@ def test_ten_steps_of_the_flat_loop_equal_the_production_loop(simulated: Path, t
         where="test",
     )  # fmt: skip
     reporter, expected = SilentReporter(), []
-    reporter.stepped = lambda _, metrics: expected.append(metrics["loss"])  # type: ignore[method-assign]
+    reporter.on_step = lambda _, metrics: expected.append(metrics["loss"])  # type: ignore[method-assign]
     weights = trained_weights(train(config, reporter))
     assert losses == expected
     found = {name.replace(".default", ""): value for name, value in model.predictor.state_dict().items()}

@@ -194,13 +194,13 @@ class TrainingConsole(ConsoleReporter):
         super().__init__()
         self._steps, self._validation = 0, ""
 
-    def started(self, done: int, total: int) -> None:
+    def on_start(self, done: int, total: int) -> None:
         """Start the progress bar at `done` of `total` optimizer steps."""
         bar, self._steps = self.task("training"), total
         if done < total:
             bar(done, total)
 
-    def stepped(self, step: int, metrics: Mapping[str, float]) -> None:
+    def on_step(self, step: int, metrics: Mapping[str, float]) -> None:
         """Update the progress bar after an optimizer step: loss, last validation, speed, time waiting for data."""
         speed = metrics["samples_per_second"]
         parts = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
@@ -208,7 +208,7 @@ class TrainingConsole(ConsoleReporter):
             parts.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
         self._bar(step, self._steps, "  ".join(part for part in parts if part))
 
-    def validated(self, step: int, found: Validation) -> None:
+    def on_validation(self, step: int, found: Validation) -> None:
         """Print the metrics of a validation; metrics.jsonl contains them for every horizon."""
         errors = found.errors
         true, zero, shuffled = (one_step_over_persistence(errors, actions).value for actions in ACTIONS)

@@ -30,7 +30,7 @@ from vjepa2_ac.evaluation.request import EvaluationOptions, resolve_config
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation
 from vjepa2_ac.model.lora import use_base_weights
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.reporter import LOADING, SILENT, Reporter
+from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.metrics_log import warnings_of
@@ -154,7 +154,7 @@ def evaluate_subject(subject: str, options: EvaluationOptions, *, reporter: Repo
     with join_processes(config) as accelerator:
         run_on_first(accelerator, partial(_require_places, subject, options))
         decoder = None if options.decoder is None else load_decoder(options.decoder)
-        progress = reporter.task("looking through the data")
+        progress = reporter.task(INDEXING)
         dataset = run_first_per_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
         chosen = validation_windows(dataset, options.split, clips=options.clips)
         reporter.task(LOADING)

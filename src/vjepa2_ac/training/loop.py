@@ -69,7 +69,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
 
 def _optimize(run: Run, outputs: RunOutputs, reporter: Reporter) -> None:
     """Run the remaining steps."""
-    reporter.started(run.state.step, run.config.training.steps)
+    reporter.on_start(run.state.step, run.config.training.steps)
     throughput = Throughput.of(run.config, run.world_model.sizes, run.accelerator)
     with contextlib.closing(batches_from(run)) as batches:
         timed = TimedBatches(batches, run.accelerator.device)
@@ -84,7 +84,7 @@ def _optimize(run: Run, outputs: RunOutputs, reporter: Reporter) -> None:
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             clips = run.clips_per_step - metrics.get("clips_left_out", 0.0)
             metrics |= throughput.metrics(clips, time.perf_counter() - started, timed.waited_s - waited_s)
-            outputs.stepped(metrics)
+            outputs.on_step(metrics)
             is_best = validate_if_due(run, outputs.metrics_log, reporter)
             outputs.save_if_due(is_best=is_best)
     outputs.finish()

@@ -132,10 +132,10 @@ class RunOutputs:
         training = self._run.config.training
         return step % training.log_every == 0 or step == training.steps
 
-    def stepped(self, metrics: dict[str, float]) -> None:
+    def on_step(self, metrics: dict[str, float]) -> None:
         """Show and log the metrics of the current step."""
         step = self._run.state.step
-        self._reporter.stepped(step, metrics)
+        self._reporter.on_step(step, metrics)
         if self.metrics_log is not None and self.is_logged(step):
             self.metrics_log.write("train", step, metrics)
 

@@ -111,7 +111,7 @@ def validate(run: Run, reporter: Reporter) -> Validation:
     with run.accelerator.autocast(), share_work(run.accelerator):
         validation = _measure(run)
     validation = broadcast_object(run.accelerator, validation)
-    reporter.validated(run.state.step, validation)
+    reporter.on_validation(run.state.step, validation)
     return validation
 
 
