@@ -28,7 +28,7 @@ def _selected(run: list[Figures]) -> Figures:
     """Return the checkpoint that a run with these validations selects."""
     state = RunState(0)
     for one in run:
-        state = replace(state, step=one["cell"]["step"]).measured(one["error"], one["action_ranking_error"])
+        state = replace(state, step=one["cell"]["step"]).with_validation(one["error"], one["action_ranking_error"])
     return next(one for one in run if one["cell"]["step"] == state.best_step)
 
 

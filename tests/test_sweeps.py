@@ -15,7 +15,7 @@ from installing import install
 from paths import ROOT
 from run_fixtures import as_yaml
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state, select_checkpoint, step_of
+from vjepa2_ac.runs.checkpoint import newest_checkpoint, parse_step, read_state, select_checkpoint
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training import loop
 
@@ -73,7 +73,7 @@ def test_a_sweep_that_is_stopped_goes_on_with_the_trial_that_was_open(
     assert len({str(trial.params) for trial in done}) == 3
     runs = [folder / f"{trial.number:03}" for trial in done]
     for run, trial in zip(runs, done, strict=True):
-        selected = step_of(select_checkpoint(run).path.name)
+        selected = parse_step(select_checkpoint(run).path.name)
         rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] == "validation"]
         assert trial.value == next(row["action_ranking_error"] for row in rows if row["step"] == selected)
     assert f"in {min(zip(done, runs, strict=True), key=lambda one: one[0].value)[1]}" in capsys.readouterr().out

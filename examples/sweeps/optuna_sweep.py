@@ -22,7 +22,7 @@ from vjepa2_ac import load_config, train
 from vjepa2_ac.cli import main as vjepa2_ac
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.process import EXIT_STATUS, StoppedError
-from vjepa2_ac.runs.checkpoint import select_checkpoint, step_of
+from vjepa2_ac.runs.checkpoint import parse_step, select_checkpoint
 from vjepa2_ac.runs.folder import METRICS
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 
@@ -54,7 +54,7 @@ def main(place: str, trials: str, *config: str) -> None:
         except StoppedError:
             sys.exit(EXIT_STATUS)
         else:
-            step = step_of(select_checkpoint(run).path.name)
+            step = parse_step(select_checkpoint(run).path.name)
             rows = [row for row in read_metrics_log(run / METRICS) if FIGURE in row and row["step"] <= step]
             study.tell(trial.number, rows[-1][FIGURE])
     print(f"{FIGURE} {study.best_value:.4f} in {folder / f'{study.best_trial.number:03}'}: {study.best_params}")

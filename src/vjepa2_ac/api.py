@@ -31,7 +31,7 @@ from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.folder import is_run
-from vjepa2_ac.runs.subject import Subject, load_subject, run_config_of
+from vjepa2_ac.runs.subject import Subject, load_subject, read_config_of_moved_run
 
 if TYPE_CHECKING:
     from vjepa2_ac.evaluation.result import Validation
@@ -222,7 +222,7 @@ def load_run(
     if not is_run(str(folder)) and (folder / ADAPTER_FILE).is_file():
         found, fix = "an adapter without its run", "Name its base, too: load_model(BASE, adapter=FOLDER)"
         raise InputError(where=str(folder), found=found, needed="the folder of a run", fix=fix)
-    run = load_subject(folder, str(checkpoint), config=run_config_of(folder, overrides))
+    run = load_subject(folder, str(checkpoint), config=read_config_of_moved_run(folder, overrides))
     run.world_model.to(place)
     return run
 

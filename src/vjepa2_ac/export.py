@@ -25,7 +25,7 @@ from vjepa2_ac.model.world_model import describe_model_widths, get_model_widths
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state, write_torch
-from vjepa2_ac.runs.subject import Subject, load_subject, run_config_of
+from vjepa2_ac.runs.subject import Subject, load_subject, read_config_of_moved_run
 from vjepa2_ac.storage import (
     atomic_writer,
     check_local_writable,
@@ -75,7 +75,7 @@ def export_run(
             finite, whatever the form.
     """
     _check_free(destination, form)
-    config = run_config_of(folder, overrides)
+    config = read_config_of_moved_run(folder, overrides)
     kind = config.adapter.kind
     if form == "hub" and kind != "lora":
         found, needed = f"a run without an adapter (adapter.kind: {kind})", "adapter.kind: lora, for --to hub"

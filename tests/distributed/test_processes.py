@@ -19,7 +19,7 @@ from vjepa2_ac.process import EXIT_STATUS, StoppedError
 from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.resume import micro_batches_of
+from vjepa2_ac.training.resume import count_micro_batches
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 
@@ -88,20 +88,20 @@ def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
     make_config, reporter, before: int, now: int, each: str | None
 ) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
-    state = RunState(step=3, processes=before, clips_per_step=8 * before, clips_asked=8)
-    assert micro_batches_of(config, state, now, reporter) * 2 == state.clips_per_step
+    state = RunState(step=3, processes=before, clips_per_step=8 * before, clips_per_process=8)
+    assert count_micro_batches(config, state, now, reporter) * 2 == state.clips_per_step
     assert [f"{each} micro-batches of 2 in each" in note for note in reporter.notes] == [True] * (each is not None)
 
 
 def test_more_processes_than_micro_batches_are_refused(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
     with pytest.raises(InputError, match=r"5 processes.*needed: 4 at most, for the 8 clips"):
-        micro_batches_of(config, RunState(step=3, clips_per_step=8, clips_asked=8), 5, reporter)
+        count_micro_batches(config, RunState(step=3, clips_per_step=8, clips_per_process=8), 5, reporter)
 
 
 def test_accumulation_changed_on_purpose_counts_as_it_is_written(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=3)
-    assert micro_batches_of(config, RunState(step=3, clips_per_step=8, clips_asked=4), 2, reporter) == 6
+    assert count_micro_batches(config, RunState(step=3, clips_per_step=8, clips_per_process=4), 2, reporter) == 6
 
 
 @given(

@@ -100,7 +100,7 @@ def findings_of(config: DataConfig) -> dict[str, Finding]:
     return {one.about: one for one in check_motion(open_dataset(config))}
 
 
-def warnings_of(config: DataConfig) -> dict[str, str]:
+def read_warnings(config: DataConfig) -> dict[str, str]:
     return {name: one.text for name, one in findings_of(config).items() if one.level in {"warning", "error"}}
 
 
@@ -116,7 +116,7 @@ def test_clean_motion_has_no_warning_at_any_rate(tmp_path: Path, make: Callable[
 
 
 def test_padding_is_named_with_its_steps_and_black_frames_are_counted(tmp_path: Path) -> None:
-    warnings = warnings_of(config_of(tmp_path / "set", padded))
+    warnings = read_warnings(config_of(tmp_path / "set", padded))
     assert set(warnings) == {"speed", "padding", "episode ends"}
     assert warnings["padding"].startswith("45 states in 6 episodes with a position and a rotation of exactly zero")
     assert re.search(r"Example: 00[135], steps 30 to 39\.", warnings["padding"])
@@ -129,7 +129,7 @@ def test_padding_is_named_with_its_steps_and_black_frames_are_counted(tmp_path: 
 
 
 def test_speed_example_is_the_step_between_joined_recordings(tmp_path: Path) -> None:
-    warnings = warnings_of(config_of(tmp_path / "set", joined))
+    warnings = read_warnings(config_of(tmp_path / "set", joined))
     assert set(warnings) == {"speed"}
     assert f"step {STEPS - 1} to {STEPS}: " in warnings["speed"]
     states = joined(0)[0]
@@ -152,11 +152,11 @@ def test_one_impossible_position_in_one_episode_is_named(
     monkeypatch.setattr(motion, "_EPISODES", in_sample)
     config = config_of(tmp_path / "set", with_one_outlier)
     assert (open_dataset(config).table.find("004") in sample_of(open_dataset(config), in_sample)) == (in_sample > 1)
-    for text in (warnings_of(config)["speed"], *(one.text for one in warnings_from_index(open_dataset(config)))):
+    for text in (read_warnings(config)["speed"], *(one.text for one in warnings_from_index(open_dataset(config)))):
         assert ": 2 control steps in 1 episode (" in text
         assert "Example: 004, step " in text
         assert re.search(r"step (6 to 7|7 to 8): \d\d\.\d m/s", text)
-    assert ("6 by the index" in warnings_of(config)["speed"]) == (in_sample == 1)
+    assert ("6 by the index" in read_warnings(config)["speed"]) == (in_sample == 1)
     assert not warnings_from_index(open_dataset(config_of(tmp_path / "clean", clean)))
 
 
@@ -167,7 +167,7 @@ def test_black_or_uniform_frames_of_some_episodes_are_named_and_no_frozen_camera
             frames[5:-5] = 40 * number - 80
         return states, frames
 
-    warnings = warnings_of(config_of(tmp_path / "set", make))
+    warnings = read_warnings(config_of(tmp_path / "set", make))
     assert set(warnings) == {"blank frames"}
     assert warnings["blank frames"].startswith("the middle frame is black or uniform in 2 of 6 episodes checked: 00")
 
@@ -206,7 +206,7 @@ def moved_in_x(number: int) -> Pair:
 
 
 def test_frozen_camera_is_counted_where_the_robot_moves(tmp_path: Path) -> None:
-    warnings = warnings_of(config_of(tmp_path / "set", with_frozen_camera))
+    warnings = read_warnings(config_of(tmp_path / "set", with_frozen_camera))
     assert warnings.keys() == {"episode ends"}
     assert warnings["episode ends"].startswith("0 black and 54 frozen frames")
     assert "the first 9 frames are one image while the robot moves" in warnings["episode ends"]

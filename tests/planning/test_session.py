@@ -173,7 +173,7 @@ def note(folder: Path, **changes: object) -> None:
     (folder / "changes.json").write_text(json.dumps({"percentile": 99, "changes": TAUGHT, "narrow": ""} | changes))
 
 
-def warnings_of(folder: Path, *overrides: str) -> tuple[str, ...]:
+def read_warnings(folder: Path, *overrides: str) -> tuple[str, ...]:
     return warn_beyond_taught(planning_settings(str(folder), overrides=list(overrides)), folder)
 
 

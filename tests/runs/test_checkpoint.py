@@ -156,16 +156,16 @@ def test_the_best_stays_besides_the_newest_until_there_is_a_better_one(tmp_path:
     for step, error in [(10, 0.9), (20, 0.7), (30, 0.8), (40, float("nan")), (50, 0.7)]:
         before = newest_checkpoint(tmp_path)
         state = replace(read_state(before), step=step) if before else RunState(step)
-        write_checkpoint(tmp_path, state.measured(error), write_weights, keep=2)
+        write_checkpoint(tmp_path, state.with_validation(error), write_weights, keep=2)
     assert names(tmp_path) == [checkpoint_name(20), checkpoint_name(40), checkpoint_name(50)]
     state = read_state(newest_checkpoint(tmp_path))
     assert (state.best_step, state.best_error) == (20, 0.7)
-    write_checkpoint(tmp_path, replace(state, step=60).measured(0.6), write_weights, keep=2)
+    write_checkpoint(tmp_path, replace(state, step=60).with_validation(0.6), write_weights, keep=2)
     assert names(tmp_path) == [checkpoint_name(50), checkpoint_name(60)]
 
 
 def test_best_checkpoint_that_was_deleted_is_forgotten(tmp_path: Path) -> None:
-    best = write_checkpoint(tmp_path, RunState(10).measured(0.5), write_weights, keep=2)
+    best = write_checkpoint(tmp_path, RunState(10).with_validation(0.5), write_weights, keep=2)
     newest = write_checkpoint(tmp_path, RunState(20, best_step=10, best_error=0.5), write_weights, keep=2)
     assert read_state(newest) == RunState(20, best_step=10, best_error=0.5)
     shutil.rmtree(best)
@@ -321,8 +321,9 @@ def test_an_optimizer_file_that_would_run_code_is_refused_and_does_not(make_conf
 
 def test_every_field_of_a_state_comes_back(tmp_path: Path) -> None:
     state = RunState(
-        10, run_id="a", clips_done=40, clips_per_step=4, clips_asked=2, processes=2,
-        data=(DataState("f", 3, {"e": "why"}),), best_step=10, best_error=0.5, measured_on={"data.frames": "16"},
+        10, run_id="a", clips_done=40, clips_per_step=4, clips_per_process=2, processes=2,
+        data=(DataState("f", 3, {"e": "why"}),), best_step=10, best_error=0.5,
+        validation_settings={"data.frames": "16"},
         loss_scale={"scale": 65536.0, "growth_interval": 2000, "_growth_tracker": 0, "growth_factor": float("inf")},
     )  # fmt: skip
     found = read_state(write_checkpoint(tmp_path, state, lambda _: None, keep=1))

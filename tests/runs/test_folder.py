@@ -24,8 +24,8 @@ from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint
 from vjepa2_ac.runs.folder import (
     RunLock,
     check_run_folder,
+    list_remote_locations,
     open_run_folder,
-    places_elsewhere,
     read_run_config,
     run_id,
 )
@@ -210,9 +210,9 @@ LINES = [
 
 
 def test_every_address_of_a_config_is_named_with_its_knob() -> None:
-    assert places_elsewhere(parse_config(ELSEWHERE, where="")) == LINES
+    assert list_remote_locations(parse_config(ELSEWHERE, where="")) == LINES
     here = {"run_dir": "r", "data": {"path": "d", "exclude": ["gs://is-but-a-name"]}, "model": {"base": "b.pt"}}
-    assert places_elsewhere(parse_config(here, where="")) == []
+    assert list_remote_locations(parse_config(here, where="")) == []
 
 
 def test_a_run_that_leads_elsewhere_says_so_before_it_goes_there(

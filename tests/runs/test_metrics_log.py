@@ -124,7 +124,7 @@ def test_a_flush_that_failed_is_not_taken_for_done_when_the_next_one_is(tmp_path
         real(handle)
 
     def checkpoint() -> None:
-        with log.before_a_checkpoint():
+        with log.flush_before_checkpoint():
             pass
 
     with MetricsLog(tmp_path, first_step=0) as log:

@@ -17,13 +17,13 @@ import pytest
 
 from accidents import without_permission
 from gcs import Failure, Gcs
-from mirrors import PLACE, content, names, there, write
+from mirrors import PLACE, content, names, remote_checkpoints, write
 from vjepa2_ac import storage
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.errors import RefusedError, UnreachableError
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, find_damage
-from vjepa2_ac.runs.folder import ENVIRONMENT, HELD, open_run_folder
-from vjepa2_ac.runs.mirror import SENDING, Mirror, RemoteCheckpoints
+from vjepa2_ac.runs.folder import ENVIRONMENT, UPLOAD_LINKS, open_run_folder
+from vjepa2_ac.runs.mirror import UPLOADING, Mirror, RemoteCheckpoints
 from vjepa2_ac.storage import retries, transfer
 
 UPLOAD = "POST /upload/"
@@ -46,7 +46,7 @@ def mirror_of(run: Path, place: str = PLACE, run_id: str = "mine", **checkpoint:
 
 def sent(mirror: Mirror) -> None:
     """Let a pass begin that is due, and wait for its end."""
-    mirror.tick()
+    mirror.upload_if_due()
     if mirror._thread is not None:
         mirror._thread.join()
 
@@ -77,10 +77,10 @@ def test_a_run_is_copied_to_any_kind_of_place_its_owner_first_and_the_manifest_l
     )
     send(run, place=place)
     assert order == [
-        "config.yaml", "metrics.jsonl", SENDING, "state.json", "weights.bin", "optimizer.pt", "manifest.json",
+        "config.yaml", "metrics.jsonl", UPLOADING, "state.json", "weights.bin", "optimizer.pt", "manifest.json",
     ]  # fmt: skip
     assert content(place) == content(run)
-    assert not (run / HELD).exists()
+    assert not (run / UPLOAD_LINKS).exists()
     assert not caplog.records
 
 
@@ -99,7 +99,7 @@ def test_what_was_sent_before_a_break_is_not_sent_again(
     monkeypatch.setattr(Gcs, "_failure_of", fail_after)
     send(run)
     total = 2 + 1 + 3 + 1  # small files, the manifest under another name, the files, the manifest
-    assert there() == (names(10) if sent_before == total else [])
+    assert remote_checkpoints() == (names(10) if sent_before == total else [])
     monkeypatch.setattr(Gcs, "_failure_of", answer)
     bucket.forget()
     send(run)
@@ -121,14 +121,16 @@ def test_files_of_another_checkpoint_by_the_same_name_are_not_taken_for_its_own(
 def test_the_same_are_kept_there_as_here(bucket: Gcs, run: Path) -> None:
     mirror, state = mirror_of(run), RunState(0)
     for step, error in [(10, 0.9), (20, 0.5), (30, 0.8), (40, 0.7), (50, 0.6), (60, 0.6)]:
-        state = replace(state, step=step).measured(error)
+        state = replace(state, step=step).with_validation(error)
         write(run, step, state)
         sent(mirror)
-    assert there() == names(20, 40, 50, 60) == sorted(path.name for path in (run / "checkpoints").iterdir())
+    assert (
+        remote_checkpoints() == names(20, 40, 50, 60) == sorted(path.name for path in (run / "checkpoints").iterdir())
+    )
     assert content(f"{PLACE}/checkpoints") == content(run / "checkpoints")
     gone = [r.target for r in bucket.requests if r.target.startswith("DELETE") and checkpoint_name(10) in r.target]
     assert gone[1].endswith("manifest.json"), gone  # the first was the claim
-    assert not [name for name in bucket.names("bucket") if checkpoint_name(10) in name or SENDING in name]
+    assert not [name for name in bucket.names("bucket") if checkpoint_name(10) in name or UPLOADING in name]
 
 
 def test_what_was_left_by_halves_goes_and_what_is_further_on_stays(bucket: Gcs, run: Path) -> None:
@@ -138,7 +140,7 @@ def test_what_was_left_by_halves_goes_and_what_is_further_on_stays(bucket: Gcs, 
     bucket.put("bucket/run/checkpoints/notes.txt", b"mine")
     write(run, 20)
     send(run)
-    assert sorted(RemoteCheckpoints(PLACE).listing()) == names(20, 90)
+    assert sorted(RemoteCheckpoints(PLACE).list_files()) == names(20, 90)
     assert "run/checkpoints/notes.txt" in bucket.names("bucket")
 
 
@@ -174,19 +176,19 @@ def test_training_goes_on_while_something_is_sent_and_nothing_is_sent_twice_at_o
     held = gate("optimizer.pt")
     mirror = mirror_of(run)
     write(run, 10, keep=1)
-    mirror.tick()
+    mirror.upload_if_due()
     assert held.waiting.wait(120)
     write(run, 20, keep=1)  # removes what is being sent
     assert not (run / "checkpoints" / checkpoint_name(10)).exists()
     for _ in range(5):
-        mirror.tick()
-    assert mirror.is_sending
+        mirror.upload_if_due()
+    assert mirror.is_uploading
     held.opened.set()
     mirror._thread.join()
-    assert there() == names(10), "held by links, it came whole"
-    assert RemoteCheckpoints(PLACE).fetch(checkpoint_name(10), run.parent / "copy") is None
+    assert remote_checkpoints() == names(10), "held by links, it came whole"
+    assert RemoteCheckpoints(PLACE).download(checkpoint_name(10), run.parent / "copy") is None
     sent(mirror)
-    assert there() == names(10, 20)
+    assert remote_checkpoints() == names(10, 20)
     assert held.most == 1
 
 
@@ -199,10 +201,10 @@ def test_a_copy_that_does_not_end_in_time_is_named_and_left(
     mirror = mirror_of(run, remote_wait_seconds=0.2)
     mirror.finish(lambda: held.waiting.is_set())
     assert f"what {run / 'checkpoints'} has after that is on this machine only: there was no more time" in caplog.text
-    assert mirror.is_sending
+    assert mirror.is_uploading
     held.opened.set()
     mirror._thread.join()
-    assert there() == [], "it has stopped before the next file"
+    assert remote_checkpoints() == [], "it has stopped before the next file"
 
 
 @pytest.mark.usefixtures("bucket")
@@ -212,13 +214,13 @@ def test_in_the_end_the_newest_is_sent_instead_of_the_one_that_was_on_its_way(
     held = gate("weights")
     write(run, 10)
     mirror = mirror_of(run, remote_every_minutes=30.0)
-    mirror.tick()
+    mirror.upload_if_due()
     assert held.waiting.wait(120)
     write(run, 20)
     threading.Timer(0.05, held.opened.set).start()
     mirror.finish(lambda: False)
-    assert there() == names(20)
-    assert sorted(RemoteCheckpoints(PLACE).listing()) == names(20)
+    assert remote_checkpoints() == names(20)
+    assert sorted(RemoteCheckpoints(PLACE).list_files()) == names(20)
 
 
 @pytest.mark.usefixtures("bucket")
@@ -231,7 +233,7 @@ def test_a_place_of_another_run_is_never_written(run: Path, caplog: pytest.LogCa
     mirror = mirror_of(run, run_id="other")
     caplog.clear()
     sent(mirror)
-    mirror.tick()
+    mirror.upload_if_due()
     mirror.finish(lambda: False)
     assert content("gs://bucket") == before
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
@@ -260,17 +262,17 @@ def test_a_newest_checkpoint_without_permission_is_reported_and_no_older_one_is_
     newest, mirror = write(run, 20), mirror_of(run)
     with without_permission(newest / "optimizer.pt"):
         sent(mirror)
-    assert there() == []
+    assert remote_checkpoints() == []
     assert "Permission denied" in caplog.text
     sent(mirror)
-    assert there() == names(20)
+    assert remote_checkpoints() == names(20)
 
 
 @pytest.mark.parametrize("name", ["/etc/x", "../x", "a/../../x", ""])
 def test_a_manifest_there_names_no_file_outside_its_folder(bucket: Gcs, tmp_path: Path, name: str) -> None:
     manifest = json.dumps({"files": {name: "0"}}).encode()
     bucket.put(f"bucket/run/checkpoints/{checkpoint_name(10)}/manifest.json", manifest)
-    problem = RemoteCheckpoints(PLACE).fetch(checkpoint_name(10), tmp_path / "copy")
+    problem = RemoteCheckpoints(PLACE).download(checkpoint_name(10), tmp_path / "copy")
     assert problem is not None
     assert "it names" in problem
 
@@ -302,7 +304,7 @@ def test_a_bucket_that_is_closed_for_a_while_costs_one_warning(
     assert "Training continues; next attempt in 0 minutes" in caplog.text
     bucket.forget()
     go_on(run, mirror, 40)
-    assert there() == (names(20, 30, 40) if match == "DELETE" else names(10, 40))
+    assert remote_checkpoints() == (names(20, 30, 40) if match == "DELETE" else names(10, 40))
     mirror.finish(lambda: False)
     assert len(caplog.records) == 1
 
@@ -333,12 +335,12 @@ def test_halves_of_a_full_disk_do_not_keep_it_full(
     go_on(run, mirror, 10, 20, 30, 40)
     room -= CHECKPOINT // 2  # others take it
     go_on(run, mirror, 50, 60, 70)
-    assert there(str(place)) == names(20, 30, 40)
+    assert remote_checkpoints(str(place)) == names(20, 30, 40)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert "No room" in caplog.text
     room += CHECKPOINT // 2
     go_on(run, mirror, 80)
-    assert there(str(place)) == names(30, 40, 80)
+    assert remote_checkpoints(str(place)) == names(30, 40, 80)
     assert len(list((place / "checkpoints").iterdir())) == 3
     assert len(caplog.records) == 1
 
@@ -392,7 +394,7 @@ def test_the_later_start_keeps_the_place_and_the_earlier_one_is_told_once(
     assert f"{disk} is used by a later start of this run, process {os.getpid()} on two, since 20" in said.getMessage()
     second.go_on(40)
     second.mirror.finish(lambda: False)
-    assert there(disk)[-1] == checkpoint_name(40)
+    assert remote_checkpoints(disk)[-1] == checkpoint_name(40)
     assert storage.read_bytes(f"{disk}/checkpoints/{checkpoint_name(40)}/optimizer.pt").startswith(b"two")
     assert len(caplog.records) == 1
 
@@ -403,7 +405,7 @@ def test_two_that_begin_at_once_do_not_both_keep_the_place(
     """Each saw an empty place; the runs have different names."""
     first, second = machine("one", "this"), machine("two", "that")
     with monkeypatch.context() as at_once:
-        at_once.setattr(RemoteCheckpoints, "listing", lambda _: {})
+        at_once.setattr(RemoteCheckpoints, "list_files", lambda _: {})
         first.go_on(10)
         second.go_on(10)
     first.go_on(20)
@@ -421,4 +423,4 @@ def test_who_removed_the_list_of_starts_took_the_place_from_nobody(machine, disk
     first.go_on(20)
     assert not caplog.records
     assert (Path(disk) / ENVIRONMENT).read_bytes() == (first.folder / ENVIRONMENT).read_bytes()
-    assert there(disk) == names(10, 20)
+    assert remote_checkpoints(disk) == names(10, 20)

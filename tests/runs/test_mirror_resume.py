@@ -10,7 +10,7 @@ import pytest
 
 from accidents import KilledError, without_permission
 from gcs import Gcs
-from mirrors import PLACE, content, names, there, write
+from mirrors import PLACE, content, names, remote_checkpoints, write
 from run_fixtures import SilentReporter, at_step, signalled_reporter
 from same_run import assert_same_run
 from vjepa2_ac import storage
@@ -90,7 +90,7 @@ def test_a_damaged_checkpoint_there_is_passed_over_by_name(
         bucket.put(f"bucket/{victim}", bytes(data) if damage == "flip" else b"{")
     open_remote(config, SILENT)
     assert [path.name for path in (local(config) / "checkpoints").iterdir()] == [checkpoint_name(10)]
-    assert there(PLACE) == [checkpoint_name(10)], "nobody is to try the other one again"
+    assert remote_checkpoints(PLACE) == [checkpoint_name(10)], "nobody is to try the other one again"
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert f"{PLACE}: {checkpoint_name(20)}" in caplog.text
 
@@ -265,12 +265,12 @@ def test_after_preemption_a_fresh_machine_goes_on_as_if_nothing_had_happened(
     config_on: MakeConfig, reporter, tmp_path: Path, whole_run: Path
 ) -> None:
     stop_after(3, config_on("one"), reporter)
-    assert there(PLACE)[-1] == checkpoint_name(3), "sent before the process ends"
+    assert remote_checkpoints(PLACE)[-1] == checkpoint_name(3), "sent before the process ends"
     shutil.rmtree(tmp_path / "one")
     train(config_on("two"), reporter)
     assert reporter.steps == [4, 5, 6]
     assert_same_run(whole_run, tmp_path / "two")
-    assert there(PLACE)[-1] == checkpoint_name(6)
+    assert remote_checkpoints(PLACE)[-1] == checkpoint_name(6)
     train(config_on("three"), reporter)
     assert reporter.steps == [4, 5, 6], "a run that is done is done everywhere"
     assert_same_run(whole_run, tmp_path / "three")
@@ -318,7 +318,7 @@ def test_a_run_that_fails_sends_its_last_checkpoint(config_on: MakeConfig, repor
 
     with pytest.raises(InputError, match="not finite"):
         train(config_on("one", checkpoint__remote_every_minutes=1e6), at_step(reporter, 5, fail))
-    assert there(PLACE)[-1] == checkpoint_name(4)
+    assert remote_checkpoints(PLACE)[-1] == checkpoint_name(4)
 
 
 # A machine killed in an upload
@@ -365,11 +365,11 @@ def test_a_run_killed_in_an_upload_goes_on_from_the_last_complete_checkpoint_and
     whole_run: Path,
 ) -> None:
     die_in_upload(config_on("this", place), reporter, monkeypatch, before_file=before_file)
-    assert there(place) == names(*complete)
+    assert remote_checkpoints(place) == names(*complete)
     next_start = type(reporter)()
     train(config_on(machine, place), next_start)
     assert machine == "this" or next_start.steps[0] == max(complete, default=0) + 1
-    assert there(place)[-1] == checkpoint_name(6)
+    assert remote_checkpoints(place)[-1] == checkpoint_name(6)
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
     assert_same_run(whole_run, tmp_path / machine)
 
@@ -388,8 +388,8 @@ def test_half_a_checkpoint_of_another_run_is_refused_before_the_first_step(
 def test_small_files_alone_keep_nobody_out(config_on, reporter, place: str) -> None:
     """Who removes the checkpoints of a place starts a run anew there, with another config if need be."""
     train(config_on("this", place), reporter)
-    for name in there(place):
+    for name in remote_checkpoints(place):
         RemoteCheckpoints(place).remove(name)
     assert {"config.yaml", "run_id"} <= {name for name in SMALL_FILES if storage.exists(storage.join(place, name))}
     train(config_on("other", place, training__learning_rate=0.5), reporter)
-    assert there(place)[-1] == checkpoint_name(6)
+    assert remote_checkpoints(place)[-1] == checkpoint_name(6)

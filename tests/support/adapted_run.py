@@ -33,6 +33,6 @@ def write_adapted_run(
             for value in model.parameters():
                 if value.requires_grad:
                     value.add_(change * torch.randn(value.shape, generator=generator))
-        state = RunState(step, best_step=best, best_error=0.5, best_rank=rank)
+        state = RunState(step, best_step=best, best_error=0.5, best_ranking_error=rank)
         write_checkpoint(folder / "checkpoints", state, lambda path: save_trained(model, path / ADAPTER), keep=9)
     return folder

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from vjepa2_ac import storage
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, write_checkpoint
-from vjepa2_ac.runs.mirror import RemoteCheckpoints, complete
+from vjepa2_ac.runs.mirror import RemoteCheckpoints, list_complete
 
 PLACE = "gs://bucket/run"
 
@@ -22,9 +22,9 @@ def write(run: Path, step: int, state: RunState | None = None, keep: int = 3, wo
     return write_checkpoint(run / "checkpoints", replace(state, run_id=state.run_id or "mine"), files, keep=keep)
 
 
-def there(place: str = PLACE) -> list[str]:
-    """Return the complete checkpoints of a place."""
-    return sorted(complete(RemoteCheckpoints(place).listing()))
+def remote_checkpoints(place: str = PLACE) -> list[str]:
+    """Return the names of the complete checkpoints in a remote folder."""
+    return sorted(list_complete(RemoteCheckpoints(place).list_files()))
 
 
 def names(*steps: int) -> list[str]:

@@ -8,9 +8,9 @@ from safetensors.torch import load_file
 
 from vjepa2_ac.runs.checkpoint import newest_checkpoint
 from vjepa2_ac.runs.metrics_log import read_metrics_log
-from vjepa2_ac.training.monitoring import MEASURED
+from vjepa2_ac.training.monitoring import MACHINE_METRICS
 
-TIMINGS = MEASURED  # metrics of the machine
+TIMINGS = MACHINE_METRICS  # metrics of the machine
 
 
 def trained_weights(run: Path) -> dict[str, torch.Tensor]:

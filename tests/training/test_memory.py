@@ -11,7 +11,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config, EncoderSizes, ModelSizes
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.model.lora import trainable_report
-from vjepa2_ac.training.cost import count_parameters, estimate_memory, ways_to_fit
+from vjepa2_ac.training.cost import count_parameters, estimate_memory, suggest_memory_savings
 from vjepa2_ac.training.optim import make_optimizer
 
 
@@ -55,9 +55,9 @@ def test_a_run_that_fits_needs_no_knob_and_a_large_one_names_them() -> None:
     config, sizes = usual(batch_size=8), model_sizes()
     stored, checkpointed = (estimate_memory(config, sizes).total(checkpointing=one) for one in (False, True))
     assert checkpointed < stored
-    assert ways_to_fit(config, sizes, stored) == []
-    assert ways_to_fit(config, sizes, stored - 1) == ["training.gradient_checkpointing=true"]
-    assert ways_to_fit(config, sizes, 0) is None
+    assert suggest_memory_savings(config, sizes, stored) == []
+    assert suggest_memory_savings(config, sizes, stored - 1) == ["training.gradient_checkpointing=true"]
+    assert suggest_memory_savings(config, sizes, 0) is None
 
 
 def test_doctor_says_whether_it_fits_and_what_of_it_is_estimated(tmp_path, capsys, monkeypatch) -> None:

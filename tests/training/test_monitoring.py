@@ -16,7 +16,7 @@ from vjepa2_ac.distributed import measure_matmul_speed
 from vjepa2_ac.runs.metrics_log import open_trackers, read_metrics_log
 from vjepa2_ac.training.flops import clip_flops
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.monitoring import MEASURED, Throughput, Watch, WatchedMetricsLog
+from vjepa2_ac.training.monitoring import MACHINE_METRICS, DivergenceDetector, DivergenceWarningLog, Throughput
 from vjepa2_ac.training.step import Update
 
 CPU = torch.device("cpu")
@@ -43,7 +43,7 @@ def test_throughput_counts_clips_tokens_and_flops_per_second() -> None:
     unusable = replace(throughput, ceiling=mfu * throughput.ceiling / 7)
     assert math.isnan(unusable.metrics(clips=12.0, seconds=4.0, waited_s=1.0)["mfu"]), "700 % is no utilisation"
     assert metrics["ceiling_tflops"] == pytest.approx(2 * speed / 1e12)
-    assert metrics.keys() == MEASURED
+    assert metrics.keys() == MACHINE_METRICS
 
 
 def test_every_row_of_training_says_how_the_run_and_the_machine_are(make_config, reporter) -> None:
@@ -54,7 +54,7 @@ def test_every_row_of_training_says_how_the_run_and_the_machine_are(make_config,
     rows = [row for row in read_metrics_log(folder / "metrics.jsonl") if row["kind"] == "train"]
     assert [row["step"] for row in rows] == [2, 3]
     for row in rows:
-        assert row.keys() >= MEASURED | {"loss", "grad_norm", "learning_rate", "update_to_weight"}
+        assert row.keys() >= MACHINE_METRICS | {"loss", "grad_norm", "learning_rate", "update_to_weight"}
         assert 0 < row["update_to_weight"] < 1
         assert 0 < row["data_wait_share"] < 1
         assert row["mfu"] is None or 0 < row["mfu"] <= 1, "a busy machine may have no usable ceiling"
@@ -74,7 +74,7 @@ def validation(one_step: float, rollout: float | None = None) -> dict[str, float
 
 def warned(config: Config, *rows: tuple[int, dict[str, Any]]) -> dict[int, str]:
     """Return the warnings of validations, by step."""
-    watch = Watch(config)
+    watch = DivergenceDetector(config)
     found = {step: watch("validation", step, metrics) for step, metrics in rows}
     return {step: text for step, text in found.items() if text}
 
@@ -96,7 +96,7 @@ def test_a_validation_that_is_worse_than_at_the_start_is_reported_once(config: C
 
 
 def test_a_loss_that_rises_far_above_its_lowest_is_reported_between_validations(config: Config) -> None:
-    watch = Watch(config)
+    watch = DivergenceDetector(config)
     losses = [0.3, 0.5, 0.3, 0.4, 0.3] * 4 + [0.9] * 20
     found = {step: texts for step, loss in enumerate(losses) if (texts := watch("train", step, {"loss": loss}))}
     (step,) = found
@@ -121,7 +121,7 @@ def test_a_model_that_predicts_better_and_ranks_actions_worse_is_warned_of_once(
 def test_a_warning_is_logged_and_shown_and_a_resumed_run_does_not_repeat_it(config: Config, reporter) -> None:
     for step, one_step in ((0, 0.8), (3, 0.85), (6, 0.86)):  # each in a process of its own
         trackers = open_trackers(config, Path(config.run_dir), run_id="a", first_step=step)
-        with WatchedMetricsLog(config, reporter, first_step=step, trackers=trackers) as log:
+        with DivergenceWarningLog(config, reporter, first_step=step, trackers=trackers) as log:
             log.write("validation", step, validation(one_step))
     (warning,) = (row for row in read_metrics_log(log.path) if row["kind"] == "warning")
     assert warning["step"] == 3

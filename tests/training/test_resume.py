@@ -8,13 +8,13 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
 from vjepa2_ac.training import validation
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.resume import best_so_far, measured_on
+from vjepa2_ac.training.resume import keep_comparable_best, validation_settings
 
 BEST = RunState(20, best_step=10, best_error=0.5)
 
 
 def of(config: object) -> dict[str, str]:
-    return dict(measured_on(config, open_dataset(config.data)))  # type: ignore[attr-defined, arg-type]
+    return dict(validation_settings(config, open_dataset(config.data)))  # type: ignore[attr-defined, arg-type]
 
 
 def test_the_best_of_other_frames_no_longer_counts_and_the_reason_is_named(make_config, reporter, monkeypatch) -> None:
@@ -34,7 +34,7 @@ def test_the_best_of_other_frames_no_longer_counts_and_the_reason_is_named(make_
 
 def test_the_best_checkpoint_stays_when_a_run_is_resumed_unchanged(make_config, reporter) -> None:
     now = of(make_config(checkpoint__keep_best="error"))
-    known = replace(BEST, measured_on=now)
+    known = replace(BEST, validation_settings=now)
     moved = make_config(
         checkpoint__keep_best="error",
         training__steps=9,
@@ -43,26 +43,26 @@ def test_the_best_checkpoint_stays_when_a_run_is_resumed_unchanged(make_config, 
         validation__every=1,
         validation__batch_size=4,
     )
-    assert best_so_far(known, of(moved), reporter) == known
-    assert best_so_far(BEST, now, reporter) == known, "where nothing is recorded it is accepted"
+    assert keep_comparable_best(known, of(moved), reporter) == known
+    assert keep_comparable_best(BEST, now, reporter) == known, "where nothing is recorded it is accepted"
     assert reporter.notes == []
 
 
 def test_a_rank_decides_and_the_error_between_equal_ones() -> None:
-    state = RunState(0).measured(0.9, 0.3)
-    assert (state.best_step, state.best_rank) == (0, 0.3), "the base is a candidate"
+    state = RunState(0).with_validation(0.9, 0.3)
+    assert (state.best_step, state.best_ranking_error) == (0, 0.3), "the base is a candidate"
     state = replace(state, step=10)
-    assert state.measured(0.1, 0.31) == state, "a lower error with a worse rank"
-    assert state.measured(0.9, 0.3) == state
-    assert state.measured(float("nan"), 0.1) == state
-    assert state.measured(0.1, float("nan")) == state
-    assert state.measured(0.8, 0.3).best_step == 10
-    assert state.measured(0.8, 0.304).best_step == 10, "as good as equal, and a lower error"
-    near = state.measured(1.0, 0.297)
-    assert (near.best_step, near.lowest_rank) == (0, 0.297), "as good as equal, and a higher error"
-    assert replace(near, step=20).measured(0.8, 0.303).best_step == 0, "not of the lowest of all"
-    assert replace(near, step=20).measured(2.0, 0.294).best_step == 20, "the best is no longer among the lowest"
-    assert state.measured(1.5, 0.2).best_error == 1.5
+    assert state.with_validation(0.1, 0.31) == state, "a lower error with a worse rank"
+    assert state.with_validation(0.9, 0.3) == state
+    assert state.with_validation(float("nan"), 0.1) == state
+    assert state.with_validation(0.1, float("nan")) == state
+    assert state.with_validation(0.8, 0.3).best_step == 10
+    assert state.with_validation(0.8, 0.304).best_step == 10, "as good as equal, and a lower error"
+    near = state.with_validation(1.0, 0.297)
+    assert (near.best_step, near.lowest_ranking_error) == (0, 0.297), "as good as equal, and a higher error"
+    assert replace(near, step=20).with_validation(0.8, 0.303).best_step == 0, "not of the lowest of all"
+    assert replace(near, step=20).with_validation(2.0, 0.294).best_step == 20, "the best is no longer among the lowest"
+    assert state.with_validation(1.5, 0.2).best_error == 1.5
 
 
 @pytest.mark.parametrize(
@@ -81,6 +81,6 @@ def test_what_changes_the_measurement_is_named(
 ) -> None:
     before, now = of(make_config()), of(make_config(**change))
     assert {key for key in before | now if before.get(key) != now.get(key)} == named
-    state = best_so_far(replace(BEST, measured_on=before), now, reporter)
-    assert (state.best_step, state.best_error, state.measured_on) == (None, None, now)
+    state = keep_comparable_best(replace(BEST, validation_settings=before), now, reporter)
+    assert (state.best_step, state.best_error, state.validation_settings) == (None, None, now)
     assert all(name in reporter.notes[0] for name in named)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.cli.waiting import Work
 from vjepa2_ac.errors import InputError, counted, shell_command
-from vjepa2_ac.runs.folder import is_of_moved, is_run
+from vjepa2_ac.runs.folder import is_run, sets_movable_path
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -286,7 +286,7 @@ def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> li
         words = cli.option_words(options, "checkpoint", "config", "plugin")
         command = shell_command("serve", options.subject, *words, *options.overrides)
     elif command and is_evaluated:
-        if any(map(is_of_moved, options.overrides)):  # `data calibrate` needs the base model at its original path
+        if any(map(sets_movable_path, options.overrides)):  # `data calibrate` needs the base model at its original path
             return []
         command = shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
     return [f"Next: {command}"] * bool(command)
@@ -294,7 +294,7 @@ def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> li
 
 def _evaluate_command(options: argparse.Namespace) -> str:
     """Return the `evaluate` command for the tested run; empty for a model, because its data are not known."""
-    words = [*cli.option_words(options, "checkpoint", "plugin"), *filter(is_of_moved, options.overrides)]
+    words = [*cli.option_words(options, "checkpoint", "plugin"), *filter(sets_movable_path, options.overrides)]
     return shell_command("evaluate", options.subject, *words) if is_run(options.subject) else ""
 
 

@@ -11,7 +11,7 @@ from vjepa2_ac.config.model import RANDOM
 from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.process import is_first_process
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.runs.folder import is_of_moved, is_run
+from vjepa2_ac.runs.folder import is_run, sets_movable_path
 
 _NAMED = ("none", "up", "left", "close")  # default actions of `imagine --image`, which has no recorded actions
 
@@ -82,7 +82,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.evaluation.request import ProbeOptions, resolve_config
 
     subject = options.subject
-    if unused := [word for word in options.overrides if not is_of_moved(word)]:
+    if unused := [word for word in options.overrides if not sets_movable_path(word)]:
         needed = "one run or model, and model.base=PATH if its base model was moved"
         fix = "For a second run use --against RUN, or call evaluate again. Other config keys cannot be changed"
         raise InputError(where="command line", found=" ".join(unused), needed=needed, fix=fix)
@@ -123,7 +123,7 @@ def _next(measured: WrittenEvaluation, options: argparse.Namespace) -> list[str]
         words = ["train", config, *[f"model.base={about.subject}"] * is_other]
     elif not summary.predicts.needs:
         if about.is_base or "no" in {verdict.conclusion for verdict in summary.verdicts[:3]}:
-            words += ["--model", about.subject] * (not any(map(is_of_moved, settings)))
+            words += ["--model", about.subject] * (not any(map(sets_movable_path, settings)))
         elif summary.plans is None and (simulation := _simulation(about, options)):
             words = simulation
         elif summary.verdicts[2].conclusion == "yes":  # `serve` is recommended only after a measured improvement

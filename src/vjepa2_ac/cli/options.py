@@ -18,7 +18,7 @@ from vjepa2_ac.config.planning import ELITES, PlanningConfig
 from vjepa2_ac.errors import InputError, did_you_mean, printable, shell_command
 from vjepa2_ac.process import is_first_process
 from vjepa2_ac.reporter import INDEXING
-from vjepa2_ac.runs.folder import is_run, places_elsewhere, read_run_config
+from vjepa2_ac.runs.folder import is_run, list_remote_locations, read_run_config
 from vjepa2_ac.storage import check_local_writable, paths, require_new_folder, translate_write_errors, write_atomically
 from vjepa2_ac.storage.structured import format_json
 
@@ -225,7 +225,7 @@ def reporter() -> ConsoleReporter:
 def say_places_elsewhere(subject: str) -> None:
     """Print the remote URLs in the config of a run, before any of them is contacted; print nothing for a model."""
     if is_run(subject) and is_first_process():
-        for url in places_elsewhere(read_run_config(Path(subject))):
+        for url in list_remote_locations(read_run_config(Path(subject))):
             show(f"{subject} names a place elsewhere: {url}")
 
 

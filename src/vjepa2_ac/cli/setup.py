@@ -229,7 +229,7 @@ def _doctor(options: argparse.Namespace) -> int:
     import torch
 
     from vjepa2_ac.model.checkpoints import base_sizes
-    from vjepa2_ac.training.cost import USUAL_GPU, estimate_memory, ways_to_fit
+    from vjepa2_ac.training.cost import USUAL_GPU, estimate_memory, suggest_memory_savings
 
     sizes = base_sizes(config.model)
     gpu, available = None, USUAL_GPU
@@ -238,7 +238,9 @@ def _doctor(options: argparse.Namespace) -> int:
         gpu, available = device.name, device.total_memory
     estimate = estimate_memory(config, sizes)
     needed = estimate.total(checkpointing=estimate.checkpointing)
-    cli.show(_verdict(needed, available, gpu, ways_to_fit(config, sizes, available)), *_memory_lines(estimate))
+    cli.show(
+        _verdict(needed, available, gpu, suggest_memory_savings(config, sizes, available)), *_memory_lines(estimate)
+    )
     cli.show(f"To check the rest: {shell_command('train', options.config, '--check', *options.overrides)}")
     return 0 if needed <= available else 1
 

@@ -262,7 +262,7 @@ def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Repor
             if step % _LOG_EVERY == 0 or is_last:
                 log.write("train", step, metrics)
             if step % every == 0 or is_last or stop.reason is not None:
-                with log.before_a_checkpoint(), translate_write_errors(saved), atomic_writer(saved) as file:
+                with log.flush_before_checkpoint(), translate_write_errors(saved), atomic_writer(saved) as file:
                     parts = {"decoder": steps.decoder.state_dict(), "optimizer": steps.optimizer.state_dict()}
                     write_torch({"step": step, "average": steps.average, **parts}, file)
             if stop.reason is not None and not is_last:

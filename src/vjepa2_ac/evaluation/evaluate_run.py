@@ -33,7 +33,7 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
-from vjepa2_ac.runs.metrics_log import warnings_of
+from vjepa2_ac.runs.metrics_log import read_warnings
 from vjepa2_ac.runs.subject import Subject, load_subject
 from vjepa2_ac.storage import check_local_writable, translate_write_errors
 from vjepa2_ac.storage.paths import BUILTIN
@@ -176,7 +176,7 @@ def evaluate_subject(subject: str, options: EvaluationOptions, *, reporter: Repo
                     loaded.evaluated_models, clips, decoder, evaluation.examples, encode=encode, reporter=reporter
                 )
     is_of_run = loaded.subject.checkpoint is not None
-    warnings = [f"In training, {text}." for text in warnings_of(Path(subject) / METRICS)] if is_of_run else []
+    warnings = [f"In training, {text}." for text in read_warnings(Path(subject) / METRICS)] if is_of_run else []
     return replace(evaluation, decoded=decoded, notes=(*loaded.notes, *warnings, *evaluation.notes))
 
 

@@ -14,7 +14,7 @@ from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.settings import with_taught_limits
 from vjepa2_ac.runs.checkpoint import SELECTED
-from vjepa2_ac.runs.folder import is_of_moved, is_run, read_run_config
+from vjepa2_ac.runs.folder import is_run, read_run_config, sets_movable_path
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def resolve_config(subject: str, options: EvaluationOptions) -> Config:
     """
     config = _config_of(subject, options)
     for override in options.overrides:
-        if not (override.startswith("planning.") or (is_run(subject) and is_of_moved(override))):
+        if not (override.startswith("planning.") or (is_run(subject) and sets_movable_path(override))):
             needed = "keys of planning, such as planning.samples=200; or, for a run, model.base=PATH"
             raise InputError(where="override", found=override, needed=needed)
     config = parse_config(config_as_dict(config), options.overrides, where="overrides")

@@ -27,7 +27,7 @@ from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 Conclusion = Literal["yes", "no", "inconclusive", "not measured"]
 
 SAME_ERROR = 0.01  # relative; errors this close count as equal, whatever their interval
-SAME_RANK = 0.005  # absolute; action-ranking errors this close count as equal, whatever their interval
+RANKING_TOLERANCE = 0.005  # absolute; action-ranking errors this close count as equal, whatever their interval
 SAME_SUCCESS = 0.1  # absolute; a success rate is not better if its upper bound is less than this above a competitor's
 CHANCE = 0.5  # action-ranking error of a model that ignores its actions
 _BASE, _PERSISTENCE, _CHANCE = "the base model", "persistence", "chance"  # values of `compared_with`
@@ -324,10 +324,14 @@ def _ranks_actions(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Ver
         return not_measured_verdict(RANKING, "`vjepa2-ac evaluate --ranking-clips 32`")
     rank = rows[key].estimate
     statement = f"action-ranking error {format_percent(rank.value)} %"
-    conclusion, reference, compared_with = draw_conclusion(rank.below(CHANCE), SAME_RANK), "chance 50 %", _CHANCE
+    conclusion, reference, compared_with = (
+        draw_conclusion(rank.below(CHANCE), RANKING_TOLERANCE),
+        "chance 50 %",
+        _CHANCE,
+    )
     if (difference := rows.get("ranking.difference_to_base")) is not None:
         if conclusion == "yes":
-            conclusion, compared_with = draw_conclusion(difference.estimate.below(0.0), SAME_RANK), _BASE
+            conclusion, compared_with = draw_conclusion(difference.estimate.below(0.0), RANKING_TOLERANCE), _BASE
         reference = f"base model {format_percent(base_rows[key].value)} %, {reference}"
     verdict = _verdict(RANKING, conclusion, statement, rank, compared_with)
     return replace(verdict, reference=f"({reference})", baseline=CHANCE)

@@ -17,7 +17,7 @@ from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, get_effect
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.folder import CHANGES, MOVABLE, is_of_moved, is_run, read_run_config
+from vjepa2_ac.runs.folder import CHANGES, MOVABLE_PATHS, is_run, read_run_config, sets_movable_path
 from vjepa2_ac.spaces import POSE, REACH_M, vector_states
 from vjepa2_ac.storage.structured import parse_record, read_json_object
 
@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 USED = (
     "planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype",
-    "training.device", *MOVABLE,
+    "training.device", *MOVABLE_PATHS,
 )  # fmt: skip
 _ANY_TYPE = "training.precision=bf16"  # allows any model.dtype: the rule about autocast is not relevant to planning
 _SLACK = 1.1  # the 99th percentile of uniform motion is below its maximum, and is inexact for few episodes
@@ -134,7 +134,7 @@ def _require_relevant(subject: str, overrides: Sequence[str]) -> None:
             is_relevant = Affects.PLAN in get_effect(key, Config)
         except KeyError:  # an unknown key; loading the config reports it
             continue
-        if is_of_moved(override) and not is_run(subject):
+        if sets_movable_path(override) and not is_run(subject):
             found = f"{subject}, which is not the folder of a run"
             raise InputError(where=f"override {override}", found=found, needed="a run, whose base was moved")
         if not is_relevant:

@@ -22,7 +22,7 @@ from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.intervals import Estimate, mean_of, ratio, ratio_difference
 from vjepa2_ac.planning.cameras import read_views, require_views
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.runs.checkpoint import step_of
+from vjepa2_ac.runs.checkpoint import parse_step
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.spaces import POSE, StateSpace, apply_actions, states_along
@@ -159,7 +159,7 @@ def ranking_of_run(subject: str, checkpoint: str) -> Estimate | None:
     """
     if not is_run(subject):
         return None
-    step = step_of(checkpoint.split(maxsplit=1)[0]) or 0
+    step = parse_step(checkpoint.split(maxsplit=1)[0]) or 0
     log = [row for row in read_metrics_log(Path(subject) / METRICS) if row["step"] <= step]
     keys = ("action_ranking_error", "action_rank")  # the second key was used before 2026-11-29
     key, rows = max(((key, [row for row in log if key in row]) for key in keys), key=lambda one: len(one[1]))

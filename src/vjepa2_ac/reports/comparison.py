@@ -20,7 +20,7 @@ from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.evaluation.summary import Verdict, format_percent
 from vjepa2_ac.intervals import Estimate, bootstrapped
 from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
-from vjepa2_ac.runs.checkpoint import SAME_RANK, step_of
+from vjepa2_ac.runs.checkpoint import RANKING_TOLERANCE, parse_step
 
 _LINE = "  {:<22}  {:>10}  {:>17}  {:>21}  {:>18}"  # widths of the columns, whose headers have three lines
 _WHAT = ("", "", "error vs", "one-step error", "action-ranking")
@@ -76,11 +76,11 @@ class Comparison:
     def next_command(self) -> str:
         """The command that exports the best run, or the reason why no run is recommended.
 
-        The rule is that of `checkpoint.keep_best`: the lowest action-ranking error; among runs within `SAME_RANK` of
-        it, the lowest prediction error.
+        The rule is that of `checkpoint.keep_best`: the lowest action-ranking error; among runs within
+        `RANKING_TOLERANCE` of it, the lowest prediction error.
         """
         ranks = {name: _number(one.summary.ranks_actions) for name, one in self.measured.items()}
-        equal = [name for name, rank in ranks.items() if rank <= min(ranks.values()) + SAME_RANK]
+        equal = [name for name, rank in ranks.items() if rank <= min(ranks.values()) + RANKING_TOLERANCE]
         best = min(equal, key=lambda name: self.curves[name][-1].value, default="")
         if len({one.ranked for one in self.measured.values()}) > 1:
             return "No run is recommended: the actions were ranked with different settings."
@@ -193,7 +193,7 @@ def _shown(share: float, form: str) -> str:
 
 def _step(metrics: Metrics) -> int | None:
     """Return the number of optimizer steps of the measured checkpoint; None for a model without checkpoints."""
-    return step_of(Path(metrics.about.checkpoint_path).name)
+    return parse_step(Path(metrics.about.checkpoint_path).name)
 
 
 def _curve(metrics: Metrics) -> tuple[Estimate, ...]:

@@ -44,8 +44,17 @@ _NEEDED = "where a run stood, as this program wrote it"
 _FIX = "Delete this checkpoint, to use an older one"
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
-SAME_RANK = 0.005  # smaller differences of the action-ranking error are ignored: other clips change it by more
+RANKING_TOLERANCE = 0.005  # smaller differences of the action-ranking error are ignored: other clips change it by more
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+_FILE_KEYS = {  # attribute of `RunState` -> key in state.json, where they differ
+    "clips_per_process": "clips_asked",
+    "best_ranking_error": "best_rank",
+    "lowest_ranking_error": "lowest_rank",
+    "base_ranking_error": "base_rank",
+    "validation_settings": "measured_on",
+}
 
 
 @dataclass(frozen=True)
@@ -65,14 +74,16 @@ class RunState:
     run_id: str = ""  # random name of the run, the same on every machine
     clips_done: Count = 0  # position in the sequence of clips of the whole run
     clips_per_step: PositiveInt | None = None  # summed over all processes
-    clips_asked: PositiveInt | None = None  # per process, from the config: batch_size * accumulation
+    clips_per_process: PositiveInt | None = None  # per process, from the config: batch_size * accumulation
     processes: PositiveInt = 1
     best_step: Count | None = None  # step of the best validation by checkpoint.keep_best; 0: before training
     best_error: Finite | None = None  # rollout error of the best validation
-    best_rank: Finite | None = None  # action-ranking error of the best validation, with keep_best=ranking
-    lowest_rank: Finite | None = None  # lowest action-ranking error of all validations
-    base_rank: Finite | None = None  # action-ranking error before the first step, with keep_best=ranking
-    measured_on: Mapping[str, str] | None = None  # settings on which validation errors depend, see `training.resume`
+    best_ranking_error: Finite | None = None  # action-ranking error of the best validation, with keep_best=ranking
+    lowest_ranking_error: Finite | None = None  # lowest action-ranking error of all validations
+    base_ranking_error: Finite | None = None  # action-ranking error before the first step, with keep_best=ranking
+    validation_settings: Mapping[str, str] | None = (
+        None  # settings on which validation errors depend, see `training.resume`
+    )
     loss_scale: Mapping[str, int | float] | None = None  # state of the gradient scaler, with fp16
     data: tuple[DataState, ...] = ()  # the data set and, if configured, the replay data set
 
@@ -81,24 +92,32 @@ class RunState:
         """The folder name of the best checkpoint, or None."""
         return None if self.best_step is None else checkpoint_name(self.best_step)
 
-    def measured(self, error: float, rank: float | None = None) -> RunState:
+    def with_validation(self, error: float, ranking_error: float | None = None) -> RunState:
         """Return the state after a validation at the current step, which becomes the best one if it is better.
 
         Args:
-            error: The rollout error. It decides if `rank` is None, and among ranks within `SAME_RANK` of the lowest.
-            rank: The action-ranking error. The rank of the best validation is within `SAME_RANK` of the lowest.
+            error: The rollout error. It decides if `ranking_error` is None, and among validations whose action-ranking
+                error is within `RANKING_TOLERANCE` of the lowest.
+            ranking_error: The action-ranking error. That of the best validation is within `RANKING_TOLERANCE` of the
+                lowest.
         """
-        if not math.isfinite(error) or (rank is not None and not math.isfinite(rank)):
+        if not math.isfinite(error) or (ranking_error is not None and not math.isfinite(ranking_error)):
             return self
-        state = self if self.step else replace(self, base_rank=rank)
+        state = self if self.step else replace(self, base_ranking_error=ranking_error)
         has_lower_error = self.best_error is None or error < self.best_error
-        if rank is None:
+        if ranking_error is None:
             return replace(state, best_step=self.step, best_error=error) if has_lower_error else state
-        lowest = rank if self.lowest_rank is None else min(rank, self.lowest_rank)
-        is_beaten = self.best_rank is None or self.best_rank > lowest + SAME_RANK
-        if is_beaten or (has_lower_error and rank <= lowest + SAME_RANK):
-            return replace(state, best_step=self.step, best_error=error, best_rank=rank, lowest_rank=lowest)
-        return replace(state, lowest_rank=lowest)
+        lowest = ranking_error if self.lowest_ranking_error is None else min(ranking_error, self.lowest_ranking_error)
+        is_beaten = self.best_ranking_error is None or self.best_ranking_error > lowest + RANKING_TOLERANCE
+        if is_beaten or (has_lower_error and ranking_error <= lowest + RANKING_TOLERANCE):
+            return replace(
+                state,
+                best_step=self.step,
+                best_error=error,
+                best_ranking_error=ranking_error,
+                lowest_ranking_error=lowest,
+            )
+        return replace(state, lowest_ranking_error=lowest)
 
 
 def checkpoint_name(step: int) -> str:
@@ -106,30 +125,30 @@ def checkpoint_name(step: int) -> str:
     return f"step-{step:08d}"
 
 
-def step_of(name: str) -> int | None:
+def parse_step(name: str) -> int | None:
     """Return the step of a checkpoint from its folder name; None for other names."""
     match = _NAME.fullmatch(name)
     return int(match[1]) if match and name == checkpoint_name(int(match[1])) else None
 
 
-def listed(folder: Path) -> list[Path]:
+def list_checkpoints(folder: Path) -> list[Path]:
     """Return all checkpoints in a folder, complete or damaged, sorted by step; empty if the folder does not exist.
 
     Raises:
         OSError: The folder cannot be listed.
     """
     try:
-        names = [entry.name for entry in os.scandir(folder) if step_of(entry.name) is not None and entry.is_dir()]
+        names = [entry.name for entry in os.scandir(folder) if parse_step(entry.name) is not None and entry.is_dir()]
     except (FileNotFoundError, NotADirectoryError):
         return []
-    return [folder / name for name in sorted(names, key=lambda name: step_of(name) or 0)]
+    return [folder / name for name in sorted(names, key=lambda name: parse_step(name) or 0)]
 
 
-def remove_leavings(folder: Path) -> None:
+def remove_incomplete(folder: Path) -> None:
     """Remove incomplete checkpoints left by killed processes. No other process may write into the folder."""
     for beginning in (_WRITING, FETCHING):
         for path in folder.glob(f"{beginning}*"):
-            if step_of(path.name.removeprefix(beginning)) is not None:
+            if parse_step(path.name.removeprefix(beginning)) is not None:
                 shutil.rmtree(path, ignore_errors=True)
 
 
@@ -149,23 +168,26 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
     """
     final = folder / checkpoint_name(state.step)
     temporary = folder / f"{_WRITING}{final.name}"
-    damaged = [path for path in listed(folder) if (step_of(path.name) or 0) >= state.step]  # skipped at the start
+    damaged = [
+        path for path in list_checkpoints(folder) if (parse_step(path.name) or 0) >= state.step
+    ]  # skipped at the start
     if complete := [path for path in damaged if find_damage(path) is None]:
         found = "a complete checkpoint that another process wrote; it is left as it is"
         raise InputError(where=str(complete[0]), found=found, fix="Start again: the run resumes from this checkpoint")
     try:
-        remove_leavings(folder)  # frees disk space
+        remove_incomplete(folder)  # frees disk space
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
         write_files(temporary)
-        (temporary / STATE).write_text(json.dumps(asdict(state)))
+        values = {_FILE_KEYS.get(name, name): value for name, value in asdict(state).items()}
+        (temporary / STATE).write_text(json.dumps(values))
         write_manifest(temporary)
         for path in damaged:
             _remove(path)
         temporary.rename(final)
         sync(folder)
-        for old in listed(folder)[:-keep]:
-            if step_of(old.name) != state.best_step:
+        for old in list_checkpoints(folder)[:-keep]:
+            if parse_step(old.name) != state.best_step:
                 _remove(old)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -182,7 +204,7 @@ def newest_checkpoint(folder: Path) -> Path | None:
         InputError: All checkpoints are damaged.
         UnreachableError: A checkpoint cannot be read, which does not show whether it is damaged.
     """
-    checkpoints = listed(folder)
+    checkpoints = list_checkpoints(folder)
     for path in reversed(checkpoints):
         problem = find_damage(path)
         if problem is None:
@@ -204,7 +226,7 @@ def find_damage(checkpoint: Path) -> str | None:
     name = MANIFEST
     try:
         with translate_read_errors(checkpoint / MANIFEST):
-            files = named_files(read_small_file(checkpoint / MANIFEST, MAX_BYTES))
+            files = parse_manifest(read_small_file(checkpoint / MANIFEST, MAX_BYTES))
         if STATE not in files:
             return f"{MANIFEST} does not name {STATE}"
         for name, digest in files.items():
@@ -220,13 +242,13 @@ def find_damage(checkpoint: Path) -> str | None:
 
 def read_state(checkpoint: Path) -> RunState:
     """Return the progress of the run at a checkpoint, without a best checkpoint if its folder is missing."""
-    state = written_state(checkpoint)
+    state = read_written_state(checkpoint)
     if state.best_name is None or (checkpoint.parent / state.best_name).is_dir():
         return state
-    return replace(state, best_step=None, best_error=None, best_rank=None, lowest_rank=None)
+    return replace(state, best_step=None, best_error=None, best_ranking_error=None, lowest_ranking_error=None)
 
 
-def written_state(checkpoint: Path) -> RunState:
+def read_written_state(checkpoint: Path) -> RunState:
     """Return the progress of the run as it is in the file.
 
     Raises:
@@ -234,6 +256,8 @@ def written_state(checkpoint: Path) -> RunState:
     """
     path = checkpoint / STATE
     values = read_json_object(path, needed=_NEEDED, fix=_FIX)  # a loss scale may be infinite
+    names = {key: name for name, key in _FILE_KEYS.items()}
+    values = {names.get(key, key): value for key, value in values.items()}
     return parse_record(RunState, values, where=str(path), needed=_NEEDED, fix=_FIX)
 
 
@@ -266,7 +290,7 @@ def write_manifest(folder: Path) -> None:
     sync(folder)
 
 
-def named_files(manifest: bytes) -> dict[str, str]:
+def parse_manifest(manifest: bytes) -> dict[str, str]:
     """Parse a manifest: relative path of each file -> SHA-256.
 
     Raises:
@@ -368,12 +392,12 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
     if newest is None:
         fix = f"Continue the training with `{shell_command('train', run, '--resume')}`"
         raise InputError(where=str(run), found="a run without a whole checkpoint", needed="at least one", fix=fix)
-    state = written_state(newest)
+    state = read_written_state(newest)
     if by == NEWEST or (by == SELECTED and state.best_step is None):
         why = "the newest" if by == NEWEST else "the newest: none was selected"
         return SelectedCheckpoint(newest, why, by, state)
     is_best = by in {SELECTED, BEST}
-    step = state.best_step if is_best else step_of(f"step-{by.zfill(8)}")
+    step = state.best_step if is_best else parse_step(f"step-{by.zfill(8)}")
     path = folder / checkpoint_name(step or 0)
     problem: str | None
     if step is None:
@@ -384,7 +408,7 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
     else:
         problem = (damage := find_damage(path)) and f"{path.name} is damaged: {damage}"
     if problem:
-        steps = ", ".join(str(step_of(path.name)) for path in listed(folder) if find_damage(path) is None)
+        steps = ", ".join(str(parse_step(path.name)) for path in list_checkpoints(folder) if find_damage(path) is None)
         raise InputError(where=str(folder), found=problem, needed=f"selected, newest, best or one of the steps {steps}")
-    measure = "error" if state.best_rank is None else "action ranking"
+    measure = "error" if state.best_ranking_error is None else "action ranking"
     return SelectedCheckpoint(path, f"the best by {measure}" if is_best else "as asked for", by, state)

@@ -38,7 +38,7 @@ from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_a
 from vjepa2_ac.config.model import RANDOM
 from vjepa2_ac.config.section import Affects, get_effect
 from vjepa2_ac.errors import InputError, shell_command
-from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_incomplete
 from vjepa2_ac.storage import (
     check_local_writable,
     read_small_file,
@@ -57,7 +57,7 @@ ENVIRONMENT = "environment.json"
 RUN_ID = "run_id"
 CALIBRATION = "calibration.json"
 CHANGES = "changes.json"
-HELD = ".mirror"
+UPLOAD_LINKS = ".mirror"
 METRICS = "metrics.jsonl"
 TENSORBOARD = "tensorboard"
 SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS)  # needed to resume on another machine
@@ -67,8 +67,11 @@ IMAGINED = "imagined"
 
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS})
 _OF_DATA = ("path", "idle.ranges", "cache_dir", "disk_cache.dir")
-MOVABLE = ("model.base", "model.encoder.path")  # paths that may change: the weights are identified by a fingerprint
-_PATHS = (*(f"{data}.{key}" for data in ("data", "replay.data") for key in _OF_DATA), *MOVABLE)
+MOVABLE_PATHS = (
+    "model.base",
+    "model.encoder.path",
+)  # paths that may change: the weights are identified by a fingerprint
+_PATHS = (*(f"{data}.{key}" for data in ("data", "replay.data") for key in _OF_DATA), *MOVABLE_PATHS)
 
 
 def check_run_folder(config: Config, *, allow_config_change: bool = False) -> None:
@@ -120,8 +123,8 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     write_atomically(path, json.dumps([*_earlier_starts(path), start], indent=1).encode())
     write_atomically(folder / RUN_ID, run_name)
     (folder / CHECKPOINTS).mkdir(exist_ok=True)
-    remove_leavings(folder / CHECKPOINTS)
-    shutil.rmtree(folder / HELD, ignore_errors=True)  # links keep deleted checkpoints on the disk
+    remove_incomplete(folder / CHECKPOINTS)
+    shutil.rmtree(folder / UPLOAD_LINKS, ignore_errors=True)  # links keep deleted checkpoints on the disk
     return folder
 
 
@@ -151,7 +154,7 @@ def write_config(config: Config) -> list[str]:
     return changes
 
 
-def asks_nothing_new(config: Config) -> bool:
+def has_same_results(config: Config) -> bool:
     """Return whether a config changes neither the computation, the measurements nor the paths of its run."""
     changed = changed_keys(read_run_config(Path(config.run_dir)), config)
     return not any(key in _PATHS or (Affects.RUN | Affects.MEASURED) & get_effect(key, Config) for key in changed)
@@ -168,9 +171,9 @@ def config_changes(config: Config) -> list[str]:
     return [f"{key}: {json.dumps(before.get(key))} -> {json.dumps(now.get(key))}" for key in keys]
 
 
-def is_of_moved(override: str) -> bool:
-    """Return whether a `key=value` override sets a path in `MOVABLE`."""
-    return override.partition("=")[0] in MOVABLE
+def sets_movable_path(override: str) -> bool:
+    """Return whether a `key=value` override sets a path in `MOVABLE_PATHS`."""
+    return override.partition("=")[0] in MOVABLE_PATHS
 
 
 def is_run(subject: str) -> bool:
@@ -217,7 +220,7 @@ def _seen_from_start(config: Config, folder: Path) -> Iterator[tuple[str, str]]:
             yield key, str(existing_path)
 
 
-def places_elsewhere(config: Config) -> list[str]:
+def list_remote_locations(config: Config) -> list[str]:
     """Return a line `key: URL` for each remote location in a config.
 
     The config of a run may be untrusted, so that its URLs are displayed before they are used.
@@ -255,7 +258,7 @@ def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
     return [start for start in starts if isinstance(start, dict)] if isinstance(starts, list) else []
 
 
-def with_settled_values(config: Config) -> Config:
+def with_values_of_run(config: Config) -> Config:
     """Return the config with values that the run in its folder has fixed.
 
     These are the calibrated stride, if the config has auto, and `data.splits`, if the config does not set it: an older
@@ -303,7 +306,7 @@ class RunLock:
             try:
                 self._lock.acquire(blocking=False)
             except Timeout:
-                found = f"a run that is being trained right now, by {last_start(self._folder / ENVIRONMENT)}"
+                found = f"a run that is being trained right now, by {describe_last_start(self._folder / ENVIRONMENT)}"
                 needed = "a folder that no other process writes to"
                 fix = "Wait until it ends, stop it, or set another run_dir"
                 raise InputError(where=str(self._folder), found=found, needed=needed, fix=fix) from None
@@ -322,7 +325,7 @@ class RunLock:
         self._lock.release()
 
 
-def last_start(path: str | Path) -> str:
+def describe_last_start(path: str | Path) -> str:
     """Describe the last start in an environment.json: process, host and time."""
     last: dict[str, Any] = (_earlier_starts(path) or [{}])[-1]
     if "host" not in last:

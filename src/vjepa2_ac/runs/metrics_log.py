@@ -78,12 +78,12 @@ class MetricsLog:
         self._trackers.log_image(kind, name, step, image)
 
     @property
-    def is_behind(self) -> bool:
+    def has_unwritten_rows(self) -> bool:
         """Whether some rows could not be written yet."""
         return bool(self._waiting)
 
     @contextmanager
-    def before_a_checkpoint(self) -> Iterator[None]:
+    def flush_before_checkpoint(self) -> Iterator[None]:
         """Sync the rows to the disk before the block saves a checkpoint, because the run resumes after these rows.
 
         The block runs in any case, because losing a checkpoint is worse than losing a row. It may also free disk space,
@@ -145,7 +145,7 @@ def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
             logger.warning("%s: a line is not a row of metrics, or was left by halves; it is dropped", path)
 
 
-def warnings_of(path: Path) -> list[str]:
+def read_warnings(path: Path) -> list[str]:
     """Return the warnings of a run, from its metrics.jsonl."""
     rows = (row for row in read_metrics_log(path) if row.get("kind") == WARNING)
     return [row["text"] for row in rows if isinstance(row.get("text"), str)]

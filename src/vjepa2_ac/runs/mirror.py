@@ -26,18 +26,18 @@ from vjepa2_ac.runs.checkpoint import (
     MANIFEST,
     STATE,
     find_damage,
-    listed,
-    named_files,
-    step_of,
-    written_state,
+    list_checkpoints,
+    parse_manifest,
+    parse_step,
+    read_written_state,
 )
-from vjepa2_ac.runs.folder import ENVIRONMENT, HELD, SMALL_FILES, last_start
+from vjepa2_ac.runs.folder import ENVIRONMENT, SMALL_FILES, UPLOAD_LINKS, describe_last_start
 from vjepa2_ac.storage.retries import suppress_retry_warnings
 from vjepa2_ac.storage.structured import MAX_BYTES, read_json_object
 
 logger = logging.getLogger(__name__)
 
-SENDING = ".sending.json"  # name of the manifest during an upload
+UPLOADING = ".sending.json"  # name of the manifest during an upload
 REMOTE_KEY = "checkpoint.remote"
 LONGEST_WAIT_S = 3600.0  # for the uploads at the end of a run
 _LOOK_EVERY_S = 0.1  # interval of checks whether the machine is about to stop
@@ -46,7 +46,7 @@ Listing = Mapping[str, Mapping[str, int]]
 """Name of the checkpoint -> file name -> size in bytes."""
 
 
-class LostPlaceError(InputError):
+class RemoteFolderTakenError(InputError):
     """The remote folder belongs to another run, or to a later start of the same run."""
 
 
@@ -54,14 +54,14 @@ class _CancelledError(Exception):
     """The current upload pass is no longer needed."""
 
 
-def complete(listing: Listing) -> list[str]:
+def list_complete(listing: Listing) -> list[str]:
     """Return the names of the complete checkpoints, newest first."""
     return sorted((name for name, files in listing.items() if MANIFEST in files), key=step_number, reverse=True)
 
 
 def step_number(name: str) -> int:
     """Return the step of a checkpoint from its name; 0 for other names."""
-    return step_of(name) or 0
+    return parse_step(name) or 0
 
 
 @dataclass(frozen=True)
@@ -74,16 +74,16 @@ class RemoteCheckpoints:
 
     place: str
 
-    def listing(self) -> Listing:
+    def list_files(self) -> Listing:
         """List all remote checkpoints, complete or not, with one request."""
         checkpoints: dict[str, dict[str, int]] = {}
         for path, size in storage.file_sizes(storage.join(self.place, CHECKPOINTS)).items():
             name, _, file = path.partition("/")
-            if step_of(name) is not None and file:
+            if parse_step(name) is not None and file:
                 checkpoints.setdefault(name, {})[file] = size
         return checkpoints
 
-    def owner(self, listing: Listing, run_id: str | None) -> str | None:
+    def find_owner(self, listing: Listing, run_id: str | None) -> str | None:
         """Return the id of the run to which all checkpoints in a listing belong; None if it is not known.
 
         Args:
@@ -91,7 +91,7 @@ class RemoteCheckpoints:
             run_id: The expected run; None for any run.
 
         Raises:
-            LostPlaceError: A checkpoint belongs to another run.
+            RemoteFolderTakenError: A checkpoint belongs to another run.
         """
         for name in sorted(listing, reverse=True):
             try:
@@ -102,12 +102,12 @@ class RemoteCheckpoints:
             if owner != run_id:
                 found = f"{self.place} holds a checkpoint of another run, {name}"
                 fix = "Set another checkpoint.remote; nothing was written there"
-                raise LostPlaceError(
+                raise RemoteFolderTakenError(
                     where=REMOTE_KEY, found=found, needed="an empty place, or that of this run", fix=fix
                 )
         return run_id
 
-    def send(self, checkpoint: Path, files: Mapping[str, int], before_each: Callable[[], None]) -> None:
+    def upload(self, checkpoint: Path, files: Mapping[str, int], before_each: Callable[[], None]) -> None:
         """Upload the missing files of a complete local checkpoint.
 
         Args:
@@ -116,16 +116,16 @@ class RemoteCheckpoints:
             before_each: Called before each file; an exception ends the upload.
         """
         name, manifest = checkpoint.name, (checkpoint / MANIFEST).read_bytes()
-        claim = next((claim for claim in (MANIFEST, SENDING) if claim in files), None)
+        claim = next((claim for claim in (MANIFEST, UPLOADING) if claim in files), None)
         if files and (claim is None or storage.read_small_file(self._path(name, claim), MAX_BYTES) != manifest):
             self.remove(name)  # a different checkpoint with the same name
             files = {}
-        sizes = {path: (checkpoint / path).stat().st_size for path in named_files(manifest)}
+        sizes = {path: (checkpoint / path).stat().st_size for path in parse_manifest(manifest)}
         missing = [path for path, size in sizes.items() if files.get(path) != size]
         if missing and MANIFEST in files:  # another process removed a file
             storage.remove(self._path(name, MANIFEST))
-        if missing and SENDING not in files:
-            storage.upload(checkpoint / MANIFEST, self._path(name, SENDING))
+        if missing and UPLOADING not in files:
+            storage.upload(checkpoint / MANIFEST, self._path(name, UPLOADING))
         manifest_last = [MANIFEST] if missing or MANIFEST not in files else []
         for path in [
             *sorted(missing, key=lambda path: path != STATE),
@@ -133,21 +133,21 @@ class RemoteCheckpoints:
         ]:  # first the file with the run id
             before_each()
             storage.upload(checkpoint / path, self._path(name, path))
-        if missing or SENDING in files:
-            storage.remove(self._path(name, SENDING))
+        if missing or UPLOADING in files:
+            storage.remove(self._path(name, UPLOADING))
 
     def remove(self, name: str) -> None:
         """Remove a checkpoint, its manifest first, so that the checkpoint is incomplete from then on."""
         storage.remove_folder(self._path(name), first=MANIFEST)
 
-    def fetch(self, name: str, folder: Path) -> str | None:
+    def download(self, name: str, folder: Path) -> str | None:
         """Download a checkpoint into a new folder; return a description of its damage, or None."""
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         try:
             with storage.translate_read_errors(source := self._path(name, MANIFEST)):
                 manifest = storage.read_small_file(source, MAX_BYTES)
-            for path in named_files(manifest):
+            for path in parse_manifest(manifest):
                 storage.download(self._path(name, path), folder / path)
         except FileNotFoundError as error:
             return f"a file is missing ({error})"
@@ -182,19 +182,19 @@ class Mirror:
         self._sent: str | None = None  # the newest remote checkpoint
         self._starts: bytes | None = None  # the uploaded list of starts; another remote list means a later start
         self._outage_reported = self._is_lost = self._is_ending = self._has_ended = False
-        shutil.rmtree(self._folder / HELD, ignore_errors=True)  # links of a killed process
+        shutil.rmtree(self._folder / UPLOAD_LINKS, ignore_errors=True)  # links of a killed process
 
-    def tick(self) -> None:
+    def upload_if_due(self) -> None:
         """Start an upload pass if one is due and there is a new checkpoint, without waiting for it.
 
         The first checkpoint after a start is uploaded immediately.
         """
         is_due = time.monotonic() - self._begun_s >= 60.0 * self._config.remote_every_minutes
-        if is_due and not self.is_sending and self._newest_here() != self._sent:
+        if is_due and not self.is_uploading and self._newest_here() != self._sent:
             self._begin()
 
     @property
-    def is_sending(self) -> bool:
+    def is_uploading(self) -> bool:
         """Whether an upload pass is in progress."""
         return self._thread is not None and self._thread.is_alive()
 
@@ -210,13 +210,13 @@ class Mirror:
         self._is_ending = True
         begun_s, limit_s = time.monotonic(), LONGEST_WAIT_S
         for is_last in (False, True):  # the current pass ends, or is cancelled if there is a newer checkpoint
-            if is_last and not self.is_sending:
+            if is_last and not self.is_uploading:
                 self._begin()
-            while self._thread and self.is_sending and time.monotonic() < begun_s + limit_s:
+            while self._thread and self.is_uploading and time.monotonic() < begun_s + limit_s:
                 if limit_s == LONGEST_WAIT_S and is_asked_to_stop():
                     limit_s = time.monotonic() - begun_s + self._config.remote_wait_seconds
                 self._thread.join(_LOOK_EVERY_S)
-        in_time, self._has_ended = not self.is_sending, True
+        in_time, self._has_ended = not self.is_uploading, True
         if not self._is_lost and not (in_time and self._sent == self._newest_here()):
             text = (
                 "%s has checkpoints up to %s; what %s has after that is on this machine only%s. A next start sends it"
@@ -245,18 +245,18 @@ class Mirror:
             self._outage_reported = False
         except _CancelledError:
             pass
-        except LostPlaceError as error:
+        except RemoteFolderTakenError as error:
             self._is_lost = True
             logger.warning("%s", error)
         except (UserError, OSError) as error:
             log = logger.info if self._outage_reported else logger.warning
             text = "%s is not up to date: %s. Training continues; next attempt in %g minutes"
-            log(text, REMOTE_KEY, reason_of(error), self._config.remote_every_minutes)
+            log(text, REMOTE_KEY, describe_upload_error(error), self._config.remote_every_minutes)
             self._outage_reported = True
         except Exception:  # no error here may stop the run
             logger.exception("%s: %s is not up to date; training continues", REMOTE_KEY, self._remote.place)
         finally:
-            shutil.rmtree(self._folder / HELD, ignore_errors=True)
+            shutil.rmtree(self._folder / UPLOAD_LINKS, ignore_errors=True)
 
     def _continue_pass(self) -> None:
         """Cancel the upload pass if the mirror has ended, or is finishing and there is a newer checkpoint."""
@@ -270,33 +270,33 @@ class Mirror:
         `checkpoint.keep` are removed afterwards.
 
         Raises:
-            LostPlaceError: The remote folder belongs to another run, or another machine has resumed this run.
+            RemoteFolderTakenError: The remote folder belongs to another run, or another machine has resumed this run.
             UnreachableError: The remote folder cannot be reached.
             OSError: The run folder cannot be read, or links cannot be written into it.
         """
         remote = self._remote
-        listing = remote.listing()
-        remote.owner(listing, self._run_id)
+        listing = remote.list_files()
+        remote.find_owner(listing, self._run_id)
         path = storage.join(remote.place, ENVIRONMENT)
         with suppress(FileNotFoundError):  # two uploaders would overwrite each other's files
             if self._starts is not None and storage.read_small_file(path, MAX_BYTES) != self._starts:
-                found = f"{remote.place} is used by a later start of this run, {last_start(path)}"
+                found = f"{remote.place} is used by a later start of this run, {describe_last_start(path)}"
                 fix = "This one continues without it; stop one of the two"
-                raise LostPlaceError(where=REMOTE_KEY, found=found, fix=fix)
-        names = [path.name for path in reversed(listed(self._folder / CHECKPOINTS))]
+                raise RemoteFolderTakenError(where=REMOTE_KEY, found=found, fix=fix)
+        names = [path.name for path in reversed(list_checkpoints(self._folder / CHECKPOINTS))]
         newest = next(filter(None, map(self._hold, names)), None)
         if newest is None:
             return
-        best = written_state(newest).best_name
-        for name in sorted(listing.keys() - {*complete(listing), newest.name, best}):
+        best = read_written_state(newest).best_name
+        for name in sorted(listing.keys() - {*list_complete(listing), newest.name, best}):
             if step_number(name) < step_number(newest.name):
                 self._continue_pass()
                 remote.remove(name)
         self._send_small_files()
         for checkpoint in (newest, self._hold(best) if best and best != newest.name else None):
             if checkpoint is not None:
-                remote.send(checkpoint, listing.get(checkpoint.name, {}), self._continue_pass)
-        for name in sorted({*complete(remote.listing())[self._config.keep :]} - {newest.name, best}):
+                remote.upload(checkpoint, listing.get(checkpoint.name, {}), self._continue_pass)
+        for name in sorted({*list_complete(remote.list_files())[self._config.keep :]} - {newest.name, best}):
             self._continue_pass()
             remote.remove(name)
         self._sent = newest.name
@@ -304,7 +304,7 @@ class Mirror:
     def _send_small_files(self) -> None:
         """Upload copies of the small files, because they may grow during the upload."""
         for name in SMALL_FILES:
-            source, copy = self._folder / name, self._folder / HELD / name
+            source, copy = self._folder / name, self._folder / UPLOAD_LINKS / name
             if source.is_file():
                 self._continue_pass()
                 shutil.copyfile(source, copy)
@@ -320,10 +320,10 @@ class Mirror:
         Raises:
             OSError: A complete checkpoint cannot be read.
         """
-        source, held = self._folder / CHECKPOINTS / name, self._folder / HELD / name
+        source, held = self._folder / CHECKPOINTS / name, self._folder / UPLOAD_LINKS / name
         shutil.rmtree(held, ignore_errors=True)
         try:
-            for file in (MANIFEST, *named_files(storage.read_small_file(source / MANIFEST, MAX_BYTES))):
+            for file in (MANIFEST, *parse_manifest(storage.read_small_file(source / MANIFEST, MAX_BYTES))):
                 (held / file).parent.mkdir(parents=True, exist_ok=True)
                 try:
                     os.link(source / file, held / file)
@@ -334,10 +334,10 @@ class Mirror:
         return held
 
     def _newest_here(self) -> str | None:
-        return next((path.name for path in reversed(listed(self._folder / CHECKPOINTS))), None)
+        return next((path.name for path in reversed(list_checkpoints(self._folder / CHECKPOINTS))), None)
 
 
-def reason_of(error: Exception) -> str:
+def describe_upload_error(error: Exception) -> str:
     """Return the message of an upload error; with a fix only if the reason is permanent."""
     if isinstance(error, UnreachableError) and not isinstance(error, RefusedError):
         return f"{error.where}: {error.found}"

@@ -20,13 +20,20 @@ from vjepa2_ac.runs.checkpoint import (
     FETCHING,
     RunState,
     find_damage,
-    listed,
+    list_checkpoints,
     newest_checkpoint,
-    remove_leavings,
-    written_state,
+    read_written_state,
+    remove_incomplete,
 )
-from vjepa2_ac.runs.folder import CONFIG, SMALL_FILES, RunLock, check_run_folder, open_run_folder, with_settled_values
-from vjepa2_ac.runs.mirror import REMOTE_KEY, Mirror, RemoteCheckpoints, complete, reason_of, step_number
+from vjepa2_ac.runs.folder import CONFIG, SMALL_FILES, RunLock, check_run_folder, open_run_folder, with_values_of_run
+from vjepa2_ac.runs.mirror import (
+    REMOTE_KEY,
+    Mirror,
+    RemoteCheckpoints,
+    describe_upload_error,
+    list_complete,
+    step_number,
+)
 from vjepa2_ac.storage.retries import suppress_retry_warnings
 
 logger = logging.getLogger(__name__)
@@ -52,7 +59,9 @@ class OpenRun:
                 `open_run_folder`.
         """
         self.lock.take()
-        later = [path for path in listed(Path(config.run_dir, CHECKPOINTS)) if step_number(path.name) > state.step]
+        later = [
+            path for path in list_checkpoints(Path(config.run_dir, CHECKPOINTS)) if step_number(path.name) > state.step
+        ]
         if newest := next((path for path in reversed(later) if find_damage(path) is None), None):
             there = f"a checkpoint of step {step_number(newest.name)}"
             found = f"{there}, which another start wrote while this one stood at {state.step}"
@@ -80,7 +89,7 @@ def open_run(
     Raises:
         InputError: The folder belongs to another run, is in use or is not writable; or see `open_remote`.
     """
-    config, trial = with_settled_values(config), None
+    config, trial = with_values_of_run(config), None
     check_run_folder(config, allow_config_change=allow_config_change)
     with contextlib.ExitStack() as exit_stack:
         lock = exit_stack.enter_context(RunLock(Path(config.run_dir)))
@@ -91,7 +100,7 @@ def open_run(
         # The lock is acquired before a download into the run folder: another process could still be writing there.
         first = None if check_only else lock
         config = open_remote(config, reporter, lock=first, allow_config_change=allow_config_change, into=trial)
-        yield OpenRun(with_settled_values(config), lock, allow_config_change)
+        yield OpenRun(with_values_of_run(config), lock, allow_config_change)
 
 
 def open_remote(
@@ -134,17 +143,17 @@ def open_remote(
     state = None
     with suppress(InputError):  # all local checkpoints are damaged, but a remote one may be complete
         newest = newest_checkpoint(run_dir / CHECKPOINTS)
-        state = None if newest is None else written_state(newest)
+        state = None if newest is None else read_written_state(newest)
     remote, newer = RemoteCheckpoints(place), list[str]()
     owner: str | None = None
     try:
         with suppress_retry_warnings():
             storage.check_writable(place)
-            listing = remote.listing()
-            owner = remote.owner(listing, None if state is None else state.run_id)
+            listing = remote.list_files()
+            owner = remote.find_owner(listing, None if state is None else state.run_id)
         minutes = config.checkpoint.remote_every_minutes
         reporter.note(f"{place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
-        newer = [name for name in complete(listing) if state is None or step_number(name) > state.step]
+        newer = [name for name in list_complete(listing) if state is None or step_number(name) > state.step]
         if not newer and (state is not None or owner is None):
             return config
         # An owner without a complete checkpoint means that a machine was killed during its first upload.
@@ -162,7 +171,7 @@ def open_remote(
         stand = f"after step {state.step}" if state else "without a checkpoint"
         there = f", though {newer[0]} is there" if newer else ""
         text = "%s: %s. Training begins with what is on this machine, %s%s, and tries again later"
-        logger.warning(text, REMOTE_KEY, reason_of(error), stand, there)
+        logger.warning(text, REMOTE_KEY, describe_upload_error(error), stand, there)
         return config
     if is_fetched or state is not None:
         return target if is_fetched else config
@@ -177,7 +186,7 @@ def _require_this_config(config: Config, place: str, *, allow_config_change: boo
         with suppress(FileNotFoundError):
             storage.download(storage.join(place, CONFIG), Path(folder, CONFIG))
         try:
-            there = with_settled_values(config.model_copy(update={"run_dir": folder}))
+            there = with_values_of_run(config.model_copy(update={"run_dir": folder}))
             check_run_folder(there, allow_config_change=allow_config_change)
         except InputError as error:
             fix = "Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change"
@@ -194,7 +203,7 @@ def _fetch_newest(
     for name in SMALL_FILES:  # config.yaml first, because it marks a run folder
         with suppress(FileNotFoundError):
             storage.download(storage.join(remote.place, name), folder / name)
-    remove_leavings(folder / CHECKPOINTS)
+    remove_incomplete(folder / CHECKPOINTS)
     for number, name in enumerate(names):
         if _fetch(remote, name, folder / CHECKPOINTS):
             reporter.note(f"Fetched {name} from {remote.place}.")
@@ -208,11 +217,11 @@ def _fetch_newest(
 def _fetch(remote: RemoteCheckpoints, name: str, checkpoints: Path) -> bool:
     """Download a checkpoint and the best checkpoint that it names; return False, with a warning, if it is damaged."""
     fetched, final = checkpoints / f"{FETCHING}{name}", checkpoints / name
-    if problem := remote.fetch(name, fetched):
+    if problem := remote.download(name, fetched):
         shutil.rmtree(fetched)
         logger.warning("%s: %s: %s; skipped", remote.place, name, problem)
         return False
-    best = written_state(fetched).best_name
+    best = read_written_state(fetched).best_name
     if best is not None and best != name and not (checkpoints / best).is_dir():
         _fetch(remote, best, checkpoints)
     shutil.rmtree(final, ignore_errors=True)  # a damaged local checkpoint

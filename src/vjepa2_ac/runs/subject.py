@@ -17,8 +17,8 @@ from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.model_files import require_base_of_run
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.process import is_first_process
-from vjepa2_ac.runs.checkpoint import ADAPTER, BEST, NEWEST, SELECTED, SelectedCheckpoint, select_checkpoint, step_of
-from vjepa2_ac.runs.folder import MOVABLE, is_of_moved, is_run, read_run_config
+from vjepa2_ac.runs.checkpoint import ADAPTER, BEST, NEWEST, SELECTED, SelectedCheckpoint, parse_step, select_checkpoint
+from vjepa2_ac.runs.folder import MOVABLE_PATHS, is_run, read_run_config, sets_movable_path
 from vjepa2_ac.storage.structured import read_json_object, utc_now
 
 logger = logging.getLogger(__name__)
@@ -84,20 +84,20 @@ def load_subject(
             raise InputError(where=f"--checkpoint {checkpoint}", found=found, needed=needed)
         config = config_of_model(name, overrides) if config is None else config
         return Subject(name, config, load_base(config.model.with_base(name), seed=config.seed))
-    folder, config = Path(name), config or run_config_of(Path(name), overrides)
+    folder, config = Path(name), config or read_config_of_moved_run(Path(name), overrides)
     require_base_of_run(config.model, folder)
     selected = select_checkpoint(folder, checkpoint)
     world_model = load_base(config.model, seed=config.seed)
     load_trained(world_model, selected.path / ADAPTER, trainable=False)
-    note = note_about(config, selected)
+    note = note_on_describe_untrained_model(config, selected)
     if note and is_first_process():
         logger.warning(note)
-    is_base = bool(note) and untrained_model(config, selected.path) == BASE_MODEL
+    is_base = bool(note) and describe_untrained_model(config, selected.path) == BASE_MODEL
     warnings = (note,) if note else ()
     return Subject(name, config, world_model.eval(), selected.path, str(selected), is_base, note, warnings)
 
 
-def untrained_model(config: Config, checkpoint: Path) -> str:
+def describe_untrained_model(config: Config, checkpoint: Path) -> str:
     """Describe the model of a run before its first step: `BASE_MODEL`, or how it differs from the base model.
 
     Args:
@@ -116,17 +116,17 @@ def untrained_model(config: Config, checkpoint: Path) -> str:
     return BASE_MODEL
 
 
-def note_about(config: Config, chosen: SelectedCheckpoint) -> str:
+def note_on_describe_untrained_model(config: Config, chosen: SelectedCheckpoint) -> str:
     """Return a sentence if a checkpoint is the untrained model, with why it was selected; otherwise ""."""
-    if step_of(chosen.path.name):
+    if parse_step(chosen.path.name):
         return ""
-    untrained, state = untrained_model(config, chosen.path), chosen.newest
+    untrained, state = describe_untrained_model(config, chosen.path), chosen.newest
     if chosen.by not in {SELECTED, BEST}:
         return f"{'The newest checkpoint' if chosen.by == NEWEST else 'Checkpoint 0'} is the {untrained}."
     if state.step < min(config.validation.every, config.training.steps):
         return f"The selected checkpoint is the {untrained}: no later checkpoint has been validated."
     training = "training" if config.model.is_random else "fine-tuning"
-    measure = "the prediction error" if state.best_rank is None else "action ranking"
+    measure = "the prediction error" if state.best_ranking_error is None else "action ranking"
     return f"The selected checkpoint is the {untrained}: {training} did not improve {measure}."
 
 
@@ -137,17 +137,17 @@ def describe_selection(folder: Path) -> str:
         InputError: See `select_checkpoint`.
     """
     config, chosen = read_run_config(folder), select_checkpoint(folder)
-    state, step = chosen.newest, step_of(chosen.path.name) or 0
+    state, step = chosen.newest, parse_step(chosen.path.name) or 0
     lines = [f"Selected checkpoint: step {step:,}, {chosen.why}."]
-    if state.best_rank is not None:
+    if state.best_ranking_error is not None:
         base = ""
-        if step and state.base_rank is not None:
-            base = f"{untrained_model(config, chosen.path)} {100 * state.base_rank:.1f} %, "
-        lines.append(f"Action-ranking error in validation: {100 * state.best_rank:.1f} % ({base}chance 50 %).")
-    return "\n".join(filter(None, (*lines, note_about(config, chosen))))
+        if step and state.base_ranking_error is not None:
+            base = f"{describe_untrained_model(config, chosen.path)} {100 * state.base_ranking_error:.1f} %, "
+        lines.append(f"Action-ranking error in validation: {100 * state.best_ranking_error:.1f} % ({base}chance 50 %).")
+    return "\n".join(filter(None, (*lines, note_on_describe_untrained_model(config, chosen))))
 
 
-def run_config_of(folder: Path, overrides: Iterable[str]) -> Config:
+def read_config_of_moved_run(folder: Path, overrides: Iterable[str]) -> Config:
     """Return the config of a run, with new paths of the base model and the encoder.
 
     Args:
@@ -158,7 +158,7 @@ def run_config_of(folder: Path, overrides: Iterable[str]) -> Config:
         InputError: The folder is no run folder, or an override sets another key.
     """
     for override in overrides:
-        if not is_of_moved(override):
-            needed = f"the new path of what was moved: {' or '.join(f'{key}=PATH' for key in MOVABLE)}"
+        if not sets_movable_path(override):
+            needed = f"the new path of what was moved: {' or '.join(f'{key}=PATH' for key in MOVABLE_PATHS)}"
             raise InputError(where=f"override {override}", found="a setting that loading does not use", needed=needed)
     return read_run_config(folder, overrides)

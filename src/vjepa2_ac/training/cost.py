@@ -356,7 +356,7 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
     return MemoryEstimate(parameters, config.training.gradient_checkpointing, parts)
 
 
-def ways_to_fit(config: Config, sizes: ModelSizes, available: int) -> list[str] | None:
+def suggest_memory_savings(config: Config, sizes: ModelSizes, available: int) -> list[str] | None:
     """Return the config changes after which a run fits into `available` bytes; None if all of them do not suffice."""
     applied, total = list[str](), _total(config, sizes)
     for override, changes in _memory_savings(config):

@@ -35,7 +35,7 @@ from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, Trackers, read_metrics_log
 from vjepa2_ac.training.flops import clip_flops
 
-MEASURED = frozenset({"data_wait_share", "samples_per_second", "mfu", "ceiling_tflops", "memory_gb"})
+MACHINE_METRICS = frozenset({"data_wait_share", "samples_per_second", "mfu", "ceiling_tflops", "memory_gb"})
 """Metrics that depend on the machine and therefore differ between identical runs."""
 
 _ERRORS = {
@@ -48,7 +48,7 @@ _FEWEST_LOSSES = 5
 _FAR_ABOVE = 2.0  # a median above this multiple of the lowest median causes a warning
 
 
-class WatchedMetricsLog(MetricsLog):
+class DivergenceWarningLog(MetricsLog):
     """A metrics log that adds a warning to its rows and to the console when the metrics show that training diverges.
 
     Warnings depend only on the rows of the log, so that a resumed run neither loses nor repeats a warning.
@@ -62,7 +62,7 @@ class WatchedMetricsLog(MetricsLog):
 
     def __init__(self, config: Config, reporter: Reporter, *, first_step: int, trackers: Trackers) -> None:
         super().__init__(Path(config.run_dir), first_step=first_step, trackers=trackers)
-        self._watch, self._reporter = Watch(config), reporter
+        self._watch, self._reporter = DivergenceDetector(config), reporter
         for row in read_metrics_log(self.path):
             self._watch(str(row.get("kind")), row["step"], row)
 
@@ -74,7 +74,7 @@ class WatchedMetricsLog(MetricsLog):
             self._reporter.note(f"Warning: {text}")
 
 
-class Watch:
+class DivergenceDetector:
     """A check of the rows of a metrics log in their order; each cause is reported only once."""
 
     def __init__(self, config: Config) -> None:

@@ -18,15 +18,15 @@ from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.registry import TRAINING_HOOKS
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, newest_checkpoint, read_state
-from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, asks_nothing_new, config_changes, read_run_config, write_config
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, config_changes, has_same_results, read_run_config, write_config
 from vjepa2_ac.runs.metrics_log import MetricsLog, open_trackers, require_installed
 from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.training.monitoring import WatchedMetricsLog
+from vjepa2_ac.training.monitoring import DivergenceWarningLog
 from vjepa2_ac.training.optim import describe_changed_rate
 from vjepa2_ac.training.resume import save_checkpoint
 from vjepa2_ac.training.step import Run
-from vjepa2_ac.training.validation import is_done
+from vjepa2_ac.training.validation import is_finished
 
 if TYPE_CHECKING:
     from vjepa2_ac.runs.mirror import Mirror
@@ -80,7 +80,11 @@ class RunOutputs:
     def _finish_ended(self) -> bool:
         """Return whether the run has ended already; if so, write the config and finish the mirror."""
         newest = newest_checkpoint(Path(self.config.run_dir, CHECKPOINTS))
-        if newest is None or not asks_nothing_new(self.config) or not is_done(self.config, state := read_state(newest)):
+        if (
+            newest is None
+            or not has_same_results(self.config)
+            or not is_finished(self.config, state := read_state(newest))
+        ):
             return False
         write_config(self.config)
         self._reporter.note(_why_ended(self.config, state))
@@ -117,7 +121,7 @@ class RunOutputs:
         if not (run.folder / CHANGES).exists() and (coverage := measure_coverage(run.dataset)) is not None:
             write_atomically(run.folder / CHANGES, json.dumps(coverage.noted()).encode())
         trackers = open_trackers(run.config, run.folder, run_id=run_id, first_step=step)
-        watched = WatchedMetricsLog(run.config, self._reporter, first_step=step, trackers=trackers)
+        watched = DivergenceWarningLog(run.config, self._reporter, first_step=step, trackers=trackers)
         self.metrics_log = self._closing.enter_context(watched)
         if (mirror := self._opened.mirror(run_id)) is not None:
             self._mirror = self._closing.enter_context(mirror)
@@ -125,7 +129,7 @@ class RunOutputs:
     @property
     def has_next_step(self) -> bool:
         """Whether another step follows."""
-        return not (self._stopped_by or is_done(self._run.config, self._run.state))
+        return not (self._stopped_by or is_finished(self._run.config, self._run.state))
 
     def is_logged(self, step: int) -> bool:
         """Return whether a step is written into the metrics log."""
@@ -146,20 +150,20 @@ class RunOutputs:
         """
         run, step = self._run, self._run.state.step
         is_due = step % run.config.checkpoint.every == 0 or time.monotonic() - self._saved_s >= SAVE_EVERY_S
-        is_due = is_due or is_best or is_done(run.config, run.state)
-        is_due = is_due or (self.metrics_log is not None and self.metrics_log.is_behind)
+        is_due = is_due or is_best or is_finished(run.config, run.state)
+        is_due = is_due or (self.metrics_log is not None and self.metrics_log.has_unwritten_rows)
         stopped_by, due = all_reduce(run.accelerator, [self._stop.number, is_due], "max")
         self._stopped_by = int(stopped_by)
         if due or self._stopped_by:
             self.save()
         if self._mirror is not None:
-            self._mirror.tick()
+            self._mirror.upload_if_due()
 
     def save(self) -> None:
         """Save a checkpoint, after the metrics of all steps up to it."""
 
         def write() -> None:
-            with self.metrics_log.before_a_checkpoint() if self.metrics_log else contextlib.nullcontext():
+            with self.metrics_log.flush_before_checkpoint() if self.metrics_log else contextlib.nullcontext():
                 save_checkpoint(self._run, self._run.folder)
 
         run_on_all(self._run.accelerator, write)
@@ -181,7 +185,7 @@ class RunOutputs:
             StoppedError: A signal stopped the run before its last step.
         """
         run = self._run
-        has_ended = is_done(run.config, run.state)
+        has_ended = is_finished(run.config, run.state)
         if has_ended and run.state.step < run.config.training.steps:
             self._reporter.note(_why_ended(run.config, run.state))
 

@@ -59,7 +59,7 @@ def save_checkpoint(run: Run, folder: Path) -> None:
             for one in run.datasets
         ),
         clips_per_step=run.clips_per_step,
-        clips_asked=run.config.training.batch_size * run.config.training.accumulation,
+        clips_per_process=run.config.training.batch_size * run.config.training.accumulation,
         processes=run.accelerator.num_processes,
         loss_scale=run.scaler.state_dict() if run.scaler.is_enabled() else None,
     )
@@ -84,8 +84,8 @@ def restore(run: Run, reporter: Reporter) -> Run:
                 f"The data has changed: {counted(windows, 'training clip')} instead of {before.windows:,}."
                 " From here on their order is another, and some may be seen twice in this epoch or not at all."
             )
-    run.state = best_so_far(state, measured_on(run.config, run.dataset), reporter)
-    run.micro_batches = micro_batches_of(run.config, state, run.accelerator.num_processes, reporter)
+    run.state = keep_comparable_best(state, validation_settings(run.config, run.dataset), reporter)
+    run.micro_batches = count_micro_batches(run.config, state, run.accelerator.num_processes, reporter)
     return run
 
 
@@ -118,7 +118,7 @@ def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any]
     return replace(state, run_id=state.run_id or run_id(run.folder)), moments
 
 
-def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
+def validation_settings(config: Config, dataset: Dataset) -> Mapping[str, str]:
     """Return the config values, and the hash of the clips, that determine the metrics of a validation."""
     settings = {key: json.dumps(value) for key, value in flatten(values_that_affect(Affects.MEASURED, config)).items()}
     windows = validation_windows(dataset, "validation", clips=config.validation.clips)
@@ -126,25 +126,32 @@ def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
     return {**settings, "its clips": hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}
 
 
-def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> RunState:
+def keep_comparable_best(state: RunState, now: Mapping[str, str], reporter: Reporter) -> RunState:
     """Return the state to resume from, without its best validation if that was measured differently than now.
 
     Errors are comparable only for the same clips, time span and latents. Settings that only one of the two records
     contains are ignored.
     """
-    before = state.measured_on or {}
+    before = state.validation_settings or {}
     differing = sorted(key for key in before.keys() & now if before[key] != now[key])
-    state = replace(state, measured_on=dict(now))
+    state = replace(state, validation_settings=dict(now))
     if not differing or state.best_error is None:
         return state
     reporter.note(
         f"Validation measures something else than before (other: {', '.join(differing)}): the error"
         f" {state.best_error:.4g} of step {state.best_step}, the best so far, does not compare and no longer counts."
     )
-    return replace(state, best_step=None, best_error=None, best_rank=None, lowest_rank=None, base_rank=None)
+    return replace(
+        state,
+        best_step=None,
+        best_error=None,
+        best_ranking_error=None,
+        lowest_ranking_error=None,
+        base_ranking_error=None,
+    )
 
 
-def micro_batches_of(config: Config, state: RunState, processes: int, reporter: Reporter) -> int:
+def count_micro_batches(config: Config, state: RunState, processes: int, reporter: Reporter) -> int:
     """Return the number of micro-batches per step, summed over all processes.
 
     At the first start, or after a change of batch_size * accumulation, the config determines the number. Otherwise the
@@ -156,7 +163,7 @@ def micro_batches_of(config: Config, state: RunState, processes: int, reporter: 
     """
     batch_size, accumulation = config.training.batch_size, config.training.accumulation
     configured = accumulation * processes
-    if state.clips_per_step is None or state.clips_asked != batch_size * accumulation:
+    if state.clips_per_step is None or state.clips_per_process != batch_size * accumulation:
         return configured
     micro_batches = state.clips_per_step // batch_size
     if micro_batches < processes:

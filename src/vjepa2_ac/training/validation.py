@@ -40,12 +40,12 @@ def validate_if_due(run: Run, metrics_log: MetricsLog | None, reporter: Reporter
         return False
     result = validate(run, reporter)
     is_first = step - config.validation.every < max(1, config.training.warmup_steps) <= step
-    if (is_first or step == config.training.steps) and (warning := unused_actions(result)):
+    if (is_first or step == config.training.steps) and (warning := action_warning(result)):
         reporter.note(warning)
     return record(run, result, metrics_log)
 
 
-def unused_actions(validation: Validation) -> str:
+def action_warning(validation: Validation) -> str:
     """Return a warning if the predictions hardly depend on the actions, otherwise an empty string."""
     cost = cost_of_actions(validation.errors, "shuffled").value
     if cost >= USED:
@@ -69,11 +69,11 @@ def record(run: Run, validation: Validation, metrics_log: MetricsLog | None) -> 
                 metrics_log.show("validation", "imagined", run.state.step, image)
     by, before = run.config.checkpoint.keep_best, run.state
     if by != "off":
-        run.state = before.measured(metrics[BEST_BY], metrics[RANK] if by == "ranking" else None)
+        run.state = before.with_validation(metrics[BEST_BY], metrics[RANK] if by == "ranking" else None)
     return run.state.best_step != before.best_step
 
 
-def is_done(config: Config, state: RunState) -> bool:
+def is_finished(config: Config, state: RunState) -> bool:
     """Return whether training ends: all steps are done, or the last `training.patience` validations were not better."""
     training = config.training
     if state.step >= training.steps:
