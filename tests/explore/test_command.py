@@ -1,4 +1,4 @@
-"""The command itself: it simulates what a model of the package lacks, says where the page is, and ends when asked."""
+"""The command `explore`: it simulates episodes for the package's model, prints the URL, and exits on SIGTERM."""
 
 import os
 import re
@@ -13,15 +13,13 @@ from vjepa2_ac.cli import main
 from windows import header
 
 
-def test_without_arguments_the_model_of_the_package_is_explored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_explore_without_arguments_shows_the_packages_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     process = Rank(["-m", "vjepa2_ac.cli", "explore", "--port", "0"], dict(os.environ))
     (url,) = wait_until(lambda: re.findall(r"The page: (\S+)\s", process.written()[0]), [process])
     with connect(url.replace("http", "ws") + "socket", origin=url.rstrip("/"), max_size=None) as page:  # type: ignore[arg-type]
-        told = header(page.recv(timeout=60))
-    assert (told["subject"], told["truth"]) == ("builtin:sim-tiny", "simulated")
+        content = header(page.recv(timeout=60))
+    assert (content["subject"], content["truth"]) == ("builtin:sim-tiny", "simulated")
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate()
     assert process.returncode == 0, errors
@@ -29,15 +27,19 @@ def test_without_arguments_the_model_of_the_package_is_explored(
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("arguments", "message"),
     [
         (["nowhere/run"], "nowhere/run"),
         (["builtin:sim-tiny", "--decoder", "nowhere"], "nowhere"),
     ],
 )
-def test_what_cannot_be_explored_is_said_at_once(
-    words: list[str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_invalid_argument_raises_before_loading(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["explore", *words]) == 2
-    assert says in capsys.readouterr().err
+    assert main(["explore", *arguments]) == 2
+    assert message in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The page of explore in a real browser: the way of a new user, by keys alone, on a phone; and what may go wrong."""
+"""The page of explore in a real browser: with mouse, with keys, on a phone, and after errors."""
 
 import re
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from vjepa2_ac.explore.views import Views
-from windows import chromium, serving, watched
+from windows import chromium, open_watched_page, serving
 
 LARGE, PHONE = {"width": 1400, "height": 900}, {"width": 390, "height": 844}
 
@@ -20,30 +20,30 @@ def started() -> Iterator[Any]:
 
 
 @pytest.fixture
-def opened(started: Any) -> Iterator[Any]:
-    """Return a function that opens a page, which may complain of nothing."""
-    contexts, complaints = [], []
+def open_page(started: Any) -> Iterator[Any]:
+    """Return a function that opens a page; afterwards the pages must not have reported any error."""
+    contexts, errors = [], []
 
-    def open_one(url: str, **context: Any) -> Any:
+    def open_page_at(url: str, **context: Any) -> Any:
         contexts.append(started.new_context(**{"viewport": LARGE, **context}))
-        page, wrong = watched(contexts[-1])
-        complaints.append(wrong)
+        page, wrong = open_watched_page(contexts[-1])
+        errors.append(wrong)
         page.goto(url)
-        steps_are(page, 0)
+        wait_for_steps(page, 0)
         return page
 
-    yield open_one
+    yield open_page_at
     for context in contexts:
         context.close()
-    assert not any(complaints)
+    assert not any(errors)
 
 
 def role(page: Any, name: str) -> Any:
     return page.locator(f'[data-role="{name}"]')
 
 
-def steps_are(page: Any, count: int) -> None:
-    """Wait until so many steps of a path are shown."""
+def wait_for_steps(page: Any, count: int) -> None:
+    """Wait until the page shows a path with `count` steps."""
     page.wait_for_function(
         "count => document.querySelectorAll('[data-role=trail] [aria-current=step]').length === 1"
         " && document.querySelectorAll('[data-role=trail] li').length === count + 1"
@@ -52,8 +52,8 @@ def steps_are(page: Any, count: int) -> None:
     )
 
 
-def shown(page: Any, of: str) -> str:
-    """Return the large picture of a teller: what its pixels are."""
+def get_pixels(page: Any, of: str) -> str:
+    """Return the pixels of the large image of a model or of the ground truth."""
     return str(
         page.evaluate(
             """of => {
@@ -67,114 +67,114 @@ def shown(page: Any, of: str) -> str:
     )
 
 
-def test_a_new_user_takes_an_action_sees_what_is_true_and_comes_back(live: Views, opened: Any) -> None:
+def test_action_changes_all_images_and_undo_restores_them(live: Views, open_page: Any) -> None:
     with serving(live) as url:
-        page = opened(url)
-        before = [shown(page, of) for of in ("base", "adapter", "truth")]
+        page = open_page(url)
+        before = [get_pixels(page, of) for of in ("base", "adapter", "truth")]
         page.get_by_role("button", name=re.compile("left$")).first.click()
-        steps_are(page, 1)
-        after = [shown(page, of) for of in ("base", "adapter", "truth")]
+        wait_for_steps(page, 1)
+        after = [get_pixels(page, of) for of in ("base", "adapter", "truth")]
         assert all(one != other for one, other in zip(before, after, strict=True))
-        assert re.search(r"error \d\.\d+.*copying \d\.\d+", role(page, "sentence").inner_text())
+        assert re.search(r"error \d\.\d+.*persistence \d\.\d+", role(page, "sentence").inner_text())
         role(page, "undo").click()
-        steps_are(page, 0)
-        assert [shown(page, of) for of in ("base", "adapter", "truth")] == before
+        wait_for_steps(page, 0)
+        assert [get_pixels(page, of) for of in ("base", "adapter", "truth")] == before
 
 
-def test_all_of_it_can_be_done_by_keys(live: Views, opened: Any) -> None:
+def test_all_functions_are_available_by_keys(live: Views, open_page: Any) -> None:
     with serving(live) as url:
-        page = opened(url)
+        page = open_page(url)
         for count, key in enumerate(("a", "r", "c", "Space", "n"), start=1):
             page.keyboard.press(key)
             if key != "n":
-                steps_are(page, count)
+                wait_for_steps(page, count)
         assert "no recorded action" in role(page, "sentence").inner_text()
         page.keyboard.press("0")
-        steps_are(page, 0)
+        wait_for_steps(page, 0)
         page.keyboard.press("n")
-        steps_are(page, 1)
+        wait_for_steps(page, 1)
         page.keyboard.press("m")
         cells = page.locator('[data-role="energy-map"] button')
         cells.first.wait_for()
         cells.nth(3).focus()
         page.keyboard.press("ArrowDown")
         page.keyboard.press("Enter")
-        steps_are(page, 2)
+        wait_for_steps(page, 2)
         page.keyboard.press("t")
-        assert role(page, "picture").locator("visible=true").count() >= 2
+        assert role(page, "view").locator("visible=true").count() >= 2
         page.keyboard.press("?")
         assert page.get_by_role("dialog").is_visible()
         page.keyboard.press("Escape")
         page.keyboard.press("p")
         role(page, "best").locator("figure").first.wait_for()
-        steps_are(page, 5)
+        wait_for_steps(page, 5)
 
 
-def test_keys_do_not_act_while_a_number_is_typed(live: Views, opened: Any) -> None:
+def test_keys_command_no_motion_while_a_number_is_typed(live: Views, open_page: Any) -> None:
     with serving(live) as url:
-        page = opened(url)
+        page = open_page(url)
         role(page, "goal").locator("summary").first.click()
         role(page, "plan-steps").fill("4")
         role(page, "plan-steps").press("d")
         page.keyboard.press("Control+a")
         page.wait_for_timeout(300)
-        steps_are(page, 0)
+        wait_for_steps(page, 0)
 
 
-def test_a_link_restores_the_state_in_another_tab_and_tabs_do_not_disturb_each_other(live: Views, opened: Any) -> None:
+def test_link_restores_the_state_in_an_independent_tab(live: Views, open_page: Any) -> None:
     with serving(live) as url:
-        first = opened(url)
+        first = open_page(url)
         for count, key in enumerate("awd", start=1):
             first.keyboard.press(key)
-            steps_are(first, count)
+            wait_for_steps(first, count)
         context = first.context
         second = context.new_page()
         second.goto(first.url)
-        steps_are(second, 3)
-        assert shown(second, "adapter") == shown(first, "adapter")
+        wait_for_steps(second, 3)
+        assert get_pixels(second, "adapter") == get_pixels(first, "adapter")
         second.keyboard.press("f")
-        steps_are(second, 4)
+        wait_for_steps(second, 4)
         first.keyboard.press("z")
-        steps_are(first, 2)
-        steps_are(second, 4)
+        wait_for_steps(first, 2)
+        wait_for_steps(second, 4)
 
 
-def test_nothing_is_beyond_the_edge_of_a_phone(live: Views, opened: Any) -> None:
+def test_page_fits_the_width_of_a_phone(live: Views, open_page: Any) -> None:
     with serving(live) as url:
-        page = opened(url, viewport=PHONE)
+        page = open_page(url, viewport=PHONE)
         page.get_by_role("button", name=re.compile("up$")).first.click()
-        steps_are(page, 1)
+        wait_for_steps(page, 1)
         assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
         page.set_viewport_size({"width": 360, "height": 640})
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
 
 
-def test_a_lost_server_is_said_and_the_page_goes_on_where_it_was(live: Views, started: Any) -> None:
+def test_page_reconnects_and_keeps_its_state(live: Views, started: Any) -> None:
     context = started.new_context()
-    page, _ = watched(context)  # a browser complains of a lost socket, and may
+    page, _ = open_watched_page(context)  # the browser may report the lost socket as an error
     with serving(live) as url:
         page.goto(url)
-        steps_are(page, 0)
+        wait_for_steps(page, 0)
         page.keyboard.press("a")
-        steps_are(page, 1)
-        seen = shown(page, "adapter")
-    role(page, "lost").wait_for(state="visible")
-    assert "does not answer" in role(page, "lost").inner_text()
+        wait_for_steps(page, 1)
+        seen = get_pixels(page, "adapter")
+    role(page, "disconnected").wait_for(state="visible")
+    assert "No connection to the server" in role(page, "disconnected").inner_text()
     with serving(live, port=int(url.rstrip("/").rpartition(":")[2])):
-        role(page, "lost").wait_for(state="hidden")
-        steps_are(page, 1)
-        assert shown(page, "adapter") == seen
+        role(page, "disconnected").wait_for(state="hidden")
+        wait_for_steps(page, 1)
+        assert get_pixels(page, "adapter") == seen
         page.keyboard.press("a")
-        steps_are(page, 2)
+        wait_for_steps(page, 2)
     context.close()
 
 
-def test_a_hostile_name_is_text(live: Views, opened: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_markup_in_episode_names_is_shown_as_text(live: Views, open_page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     name = "<img src=x onerror=alert(1)>\x1b[31m<script>alert(2)<b>"
-    monkeypatch.setattr(type(live.explorer), "name", lambda _self, number: f"{name}{number}")
+    monkeypatch.setattr(type(live.explorer), "get_episode_name", lambda _self, number: f"{name}{number}")
     with serving(replace(live)) as url:  # names are cached
-        page = opened(url)
+        page = open_page(url)
         page.keyboard.press("a")
-        steps_are(page, 1)
+        wait_for_steps(page, 1)
         assert name.replace("\x1b", "") in role(page, "episode").inner_text().replace("\x1b", "")
         assert not page.locator("img[src=x]").count()

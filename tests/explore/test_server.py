@@ -1,4 +1,4 @@
-"""Who may open the page and its socket, and that the newest request of a page wins."""
+"""Access to the page and its socket; the newest request of a page is answered."""
 
 import http.client
 import json
@@ -13,9 +13,9 @@ from vjepa2_ac.explore.views import Views
 from windows import header, serving
 
 
-def got(url: str, path: str, **headers: str) -> http.client.HTTPResponse:
-    place = urlsplit(url)
-    connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=60)
+def get(url: str, path: str, **headers: str) -> http.client.HTTPResponse:
+    position = urlsplit(url)
+    connection = http.client.HTTPConnection(position.hostname or "", position.port, timeout=60)
     connection.request("GET", path, headers=headers)
     response = connection.getresponse()
     response.body = response.read()  # type: ignore[attr-defined]
@@ -30,63 +30,63 @@ def socket(url: str, origin: str | None = None, **headers: str) -> Any:
     )  # fmt: skip
 
 
-def test_the_page_is_there_with_rules_for_the_browser(recorded: Views) -> None:
+def test_page_is_served_with_a_content_security_policy(recorded: Views) -> None:
     with serving(recorded) as url:
-        page = got(url, "/")
+        page = get(url, "/")
         assert page.status == 200
         assert page.getheader("Content-Type") == "text/html; charset=utf-8"
         assert "default-src 'none'" in (page.getheader("Content-Security-Policy") or "")
-        assert got(url, "/explore.js").getheader("Content-Type") == "text/javascript; charset=utf-8"
+        assert get(url, "/explore.js").getheader("Content-Type") == "text/javascript; charset=utf-8"
         for path in ("/../server.py", "/%2e%2e/server.py", "//etc/passwd", "/socket.html", "/watch.html"):
-            assert got(url, path).status == 404
+            assert get(url, path).status == 404
 
 
-@pytest.mark.parametrize("origin", ["http://elsewhere.example", "null", "", "http://127.0.0.1:1", "http://["])
-def test_a_page_of_somebody_else_gets_no_socket(recorded: Views, origin: str) -> None:
+@pytest.mark.parametrize("origin", ["http://other.example", "null", "", "http://127.0.0.1:1", "http://["])
+def test_socket_rejects_other_origins(recorded: Views, origin: str) -> None:
     with serving(recorded) as url, pytest.raises(InvalidStatus) as refused:
         socket(url, origin)
     assert refused.value.response.status_code == 403
 
 
-def test_a_name_that_is_not_this_servers_gets_no_page(recorded: Views) -> None:
+def test_unknown_host_name_gets_no_page(recorded: Views) -> None:
     with serving(recorded) as url:
-        assert got(url, "/", Host="rebound.example").status == 403
+        assert get(url, "/", Host="rebound.example").status == 403
         with pytest.raises(InvalidStatus):
             socket(url, "http://rebound.example", Host="rebound.example")
 
 
-def test_the_newest_request_wins_and_a_search_ends_for_it(recorded: Views) -> None:
+def test_newest_request_is_answered_and_cancels_a_search(recorded: Views) -> None:
     goal = {"episode": 0, "step": 6}
     with serving(recorded) as url, socket(url) as page:
         page.recv()
-        page.send(json.dumps({"seq": 1, "kind": "plan", "goal": goal, "teller": "base", "steps": 8}))
+        page.send(json.dumps({"seq": 1, "kind": "plan", "goal": goal, "model": "base", "steps": 8}))
         for seq in range(2, 30):
-            page.send(json.dumps({"seq": seq, "kind": "look", "goal": goal}))
+            page.send(json.dumps({"seq": seq, "kind": "predict", "goal": goal}))
         answers = []
         while not answers or answers[-1]["seq"] != 29:
             answers.append(header(page.recv()))
-        looked = [one["seq"] for one in answers if one["kind"] == "look"]
-        assert looked == sorted(looked)
+        predicted = [one["seq"] for one in answers if one["kind"] == "predict"]
+        assert predicted == sorted(predicted)
 
 
-def test_what_is_no_request_is_told_and_the_page_goes_on(recorded: Views) -> None:
+def test_invalid_request_gets_an_error_and_the_next_one_is_answered(recorded: Views) -> None:
     with serving(recorded) as url, socket(url) as page:
         page.recv()
-        for wrong in ("{}", b"\x00", "[" * 1000, json.dumps({"seq": 1, "kind": "look", "episode": 999})):
+        for wrong in ("{}", b"\x00", "[" * 1000, json.dumps({"seq": 1, "kind": "predict", "episode": 999})):
             page.send(wrong)
             assert header(page.recv())["kind"] == "error"
-        page.send(json.dumps({"seq": 2, "kind": "look"}))
+        page.send(json.dumps({"seq": 2, "kind": "predict"}))
         assert header(page.recv())["seq"] == 2
 
 
-def test_a_failure_is_logged_and_the_page_goes_on(
+def test_internal_error_is_logged_and_the_next_request_is_answered(
     recorded: Views, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(Views, "_episode", lambda *_: 1 / 0)
+    monkeypatch.setattr(Views, "_answer_episode", lambda *_: 1 / 0)
     with serving(recorded) as url, socket(url) as page:
         page.recv()
         page.send(json.dumps({"seq": 1, "kind": "episode"}))
-        assert "terminal" in header(page.recv())["text"]
-        page.send(json.dumps({"seq": 2, "kind": "look"}))
-        assert header(page.recv())["kind"] == "look"
+        assert "Internal error" in header(page.recv())["text"]
+        page.send(json.dumps({"seq": 2, "kind": "predict"}))
+        assert header(page.recv())["kind"] == "predict"
     assert "ZeroDivisionError" in caplog.text

@@ -1,4 +1,4 @@
-"""What a page is told: pictures and numbers of a place, energies and plans; and what is no request."""
+"""Messages to the page: predictions at a position, energies and plans; and invalid requests."""
 
 import json
 from typing import Any
@@ -9,18 +9,18 @@ import torch
 
 from vjepa2_ac.episode import no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.explore.explorer import Place
+from vjepa2_ac.explore.explorer import RolloutPosition
 from vjepa2_ac.explore.views import GoalFrame, PageRequest, Views, read_request
 from vjepa2_ac.media.images import decode_image
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost
 from vjepa2_ac.planning.planner import SearchCancelledError
 
-STILL = [0.0] * 7
+ZERO_ACTION = [0.0] * 7
 UP = [0.0, 0.0, 0.02, 0.0, 0.0, 0.0, 0.0]
 GOAL = GoalFrame(0, 6)
 
 
-def unpacked(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def parse_message(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     size = int.from_bytes(message[:4], "big")
     header, rest, images = json.loads(message[4 : 4 + size]), message[4 + size :], {}
     for one in header["images"]:
@@ -29,108 +29,111 @@ def unpacked(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return header, images
 
 
-def asked(views: Views, **values: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    return unpacked(views.answer(PageRequest(seq=7, **values), no_progress, lambda: False))
+def get_answer(views: Views, **values: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    return parse_message(views.answer(PageRequest(seq=7, **values), no_progress, lambda: False))
 
 
-def test_hello_says_what_can_be_done(live: Views) -> None:
-    told, images = unpacked(live.hello())
+def test_hello_lists_models_episodes_and_moves(live: Views) -> None:
+    content, images = parse_message(live.make_hello())
     assert not images
-    assert [one["id"] for one in told["tellers"]] == ["base", "adapter"]
-    assert told["truth"] == "simulated"
-    assert len(told["episodes"]) == len(live.explorer.episodes)
-    assert [one["name"] for one in told["action"]] == ["dx", "dy", "dz", "droll", "dpitch", "dyaw", "dgripper"]
-    assert all(0 < one["step"] < one["most"] for one in told["action"])
-    assert {"left", "up", "close", "still"} <= {one["id"] for one in told["moves"]}
-    live.explorer.require(Place(told["place"]["episode"], told["place"]["start"]))
+    assert [one["id"] for one in content["models"]] == ["base", "adapter"]
+    assert content["truth"] == "simulated"
+    assert len(content["episodes"]) == len(live.explorer.episodes)
+    assert [one["name"] for one in content["action"]] == ["dx", "dy", "dz", "droll", "dpitch", "dyaw", "dgripper"]
+    assert all(0 < one["step"] < one["most"] for one in content["action"])
+    assert {"left", "up", "close", "zero action"} <= {one["id"] for one in content["moves"]}
+    live.explorer.validate(RolloutPosition(content["position"]["episode"], content["position"]["start"]))
 
 
-def test_a_strip_shows_the_frames_it_names(recorded: Views) -> None:
-    told, images = asked(recorded, kind="episode", episode=1)
-    assert [f"frame-{number}" for number in range(len(told["steps"]))] == list(images)
-    for number, step in enumerate(told["steps"]):
-        off = np.abs(images[f"frame-{number}"].astype(int) - recorded.explorer.moment(1, step).pixels)
+def test_image_strip_has_the_frames_of_its_steps(recorded: Views) -> None:
+    content, images = get_answer(recorded, kind="episode", episode=1)
+    assert [f"frame-{number}" for number in range(len(content["steps"]))] == list(images)
+    for number, step in enumerate(content["steps"]):
+        off = np.abs(images[f"frame-{number}"].astype(int) - recorded.explorer.get_observation(1, step).pixels)
         assert off.mean() < 3  # JPEG
 
 
-def test_a_look_has_pictures_and_numbers_of_all_who_tell(live: Views) -> None:
-    told, images = asked(live, kind="look", start=4, actions=[UP, UP], goal=GOAL)
-    assert {"given", "truth", "goal", "imagined-base", "imagined-adapter", "error-base", "error-adapter"} == set(images)
-    assert told["truth"] == "simulated"
-    assert told["actions"] == [UP, UP]
-    assert len(told["path"]) == 3
-    for one in told["tellers"]:
+def test_prediction_has_images_and_metrics_of_all_models(live: Views) -> None:
+    content, images = get_answer(live, kind="predict", start=4, actions=[UP, UP], goal=GOAL)
+    assert {"start", "truth", "goal", "predicted-base", "predicted-adapter", "error-base", "error-adapter"} == set(
+        images
+    )
+    assert content["truth"] == "simulated"
+    assert content["actions"] == [UP, UP]
+    assert len(content["path"]) == 3
+    for one in content["models"]:
         assert min(one["error"], one["spread"], one["energy"]) > 0
-    assert told["copying"] > 0
+    assert content["persistence_error"] > 0
 
 
-def test_without_a_simulator_only_the_recorded_way_has_a_truth(recorded: Views) -> None:
-    start, _ = asked(recorded, kind="look")
-    there, images = asked(recorded, kind="look", actions=[start["next_recorded"]])
-    assert there["truth"] == "recorded"
+def test_ground_truth_without_simulator_exists_only_for_recorded_actions(recorded: Views) -> None:
+    start, _ = get_answer(recorded, kind="predict")
+    recorded_content, images = get_answer(recorded, kind="predict", actions=[start["next_recorded"]])
+    assert recorded_content["truth"] == "recorded"
     assert "error-adapter" in images
-    elsewhere, images = asked(recorded, kind="look", actions=[UP])
-    assert elsewhere["truth"] is None
-    assert elsewhere["copying"] is None
+    other, images = get_answer(recorded, kind="predict", actions=[UP])
+    assert other["truth"] is None
+    assert other["persistence_error"] is None
     assert "truth" not in images
     assert "error-adapter" not in images
 
 
-def test_a_map_has_the_energy_of_each_action(recorded: Views) -> None:
-    told, _ = asked(recorded, kind="energy", actions=[UP], goal=GOAL, teller="adapter", action=STILL)
-    explorer, one = recorded.explorer, told["maps"][0]
-    place = Place(0, 0, (tuple(UP),))
-    state = torch.tensor(explorer.states(place)[-1], dtype=torch.float32)
-    scene = Scene(explorer.imagined(1, place), state)
-    goal = Goal(explorer.moment(0, GOAL.step).latents[None])
-    cost = WorldModelCost(explorer.model(1), scene, goal, recorded.search.config.energy)
+def test_energy_map_has_the_energy_of_each_action(recorded: Views) -> None:
+    content, _ = get_answer(recorded, kind="energy", actions=[UP], goal=GOAL, model="adapter", action=ZERO_ACTION)
+    explorer, one = recorded.explorer, content["maps"][0]
+    position = RolloutPosition(0, 0, (tuple(UP),))
+    state = torch.tensor(explorer.integrate_states(position)[-1], dtype=torch.float32)
+    scene = Scene(explorer.predict_latents(1, position), state)
+    goal = Goal(explorer.get_observation(0, GOAL.step).latents[None])
+    cost = WorldModelCost(explorer.get_model(1), scene, goal, recorded.search.config.energy)
     action = torch.zeros(1, 1, 7)
     action[0, 0, one["across"]], action[0, 0, one["up"]] = one["across_values"][5], one["up_values"][2]
     with torch.no_grad():
         assert one["energy"][2][5] == pytest.approx(float(cost(action)[0]), rel=1e-5)
-    assert len(told["maps"]) == 3
+    assert len(content["maps"]) == 3
 
 
-def test_a_plan_is_within_the_limits_and_its_end_was_seen(recorded: Views) -> None:
-    told, images = asked(recorded, kind="plan", goal=GOAL, teller="base", steps=3)
-    assert np.abs(np.array(told["actions"])[:, :3]).max() <= recorded.search.config.limits.xyz_m[0]
-    assert len(told["actions"]) == 3
-    assert list(images) == [f"best-{number}" for number in range(len(told["iterations"]))]
-    assert told["energy_plan"] == pytest.approx(min(one["lowest"] for one in told["iterations"]), rel=0.2)
-    assert told == asked(recorded, kind="plan", goal=GOAL, teller="base", steps=3)[0]
+def test_plan_is_within_the_limits_and_shows_each_iteration(recorded: Views) -> None:
+    content, images = get_answer(recorded, kind="plan", goal=GOAL, model="base", steps=3)
+    assert np.abs(np.array(content["actions"])[:, :3]).max() <= recorded.search.config.limits.xyz_m[0]
+    assert len(content["actions"]) == 3
+    assert list(images) == [f"best-{number}" for number in range(len(content["iterations"]))]
+    assert content["energy_plan"] == pytest.approx(min(one["lowest"] for one in content["iterations"]), rel=0.2)
+    assert content == get_answer(recorded, kind="plan", goal=GOAL, model="base", steps=3)[0]
 
 
-def test_a_search_that_nobody_waits_for_ends(recorded: Views) -> None:
+def test_cancelled_search_raises(recorded: Views) -> None:
     for kind in ("plan", "energy"):
         with pytest.raises(SearchCancelledError):
-            recorded.answer(PageRequest(1, kind, goal=GOAL, teller="base"), no_progress, lambda: True)  # type: ignore[arg-type]
+            recorded.answer(PageRequest(1, kind, goal=GOAL, model="base"), no_progress, lambda: True)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "", "[]", "{}", "[" * 100_000, '{"seq": 1, "kind": "shell"}', '{"seq": 1, "kind": "look", "actions": [[NaN]]}',
-        '{"seq": 1, "kind": "look", "start": -1}', '{"seq": 1, "kind": "look", "actions": "up"}',
-        '{"seq": 1, "kind": "plan", "steps": 10000000}', '{"seq": 1, "kind": "look", "more": 1}',
-        json.dumps({"seq": 1, "kind": "look", "actions": [[0.0] * 7] * 17}),
+        "", "[]", "{}", "[" * 100_000, '{"seq": 1, "kind": "shell"}',
+        '{"seq": 1, "kind": "predict", "actions": [[NaN]]}',
+        '{"seq": 1, "kind": "predict", "start": -1}', '{"seq": 1, "kind": "predict", "actions": "up"}',
+        '{"seq": 1, "kind": "plan", "steps": 10000000}', '{"seq": 1, "kind": "predict", "more": 1}',
+        json.dumps({"seq": 1, "kind": "predict", "actions": [[0.0] * 7] * 17}),
     ],
 )  # fmt: skip
-def test_what_is_no_request_is_refused(text: str) -> None:
+def test_invalid_request_raises(text: str) -> None:
     with pytest.raises(InputError, match="request"):
         read_request(text)
 
 
 @pytest.mark.parametrize("goal", [GoalFrame(50, 0), GoalFrame(0, 5000), None])
-def test_a_search_needs_a_goal_that_is_there(recorded: Views, goal: GoalFrame | None) -> None:
+def test_search_with_invalid_goal_or_model_raises(recorded: Views, goal: GoalFrame | None) -> None:
     with pytest.raises(InputError):
-        asked(recorded, kind="plan", goal=goal, teller="base")
+        get_answer(recorded, kind="plan", goal=goal, model="base")
     with pytest.raises(InputError):
-        asked(recorded, kind="plan", goal=GOAL, teller="nobody")
+        get_answer(recorded, kind="plan", goal=GOAL, model="unknown")
 
 
-def test_a_simulated_look_that_is_cancelled_ends_before_the_next_action(live: Views) -> None:
-    actions = [UP, STILL, [-one for one in UP], UP]
-    asked_times, request = [], PageRequest(seq=7, kind="look", start=2, actions=actions)
+def test_cancelled_simulation_stops_before_the_next_action(live: Views) -> None:
+    actions = [UP, ZERO_ACTION, [-one for one in UP], UP]
+    asked_times, request = [], PageRequest(seq=7, kind="predict", start=2, actions=actions)
 
     def cancelled() -> bool:
         asked_times.append(1)
@@ -139,7 +142,7 @@ def test_a_simulated_look_that_is_cancelled_ends_before_the_next_action(live: Vi
     with pytest.raises(SearchCancelledError):
         live.answer(request, no_progress, cancelled)
     assert len(asked_times) == 3
-    again, images = unpacked(live.answer(request, no_progress, lambda: False))
-    other, expected = asked(live, kind="look", start=2, actions=actions)
+    again, images = parse_message(live.answer(request, no_progress, lambda: False))
+    other, expected = get_answer(live, kind="predict", start=2, actions=actions)
     assert again["truth_state"] == other["truth_state"]
     np.testing.assert_array_equal(images["truth"], expected["truth"])

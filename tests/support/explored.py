@@ -1,4 +1,4 @@
-"""Explorers of the tiny run: on its own data, and on simulated episodes."""
+"""Explorers of the tiny run on its own data and on simulated episodes."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ def explorer_of(subject: Path, decoder: Path, asked: EvaluationOptions) -> tuple
 
 
 def views_of(subject: Path, decoder: Path, data: Path, folder: Path, base: Path) -> Views:
-    """Return the views of a run on data, with a search that is over at once."""
+    """Return the views of a run on data, with a small search."""
     config = tiny_config(folder / "none", data, base, data__test_share=0.5, data__stride=2)
     explorer, config = explorer_of(subject, decoder, EvaluationOptions(data=config, out=folder))
     return Views.of("the run", explorer, config.model_copy(update={"planning": QUICK}))
@@ -39,7 +39,7 @@ def views_of(subject: Path, decoder: Path, data: Path, folder: Path, base: Path)
 def recorded(
     whole_run: Path, whole_decoder: Path, data_folder: Path, base_folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Views:
-    """Of data of which only the recording is known."""
+    """Views of data that cannot be simulated."""
     return views_of(whole_run, whole_decoder, data_folder, tmp_path_factory.mktemp("recorded"), base_folder)
 
 
@@ -47,5 +47,5 @@ def recorded(
 def live(
     whole_run: Path, whole_decoder: Path, simulated: Path, base_folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Views:
-    """Of data whose world can be simulated again."""
+    """Views of simulated data."""
     return views_of(whole_run, whole_decoder, simulated, tmp_path_factory.mktemp("live"), base_folder)

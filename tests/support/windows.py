@@ -1,4 +1,4 @@
-"""The server of the window in a thread of the test, and a real browser in front of it."""
+"""Run the server of explore in a thread of the test, and open its page in a real browser."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -12,9 +12,9 @@ from vjepa2_ac.explore.views import Views
 
 
 def header(message: Any) -> dict[str, Any]:
-    """Return what a message of the server says, without its images."""
-    found: dict[str, Any] = json.loads(message[4 : 4 + int.from_bytes(message[:4], "big")])
-    return found
+    """Return the header of a message of the server."""
+    content: dict[str, Any] = json.loads(message[4 : 4 + int.from_bytes(message[:4], "big")])
+    return content
 
 
 @contextmanager
@@ -26,7 +26,7 @@ def serving(views: Views, port: int = 0) -> Iterator[str]:
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """Yield a real browser, headless; skip aloud where there is none."""
+    """Yield a headless browser; skip the test if there is none."""
     import pytest
 
     path, api = browser(), pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -41,15 +41,15 @@ def chromium() -> Iterator[Any]:
 NewPage = Callable[..., Any]
 
 
-def watched(context: Any) -> tuple[Any, list[str]]:
-    """Return a page of a browser's context, and what it complains of or asks others for, which grows."""
-    page, wrong = context.new_page(), []
-    page.on("pageerror", lambda error: wrong.append(f"error: {error}"))
-    page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
-    page.on("request", lambda one: None if _is_own(one.url) else wrong.append(f"request: {one.url}"))
-    page.on("dialog", lambda dialog: (wrong.append(f"dialog: {dialog.message}"), dialog.dismiss()))
+def open_watched_page(context: Any) -> tuple[Any, list[str]]:
+    """Return a page of a browser context, and a list that collects its errors and its requests to other hosts."""
+    page, problems = context.new_page(), []
+    page.on("pageerror", lambda error: problems.append(f"error: {error}"))
+    page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+    page.on("request", lambda request: None if _is_own(request.url) else problems.append(f"request: {request.url}"))
+    page.on("dialog", lambda dialog: (problems.append(f"dialog: {dialog.message}"), dialog.dismiss()))
     page.set_default_timeout(60_000)  # on a busy machine
-    return page, wrong
+    return page, problems
 
 
 def _is_own(url: str) -> bool:

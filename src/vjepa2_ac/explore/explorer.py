@@ -35,9 +35,9 @@ from vjepa2_ac.planning.search_space import SearchSpace, search_space
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces, counterfactual_states, feasible_actions
 
-MOST_STEPS = 16  # longest path in model steps, as in the training of the released model
-_KEPT_STEPS = 128  # cached predictions per model, for undo and for other branches
-_SAME = 2e-5  # tolerance for equal actions, because links to the page contain rounded numbers
+MAX_STEPS = 16  # longest path in model steps, as in the training of the released model
+_MAX_CACHED_STEPS = 128  # cached predictions per model, for undo and for other branches
+_ACTION_TOLERANCE = 2e-5  # tolerance for equal actions, because links to the page contain rounded numbers
 Pixels = UInt8[np.ndarray, "size size 3"]
 Actions = tuple[tuple[float, ...], ...]
 Simulate = Callable[[int, int, Actions, Cancelled], tuple[np.ndarray, np.ndarray, bool]]
@@ -45,25 +45,25 @@ Simulate = Callable[[int, int, Actions, Cancelled], tuple[np.ndarray, np.ndarray
 
 
 @dataclass(frozen=True)
-class Place:
-    """A position in a rollout: the start frame, and the actions since then."""
+class RolloutPosition:
+    """A position in a rollout, given by the start frame and the actions since then."""
 
     episode: int  # index among the episodes of the page
     start: int  # control step
     actions: Actions = ()
 
     @property
-    def before(self) -> Place:
+    def previous(self) -> RolloutPosition:
         """The position before the last action."""
-        return Place(self.episode, self.start, self.actions[:-1])
+        return RolloutPosition(self.episode, self.start, self.actions[:-1])
 
-    def after(self, action: tuple[float, ...]) -> Place:
+    def with_action(self, action: tuple[float, ...]) -> RolloutPosition:
         """Return the position after one more action."""
-        return Place(self.episode, self.start, (*self.actions, action))
+        return RolloutPosition(self.episode, self.start, (*self.actions, action))
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class Observation:
     """A true observation: a frame with its latents, and the state at the same time."""
 
     pixels: Pixels  # the input of the encoder
@@ -72,13 +72,13 @@ class Moment:
     action: tuple[float, ...] | None = None  # the recorded action that leads to the next frame; None: unknown
     extrinsics: Float[Tensor, " 6"] | None = None  # pose of the camera, if the model uses it
     is_simulated: bool = False  # whether the frame is simulated; otherwise it was recorded
-    reached: bool = True  # whether the arm could carry out the last action
+    has_reached_target: bool = True  # whether the arm could carry out the last action
 
 
 class Explorer:
     """Predicts rollouts from held-out frames, one action at a time, with each of several models.
 
-    A prediction is a pure function of its `Place`, so several pages, undo and links need no state on the server.
+    A prediction depends only on its `RolloutPosition`, so several pages, undo and links need no state on the server.
     Predictions are cached.
     """
 
@@ -108,11 +108,11 @@ class Explorer:
         self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
         self.simulate = simulate
         if self.spaces.action.follows == "unknown":
-            found = "commands of which nobody knows what they do to the state"
-            needed = "data.actions: difference; or join_actions: sum or last"
+            found = "the effect of the recorded commands on the state is not known"
+            needed = "data.actions: difference, or data.join_actions: sum or last"
             raise InputError(where="data.actions: recorded", found=found, needed=needed)
-        self._pair = lru_cache(maxsize=256)(self._read_pair)
-        self._end = lru_cache(maxsize=_KEPT_STEPS * len(self.evaluated_models))(self._imagine)
+        self._cached_pair = lru_cache(maxsize=256)(self._read_pair)
+        self._cached_prediction = lru_cache(maxsize=_MAX_CACHED_STEPS * len(self.evaluated_models))(self._predict_step)
 
     @property
     def spaces(self) -> Spaces:
@@ -129,149 +129,164 @@ class Explorer:
         """The device of the models."""
         return self.world_model.device
 
-    def name(self, episode: int) -> str:
+    def get_episode_name(self, episode: int) -> str:
         """Return the name of an episode in its data set."""
         return self.dataset.table.identity(self.episodes[episode])
 
-    def steps(self, episode: int) -> int:
+    def get_num_steps(self, episode: int) -> int:
         """Return the number of control steps of an episode."""
         return int(self.dataset.table.num_steps[self.episodes[episode]])
 
-    def require(self, place: Place) -> Place:
+    def validate(self, position: RolloutPosition) -> RolloutPosition:
         """Check a position, and replace actions that are equal to the recorded one up to rounding by the recorded one.
 
         Raises:
             InputError: There is no such frame, or an action is invalid.
         """
-        if place.episode >= len(self.episodes):
+        if position.episode >= len(self.episodes):
             needed = f"0 to {len(self.episodes) - 1}"
-            raise InputError(where="episode", found=str(place.episode), needed=needed)
-        last = self.steps(place.episode) - 1 - self.stride
-        if not 0 <= place.start <= last:
-            raise InputError(where="start", found=f"control step {place.start}", needed=f"0 to {last}")
-        if len(place.actions) > MOST_STEPS:
-            fix = "Undo some, or begin anew from another frame"
-            raise InputError(where="actions", found=f"{len(place.actions)}", needed=f"at most {MOST_STEPS}", fix=fix)
-        width, checked = len(self.spaces.state), Place(place.episode, place.start)
-        for action in place.actions:
+            raise InputError(where="episode", found=f"episode {position.episode}", needed=needed)
+        last = self.get_num_steps(position.episode) - 1 - self.stride
+        if not 0 <= position.start <= last:
+            raise InputError(where="start", found=f"control step {position.start}", needed=f"0 to {last}")
+        if len(position.actions) > MAX_STEPS:
+            fix = "Undo some actions, or start from another frame"
+            raise InputError(
+                where="actions", found=f"{len(position.actions)} actions", needed=f"at most {MAX_STEPS}", fix=fix
+            )
+        width, checked = len(self.spaces.state), RolloutPosition(position.episode, position.start)
+        for action in position.actions:
             if len(action) != width or not np.isfinite(action).all() or np.abs(action).max() > np.pi:
-                needed = f"{width} numbers of one step, in metres, radians and closedness"
+                needed = f"{width} numbers of one step in metres, radians and closedness, each at most pi"
                 raise InputError(where="actions", found=f"{len(action)} numbers", needed=needed)
-            recorded = self.recorded_next(checked)
-            is_recorded = recorded is not None and np.allclose(action, recorded, atol=_SAME)
-            checked = checked.after(recorded if is_recorded and recorded is not None else action)
+            recorded = self.get_next_recorded_action(checked)
+            is_recorded = recorded is not None and np.allclose(action, recorded, atol=_ACTION_TOLERANCE)
+            checked = checked.with_action(recorded if is_recorded and recorded is not None else action)
         return checked
 
-    # ---- true frames ----
+    # ---- ground truth ----
 
-    def moment(self, episode: int, step: int) -> Moment:
+    def get_observation(self, episode: int, step: int) -> Observation:
         """Return the recorded observation at a control step."""
-        last = self.steps(episode) - 1 - self.stride
-        return self._pair(episode, step)[0] if step <= last else self._pair(episode, step - self.stride)[1]
+        last = self.get_num_steps(episode) - 1 - self.stride
+        return (
+            self._cached_pair(episode, step)[0] if step <= last else self._cached_pair(episode, step - self.stride)[1]
+        )
 
-    def along(self, place: Place) -> list[Moment | None]:
+    def get_recorded_observations(self, position: RolloutPosition) -> list[Observation | None]:
         """Return the recorded observations at the start and after each action.
 
         An entry is None from the first action on that differs from the recorded one, and after the end of the episode.
         """
-        step = place.start
-        moments: list[Moment | None] = [self.moment(place.episode, step)]
-        for action in place.actions:
-            before, step = moments[-1], step + self.stride
-            is_recorded = before is not None and action == before.action and step < self.steps(place.episode)
-            moments.append(self.moment(place.episode, step) if is_recorded else None)
-        return moments
+        step = position.start
+        observations: list[Observation | None] = [self.get_observation(position.episode, step)]
+        for action in position.actions:
+            previous, step = observations[-1], step + self.stride
+            is_recorded = (
+                previous is not None and action == previous.action and step < self.get_num_steps(position.episode)
+            )
+            observations.append(self.get_observation(position.episode, step) if is_recorded else None)
+        return observations
 
-    def recorded(self, place: Place) -> Moment | None:
+    def get_recorded_observation(self, position: RolloutPosition) -> Observation | None:
         """Return the recorded observation at a position; None if the actions differ from the recorded ones."""
-        return self.along(place)[-1]
+        return self.get_recorded_observations(position)[-1]
 
-    def recorded_next(self, place: Place) -> tuple[float, ...] | None:
+    def get_next_recorded_action(self, position: RolloutPosition) -> tuple[float, ...] | None:
         """Return the recorded action at a position; None if there is none."""
-        moment = self.recorded(place)
-        return None if moment is None else moment.action
+        observation = self.get_recorded_observation(position)
+        return None if observation is None else observation.action
 
     @torch.no_grad()
-    def _read_pair(self, episode: int, step: int) -> tuple[Moment, Moment]:
+    def _read_pair(self, episode: int, step: int) -> tuple[Observation, Observation]:
         (batch,) = read_batches(self.dataset, [(self.episodes[episode], step)], batch_size=1)
         with self.autocast():
             encoded = encode_batch(self.world_model, batch, device=self.device, chunk=2)
         if batch.frames is None:
-            raise ValueError("a cache was refused")  # `open_explorer` has checked that the data have frames
+            raise ValueError("the batch has no frames")  # `open_explorer` has checked that the data have frames
         pixels = to_display_frames(batch.frames[0].numpy(), self.world_model.image_size)
         states = batch.states[0].double().numpy()
         action = batch.actions[0, 0].double().numpy()
         if self.spaces.action.follows == "target":
             action = self.spaces.state.differences(np.stack([states[0], action]))[0]
         camera, latents = None if encoded.extrinsics is None else encoded.extrinsics[0, 0], encoded.latents[0]
-        first = Moment(pixels[0], latents[0], states[0], tuple(action.tolist()), camera)
-        return first, Moment(pixels[1], latents[1], states[1])
+        first = Observation(pixels[0], latents[0], states[0], tuple(action.tolist()), camera)
+        return first, Observation(pixels[1], latents[1], states[1])
 
     @torch.no_grad()
-    def truth(self, place: Place, cancelled: Cancelled = lambda: False) -> Moment | None:
+    def get_true_observation(
+        self, position: RolloutPosition, cancelled: Cancelled = lambda: False
+    ) -> Observation | None:
         """Return the true observation at a position, recorded or else simulated; None if it is unknown.
 
         Raises:
             SearchCancelledError: The simulation was cancelled.
         """
-        recorded = self.recorded(place)
+        recorded = self.get_recorded_observation(position)
         if recorded is not None or self.simulate is None:
             return recorded
-        episode, crop = self.episodes[place.episode], self.dataset.config.crop
-        frame, state, reached = self.simulate(episode, place.start, place.actions, cancelled)
+        episode, crop = self.episodes[position.episode], self.dataset.config.crop
+        frame, state, has_reached_target = self.simulate(episode, position.start, position.actions, cancelled)
         with self.autocast():
             latents = encode_frames(self.world_model, frame[None], crop)[0]
         (pixels,) = to_display_frames(crop_frames(frame[None], crop), self.world_model.image_size)
-        return Moment(pixels, latents, state, is_simulated=True, reached=reached)
+        return Observation(pixels, latents, state, is_simulated=True, has_reached_target=has_reached_target)
 
     # ---- predictions ----
 
-    def states(self, place: Place) -> Float[np.ndarray, "time state_dim"]:
+    def integrate_states(self, position: RolloutPosition) -> Float[np.ndarray, "time state_dim"]:
         """Return the states along a path: recorded while the actions are the recorded ones, then integrated."""
-        states = [self.moment(place.episode, place.start).state]
-        for action, recorded in zip(place.actions, self.along(place)[1:], strict=True):
+        states = [self.get_observation(position.episode, position.start).state]
+        for action, recorded in zip(position.actions, self.get_recorded_observations(position)[1:], strict=True):
             following = counterfactual_states(states[-1], np.array([action]), self.spaces.state)[1]
             states.append(following if recorded is None else recorded.state)
         return np.stack(states)
 
-    def imagined(self, teller: int, place: Place) -> Float[Tensor, "tokens dim"]:
+    def predict_latents(self, model_index: int, position: RolloutPosition) -> Float[Tensor, "tokens dim"]:
         """Return the predicted latents at the end of a path; without actions the true ones.
 
         Args:
-            teller: Index of the model in `evaluated_models`.
-            place: The start frame and the actions.
+            model_index: Index of the model in `evaluated_models`.
+            position: The start frame and the actions.
         """
-        return self._end(teller, place)[0]
+        return self._cached_prediction(model_index, position)[0]
 
     @torch.no_grad()
-    def _imagine(self, teller: int, place: Place) -> tuple[Float[Tensor, "tokens dim"], KeyValueCache]:
+    def _predict_step(
+        self, model_index: int, position: RolloutPosition
+    ) -> tuple[Float[Tensor, "tokens dim"], KeyValueCache]:
         """Return the predicted latents at the end of a path, and the key/value cache of all its steps."""
-        if not place.actions:
-            return self.moment(place.episode, place.start).latents, KeyValueCache()
-        (before, cache), states = self._end(teller, place.before), self.states(place)
+        if not position.actions:
+            return self.get_observation(position.episode, position.start).latents, KeyValueCache()
+        (latents, cache), states = (
+            self._cached_prediction(model_index, position.previous),
+            self.integrate_states(position),
+        )
         values = states[-1]
         if self.spaces.action.follows != "target":
-            values = np.array(place.actions[-1])
-            if self.recorded(place) is None:  # limits the change of the gripper to what is possible
+            values = np.array(position.actions[-1])
+            if self.get_recorded_observation(position) is None:  # the gripper cannot open or close beyond its range
                 values = feasible_actions(states[-2], values[None], self.spaces.state)[0]
-        cache, camera = cache.copy(), self.camera(place)
+        cache, camera = cache.copy(), self.get_extrinsics(position)
         action, state = (torch.as_tensor(x, dtype=torch.float32, device=self.device) for x in (values, states[-2]))
-        inputs = before[None, None], action[None, None], state[None, None]
-        with self.autocast(), self.evaluated_models[teller].prediction_context():
-            predicted = self.model(teller).predict(*inputs, None if camera is None else camera[None, None], cache)
+        inputs = latents[None, None], action[None, None], state[None, None]
+        with self.autocast(), self.evaluated_models[model_index].prediction_context():
+            predicted = self.get_model(model_index).predict(
+                *inputs, None if camera is None else camera[None, None], cache
+            )
         return predicted[0, 0].float(), cache
 
-    def model(self, teller: int) -> WorldModel:
+    def get_model(self, model_index: int) -> WorldModel:
         """Return a model. Use it within its `prediction_context()`, because models share weights."""
-        model = self.evaluated_models[teller].model
+        model = self.evaluated_models[model_index].model
         assert isinstance(model, WorldModel)  # noqa: S101  # `load_subject` loads no other
         return model
 
-    def camera(self, place: Place) -> Float[Tensor, " 6"] | None:
+    def get_extrinsics(self, position: RolloutPosition) -> Float[Tensor, " 6"] | None:
         """Return the pose of the camera, if the models use it."""
-        return self.moment(place.episode, place.start).extrinsics
+        return self.get_observation(position.episode, position.start).extrinsics
 
-    def decoded(self, latents: Float[Tensor, "tokens dim"]) -> Pixels:
+    def decode(self, latents: Float[Tensor, "tokens dim"]) -> Pixels:
         """Decode latents into an image."""
         return np.asarray(shown(self.decoder.decoder, latents[None])[0])
 
@@ -306,7 +321,7 @@ def open_explorer(
     config = config.model_copy(update={"data": config.data.model_copy(update=changes)})
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-    require_frames(config.data, to="show what is true")
+    require_frames(config.data, to="show the recorded frames")
     reporter.task(LOADING)
     models = load(dataset, decoder)
     models.move_to(accelerator.device)
@@ -321,11 +336,11 @@ def open_explorer(
 
 # ---- energies and plans ----
 
-_NODES = 7  # points of an energy map along each axis
+_GRID_POINTS = 7  # points of an energy map along each axis
 
 
 @dataclass(frozen=True, eq=False)
-class PlanFound:
+class PlanResult:
     """A plan, and the best sample of each iteration of its search."""
 
     plan: Plan
@@ -345,35 +360,41 @@ class Search:
         """
         self._explorer, self.config = explorer, config
 
-    def space(self, steps: int = 1) -> SearchSpace:
+    def make_search_space(self, steps: int = 1) -> SearchSpace:
         """Return the allowed actions of a plan.
 
         Raises:
             InputError: There are no limits for vectors.
         """
-        return search_space(self._of(steps), self._explorer.spaces.state)
+        return search_space(self._with_horizon(steps), self._explorer.spaces.state)
 
-    def _of(self, steps: int) -> PlanningConfig:
+    def _with_horizon(self, steps: int) -> PlanningConfig:
         return self.config.model_copy(update={"horizon": steps, "action_repeat": 1})
 
     @property
     def axes(self) -> tuple[int, ...]:
         """The axes of the energy maps, as indices of an action: the position of a pose, or the first free numbers."""
         is_pose = self._explorer.spaces.state.is_pose
-        return (0, 1, 2) if is_pose else tuple(self.space().free[:3].tolist())
+        return (0, 1, 2) if is_pose else tuple(self.make_search_space().free[:3].tolist())
 
-    def energy(self, latents: Float[Tensor, "tokens dim"], goal: Float[Tensor, "tokens dim"]) -> float:
+    def compute_energy(self, latents: Float[Tensor, "tokens dim"], goal: Float[Tensor, "tokens dim"]) -> float:
         """Return the energy of a frame: its distance to the goal frame."""
         return float(distance(latents[None], goal[None], self.config.energy))
 
-    def maps(
-        self, teller: int, place: Place, goal: Tensor, action: Sequence[float], progress: Progress, cancelled: Cancelled
+    def compute_maps(
+        self,
+        model_index: int,
+        position: RolloutPosition,
+        goal: Tensor,
+        action: Sequence[float],
+        progress: Progress,
+        cancelled: Cancelled,
     ) -> tuple[EnergySlice, ...]:
         """Return the energy after one more action, as maps over each pair of the numbers in `axes`.
 
         Args:
-            teller: Index of the model.
-            place: The position to start from.
+            model_index: Index of the model.
+            position: The position to start from.
             goal: Latents of the goal frame.
             action: The action in the middle of the maps.
             progress: Called with the number of evaluated actions.
@@ -384,33 +405,43 @@ class Search:
             SearchCancelledError: It was cancelled.
         """
         around = torch.tensor([list(action)], dtype=torch.float32)
-        with self._cost(teller, place, goal) as cost:
-            watched = until_cancelled(cancelled, progress)
-            return energy_slices(cost, around, self.space(), self.axes, nodes=_NODES, progress=watched)
+        with self._cost(model_index, position, goal) as cost:
+            checked_progress = until_cancelled(cancelled, progress)
+            return energy_slices(
+                cost, around, self.make_search_space(), self.axes, nodes=_GRID_POINTS, progress=checked_progress
+            )
 
     def plan(
-        self, teller: int, place: Place, goal: Tensor, steps: int, progress: Progress, cancelled: Cancelled
-    ) -> PlanFound:
+        self,
+        model_index: int,
+        position: RolloutPosition,
+        goal: Tensor,
+        steps: int,
+        progress: Progress,
+        cancelled: Cancelled,
+    ) -> PlanResult:
         """Plan `steps` model steps towards a goal frame.
 
         Raises:
             InputError: The config has no limits of actions.
             SearchCancelledError: The search was cancelled.
         """
-        planner = Planner(self._of(steps), self.space(steps), progress=progress)
-        with self._cost(teller, place, goal) as cost, torch.no_grad():
+        planner = Planner(self._with_horizon(steps), self.make_search_space(steps), progress=progress)
+        with self._cost(model_index, position, goal) as cost, torch.no_grad():
             plan = planner.plan(cost, torch.Generator().manual_seed(0), cancelled=cancelled)
-            elites = torch.stack([one.elites[0] for one in plan.iterations if len(one.elites)][-8:] or [plan.actions])
+            elites = torch.stack(
+                [iteration.elites[0] for iteration in plan.iterations if len(iteration.elites)][-8:] or [plan.actions]
+            )
             best, _ = cost.imagine(elites)
-        now = self.energy(self._explorer.imagined(teller, place), goal)
-        return PlanFound(plan, now, tuple(best[:, -1].float()))
+        energy_now = self.compute_energy(self._explorer.predict_latents(model_index, position), goal)
+        return PlanResult(plan, energy_now, tuple(best[:, -1].float()))
 
     @contextmanager
-    def _cost(self, teller: int, place: Place, goal: Tensor) -> Iterator[WorldModelCost]:
+    def _cost(self, model_index: int, position: RolloutPosition, goal: Tensor) -> Iterator[WorldModelCost]:
         """Yield the cost function of a search from a position, whose predicted frame is used like an observed one."""
         explorer = self._explorer
-        state = torch.from_numpy(np.array(explorer.states(place)[-1], dtype=np.float32))
-        scene = Scene(explorer.imagined(teller, place), state, explorer.camera(place))
-        with explorer.autocast(), explorer.evaluated_models[teller].prediction_context():
+        state = torch.from_numpy(np.array(explorer.integrate_states(position)[-1], dtype=np.float32))
+        scene = Scene(explorer.predict_latents(model_index, position), state, explorer.get_extrinsics(position))
+        with explorer.autocast(), explorer.evaluated_models[model_index].prediction_context():
             goals, config = Goal(goal[None]), self.config.energy
-            yield WorldModelCost(explorer.model(teller), scene, goals, config, spaces=explorer.spaces)
+            yield WorldModelCost(explorer.get_model(model_index), scene, goals, config, spaces=explorer.spaces)

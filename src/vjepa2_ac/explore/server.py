@@ -14,7 +14,7 @@ from importlib.resources import files
 from typing import Any
 
 from vjepa2_ac.errors import InputError, UserError, require_library
-from vjepa2_ac.explore.views import MOST_BYTES, PageRequest, Views, packed, read_request
+from vjepa2_ac.explore.views import MAX_REQUEST_BYTES, PageRequest, Views, encode_message, read_request
 from vjepa2_ac.planning.planner import SearchCancelledError
 from vjepa2_ac.serving.access import (
     Access,
@@ -42,7 +42,7 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-_MOST_PAGES = 8  # pages that may be open at the same time
+_MAX_PAGES = 8  # pages that may be open at the same time
 
 
 @dataclass
@@ -65,7 +65,7 @@ class ExploreServer:
             port: The port; 0: a free one.
         """
         self._views, self._access, self._port = views, Access("127.0.0.1"), port
-        self._computing = ThreadPoolExecutor(1, "imagining")
+        self._computing = ThreadPoolExecutor(1, "predictions")
         self._pages = 0
 
     async def run(self, stop: asyncio.Event, ready: Callable[[str], None]) -> None:
@@ -79,9 +79,14 @@ class ExploreServer:
             InputError: The server cannot listen on the address.
         """
         library = require_library("websockets.asyncio.server", where="explore", called="websockets", extra="explore")
-        how = {"process_request": self._respond, "max_size": MOST_BYTES, "compression": None, "server_header": None}
+        options = {
+            "process_request": self._respond,
+            "max_size": MAX_REQUEST_BYTES,
+            "compression": None,
+            "server_header": None,
+        }
         with translate_listen_errors(self._access, self._port):
-            server = await library.serve(self._serve_client, self._access.host, self._port, **how)
+            server = await library.serve(self._serve_client, self._access.host, self._port, **options)
         ready(f"{format_url(server, 'http')}/")
         try:
             await stop.wait()
@@ -97,17 +102,23 @@ class ExploreServer:
         """
         path, host, status = request.path.partition("?")[0], get_single_header(request, "Host"), http.HTTPStatus
         if self._access.find_rejection(host, None) is not None:
-            return connection.respond(status.FORBIDDEN, "the page is for this machine only, under its own names\n")
+            return connection.respond(
+                status.FORBIDDEN, "unknown host name; the page is available only on this machine\n"
+            )
         if path == "/socket":
             is_same_origin = get_single_header(request, "Origin") == f"http://{host}"
-            return None if is_same_origin else connection.respond(status.FORBIDDEN, "not this server's page\n")
+            return (
+                None
+                if is_same_origin
+                else connection.respond(status.FORBIDDEN, "connections from pages of other servers are not accepted\n")
+            )
         if path not in _FILES:
-            return connection.respond(status.NOT_FOUND, "no such page\n")
+            return connection.respond(status.NOT_FOUND, "not found\n")
         return _file(connection, *_FILES[path])
 
     async def _serve_client(self, connection: Any) -> None:
-        if self._pages >= _MOST_PAGES:
-            await connection.close(1013, f"{_MOST_PAGES} pages are open")
+        if self._pages >= _MAX_PAGES:
+            await connection.close(1013, f"{_MAX_PAGES} pages are open already")
             return
         self._pages += 1
         client, closed = _Client(), require_library("websockets", where="explore", called="websockets", extra="explore")
@@ -124,21 +135,21 @@ class ExploreServer:
             answering.cancel()
             for error in await asyncio.gather(answering, return_exceptions=True):
                 if isinstance(error, Exception) and not isinstance(error, closed.exceptions.ConnectionClosed):
-                    logger.error("a page was given up", exc_info=error)
+                    logger.error("the connection to a page was closed after an error", exc_info=error)
 
     def _take(self, client: _Client, message: str | bytes) -> bytes | None:
         """Set the pending request of a page, which cancels the running one; return an error if it is invalid."""
         try:
             client.waiting = read_request(message)
         except InputError as error:
-            return packed("error", None, {"text": str(error)})
+            return encode_message("error", None, {"text": str(error)})
         client.replaced.set()
         client.arrived.set()
         return None
 
     async def _answer_all(self, connection: Any, client: _Client) -> None:
         loop = asyncio.get_running_loop()
-        await connection.send(await loop.run_in_executor(self._computing, self._views.hello))
+        await connection.send(await loop.run_in_executor(self._computing, self._views.make_hello))
         while True:
             await client.arrived.wait()
             client.arrived.clear()
@@ -147,7 +158,7 @@ class ExploreServer:
                 continue
 
             def progress(done: int, total: int, seq: int = request.seq) -> None:
-                message = packed("progress", seq, {"done": done, "total": total, "what": "action sequences"})
+                message = encode_message("progress", seq, {"done": done, "total": total, "what": "action sequences"})
                 asyncio.run_coroutine_threadsafe(connection.send(message), loop)
 
             answer = await loop.run_in_executor(
@@ -164,10 +175,10 @@ class ExploreServer:
         except SearchCancelledError:
             return None
         except UserError as error:
-            return packed("error", request.seq, {"text": str(error)})
+            return encode_message("error", request.seq, {"text": str(error)})
         except Exception:
-            logger.exception("a request of a page could not be answered")
-            return packed("error", request.seq, {"text": "This could not be computed; the terminal says more."})
+            logger.exception("an internal error occurred while a request of the page was processed")
+            return encode_message("error", request.seq, {"text": "Internal error. The terminal shows the details."})
 
 
 def _file(connection: Any, name: str, kind: str) -> Any:

@@ -20,7 +20,15 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.windows import spread_indices_with_ends
 from vjepa2_ac.episode import Progress, short_names
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.explore.explorer import MOST_STEPS, Explorer, Moment, Pixels, Place, Search, relative_spread
+from vjepa2_ac.explore.explorer import (
+    MAX_STEPS,
+    Explorer,
+    Observation,
+    Pixels,
+    RolloutPosition,
+    Search,
+    relative_spread,
+)
 from vjepa2_ac.media.figure import colour_errors
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.planning.energy import mean_difference
@@ -28,16 +36,21 @@ from vjepa2_ac.planning.planner import Cancelled
 from vjepa2_ac.spaces import Space
 from vjepa2_ac.storage.structured import parse_record, to_plain
 
-_QUICK = {"samples": 64, "iterations": 4}  # size of a search on a CPU; docs/planning.md rates its plans
-_MOST_FRAMES = 16  # frames of an image strip
-_MOST_EPISODES = 500  # episodes in the list of the page
-_SEARCHED = 32  # episodes that are read to find the one with the most motion, and usual step sizes
-_USUAL = 90.0  # percentile of the recorded changes that is proposed as step size
-_MOVES_FROM = 0.1  # changes below this share of the largest change count as rest
-_UNKNOWN = 0.05, 0.1, 0.5, 0.05  # step of positions, rotations, grippers, other numbers that never change in the data
+_CPU_SEARCH = {"samples": 64, "iterations": 4}  # size of a search on a CPU; docs/planning.md rates its plans
+_MAX_FRAMES = 16  # frames of an image strip
+_MAX_EPISODES = 500  # episodes in the list of the page
+_MAX_SAMPLED_EPISODES = 32  # episodes that are read to find the one with the most motion, and typical step sizes
+_STEP_PERCENTILE = 90.0  # percentile of the recorded changes that is proposed as step size
+_REST_SHARE = 0.1  # changes below this share of the largest change count as rest
+_DEFAULT_STEPS = (
+    0.05,
+    0.1,
+    0.5,
+    0.05,
+)  # step of positions, rotations, grippers, other numbers that never change in the data
 _MOVES: tuple[tuple[str, int | None, int], ...] = (
     ("forward", 0, 1), ("back", 0, -1), ("left", 1, 1), ("right", 1, -1), ("up", 2, 1), ("down", 2, -1),
-    ("turn left", 5, 1), ("turn right", 5, -1), ("open", 6, -1), ("close", 6, 1), ("still", None, 0),
+    ("turn left", 5, 1), ("turn right", 5, -1), ("open", 6, -1), ("close", 6, 1), ("zero action", None, 0),
 )  # fmt: skip
 
 
@@ -54,7 +67,7 @@ class Views:
         """Return the views of an explorer. On a CPU the search is small, unless the config changes `planning`."""
         planning = config.planning
         if explorer.device.type == "cpu" and planning == PlanningConfig(limits=planning.limits):
-            planning = planning.model_copy(update=_QUICK)
+            planning = planning.model_copy(update=_CPU_SEARCH)
         return cls(subject, explorer, Search(explorer, planning))
 
     def answer(self, request: PageRequest, progress: Progress, cancelled: Cancelled) -> bytes:
@@ -70,44 +83,44 @@ class Views:
             SearchCancelledError: It was cancelled.
         """
         if request.kind == "episode":
-            return self._episode(request)
+            return self._answer_episode(request)
         actions = tuple(tuple(action) for action in request.actions)
-        place = self.explorer.require(Place(request.episode, request.start, actions))
-        if request.kind == "look":
-            return self._look(request, place, cancelled)
-        return self._searched(request, place, progress, cancelled)
+        position = self.explorer.validate(RolloutPosition(request.episode, request.start, actions))
+        if request.kind == "predict":
+            return self._answer_prediction(request, position, cancelled)
+        return self._answer_search(request, position, progress, cancelled)
 
-    def hello(self) -> bytes:
+    def make_hello(self) -> bytes:
         """Return the first message to a page: models, episodes, units, moves, and a proposed start and goal."""
         explorer, space = self.explorer, self.explorer.spaces.state
-        episode, goal = self._proposed
+        episode, goal = self._initial_episode_and_goal
         content = {
             "subject": self.subject,
             "notes": explorer.notes,
-            "tellers": [{"id": one.name, "label": one.name} for one in explorer.evaluated_models],
+            "models": [{"id": model.name, "label": model.name} for model in explorer.evaluated_models],
             "truth": "recorded" if explorer.simulate is None else "simulated",
             "episodes": [
-                {"name": name, "full": explorer.name(index), "steps": explorer.steps(index)}
-                for index, name in enumerate(self.episode_names[:_MOST_EPISODES])
+                {"name": name, "full": explorer.get_episode_name(index), "steps": explorer.get_num_steps(index)}
+                for index, name in enumerate(self.episode_names[:_MAX_EPISODES])
             ],
             "stride": explorer.stride,
             "seconds_per_step": explorer.stride / explorer.dataset.control_rate_hz,
-            "most_steps": MOST_STEPS,
+            "max_steps": MAX_STEPS,
             "device": explorer.device.type,
             "step_seconds": self.step_seconds,
             "action": self.numbers,
-            "state": shown_units(space),
+            "state": make_displayed_units(space),
             "is_pose": space.is_base_pose,
             "moves": self.moves,
-            "place": {"episode": episode, "start": 0},
+            "position": {"episode": episode, "start": 0},
             "goal": {"episode": episode, "step": goal},
         }
-        return packed("hello", None, content)
+        return encode_message("hello", None, content)
 
     @cached_property
     def episode_names(self) -> list[str]:
         """The names of the episodes, shortened to the parts in which they differ."""
-        names = [self.explorer.name(index) for index in range(len(self.explorer.episodes))]
+        names = [self.explorer.get_episode_name(index) for index in range(len(self.explorer.episodes))]
         short = short_names(names)
         return [short[name] for name in names]
 
@@ -115,18 +128,22 @@ class Views:
 
     @cached_property
     def numbers(self) -> list[dict[str, Any]]:
-        """The numbers of an action: name, unit, usual step size, and the largest value that can be selected."""
-        space, usual = self.explorer.spaces.state, self._usual_changes
+        """The numbers of an action: name, unit, typical step size, and the largest value that can be selected."""
+        space, typical_sizes = self.explorer.spaces.state, self._typical_step_sizes
         steps = []
         for number in range(len(space)):
             kind = {"m": 0, "rad": 1}.get(space.units[number], 2 if number == space.gripper else 3)
-            steps.append(float(usual[number]) if usual[number] > _UNKNOWN[kind] / 10 else _UNKNOWN[kind])
+            steps.append(
+                float(typical_sizes[number])
+                if typical_sizes[number] > _DEFAULT_STEPS[kind] / 10
+                else _DEFAULT_STEPS[kind]
+            )
         for part in (space.position, space.rotation):
             if part is not None:
                 steps[part] = [max(steps[part])] * len(steps[part])
         return [
             {**unit, "name": name, "step": step, "most": 2 * step}
-            for unit, name, step in zip(shown_units(space), space.change_names, steps, strict=True)
+            for unit, name, step in zip(make_displayed_units(space), space.change_names, steps, strict=True)
         ]
 
     @property
@@ -143,86 +160,90 @@ class Views:
     def _recorded_changes(self) -> list[Float[np.ndarray, "steps dim"]]:
         """The changes of the state in each model step of some episodes."""
         explorer, changes = self.explorer, []
-        for episode in explorer.episodes[:_SEARCHED]:
+        for episode in explorer.episodes[:_MAX_SAMPLED_EPISODES]:
             states = np.asarray(explorer.dataset.source.read(episode).states, dtype=np.float64)
             changes.append(explorer.spaces.state.differences(states[:: explorer.stride]))
         return changes
 
     @property
-    def _usual_changes(self) -> Float[np.ndarray, " dim"]:
+    def _typical_step_sizes(self) -> Float[np.ndarray, " dim"]:
         sizes = np.abs(np.concatenate(self._recorded_changes)).T
-        return np.array([np.percentile(axis[axis >= _MOVES_FROM * axis.max()], _USUAL) for axis in sizes])
+        return np.array([np.percentile(axis[axis >= _REST_SHARE * axis.max()], _STEP_PERCENTILE) for axis in sizes])
 
     @property
-    def _proposed(self) -> tuple[int, int]:
+    def _initial_episode_and_goal(self) -> tuple[int, int]:
         """The proposed start and goal: the episode with the most motion, and its last control step."""
         size = self.explorer.spaces.state.sized
         lengths = [float(np.linalg.norm(changes[:, size], axis=1).sum()) for changes in self._recorded_changes]
         episode = int(np.argmax(lengths))
-        return episode, self.explorer.steps(episode) - 1
+        return episode, self.explorer.get_num_steps(episode) - 1
 
     @cached_property
     def step_seconds(self) -> float:
         """Seconds for the prediction and decoding of one step with all models, measured once after a warm-up."""
         zero_action = (0.0,) * len(self.explorer.spaces.state)
         for attempt in range(2):
-            began, place = time.perf_counter(), Place(0, 0, (zero_action,) * (attempt + 1))
-            for teller in range(len(self.explorer.evaluated_models)):
-                self.explorer.decoded(self.explorer.imagined(teller, place))
-        return time.perf_counter() - began
+            start_time, position = time.perf_counter(), RolloutPosition(0, 0, (zero_action,) * (attempt + 1))
+            for model_index in range(len(self.explorer.evaluated_models)):
+                self.explorer.decode(self.explorer.predict_latents(model_index, position))
+        return time.perf_counter() - start_time
 
     # ---- answers ----
 
-    def _episode(self, request: PageRequest) -> bytes:
+    def _answer_episode(self, request: PageRequest) -> bytes:
         explorer, index = self.explorer, request.episode
-        explorer.require(Place(index, 0))
-        last, stride = explorer.steps(index) - 1, explorer.stride
-        steps = [index * stride for index in spread_indices_with_ends(last // stride + 1, _MOST_FRAMES)]
+        explorer.validate(RolloutPosition(index, 0))
+        last, stride = explorer.get_num_steps(index) - 1, explorer.stride
+        steps = [index * stride for index in spread_indices_with_ends(last // stride + 1, _MAX_FRAMES)]
         images = [
-            Image(f"frame-{number}", explorer.moment(index, step).pixels, f"recorded at control step {step}")
+            Image(f"frame-{number}", explorer.get_observation(index, step).pixels, f"recorded at control step {step}")
             for number, step in enumerate(steps)
         ]
-        return packed("episode", request.seq, {"episode": index, "steps": steps}, images)
+        return encode_message("episode", request.seq, {"episode": index, "steps": steps}, images)
 
-    def _look(self, request: PageRequest, place: Place, cancelled: Cancelled) -> bytes:
-        explorer, start = self.explorer, self.explorer.moment(place.episode, place.start)
-        goal = self._goal(request)
-        outcome, states = explorer.truth(place, cancelled), explorer.states(place)
-        known = None if outcome is None else "simulated" if outcome.is_simulated else "recorded"
-        images = [Image("given", start.pixels, f"the given frame, recorded at control step {place.start}")]
-        images += [] if outcome is None else [Image("truth", outcome.pixels, f"what really happens, {known}")]
-        images += [] if goal is None else [Image("goal", goal.pixels, "the goal frame")]
-        tellers = []
+    def _answer_prediction(self, request: PageRequest, position: RolloutPosition, cancelled: Cancelled) -> bytes:
+        explorer, start = self.explorer, self.explorer.get_observation(position.episode, position.start)
+        goal = self._get_goal_observation(request)
+        outcome, states = explorer.get_true_observation(position, cancelled), explorer.integrate_states(position)
+        truth_kind = None if outcome is None else "simulated" if outcome.is_simulated else "recorded"
+        images = [Image("start", start.pixels, f"start frame, recorded at control step {position.start}")]
+        images += [] if outcome is None else [Image("truth", outcome.pixels, f"ground truth, {truth_kind}")]
+        images += [] if goal is None else [Image("goal", goal.pixels, "goal frame")]
+        model_results = []
         for number, evaluated_model in enumerate(explorer.evaluated_models):
-            latents, name = explorer.imagined(number, place), evaluated_model.name
-            images.append(Image(f"imagined-{name}", explorer.decoded(latents), f"what {name} imagines"))
-            errors = None if outcome is None or not place.actions else mean_difference(latents, outcome.latents)
+            latents, name = explorer.predict_latents(number, position), evaluated_model.name
+            images.append(Image(f"predicted-{name}", explorer.decode(latents), f"frame predicted by {name}"))
+            errors = None if outcome is None or not position.actions else mean_difference(latents, outcome.latents)
             if errors is not None:
-                images.append(Image(f"error-{name}", self._error_map(errors), f"where {name} is wrong"))
-            tellers.append({
+                images.append(Image(f"error-{name}", self._error_map(errors), f"error map of {name}"))
+            model_results.append({
                 "id": name,
                 "error": None if errors is None else float(errors.mean()),
                 "spread": relative_spread(latents, start.latents if outcome is None else outcome.latents),
-                "energy": None if goal is None else self.search.energy(latents, goal.latents),
+                "energy": None if goal is None else self.search.compute_energy(latents, goal.latents),
             })  # fmt: skip
-        position = explorer.spaces.state.position
+        position_axes = explorer.spaces.state.position
         content = {
-            "episode": place.episode,
-            "start": place.start,
-            "actions": place.actions,
-            "recorded": explorer.recorded(place) is not None,
-            "next_recorded": explorer.recorded_next(place),
+            "episode": position.episode,
+            "start": position.start,
+            "actions": position.actions,
+            "recorded": explorer.get_recorded_observation(position) is not None,
+            "next_recorded": explorer.get_next_recorded_action(position),
             "state": states[-1],
-            "path": None if position is None else states[:, position],
-            "truth": known,
+            "path": None if position_axes is None else states[:, position_axes],
+            "truth": truth_kind,
             "truth_state": None if outcome is None else outcome.state,
-            "note": "" if outcome is None or outcome.reached else "The arm cannot go so far: it went as far as it can.",
-            "tellers": tellers,
-            "copying": None if outcome is None else float(mean_difference(start.latents, outcome.latents).mean()),
+            "note": ""
+            if outcome is None or outcome.has_reached_target
+            else "The target is out of reach. The arm stopped on the way to it.",
+            "models": model_results,
+            "persistence_error": None
+            if outcome is None
+            else float(mean_difference(start.latents, outcome.latents).mean()),
         }
-        return packed("look", request.seq, content, images)
+        return encode_message("predict", request.seq, content, images)
 
-    def _goal(self, request: PageRequest) -> Moment | None:
+    def _get_goal_observation(self, request: PageRequest) -> Observation | None:
         """Return the goal frame of a request; None if there is none.
 
         Raises:
@@ -231,24 +252,28 @@ class Views:
         explorer, goal = self.explorer, request.goal
         if goal is None:
             return None
-        if goal.episode >= len(explorer.episodes) or goal.step >= explorer.steps(goal.episode):
+        if goal.episode >= len(explorer.episodes) or goal.step >= explorer.get_num_steps(goal.episode):
             found = f"step {goal.step} of episode {goal.episode}"
-            raise InputError(where="goal", found=found, needed="a frame of an episode that is shown")
-        return explorer.moment(goal.episode, goal.step)
+            raise InputError(where="goal", found=found, needed="a frame of one of the listed episodes")
+        return explorer.get_observation(goal.episode, goal.step)
 
     def _error_map(self, errors: Float[Tensor, " tokens"]) -> Pixels:
         size = self.explorer.world_model.image_size
         grid = size // self.explorer.world_model.sizes.patch_size
         return colour_errors(errors.float().reshape(grid, grid).cpu().numpy(), (size, size)).astype(np.uint8)
 
-    def _searched(self, request: PageRequest, place: Place, progress: Progress, cancelled: Cancelled) -> bytes:
+    def _answer_search(
+        self, request: PageRequest, position: RolloutPosition, progress: Progress, cancelled: Cancelled
+    ) -> bytes:
         names = [evaluated_model.name for evaluated_model in self.explorer.evaluated_models]
-        moment = self._goal(request)
-        if moment is None or request.teller not in names:
-            raise InputError(where=request.kind, found="no goal, or no model", needed="both")
-        goal, teller = moment.latents, names.index(request.teller)
+        goal_observation = self._get_goal_observation(request)
+        if goal_observation is None or request.model not in names:
+            raise InputError(
+                where=request.kind, found="no goal frame or no known model", needed="a goal frame and a model"
+            )
+        goal, model_index = goal_observation.latents, names.index(request.model)
         if request.kind == "plan":
-            result = self.search.plan(teller, place, goal, request.steps, progress, cancelled)
+            result = self.search.plan(model_index, position, goal, request.steps, progress, cancelled)
             iterations = [iteration for iteration in result.plan.iterations if len(iteration.elites)]
             content = {
                 "actions": result.plan.actions.double(),
@@ -257,27 +282,27 @@ class Views:
                 "iterations": [{"lowest": iteration.lowest} for iteration in iterations],
             }
             images = [
-                Image(f"best-{number}", self.explorer.decoded(latents), f"best of iteration {number + 1}")
+                Image(f"best-{number}", self.explorer.decode(latents), f"best of iteration {number + 1}")
                 for number, latents in enumerate(result.best)
             ]
-            return packed("plan", request.seq, content, images)
+            return encode_message("plan", request.seq, content, images)
         width = len(self.explorer.spaces.state)
         action = request.action if len(request.action) == width else [0.0] * width
-        maps = self.search.maps(teller, place, goal, action, progress, cancelled)
-        shown = [
+        maps = self.search.compute_maps(model_index, position, goal, action, progress, cancelled)
+        energy_maps = [
             {
                 "across": plane.axes[0], "up": plane.axes[1], "across_values": plane.across, "up_values": plane.up,
                 "energy": plane.energy,
             }
             for plane in maps
         ]  # fmt: skip
-        now = self.search.energy(self.explorer.imagined(teller, place), goal)
-        return packed("energy", request.seq, {"maps": shown, "now": now}, ())
+        energy_now = self.search.compute_energy(self.explorer.predict_latents(model_index, position), goal)
+        return encode_message("energy", request.seq, {"maps": energy_maps, "energy_now": energy_now}, ())
 
 
 # ---- message format: a request is JSON; an answer is a JSON header followed by images ----
 
-MOST_BYTES = 1 << 16  # size limit of a request
+MAX_REQUEST_BYTES = 1 << 16  # size limit of a request
 _QUALITY = 90  # JPEG quality
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -298,12 +323,12 @@ class PageRequest:
     """A request of a page; `kind` determines which fields are used."""
 
     seq: Index
-    kind: Literal["episode", "look", "energy", "plan"]
+    kind: Literal["episode", "predict", "energy", "plan"]
     episode: Index = 0
     start: Index = 0  # control step of the given frame
-    actions: Annotated[list[Action], Field(max_length=MOST_STEPS)] = field(default_factory=list)
+    actions: Annotated[list[Action], Field(max_length=MAX_STEPS)] = field(default_factory=list)
     goal: GoalFrame | None = None
-    teller: Annotated[str, Field(max_length=200)] = ""  # name of the model, for energy and plan
+    model: Annotated[str, Field(max_length=200)] = ""  # name of the model, for energy and plan
     action: Action = field(default_factory=list)  # the action in the middle of the energy maps
     steps: Annotated[int, Field(ge=1, le=8)] = 1  # model steps of a plan
 
@@ -317,8 +342,10 @@ def read_request(text: str | bytes) -> PageRequest:
     try:
         values = json.loads(text)
     except (ValueError, RecursionError):
-        raise InputError(where="request", found="no JSON", needed="what explore's own page sends") from None
-    return parse_record(PageRequest, values, where="request", needed="what explore's own page sends")
+        raise InputError(
+            where="request", found="invalid JSON", needed="a request in the format of explore's page"
+        ) from None
+    return parse_record(PageRequest, values, where="request", needed="a request in the format of explore's page")
 
 
 @dataclass(frozen=True)
@@ -330,7 +357,7 @@ class Image:
     alt: str  # text description
 
 
-def packed(kind: str, seq: int | None, values: dict[str, Any], images: Sequence[Image] = ()) -> bytes:
+def encode_message(kind: str, seq: int | None, values: dict[str, Any], images: Sequence[Image] = ()) -> bytes:
     """Encode an answer: the length of the header in 4 bytes, the JSON header, and the images as JPEG.
 
     Args:
@@ -347,8 +374,8 @@ def packed(kind: str, seq: int | None, values: dict[str, Any], images: Sequence[
     return b"".join([len(text).to_bytes(4, "big"), text, *jpegs])
 
 
-def shown_units(space: Space) -> list[dict[str, Any]]:
+def make_displayed_units(space: Space) -> list[dict[str, Any]]:
     """Return the name, unit, displayed unit and conversion factor of each number of a state or an action."""
     shown = {"m": ("cm", 100.0), "rad": ("°", 180 / math.pi)}
     units = [(name, unit, *shown.get(unit, (unit, 1.0))) for name, unit in zip(space.names, space.units, strict=True)]
-    return [dict(zip(("name", "unit", "shown_unit", "factor"), one, strict=True)) for one in units]
+    return [dict(zip(("name", "unit", "shown_unit", "factor"), values, strict=True)) for values in units]

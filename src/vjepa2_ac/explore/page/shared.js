@@ -1,20 +1,20 @@
 // @ts-check
-/** How does the page talk with its server, and draw the answers? */
+/** The connection to the server, and helpers that create elements of the page. */
 
 /** @typedef {{kind: string, seq: number | null, images: {name: string, bytes: number, alt: string}[]}} Common */
-/** @typedef {Common & {[key: string]: any}} Header of a message: its kind says which further fields it has */
-/** @typedef {Map<string, HTMLImageElement>} Pictures decoded, by their names */
-/** @typedef {{header: Header, pictures: Pictures}} Answer */
+/** @typedef {Common & {[key: string]: any}} Header of a message; its kind determines the further fields */
+/** @typedef {Map<string, HTMLImageElement>} Images decoded images by name */
+/** @typedef {{header: Header, images: Images}} Answer */
 /** @typedef {{kind: string, fields: object, seq: number, settle: (answer: Answer | Error | null) => void}} Request */
-/** @typedef {{shown_unit: string, factor: number}} Unit of a number, as people read it */
+/** @typedef {{shown_unit: string, factor: number}} Unit displayed unit of a number */
 
-const SEARCHES = new Set(["energy", "plan"]); // a newer request ends them
+const SEARCHES = new Set(["energy", "plan"]); // requests that are cancelled by a newer request
 const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 5000;
 
 /**
- * A socket that comes back. One request is under way at a time, and the newest of a kind waits; only a search is
- * interrupted. Answers are handed over when their images are decoded, in the order in which they were sent.
+ * A websocket that reconnects. One request is processed at a time, and only the newest request of each kind is queued.
+ * A newer request cancels a running search. Answers are passed on in order, after their images are decoded.
  */
 export class Wire {
   #socket = /** @type {WebSocket | null} */ (null);
@@ -27,8 +27,9 @@ export class Wire {
 
   /**
    * @param {string} path of the socket, relative to the page
-   * @param {{told: (answer: Answer) => void, progress: (header: Header) => void, lost: (why: string) => void}} events
-   *   told: what nobody asked for, `hello` first, after every connection; lost: it is tried again by itself
+   * @param {{received: (answer: Answer) => void, progress: (header: Header) => void, disconnected: (reason: string) => void}} events
+   *   received: a message without a request, first `hello` after each connection; disconnected: the connection was
+   *   lost and is retried automatically
    */
   constructor(path, events) {
     this.url = new URL(path, location.href.replace(/^http/, "ws").replace(/#.*/, ""));
@@ -36,7 +37,7 @@ export class Wire {
     this.connect();
   }
 
-  /** Connect, now. */
+  /** Connect immediately. */
   connect() {
     clearTimeout(this.#timer);
     this.#socket?.close();
@@ -52,26 +53,27 @@ export class Wire {
       this.#running = null;
       this.#waiting = [];
       for (const request of unanswered) request.settle(null);
-      this.events.lost(reason);
+      this.events.disconnected(reason);
       this.#timer = setTimeout(() => this.connect(), this.#retry);
       this.#retry = Math.min(2 * this.#retry, LAST_RETRY_MS);
     };
   }
 
   /**
-   * Ask the server; null: a newer request took its place, or the server was lost. Rejects with what the server says.
+   * Send a request. Resolves to null if a newer request replaced it or the connection was lost; rejects with the server's
+   * error.
    *
    * @param {string} kind
    * @param {object} fields
    * @returns {Promise<Answer | null>}
    */
-  ask(kind, fields) {
+  send(kind, fields) {
     if (this.#socket?.readyState !== WebSocket.OPEN) return Promise.resolve(null);
     return new Promise((resolve, reject) => {
       /** @param {Answer | Error | null} answer */
       const settle = (answer) => (answer instanceof Error ? reject(answer) : resolve(answer));
-      for (const older of this.#waiting.filter((one) => one.kind === kind)) older.settle(null);
-      this.#waiting = [...this.#waiting.filter((one) => one.kind !== kind), { kind, fields, seq: 0, settle }];
+      for (const older of this.#waiting.filter((request) => request.kind === kind)) older.settle(null);
+      this.#waiting = [...this.#waiting.filter((request) => request.kind !== kind), { kind, fields, seq: 0, settle }];
       this.#next();
     });
   }
@@ -87,21 +89,21 @@ export class Wire {
 
   /** @param {ArrayBuffer} data */
   async #take(data) {
-    const { header, images } = unpacked(data);
-    const isLate = () => header.seq !== null && header.seq !== this.#running?.seq;
-    if (isLate()) return;
+    const { header, buffer } = parseMessage(data);
+    const isOutdated = () => header.seq !== null && header.seq !== this.#running?.seq;
+    if (isOutdated()) return;
     if (header.kind === "progress") return this.events.progress(header);
     /** @type {Answer | Error} */
     let answer;
     try {
-      answer = header.kind === "error" ? new Error(header.text) : { header, pictures: await decoded(header, images) };
+      answer = header.kind === "error" ? new Error(header.text) : { header, images: await decodeImages(header, buffer) };
     } catch {
-      answer = new Error("An image of the answer cannot be shown.");
+      answer = new Error("An image of the answer could not be decoded.");
     }
-    if (isLate()) return; // a newer request came while images were decoded
+    if (isOutdated()) return; // a newer request was sent while the images were decoded
     if (header.seq === null) {
       this.#retry = FIRST_RETRY_MS;
-      if (!(answer instanceof Error)) this.events.told(answer);
+      if (!(answer instanceof Error)) this.events.received(answer);
       return;
     }
     const request = this.#running;
@@ -113,44 +115,44 @@ export class Wire {
 
 /**
  * @param {ArrayBuffer} data 4 bytes: length of the header; the header; the images
- * @returns {{header: Header, images: ArrayBuffer}}
+ * @returns {{header: Header, buffer: ArrayBuffer}}
  */
-function unpacked(data) {
+function parseMessage(data) {
   const end = 4 + new DataView(data).getUint32(0);
-  return { header: JSON.parse(new TextDecoder().decode(data.slice(4, end))), images: data.slice(end) };
+  return { header: JSON.parse(new TextDecoder().decode(data.slice(4, end))), buffer: data.slice(end) };
 }
 
 /**
  * @param {Header} header
- * @param {ArrayBuffer} images one after another
- * @returns {Promise<Pictures>}
+ * @param {ArrayBuffer} buffer the images in sequence
+ * @returns {Promise<Images>}
  */
-async function decoded(header, images) {
+async function decodeImages(header, buffer) {
   let begin = 0;
-  const pictures = header.images.map(({ name, bytes, alt }) => {
-    const picture = new Image();
-    picture.src = URL.createObjectURL(new Blob([images.slice(begin, (begin += bytes))], { type: "image/jpeg" }));
-    picture.alt = alt;
-    return /** @type {[string, HTMLImageElement]} */ ([name, picture]);
+  const images = header.images.map(({ name, bytes, alt }) => {
+    const image = new Image();
+    image.src = URL.createObjectURL(new Blob([buffer.slice(begin, (begin += bytes))], { type: "image/jpeg" }));
+    image.alt = alt;
+    return /** @type {[string, HTMLImageElement]} */ ([name, image]);
   });
-  await Promise.all(pictures.map(([, picture]) => picture.decode()));
-  return new Map(pictures);
+  await Promise.all(images.map(([, image]) => image.decode()));
+  return new Map(images);
 }
 
 /**
- * Put a decoded picture where another one is; without one, hide that.
+ * Replace an image of the page by a decoded image; hide it if there is none.
  *
- * @param {HTMLImageElement} place
- * @param {HTMLImageElement | undefined} picture
+ * @param {HTMLImageElement} element
+ * @param {HTMLImageElement | undefined} image
  */
-export function swap(place, picture) {
-  place.hidden = !picture;
-  if (!picture) return;
-  picture.className = place.className;
-  picture.draggable = false;
-  Object.assign(picture.dataset, place.dataset);
-  URL.revokeObjectURL(place.src);
-  place.replaceWith(picture);
+export function replaceImage(element, image) {
+  element.hidden = !image;
+  if (!image) return;
+  image.className = element.className;
+  image.draggable = false;
+  Object.assign(image.dataset, element.dataset);
+  URL.revokeObjectURL(element.src);
+  element.replaceWith(image);
 }
 
 /**
@@ -158,21 +160,21 @@ export function swap(place, picture) {
  *
  * @param {string} role
  * @param {ParentNode} within
- * @returns {any} an element; which one, the page's HTML says
+ * @returns {any} the element
  */
-export function part(role, within = document) {
+export function byRole(role, within = document) {
   return within.querySelector(`[data-role="${role}"]`);
 }
 
 /**
- * Make an element; texts become text, never HTML.
+ * Create an element. Strings become text nodes, never HTML.
  *
  * @param {string} tag
  * @param {{[name: string]: any}} properties of the element; `data`: its data attributes
  * @param {(Node | string)[]} children
  * @returns {any}
  */
-export function make(tag, { data = {}, ...properties } = {}, ...children) {
+export function createElement(tag, { data = {}, ...properties } = {}, ...children) {
   const element = Object.assign(document.createElement(tag), properties);
   Object.assign(element.dataset, data);
   element.append(...children);
@@ -180,30 +182,30 @@ export function make(tag, { data = {}, ...properties } = {}, ...children) {
 }
 
 /**
- * Make a shape of an SVG.
+ * Create a shape of an SVG.
  *
  * @param {string} tag
  * @param {{[name: string]: string | number}} values of its attributes
  */
-export function shape(tag, values) {
+export function createShape(tag, values) {
   const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
-  for (const [name, one] of Object.entries(values)) element.setAttribute(name, String(one));
+  for (const [name, value] of Object.entries(values)) element.setAttribute(name, String(value));
   return element;
 }
 
 /**
- * Write a number in its unit.
+ * Format a number in its displayed unit.
  *
  * @param {number | null} value
  * @param {Unit} unit
  * @param {boolean} signed
  */
-export function amount(value, unit, signed = false) {
+export function formatValue(value, unit, signed = false) {
   if (value === null) return "–";
-  const text = Math.abs(value * unit.factor).toFixed(digits(unit));
+  const text = Math.abs(value * unit.factor).toFixed(getDigits(unit));
   const sign = value < 0 && Number(text) !== 0 ? "−" : signed ? "+" : "";
   return `${sign}${text}${unit.shown_unit && unit.shown_unit !== "°" ? " " : ""}${unit.shown_unit}`;
 }
 
 /** @param {Unit} unit */
-export const digits = (unit) => (unit.factor === 1 ? 2 : 1);
+export const getDigits = (unit) => (unit.factor === 1 ? 2 : 1);
