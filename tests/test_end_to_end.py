@@ -168,5 +168,5 @@ def test_latents_of_another_frame_path_are_not_taken(on_an_encoder: Path, capsys
     config = config_of_encoder(on_an_encoder, "image", {**MODEL, "encoder": {**ENCODER, "frame": "image"}})
     assert main(["train", config]) == 2
     error = capsys.readouterr().err
-    assert "no latent cache of this model" in error
+    assert "no latent cache for this model" in error
     assert "encoder.frame: tubelet, not image" in error

@@ -127,7 +127,7 @@ def test_a_trained_weight_that_is_not_finite_is_named(copied, tmp_path: Path, ki
     checkpoint = load_subject(run).checkpoint
     name = poison(checkpoint / "adapter" / file)
     write_manifest(checkpoint)
-    with pytest.raises(InputError, match=rf"{file}: {re.escape(name)} holds NaN or infinity"):
+    with pytest.raises(InputError, match=rf"{file}: {re.escape(name)} contains NaN or infinity"):
         export_run(run, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -126,7 +126,7 @@ def test_weights_of_another_type_are_refused_by_name(files: Path, name: str, dty
     weights = load_file(files / name)
     tensor = sorted(weights)[0]
     save_file({**weights, tensor: weights[tensor].to(dtype)}, files / name, metadata={"format": "pt"})
-    with pytest.raises(InputError, match=rf"{re.escape(tensor)} is {dtype}, .*needed: dense weights in float16"):
+    with pytest.raises(InputError, match=rf"{re.escape(tensor)} has type {dtype} and .*needed: dense weights in float16"):
         READERS[name](files)
 
 
@@ -138,7 +138,7 @@ def test_a_checkpoint_with_weights_of_another_type_is_refused_by_name(tmp_path: 
     value = parts[part][name]
     parts[part][name] = value.to_sparse() if dtype == "sparse" else value.to(dtype)
     torch.save(parts, tmp_path / "odd.pt")
-    found = rf"odd\.pt: {part}: {re.escape(name.removeprefix('module.'))} is torch\."
+    found = rf"odd\.pt: {part}: {re.escape(name.removeprefix('module.'))} has type torch\."
     with pytest.raises(InputError, match=rf"{found}.*needed: dense weights"):
         load_official(tmp_path / "odd.pt", SIZES)
 
@@ -150,7 +150,7 @@ def test_an_encoder_of_whole_numbers_is_refused_by_name(files: Path) -> None:
     save_file({**weights, name: weights[name].long()}, path)
     sizes, encoder = SizesConfig.model_validate(TINY_CONFIG), EncoderConfig(path=str(files / "model"))
     config = ModelConfig(base="random", sizes=sizes, encoder=encoder, dtype="float32")
-    with pytest.raises(InputError, match=rf"{re.escape(name)} is torch\.int64"):
+    with pytest.raises(InputError, match=rf"{re.escape(name)} has type torch\.int64"):
         load_base(config, seed=0)
 
 

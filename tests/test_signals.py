@@ -143,7 +143,7 @@ def test_a_signal_while_data_do_not_come_ends_the_run_before_the_step(
         for number, batch in enumerate(batches_from(run)):
             if number == 5:  # the second of two micro-batches of step 3
                 os.kill(os.getpid(), signal.SIGTERM)
-                raise UnreachableError(where="data", found="no batch after SIGTERM")
+                raise UnreachableError(where="data", found="no batch arrived after SIGTERM")
             yield batch
 
     config = make_config(run_dir=str(tmp_path / "stopped"), checkpoint__keep_best=False)

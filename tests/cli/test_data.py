@@ -131,7 +131,7 @@ def test_convert_writes_a_data_set_that_can_be_checked(config: str, tmp_path: Pa
     assert main(["data", "check", config, *keys, "--limit", "4"]) == 0
     for folder in (out, tmp_path):
         assert main(["data", "convert", config, str(folder)]) == 2
-        assert "already there and not empty" in capsys.readouterr().err
+        assert "the folder exists and is not empty" in capsys.readouterr().err
 
 
 def test_calibrate_prints_a_table_and_writes_its_metrics(config: str, tmp_path: Path, capsys: Printed) -> None:

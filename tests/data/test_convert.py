@@ -219,7 +219,7 @@ def test_a_broken_episode_is_left_out_where_the_policy_says_so(spoiled: Callable
 
 
 def test_latents_and_names_with_a_slash_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"latents, without frames.*to write its frames"):
+    with pytest.raises(InputError, match=r"a latent cache, which has no frames.*to write its frames"):
         convert_to_lerobot(config_of("x", source="latents"), tmp_path / "out", SILENT)
     with pytest.raises(InputError, match=r"'a/b'.*without /"):
         convert_to_lerobot(config_of("x", source="npz", camera="a/b"), tmp_path / "out", SILENT)

@@ -46,7 +46,7 @@ def test_every_filter_counts_what_it_took() -> None:
 def test_an_outcome_that_nobody_tells_is_refused() -> None:
     with pytest.raises(InputError, match=r"data\.outcome: success: no episode.*Set data\.outcome: all"):
         open_in_memory(MemorySource([10, 10]), outcome="success")
-    with pytest.raises(InputError, match=r"none of 2 episodes is left \(left out: outcome 2\)"):
+    with pytest.raises(InputError, match=r"none of 2 episodes remains \(removed: outcome 2\)"):
         open_in_memory(MemorySource([10, 10], [False, None]), outcome="success")
 
 
@@ -63,7 +63,7 @@ def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> 
 
 
 def test_excluding_what_there_is_not_is_refused() -> None:
-    with pytest.raises(InputError, match=r"data\.exclude: not the identity of any episode: elsewhere\."):
+    with pytest.raises(InputError, match=r"data\.exclude: unknown episodes: elsewhere\."):
         open_in_memory(MemorySource([10], problems=problems(1)), exclude=("elsewhere", "bad 0"))
 
 

@@ -88,7 +88,7 @@ def test_every_source_offers_what_it_knows(source: str, by: str, groups: int, tm
 
 def test_an_episode_of_which_the_field_is_not_said_is_named(tmp_path: Path) -> None:
     folder = write_npz(tmp_path / "set", range(4), scene=lambda place: "" if place == 2 else "kitchen")
-    with pytest.raises(InputError, match=r"does not say it of 1 of 4 episodes: 002"):
+    with pytest.raises(InputError, match=r"the data set has no value for 1 of 4 episodes: 002"):
         open_dataset(config_of(source="npz", path=str(folder), split_by="scene"))
 
 

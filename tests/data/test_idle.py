@@ -137,7 +137,7 @@ def test_an_episode_that_breaks_on_the_way_is_a_broken_episode(open_with: Any, c
     with pytest.raises(InputError, match=r"memory: episode 7: damaged\. 1 more.*\[\"episode 7\", \"episode 9\"\]"):
         open_with(source, idle=MOTION)
     dataset = open_with(source, idle=MOTION, broken_episodes="skip")
-    assert "2 of 200 episodes are broken and left out: episode 7, episode 9" in caplog.text
+    assert "2 of 200 episodes are broken and skipped: episode 7, episode 9" in caplog.text
     assert not dataset.is_selected[[7, 9]].any()
     assert {one.name: one.episodes for one in dataset.removed}["broken"] == 2
     assert len(open_with(source, idle=MOTION, exclude=("episode 7", "episode 9")).broken) == 0
@@ -164,7 +164,7 @@ def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, 
     source = restful()
     dataset = open_with(source, **published(tmp_path, ranges))
     assert [dataset.kept_steps.ranges_of(episode) for episode in range(3)] == [(), ((0, 12), (20, 40)), ()]
-    assert "knows 2 of the 3 episodes; the other 1 count as idle" in caplog.text
+    assert "lists 2 of the 3 episodes; the other 1 are treated as idle" in caplog.text
     assert source.reads == []
     assert starts(dataset) == {(1, start) for start in (*range(8), *range(20, 36))}
     other = open_with(source, **published(tmp_path, {"episode 1": [[0, 13]]}))
@@ -176,13 +176,16 @@ def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, 
 
 
 BAD_LISTS = {
-    "of another set": ({"elsewhere": [[0, 3]]}, r"none of the 3 episodes; its first is elsewhere.*such as episode 0"),
+    "of another set": (
+        {"elsewhere": [[0, 3]]},
+        r"none of the 3 episodes .*first entry is elsewhere.*episode 0",
+    ),
     **{
         str(wrong): ({"episode 1": wrong}, r"ranges\.json: episode 1: .*pairs \[start, end\) of steps from 0 to 40")
         for wrong in ([[0, 41]], [[0, 9], [5, 12]], [[9, 3]], [1, 2], [[0, "9"]], None)
     },
     "not an object": ([1, 2], r"a JSON list"),
-    "not JSON": ("{", r"not JSON"),
+    "not JSON": ("{", r"invalid JSON"),
 }
 
 

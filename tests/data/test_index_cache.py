@@ -47,7 +47,7 @@ def test_a_table_is_built_once_and_again_when_that_is_asked_for(tmp_path: Path) 
     for table in (TABLE, None):
         found = kept(tmp_path, table=table)
         assert (ids(found), found.problems, compute_fingerprint(found)) == (ids(TABLE), TABLE.problems, KEY)
-        assert found.labels["task"].of_episode(2) == "push"
+        assert found.labels["task"].name_at(2) == "push"
         assert np.array_equal(found.id_rank, TABLE.id_rank)
     (tmp_path / f"index/{KEY}.index").unlink()
     assert ids(kept(tmp_path, table=EpisodeTable.from_infos([EpisodeInfo("other", 1)]))) == ["other"]

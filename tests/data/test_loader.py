@@ -225,7 +225,7 @@ def test_a_clip_that_cannot_be_read_is_missing_and_no_other_takes_its_place(capl
     assert [names([batch]) for batch in found] == [[one for one in row if one[0] not in broken] for row in whole]
     assert any(len(batch.starts) < 4 for batch in found)
     assert set(dataset.broken.reasons) == broken
-    assert sum("A clip is left out" in record.getMessage() for record in caplog.records) == 2
+    assert sum("Skipped a clip" in record.getMessage() for record in caplog.records) == 2
     assert "memory: pictures of episode 17: damaged." in caplog.text
 
 

@@ -112,8 +112,8 @@ def test_a_missing_split_is_drawn_from_train_alone(opened: Opened, tmp_path: Pat
     ("names", "changes", "why"),
     [
         (("train", "val"), {"splits": "hash"}, "data.splits is hash"),
-        (("part_1", "part_2"), {}, "no train beside val, validation or test"),
-        (("val", "test"), {}, "no train beside val, validation or test"),
+        (("part_1", "part_2"), {}, "do not include both train and a held-out split"),
+        (("val", "test"), {}, "do not include both train and a held-out split"),
     ],
 )
 def test_other_splits_are_pooled_and_drawn_by_hash_as_is_said(

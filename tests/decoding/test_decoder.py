@@ -41,7 +41,7 @@ def test_a_decoder_is_read_as_it_was_written_bit_for_bit(whole_decoder: Path, tm
 
 
 @pytest.mark.parametrize(
-    ("damage", "found"), [(Path.unlink, "No such file"), (truncated, "not a whole safetensors file")]
+    ("damage", "found"), [(Path.unlink, "No such file"), (truncated, "not a complete safetensors file")]
 )
 def test_damaged_weights_are_refused_and_named(folder: Path, damage: Callable[[Path], None], found: str) -> None:
     damage(folder / WEIGHTS)

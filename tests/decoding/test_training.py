@@ -123,7 +123,7 @@ def test_the_folder_of_another_decoder_is_refused_and_what_differs_is_named(
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"data__source": "latents"}, r"data\.source: latents, without frames"),
+        ({"data__source": "latents"}, r"data\.source: a latent cache, which has no frames"),
         ({"data__stride": "auto"}, r"data\.stride"),
     ],
 )

@@ -142,7 +142,7 @@ def test_a_cache_is_opened_by_one_listing_and_read_in_ranges_once(bucket: Gcs, f
 @pytest.mark.parametrize(
     ("url", "status", "words"),
     [
-        ("gs://nowhere/caches", None, "there is no bucket nowhere"),
+        ("gs://nowhere/caches", None, "bucket nowhere does not exist"),
         (URL, 403, r"no permission.*gcloud auth application-default login"),
     ],
 )

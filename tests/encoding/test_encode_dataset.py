@@ -50,7 +50,7 @@ def test_every_needed_frame_is_encoded_once(
     assert reported[-1] == (frames, frames)
     assert (found.encoded, found.episodes, found.frames, found.is_finished) == (8, 8, frames, True)
     assert found.bytes == sum(path.stat().st_size for path in latents_in(tmp_path / "out"))
-    assert "GB free on its disk" in reporter.notes[1]
+    assert "GB free)" in reporter.notes[1]
     encoded_frames.clear()
     assert encode(config, tmp_path / "out") == found
     assert not encoded_frames
@@ -128,7 +128,7 @@ def test_a_folder_that_cannot_be_written_or_holds_other_things_is_refused(
     ("changes", "words"),
     [
         ({"data__stride": "auto"}, "data.stride: auto"),
-        ({"data__source": "latents"}, "encoded already"),
+        ({"data__source": "latents"}, "already encoded"),
     ],
 )
 def test_what_cannot_be_encoded_is_refused_before_the_data_is_opened(
@@ -238,7 +238,7 @@ def test_a_run_that_encodes_first_is_the_run_on_frames_bit_for_bit(
     encoded_frames.clear()
     assert_same_run(whole_run, train(make_config(run_dir=str(tmp_path / "again"), **cached), reporter))
     assert not encoded_frames
-    assert any("Latents come from" in note for note in reporter.notes)
+    assert any("Reading latents from" in note for note in reporter.notes)
 
 
 def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
@@ -251,5 +251,5 @@ def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
     (folder,) = cache.iterdir()
     assert len(latents_in(folder)) == 8
     assert "encoding frames 96/96" in reported[0][0]
-    assert "Latents come from" in reported[0][0]
+    assert "Reading latents from" in reported[0][0]
     assert not reported[1][0]

@@ -372,7 +372,9 @@ def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
     original, through, _ = a_cache
     encoding = replace(NUMBERS, parts={**NUMBERS.parts, **change})
     monkeypatch.setattr(batch, "get_encoding", lambda model, _: model)
-    with pytest.raises(InputError, match=f"no latent cache.*Other caches there: 1; .*{reported}.*vjepa2-ac encode"):
+    with pytest.raises(
+        InputError, match=f"no latent cache.*other caches in its folder: 1.*{reported}.*vjepa2-ac encode"
+    ):
         LatentCache.for_dataset(original, encoding).open_dataset()
     with pytest.raises(InputError, match=reported):
         batch.require_same_encoder(encoding, alone(through), None)  # type: ignore[arg-type]

@@ -125,7 +125,7 @@ def test_an_actor_that_does_not_see_the_folder_or_sees_another_cache_there_says_
     config = make_config()
     wanted = _Task(list(needed_frames(open_dataset(config.data))))
     encode_config(make_config(data__crop="square"), out=tmp_path / "other")
-    for folder, words in (("none", "does not see what another one wrote"), ("other", "data.crop: square, not")):
+    for folder, words in (("none", "are not visible to another process"), ("other", "data.crop: square, not")):
         found = _Actor(config_as_dict(config), tmp_path / folder, Path.cwd())({"wanted": wanted})["found"]
         assert isinstance(found.error, InputError)
         assert words in str(found.error)

@@ -180,7 +180,7 @@ def test_where_nothing_was_simulated_no_outcome_is_known(whole_run: Path, whole_
         ({"actions": ("sideways",)}, r"actions: 'sideways'. needed: true \(of a recorded clip\), none, up"),
         ({"actions": ("nowhere.npy",)}, "nowhere.npy: cannot be read"),
         ({"size_m": 0.0}, "--size"),
-        ({"episode": "nobody"}, "--episode nobody: 0 episodes of this name"),
+        ({"episode": "nobody"}, "--episode nobody: 0 episodes with this name"),
         ({"episode": "first", "start": -1}, r"--start: -1, in an episode of 24 steps.*0 to 17"),
         ({"episode": "first", "start": 18}, r"--start: 18, .*0 to 17: a clip takes 7 control steps"),
         ({"episode": "first", "steps": 12}, "a longer episode"),

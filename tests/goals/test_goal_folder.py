@@ -96,7 +96,7 @@ def test_images_that_are_none_or_of_another_size_are_refused(folder: Path) -> No
     with pytest.raises(InputError, match=r"goal_2\.png: 48 x 40 pixels"):
         read_goal_folder(folder)
     (folder / "goal_2.png").write_bytes(b"GIF89a")
-    with pytest.raises(InputError, match=r"goal_2\.png: 6 bytes that are no image"):
+    with pytest.raises(InputError, match=r"goal_2\.png: 6 bytes that are not an image"):
         read_goal_folder(folder)
 
 

@@ -97,7 +97,7 @@ def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
 @pytest.mark.parametrize(
     ("words", "wrong"),
     [
-        (["config.yaml", "--episode", "9"], "--episode 9: 0 episodes of this name"),
+        (["config.yaml", "--episode", "9"], "--episode 9: 0 episodes with this name"),
         (["config.yaml", "data.stride=auto"], "data.stride: auto"),
     ],
 )

@@ -45,12 +45,12 @@ def test_images_are_their_pixels_in_rgb(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "complaint"),
     [
-        (b"", "0 bytes that are no image"),
-        (b"x,y,z\n1,2,3\n", "no image, starting with b'x,y,'"),
-        (png(Image.fromarray(PIXELS))[:60], "no image"),
-        (simplejpeg.encode_jpeg(PIXELS)[:60], "no image"),
-        (png(Image.fromarray(PIXELS[..., 0].astype(np.uint16))), "not 8 bits a channel"),
-        (png(Image.fromarray(PIXELS[..., 0].astype(np.uint16)), "TIFF"), "no image, .*depth, as TIFF, is not used"),
+        (b"", "0 bytes that are not an image"),
+        (b"x,y,z\n1,2,3\n", "not an image, starting with b'x,y,'"),
+        (png(Image.fromarray(PIXELS))[:60], "not an image"),
+        (simplejpeg.encode_jpeg(PIXELS)[:60], "not an image"),
+        (png(Image.fromarray(PIXELS[..., 0].astype(np.uint16))), "not 8 bits per channel"),
+        (png(Image.fromarray(PIXELS[..., 0].astype(np.uint16)), "TIFF"), "not an image, .*depth images, such as TIFF"),
     ],
 )
 def test_what_is_no_image_is_refused(data: bytes, complaint: str, tmp_path: Path) -> None:
@@ -158,5 +158,5 @@ def test_an_image_that_may_never_end_or_is_too_large_is_refused(
             read_image(path)
     monkeypatch.setattr(jpeg, "_MAX_FILE_BYTES", 1000)
     (tmp_path / "large.png").write_bytes(png(Image.fromarray(PIXELS)))
-    with pytest.raises(InputError, match=r"large\.png: more than 1,000 bytes"):
+    with pytest.raises(InputError, match=r"large\.png: .*at most 1,000 bytes"):
         read_image(tmp_path / "large.png")

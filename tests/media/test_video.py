@@ -66,7 +66,7 @@ def test_depth_is_refused_by_its_pixels(
             file.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 64), 900, np.uint16), format=pixels)))
         file.mux(stream.encode(None))
     capfd.readouterr()  # what the encoder says
-    with pytest.raises(InputError, match=f"a: frames of {pixels}: one channel of more than 8 bits, as depth is stored"):
+    with pytest.raises(InputError, match=f"a: frames of {pixels}: one channel of more than 8 bits, as in depth videos"):
         read_frames(path, [0], where="a")
 
 
@@ -112,14 +112,16 @@ def test_a_frame_half_a_step_away_is_not_the_steps_frame(tmp_path: Path) -> None
     times[20] += 10
     path = write_mp4(tmp_path / "a.mp4", FRAMES, times=times)
     assert len(read_frames(path, [19, 21], where="a", clock=Clock(0.0, 15.0))) == 2
-    with pytest.raises(InputError, match=r"a: no frame at 1\.333 s\. needed: one for each of 3 times from 1\.267 s on"):
+    with pytest.raises(
+        InputError, match=r"a: no frame at 1\.333 s\. .*each of 3 times, starting at 1\.267 s"
+    ):
         read_frames(path, [19, 20, 21], where="a", clock=Clock(0.0, 15.0))
 
 
 def test_a_video_slower_than_its_clock_is_named_with_both_rates(tmp_path: Path) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, rate=10)
     message = (
-        r"a: no frame at 0\.033 s: the video has 10 frames a second, and meta/info\.json says 30\. needed: a frame"
+        r"a: no frame at 0\.033 s: the video has 10 frames per second, but meta/info\.json states 30\. needed: a frame"
     )
     with pytest.raises(InputError, match=message):
         read_frames(path, [0, 1], where="a", clock=Clock(0.0, 30.0, "meta/info.json"))
@@ -175,7 +177,7 @@ def test_frames_are_displayed_upright(
 @pytest.mark.parametrize("matrix", [(0, 0, 0, 0), (1, 1, -1, 1), (1, 0, 0, 0)])
 def test_a_display_matrix_other_than_a_quarter_turn_is_refused(matrix: tuple[int, ...], tmp_path: Path) -> None:
     path = with_matrix(write_mp4(tmp_path / "a.mp4", FRAMES), *matrix)
-    with pytest.raises(InputError, match="a: a display matrix that is no rotation by 90, 180 or 270 degrees"):
+    with pytest.raises(InputError, match="a: a display matrix that is not a rotation by a multiple of 90 degrees"):
         read_frames(path, [0], where="a")
 
 
@@ -287,7 +289,10 @@ def test_a_clock_too_coarse_for_its_frames_shows_none_twice(tmp_path: Path) -> N
     scale = data.index(b"mdhd") + 16
     data[scale : scale + 4] = bytes(4)
     path.write_bytes(data)
-    with pytest.raises(InputError, match=r"times in units of 1 s for 15 frames a second\. needed: a time for each"):
+    with pytest.raises(
+        InputError,
+        match=r"a time unit of 1 s.*too coarse for 15 frames per second\. .*a different time",
+    ):
         read_frames(path, [0, 5], where="a", clock=Clock(0.0, 15.0))
 
 

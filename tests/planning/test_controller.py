@@ -49,8 +49,8 @@ def test_a_model_in_bfloat16_plans_as_well(planner: str) -> None:
 @pytest.mark.parametrize(
     ("frame", "complaint"),
     [
-        (image(0, 48, 60), "as the goal image"), (image(0, 60, 60), "as the goal image"),
-        (image(0, 50, 48), "as the goal image"), (image(0)[..., 0], "RGB image"),
+        (image(0, 48, 60), "like the goal image"), (image(0, 60, 60), "like the goal image"),
+        (image(0, 50, 48), "like the goal image"), (image(0)[..., 0], "RGB image"),
         (np.dstack([image(0), image(0)]), "RGB image"),
         (image(0).astype(np.float32), "RGB image"), (image(0)[:4, :4], "RGB image"),
     ],

@@ -195,7 +195,7 @@ def test_a_place_without_permission_is_an_error_with_the_way_out(
 
 def test_a_bucket_that_does_not_exist_is_an_error(bucket: Gcs, make_config: Callable[..., Config]) -> None:
     assert bucket.names("bucket")
-    with pytest.raises(InputError, match=r"there is no bucket buckett\..*check its name\. Or name another place"):
+    with pytest.raises(InputError, match=r"bucket buckett does not exist\..*check its name\. Or name another place"):
         open_remote(make_config(checkpoint__remote="gs://buckett/run"), SILENT)
 
 

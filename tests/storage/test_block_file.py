@@ -289,6 +289,6 @@ def test_an_entry_without_permission_is_fetched_again_and_not_replaced(
             assert cache.read_parts("key", 2, [0]) is None
             cache.write("key", b"other")
     (warning,) = (record.getMessage() for record in caplog.records)
-    assert warning.startswith(f"{entry}: cannot be used (Permission denied (mode 0000, owner uid")
+    assert warning.startswith(f"{entry}: the disk cache cannot be used (Permission denied (mode 0000, owner uid")
     assert entry.read_bytes() == before
     assert DiskCache(tmp_path, None).read_parts("key", 2, [1]) == [b"second"]

@@ -73,7 +73,7 @@ def test_camera_poses_go_to_the_model_that_wants_them_only(make_config, reporter
     wanting = run.world_model.sizes.predictor.model_copy(update={"use_extrinsics": True})
     run.world_model.sizes = run.world_model.sizes.model_copy(update={"predictor": wanting})
     assert get_extrinsics(run.world_model, posed) is posed.extrinsics
-    with pytest.raises(InputError, match=r"use_extrinsics: no pose of the camera in some of these episodes: /data/LAB"):
+    with pytest.raises(InputError, match=r"use_extrinsics: no camera pose in some of these episodes: /data/LAB"):
         get_extrinsics(run.world_model, batch)
 
 

@@ -73,8 +73,8 @@ def cut_clip(recording: Episode, request: ClipRequest, config: DataConfig) -> Cl
     extrinsics = None if recording.extrinsics is None else recording.extrinsics[list(steps)]
     if config.pose_frame == "camera":
         if extrinsics is None:
-            fix = "Set data.pose_frame: base, or choose a camera that has one"
-            raise InputError(where=f"episode {recording.info.id}", found="no pose of the camera", fix=fix)
+            fix = "Set data.pose_frame: base, or choose a camera with a known pose"
+            raise InputError(where=f"episode {recording.info.id}", found="no camera pose", fix=fix)
         states = states_in_camera_frame(states, extrinsics)
     return Clip(
         frames=frames,
@@ -109,7 +109,7 @@ def compute_actions(
     if config.actions == "difference":
         return measured_space(config, states.shape[1]).differences(states)
     if commands is None:
-        raise ValueError("no commands: a source gives them where data.actions is recorded")
+        raise ValueError("the episode has no recorded commands")
     return join_commands(commands[steps[0] : steps[-1]], config.model_stride, config.join_actions)
 
 
@@ -141,7 +141,7 @@ def collate(clips: Sequence[Clip]) -> Batch:
     ]
     if other := next((pair for pair in sizes if pair[0] != sizes[0][0]), None):
         (size, first), (other_size, name) = sizes[0], other
-        found = f"frames of {other_size} after the crop; those of episode {first} are {size}"
+        found = f"frames of {other_size} pixels after the crop, but those of episode {first} have {size}"
         fix = "Train on episodes of one size, or set training.batch_size: 1"
         raise add_exclusion_fix(InputError(where=f"episode {name}", found=found, fix=fix), [name])
     latents = [clip.latents for clip in clips if clip.latents is not None]

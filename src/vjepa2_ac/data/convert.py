@@ -69,7 +69,9 @@ def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> 
     episodes = np.flatnonzero(dataset.is_selected).tolist()
     is_known = dataset.table.success[episodes] >= 0
     if is_known.any() and not is_known.all():
-        reporter.note(f"Success is left out: {(~is_known).sum()} of {counted(len(episodes), 'episode')} lack it.")
+        reporter.note(
+            f"Success is not written: {(~is_known).sum()} of {counted(len(episodes), 'episode')} have no success label."
+        )
     progress, spaces = reporter.task("writing episodes"), dataset.spaces
     names = {STATE: spaces.state.names, ACTION: spaces.action.names}
     with (

@@ -125,7 +125,7 @@ class Dataset:
         """
         if split not in get_args(Split):
             raise InputError(where="split", found=repr(split), needed=", ".join(get_args(Split)))
-        require_stride(self.config, to="read clips", fix="Give one: open_dataset(config, stride=4)")
+        require_stride(self.config, to="read clips", fix="Pass a stride: open_dataset(config, stride=4)")
         members = self.split_mask(split)
         if not members.any():
             raise self._empty_split(split)
@@ -138,7 +138,7 @@ class Dataset:
         shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
         fix = "Lower data.validation_share or data.test_share" if split == "train" else f"Raise data.{split}_share"
         if split in held_out_splits(self.table, config):
-            fix = "Set data.splits: hash, to draw the splits from all episodes"
+            fix = "Set data.splits: hash to draw the splits from all episodes"
         found = f"no {split} episodes among {is_selected.sum()}{together} ({shares})"
         return InputError(where=f"data.path: {config.path}", found=found, fix=fix)
 
@@ -153,7 +153,7 @@ class Dataset:
             InputError: The data are a latent cache, which has the frames of one stride only.
         """
         if self.config.is_cache and stride != self.config.stride:
-            found = f"latents that were encoded for clips at stride {self.config.stride}, not {stride}"
+            found = f"latents for clips at stride {self.config.stride}, not {stride}"
             fix = "Use the data set itself, with data.cache: off"
             raise InputError(where=self.config.path, found=found, fix=fix)
         return replace(self, config=self.config.with_stride(stride))
@@ -275,11 +275,11 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     dataset = replace(dataset, groups=hash_groups(table, dataset.is_selected, config))
     if not len(dataset.episodes):
         filters = ", ".join(f"{removed.name} {removed.episodes}" for removed in dataset.removed if removed.episodes)
-        left_out = f" (left out: {filters})" if filters else ""
-        found = f"none of {counted(len(table) + len(table.problems), 'episode')} is left{left_out}"
-        fix = "Look at data.exclude, data.outcome and data.idle" if filters else ""
+        left_out = f" (removed: {filters})" if filters else ""
+        found = f"none of {counted(len(table) + len(table.problems), 'episode')} remains{left_out}"
+        fix = "Check data.exclude, data.outcome and data.idle" if filters else ""
         raise InputError(where=f"data.path: {config.path}", found=found, fix=fix)
-    logger.info("%s: %d episodes take part, %d steps of them", config.path, dataset.is_selected.sum(), kept.num_steps)
+    logger.info("%s: using %d episodes with %d steps", config.path, dataset.is_selected.sum(), kept.num_steps)
     return _settled(dataset)
 
 
@@ -352,9 +352,9 @@ def find_episode(dataset: Dataset, name: str) -> int:
         return int(name)
     matching = [int(index) for index in dataset.episodes if name in table.identity(int(index))]
     if len(matching) != 1:
-        found = f"{counted(len(matching), 'episode')} of this name in {dataset.config.path}"
+        found = f"{counted(len(matching), 'episode')} with this name in {dataset.config.path}"
         example = table.identity((matching or dataset.episodes.tolist())[0])
-        needed = f"a name such as {example}, a part that only it has, or a number from 0 to {len(table) - 1}"
+        needed = f"an identity such as {example}, a unique part of one, or an index from 0 to {len(table) - 1}"
         raise InputError(where=f"--episode {name}", found=found, needed=needed)
     return matching[0]
 
@@ -374,6 +374,6 @@ def require_widths(episode: Episode, widths: Widths) -> None:
     actual = get_widths(episode)
     if actual != widths:
         found = f"states of {actual.state} and actions of {actual.action} numbers"
-        needed = f"{widths.state} and {widths.action}, as in the others"
+        needed = f"{widths.state} and {widths.action}, as in the other episodes"
         fix = "Keep the recordings of different robots in different data sets"
         raise InputError(where=f"episode {episode.info.id}", found=found, needed=needed, fix=fix)

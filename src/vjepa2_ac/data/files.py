@@ -125,6 +125,8 @@ def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
     entries = storage.list_folder(path)
     for entry in entries:  # identities of episodes must be encodable as UTF-8
         if not entry.name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in entry.name):
-            raise InputError(where=path, found=f"the name {entry.name!r}", needed="names in UTF-8", fix="Rename it")
+            raise InputError(
+                where=path, found=f"the name {entry.name!r}", needed="names in UTF-8", fix="Rename the file or folder"
+            )
     folders = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
     return [entry for entry in entries if entry.is_file], folders

@@ -77,25 +77,26 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     """
     where = f"data.idle.ranges: {path}"
     needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
-    another = "Name the list of this version of the data set, or set data.idle.rule: commands or motion"
+    another = "Use the list for this version of the data set, or set data.idle.rule: commands or motion"
     lists = read_json_object(path, max_bytes=_MOST_BYTES, needed=needed)
     names = [table.identity(index) for index in range(len(table))]
     listed = sum(name in lists for name in names)
     if not listed:
-        first = next(iter(lists), "none at all")
-        found = f"none of the {counted(len(table), 'episode')}; its first is {first}"
+        first = next(iter(lists), "missing")
+        found = f"the list has none of the {counted(len(table), 'episode')} of the data set. Its first entry is {first}"
         needed = "the identities of the episodes" + (f", such as {names[0]}" if names else "")
         raise InputError(where=where, found=found, needed=needed, fix=another)
     ranges: list[RangesOrProblem] = []
     for name, steps in zip(names, table.num_steps.tolist(), strict=True):
         pairs = _pairs(lists.get(name, []), steps)
         if pairs is None:
-            needed = f"pairs [start, end) of steps from 0 to {steps}, its length, that do not overlap"
+            needed = f"pairs [start, end) of steps from 0 to {steps}, the episode's length, that do not overlap"
             raise InputError(where=f"{where}: {name}", found=short_repr(lists[name]), needed=needed, fix=another)
         ranges.append(pairs)
     logger.log(
         logging.INFO if listed == len(table) else logging.WARNING,
-        "%s: knows %d of the %d episodes; the other %d count as idle", path, listed, len(table), len(table) - listed,
+        "%s: lists %d of the %d episodes; the other %d are treated as idle",
+        path, listed, len(table), len(table) - listed,
     )  # fmt: skip
     return StepSelection.from_ranges(ranges)
 
@@ -121,7 +122,7 @@ def kept_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
         return moving_ranges(idle_by_motion(episode.states, config), config)
     where, velocities = f"episode {episode.info.id}", episode.joint_velocities
     if velocities is None:
-        fix = "Set data.idle.rule: motion, which needs only poses, or name the feature with the velocities"
+        fix = "Set data.idle.rule: motion, which needs only poses, or set the key for the feature with the velocities"
         raise InputError(where=where, found="no commanded joint velocities", fix=fix)
     if not np.isfinite(velocities).all():
         raise InputError(where=where, found="a joint velocity that is not finite", needed="finite numbers")

@@ -222,7 +222,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise InvalidTableError(str(error)) from None
         if len({len(column) for column in (*columns.values(), *locators.values())}) != 1:
-            raise InvalidTableError("columns of several lengths")
+            raise InvalidTableError("columns of different lengths")
         return table
 
 
@@ -280,7 +280,7 @@ class StepSelection:
         try:
             return cls(**arrays, problems=tuple((index, EpisodeProblem(**values)) for index, values in problems))
         except (LookupError, TypeError, ValueError) as error:
-            raise InvalidTableError(f"no ranges of steps ({error})") from None
+            raise InvalidTableError(f"invalid ranges of steps ({error})") from None
 
 
 T = TypeVar("T", EpisodeTable, StepSelection)
@@ -288,7 +288,10 @@ T = TypeVar("T", EpisodeTable, StepSelection)
 
 def nul_error(identity: str, where: str) -> InputError:
     """Return the error of an identity with a NUL character, which arrays of type S lose at the end of a text."""
-    text, fix = f"a NUL character in the identity {identity!r}", "Remove it where the data set stores the identity"
+    text, fix = (
+        f"a NUL character in the identity {identity!r}",
+        "Remove the character from the identity in the data set",
+    )
     return InputError(where=where, found=text, needed="text without NUL characters", fix=fix)
 
 
@@ -349,7 +352,7 @@ def cache_folder(config: DiskCacheConfig) -> Path:
         try:
             return Path(paths.resolve_local_path(configured))
         except ValueError as error:
-            raise InputError(where=_CACHE, found=f"{configured!r} {error}", needed="a folder of this machine") from None
+            raise InputError(where=_CACHE, found=f"{configured!r} {error}", needed="a local folder") from None
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
 
 
@@ -411,7 +414,7 @@ def get_or_build(config: DiskCacheConfig, key: str, make: Callable[[], T], kind:
         with storage.translate_read_errors(path):
             data = path.read_bytes()
         if not data.endswith(key.encode()):
-            raise InvalidTableError("it is damaged, from an older version, or of other data")  # noqa: TRY301
+            raise InvalidTableError("damaged, written by an older version, or for other data")  # noqa: TRY301
         return kind.from_bytes(data.removesuffix(key.encode()))
     except MissingFileError:
         pass

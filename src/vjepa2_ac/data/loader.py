@@ -49,7 +49,7 @@ PREFETCH = 2  # batches that each worker prepares in advance
 _POLL_S = 1.0  # interval of checks of workers and signals while waiting for a batch
 _GRACE_S = 5.0  # time limit for a batch after a stop signal, so that the step can be finished
 _NO_WORKERS = "data.workers=0"
-_ROOM = f"With Docker add --shm-size=8g or --ipc=host to `docker run`, set {_NO_WORKERS}"
+_MORE_SHARED_MEMORY = f"In Docker, add --shm-size=8g or --ipc=host to `docker run`. Otherwise set {_NO_WORKERS}"
 MIN_CLIPS_FOR_WORKERS = 256  # starting workers takes longer than reading fewer validation clips
 
 
@@ -337,14 +337,14 @@ def _next_row(rows: Iterator[Any], workers: Iterable[BaseProcess]) -> Any:
         except RuntimeError as error:
             if dead := [worker for worker in workers if not worker.is_alive()]:
                 found = f"a loader worker has ended unexpectedly (exit code {dead[0].exitcode})"
-                fix = f"If memory is full, lower data.workers. With {_NO_WORKERS} there are no workers"
+                fix = f"If memory is full, lower data.workers. With {_NO_WORKERS} the main process reads the clips"
                 raise UnreachableError(where="data.workers", found=found, fix=fix) from error
             if "timed out" not in str(error):
                 raise
         stop = stop_request()
         if min(stop.age_s, time.monotonic() - started) > _GRACE_S:
-            found, fix = f"no batch after {stop.reason}", "The same command resumes from the newest checkpoint"
-            raise UnreachableError(where="data", found=found, needed=f"one within {_GRACE_S:.0f} s", fix=fix)
+            found, fix = f"no batch arrived after {stop.reason}", "The same command resumes from the newest checkpoint"
+            raise UnreachableError(where="data", found=found, needed=f"a batch within {_GRACE_S:.0f} s", fix=fix)
 
 
 def _end_workers(workers: Iterable[BaseProcess]) -> None:
@@ -414,9 +414,11 @@ def require_shared_memory(data: DataConfig, batch_bytes: float, processes: int =
     needed = processes * data.workers * PREFETCH * batch_bytes
     free = shutil.disk_usage(SHARED_MEMORY).free if SHARED_MEMORY.is_dir() else math.inf
     if needed > free:
-        text = f"{counted(processes * data.workers, 'worker')} x {PREFETCH} batches of {_megabytes(batch_bytes)}"
-        text = f"{_megabytes(needed)}, for {text} in advance"
-        raise UnreachableError(where=str(SHARED_MEMORY), found=f"{_megabytes(free)} free", needed=text, fix=_ROOM)
+        workers = counted(processes * data.workers, "worker")
+        required = f"{_megabytes(needed)} for {workers} x {PREFETCH} prefetched batches of {_megabytes(batch_bytes)}"
+        raise UnreachableError(
+            where=str(SHARED_MEMORY), found=f"{_megabytes(free)} free", needed=required, fix=_MORE_SHARED_MEMORY
+        )
 
 
 def _in_shared_memory(batch: Batch) -> Batch:
@@ -428,8 +430,8 @@ def _in_shared_memory(batch: Batch) -> Batch:
     try:
         return batch.mapped(Tensor.share_memory_)
     except RuntimeError as error:
-        found = f"no room for a batch of {_megabytes(batch.nbytes)} from a loader worker ({error})"
-        raise UnreachableError(where=str(SHARED_MEMORY), found=found, fix=_ROOM) from None
+        found = f"not enough space for a batch of {_megabytes(batch.nbytes)} from a loader worker ({error})"
+        raise UnreachableError(where=str(SHARED_MEMORY), found=found, fix=_MORE_SHARED_MEMORY) from None
 
 
 def _megabytes(size: float) -> str:

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.data import PoseFields, RotationFormat
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import ANGLE_RAD, POSE
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -115,14 +115,16 @@ def require_selection(
     if fields.select is not None:
         where, count = f"{place}.select", len(fields.select)
         if beyond := [number for number in fields.select if number >= width]:
-            found = f"{beyond[0]}, of {width} numbers in {source}"
-            raise InputError(where=where, found=found, needed=f"0 to {width - 1}")
+            found = f"index {beyond[0]}, but {source} has {counted(width, 'number')}"
+            raise InputError(where=where, found=found, needed=f"indices from 0 to {width - 1}")
     rotation_width = num_rotation_numbers(fields.rotation)
     if is_pose and count != 4 + rotation_width:
         kind = "a quaternion's 4 numbers" if rotation_width == 4 else "3 numbers of the rotation"
-        needed = f"{4 + rotation_width}: x, y, z, {kind} ({section}.rotation: {fields.rotation}), the gripper"
-        fix = f"Name other columns in {section}.state, or choose among their numbers with {section}.select"
-        raise InputError(where=where, found=f"{count} numbers a step from {source}", needed=needed, fix=fix)
+        needed = (
+            f"{4 + rotation_width} numbers: x, y, z, {kind} ({section}.rotation: {fields.rotation}) and the gripper"
+        )
+        fix = f"Set other columns in {section}.state, or select some of their numbers with {section}.select"
+        raise InputError(where=where, found=f"{count} numbers per step from {source}", needed=needed, fix=fix)
 
 
 def _require_unit_quaternions(quaternions: Float[np.ndarray, "steps 4"], where: str, fix: str) -> None:

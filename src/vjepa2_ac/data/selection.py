@@ -49,8 +49,8 @@ def select_included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray,
     names = {index: name for index in candidates if (name := table.identity(index)) in excluded}
     unknown = excluded.difference(names.values(), (problem.name for problem in table.problems))
     if unknown:
-        found = f"not the identity of any episode: {format_identities(sorted(unknown))}"
-        needed = "identities as errors name them" + (f", such as {table.identity(0)}" if len(table) else "")
+        found = f"unknown episodes: {format_identities(sorted(unknown))}"
+        needed = "identities of episodes" + (f", such as {table.identity(0)}" if len(table) else "")
         raise InputError(where="data.exclude", found=found, needed=needed)
     is_selected = np.ones(len(table), bool)
     is_selected[list(names)] = False
@@ -66,7 +66,7 @@ def select_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, 
     if config.outcome == "all":
         return np.ones(len(table), bool)
     if len(table) and (table.success < 0).all():
-        found = f"no episode of {config.path} says whether it succeeded"
+        found = f"no episode of {config.path} has a success label"
         raise InputError(where=f"data.outcome: {config.outcome}", found=found, fix="Set data.outcome: all")
     return np.asarray(table.success == (config.outcome == "success"))
 
@@ -131,10 +131,10 @@ class BrokenEpisodes:
         names = [problem.name for problem in problems]
         if self._config.broken_episodes == "error":
             first, more = problems[0], len(problems) - 1
-            more_problems = f"{more} more cannot be used either. " if more else ""
+            more_problems = f"{counted(more, 'more episode')} cannot be used either. " if more else ""
             raise self.add_fix(replace(first, fix=more_problems + first.fix).error, names)
         logger.warning(
-            "%s: %d of %d episodes are broken and left out: %s; the first: %s",
+            "%s: %d of %d episodes are broken and skipped: %s. First error: %s",
             self._config.path, len(problems), self._episodes, format_identities(names), problems[0].error,
         )  # fmt: skip
         self._add({problem.name: str(problem.error) for problem in problems})
@@ -147,7 +147,7 @@ class BrokenEpisodes:
         """
         if name not in self.reasons:
             count = len(self) + 1
-            logger.warning("A clip is left out, %d of %d episodes are broken: %s", count, self._episodes, reason)
+            logger.warning("Skipped a clip; %d of %d episodes are broken: %s", count, self._episodes, reason)
             self._add({name: reason})
 
     def restore(self, reasons: Mapping[str, str]) -> None:
@@ -246,8 +246,10 @@ def describe_splits(table: EpisodeTable, config: DataConfig) -> str:
     counts = np.bincount(labels.number[labels.number >= 0], minlength=len(labels.names)).tolist()
     listed = [f"{name} ({counted(count, 'episode')})" for name, count in zip(labels.names, counts, strict=True)]
     if not (held_out := held_out_splits(table, config)):
-        why = "data.splits is hash" if config.splits == "hash" else "no train beside val, validation or test"
-        return f"drawn by hash from all of the data set's own, {', '.join(listed)}: {why}"
+        reason = (
+            "data.splits is hash" if config.splits == "hash" else "they do not include both train and a held-out split"
+        )
+        return f"drawn by hash; the data set's own splits are not used because {reason}: {', '.join(listed)}"
     roles = zip(listed, map_split_roles(labels.names).items(), strict=True)
     used = ", ".join(text if name == role else f"{text} as {role}" for text, (name, role) in roles)
     drawn = next((f"; {split} is drawn from train by hash" for split in _HELD_OUT if split not in held_out), "")
@@ -336,10 +338,10 @@ def hash_groups(
     ungrouped = [table.identity(index) for index in np.flatnonzero(is_selected).tolist() if not groups[index]]
     if ungrouped:
         from_source = split_by in table.labels
-        reason = "the data set does not say it of" if from_source else "found nothing in the identities of"
+        reason = "the data set has no value for" if from_source else "the pattern does not match the identities of"
         alternative = "choose another field" if from_source else "choose a pattern that fits every identity"
         found = f"{reason} {len(ungrouped)} of {counted(is_selected.sum(), 'episode')}: {format_identities(ungrouped)}"
-        fix = f"Leave these out with data.exclude, or {alternative}"
+        fix = f"Exclude these with data.exclude, or {alternative}"
         raise InputError(where=f"data.split_by: {split_by}", found=found, fix=fix)
     hashes = {group: hash_identity(group) for group in groups if group}
     any_hash = next(iter(hashes.values()), 0)
@@ -351,10 +353,10 @@ def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
         return [labels.name_at(index) for index in range(len(table))]
     identities = [table.identity(index) for index in range(len(table))]
     if split_by not in IDENTITY_PATTERNS and re.fullmatch(r"[A-Za-z_]+", split_by):
-        fields = ", ".join(table.labels) or "none of its own"
+        fields = ", ".join(table.labels) or "no fields"
         example = f", such as {identities[0]}" if identities else ""
-        found = f"no such field; this data set has {fields}, and its identities may have {', '.join(IDENTITY_PATTERNS)}"
-        needed = f"a field, or a regular expression with one group for the identity{example}"
+        found = f"unknown field. This data set has {fields}; built-in patterns are {', '.join(IDENTITY_PATTERNS)}"
+        needed = f"a field, a built-in pattern, or a regular expression with one group for the identity{example}"
         raise InputError(where=f"data.split_by: {split_by}", found=found, needed=needed)
     search = re.compile(IDENTITY_PATTERNS.get(split_by, split_by)).search
     return [match.group(1) if (match := search(identity)) else None for identity in identities]

@@ -111,7 +111,7 @@ def select_split_windows(
         found += f" Too short: {format_identities(names, len(short))}"
         raise InputError(where=where, found=found, needed=length, fix="Lower data.frames or data.stride")
     if len(short):
-        clip = f"a clip of {config.clip_steps} control steps and left out: {format_identities(names, len(short))}"
+        clip = f"a clip of {config.clip_steps} control steps and are skipped: {format_identities(names, len(short))}"
         _warn_once(f"{config.path}: {len(short)} of {count} {split} episodes are shorter than {clip}")
     windows = starts.select(members[starts.episode])
     if not len(windows):
@@ -189,7 +189,9 @@ def candidate_strides(control_rate_hz: float) -> tuple[int, ...]:
     return tuple(sorted({max(1, round(stride * control_rate_hz / 15)) for stride in (4, 8, 15)}))
 
 
-def require_stride(config: DataConfig, *, to: str, fix: str = "`vjepa2-ac data calibrate CONFIG` finds one") -> int:
+def require_stride(
+    config: DataConfig, *, to: str, fix: str = "Run `vjepa2-ac data calibrate CONFIG` to choose one"
+) -> int:
     """Return the stride of a config, which must not be auto.
 
     Args:
@@ -217,7 +219,7 @@ def require_frames(config: DataConfig, *, to: str) -> None:
     """
     if config.is_cache:
         needed = f"the data set itself, to {to}"
-        raise InputError(where="data.source", found="latents, without frames", needed=needed)
+        raise InputError(where="data.source", found="a latent cache, which has no frames", needed=needed)
 
 
 def spread_indices(size: int, count: int) -> list[int]:

@@ -132,8 +132,8 @@ def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> No
     """
     if find_heads_to_replace(world_model.sizes, widths):
         found = f"data with states of {widths.state} and actions of {widths.action} numbers"
-        needed = f"{describe_model_widths(world_model.sizes)}, which this model takes"
-        fix = "Choose other data, or train on these: `train` then replaces the model's input heads"
+        needed = f"{describe_model_widths(world_model.sizes)}, as this model requires"
+        fix = "Choose other data, or train on this data: `train` replaces the model's input heads"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 
@@ -146,7 +146,7 @@ def get_extrinsics(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "ba
     if not world_model.sizes.predictor.use_extrinsics:
         return None
     if batch.extrinsics is None:
-        found = f"no pose of the camera in some of these episodes: {', '.join(dict.fromkeys(batch.episode_ids))}"
-        fix = "Choose a data.source and data.camera that have them, or a model without use_extrinsics"
+        found = f"no camera pose in some of these episodes: {', '.join(dict.fromkeys(batch.episode_ids))}"
+        fix = "Choose a data.source and data.camera with camera poses, or a model without use_extrinsics"
         raise InputError(where="model: predictor.use_extrinsics", found=found, fix=fix)
     return batch.extrinsics

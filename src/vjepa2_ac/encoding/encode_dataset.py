@@ -76,7 +76,9 @@ def encode_config(
         encode_share(cache, left, EncoderOnDevice.from_model(config, model, device), share, reporter)
     else:
         cache.begin()
-        reporter.note(f"Everything is encoded already, in {cache.folder}")
+        reporter.note(
+            f"All {counted(count_frames(cache.requests), 'frame')} are cached in {cache.folder}; nothing to encode."
+        )
     table, broken, files = cache.dataset.table, cache.broken, cache.files
     sizes = [(request, files.size(request.episode, request.camera)) for request in cache.requests]
     absent = {request.episode for request, size in sizes if not size}
@@ -115,12 +117,14 @@ def require_encodable(config: Config) -> None:
     """
     data = config.data
     if data.is_cache:
-        raise InputError(where="data.source", found="latents: they are encoded already", needed="a data set of frames")
-    fix = "`vjepa2-ac data calibrate CONFIG` finds one; or let the run encode by itself, with data.cache: auto"
+        raise InputError(where="data.source", found="latents, which are already encoded", needed="a data set of frames")
+    fix = "Run `vjepa2-ac data calibrate CONFIG`, or set data.cache: auto to encode at the start of the training run"
     require_stride(data, to="know which frames are needed", fix=fix)
     if data.transforms:
-        found = "clips that look different every time, and a cache holds one latent of each frame"
-        raise InputError(where="data.transforms", found=found, fix="Leave data.transforms out")
+        found = "transforms that differ between clips, but a latent cache stores each frame once"
+        raise InputError(
+            where="data.transforms", found=found, fix="Remove data.transforms, or train with data.cache: off"
+        )
 
 
 def begin_encoding(cache: LatentCache, left: Sequence[FramesToEncode], reporter: Reporter) -> None:
@@ -133,11 +137,11 @@ def begin_encoding(cache: LatentCache, left: Sequence[FramesToEncode], reporter:
     config = cache.dataset.config
     reporter.note(f"Encoding {config.path} as {config.cache_dtype}: {cache.summary(left)}")
     if isinstance(cache.folder, Path):
-        free = f", with {free_bytes(cache.folder) / 1e9:.4g} GB free on its disk"
+        free = f" ({free_bytes(cache.folder) / 1e9:.4g} GB free)"
     else:
         free = ""
         storage.check_writable(cache.folder)
-    reporter.note(f"The latents go into {cache.folder}{free}")
+    reporter.note(f"Writing the latents to {cache.folder}{free}")
     cache.require_space(left)
     cache.begin()
 
@@ -197,10 +201,12 @@ def use_latent_cache(
             cache.require_same_key()
             cache.require_space(left)
             frames = counted(count_frames(left), "frame")
-            reporter.note(f"A run would first encode {frames} of {cache.summary(left)}. The cache is {cache.folder}")
+            reporter.note(
+                f"Training will first encode {frames} into {cache.folder}. Complete cache: {cache.summary(left)}"
+            )
             return dataset
     cached_dataset = cache.open_dataset()
-    reporter.note(f"Latents come from {cache.folder}: the encoder is not needed")
+    reporter.note(f"Reading latents from {cache.folder}; the encoder is not needed.")
     return cached_dataset
 
 
@@ -253,7 +259,7 @@ def require_shared(cache: LatentCache, is_visible: Callable[[], bool]) -> None:
     end = time.monotonic() + _LONGEST_UNSEEN_S
     while not is_visible():
         if time.monotonic() > end:
-            found = "a folder in which a process of the run does not see what another one wrote"
-            fix = "Set it to one that all machines of the run share; or run `vjepa2-ac encode` once on every machine"
+            found = "files of one process of the run are not visible to another process"
+            fix = "Choose a folder that all machines of the run share, or run `vjepa2-ac encode` once on every machine"
             raise InputError(where=f"data.cache_dir: {cache.folder}", found=found, fix=fix)
         time.sleep(_LOOKS_EVERY_S)

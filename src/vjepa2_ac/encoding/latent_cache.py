@@ -194,8 +194,8 @@ class LatentCache:
         if not isinstance(self.folder, Path):
             return
         fix = (
-            f"Set data.cache_dtype: int8, or data.start_every: {self.dataset.config.model_stride}; take fewer episodes"
-            " (data.outcome, data.idle, data.exclude); or name a folder on a larger disk (data.cache_dir)"
+            f"Set data.cache_dtype: int8 or data.start_every: {self.dataset.config.model_stride}, use fewer episodes"
+            " (data.outcome, data.idle, data.exclude), or set data.cache_dir to a folder on a larger disk"
         )
         require_space(self.folder, count_frames(left), self.bytes_per_frame, fix=fix)
 
@@ -211,10 +211,12 @@ class LatentCache:
         for name in storage.list_names(parent):
             if storage.exists(storage.join(other := storage.join(parent, name), CACHE)):
                 differing = read_key(other).differences(self.key.parts)
-                others.append((len(differing), f"{name} was made otherwise: {'; '.join(differing)}"))
-        nearest = f". Other caches there: {len(others)}; {min(others)[1]}" if others else ""
+                others.append((len(differing), f"{name}, which differs: {'; '.join(differing)}"))
+        nearest = (
+            f". Number of other caches in its folder: {len(others)}. Most similar: {min(others)[1]}" if others else ""
+        )
         where = f"data.cache: {self.dataset.config.cache}: {self.folder}"
-        found = f"no latent cache of this model and these settings{nearest}"
+        found = f"no latent cache for this model and these settings{nearest}"
         fix = "Run `vjepa2-ac encode` with this config, or set data.cache: auto"
         raise InputError(where=where, found=found, fix=fix)
 
@@ -244,7 +246,7 @@ def require_space(folder: Path, frames: int, per_frame: int, *, fix: str) -> Non
     needed, free = frames * per_frame, free_bytes(folder)
     if needed > free:
         size = f"{needed / _GIGABYTE:.4g} GB for the latents of {frames:,} frames ({per_frame / 1e6:.3g} MB each)"
-        found = f"{free / _GIGABYTE:.4g} GB free on its disk"
+        found = f"{free / _GIGABYTE:.4g} GB free on the disk"
         raise InputError(where=str(folder), found=found, needed=size, fix=fix)
 
 

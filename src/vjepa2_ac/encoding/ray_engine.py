@@ -25,7 +25,7 @@ _MOST_AT_ONCE = 16  # requests per task at most; within a task decoding and enco
 _FEWEST_TASKS = 64  # with enough requests, so that all actors finish at about the same time
 _MOST_DEATHS = 10  # consecutive actors that die during start-up, as on nodes without this package
 _LONGEST_END_S = 30.0  # wait for a thread of Ray Data at shutdown
-_AGAIN = "The same command goes on with what is missing"
+_AGAIN = "Run the same command again to encode the missing frames"
 
 
 @contextlib.contextmanager
@@ -48,12 +48,14 @@ def ray_engine(address: str) -> Iterator[Engine]:
     try:
         ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
     except (OSError, RuntimeError, ValueError) as error:
-        found = f"no Ray cluster that can be used ({error})"
-        raise UnreachableError(where=where, found=found, fix="`ray status` on its head node shows it") from None
+        found = f"cannot connect to a Ray cluster ({error})"
+        raise UnreachableError(
+            where=where, found=found, fix="Run `ray status` on the head node to check the address"
+        ) from None
     try:
         yield partial(_encode, where)
     except (ray.exceptions.RayError, ray.data.exceptions.ExecutionTimeoutError) as error:
-        raise UnreachableError(where=where, found=f"Ray has given up ({error})", fix=_AGAIN) from error
+        raise UnreachableError(where=where, found=f"Ray failed ({error})", fix=_AGAIN) from error
     finally:
         for thread in threading.enumerate():
             if thread.name == "iter_threaded":  # this thread of Ray Data would kill the process if Ray shut down first
@@ -75,7 +77,7 @@ def _encode(where: str, config: Config, cache: LatentCache, left: Sequence[Frame
     devices = ray.cluster_resources()
     kind = "GPU" if config.training.device != "cpu" and devices.get("GPU") else "CPU"
     if kind == "CPU" and config.training.device == "cuda":
-        raise InputError(where=f"training.device: cuda, {where}", found="a cluster without a GPU")
+        raise InputError(where=f"training.device: cuda, {where}", found="the cluster has no GPU")
     begin_encoding(cache, left, reporter)
     context, size = ray.data.DataContext.get_current(), max(1, min(_MOST_AT_ONCE, len(left) // _FEWEST_TASKS))
     context.enable_progress_bars = context.print_on_execution_start = False

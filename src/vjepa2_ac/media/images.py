@@ -41,9 +41,9 @@ def require_decodable_size(height: int, width: int, where: str, *, count: int = 
         InputError: The images are too large.
     """
     if not 0 < height * width <= MAX_PIXELS or count * height * width * 3 > _MAX_BYTES:
-        found = f"{count} images of {height} x {width} pixels at once"
+        found = f"{count} images of {height} x {width} pixels, decoded together"
         needed = f"at most {MAX_PIXELS // 10**6} megapixels each, and {_MAX_BYTES // 10**9} GB together"
-        fix = "Make the images smaller, leave the episode out, or set data.frames lower"
+        fix = "Reduce the size of the images, exclude the episode, or lower data.frames"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 
@@ -64,7 +64,7 @@ def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = No
         raise InputError(where=where, found=found, needed=needed)
     if like is not None and image.shape != like.shape:
         found = f"{image.shape[1]} x {image.shape[0]} pixels (width x height)"
-        needed = f"{like.shape[1]} x {like.shape[0]}, as the goal image: same camera, place and resolution"
+        needed = f"{like.shape[1]} x {like.shape[0]}, like the goal image: same camera, viewpoint and resolution"
         raise InputError(where=where, found=found, needed=needed)
 
 
@@ -75,7 +75,7 @@ def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
         InputError: The sizes differ.
     """
     if mask.shape != like.shape[:2]:
-        found, needed = f"shape {mask.shape} (height, width)", f"{like.shape[:2]}, as the goal image"
+        found, needed = f"shape {mask.shape} (height, width)", f"{like.shape[:2]}, like the goal image"
         raise InputError(where=where, found=found, needed=needed)
 
 
@@ -172,8 +172,8 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
             require_decodable_size(image.height, image.width, where)
             return _upright(_as_rgb(image), image)
     except (OSError, ValueError, SyntaxError, struct.error, zlib.error, EOFError, IndexError) as error:
-        found = f"{len(data)} bytes that are no image, starting with {data[:4]!r} ({error})"
-        needed = "PNG or JPEG, as a camera's images are stored; depth, as TIFF, is not used"
+        found = f"{len(data)} bytes that are not an image, starting with {data[:4]!r} ({error})"
+        needed = "a PNG or JPEG image; depth images, such as TIFF, are not supported"
         raise InputError(where=where, found=found, needed=needed) from None
 
 
@@ -195,7 +195,7 @@ def _upright(pixels: UInt8[np.ndarray, "height width 3"], image: Image.Image) ->
 
 def _as_rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:
     if image.mode not in _EIGHT_BIT:
-        raise ValueError(f"pixels of the kind {image.mode}, not 8 bits a channel")
+        raise ValueError(f"pixel format {image.mode}, not 8 bits per channel")
     return np.array(image.convert("RGB"))
 
 
@@ -284,5 +284,5 @@ def require_contrast(views: Iterable[np.ndarray], *, where: str) -> None:
         InputError: A view is uniform.
     """
     if any(map(is_uniform, views)):
-        found, needed = "an image without contrast, as of a black or covered camera", "an image of the scene"
+        found, needed = "an image without contrast, as from a black or covered camera", "an image of the scene"
         raise InputError(where=where, found=found, needed=needed)

@@ -35,7 +35,7 @@ _STRICT = {
 }
 _START = -(1 << 40)  # a time before all frames
 _SAME_RATE = 0.98  # least ratio of the video's rate to the steps' rate; times in ms round 30 Hz to 30.3 Hz
-_FIX = "Copy the file again, or leave the episode out"
+_FIX = "Copy the file again, or exclude the episode"
 _CRF = 20  # x264's constant rate factor: text stays sharp
 _COLOURS = 255  # colours of a GIF
 _SAMPLED = 4  # every n-th pixel along both axes is used to compute the palette
@@ -106,7 +106,7 @@ def _frame_times_by_position(steps: Sequence[int], times: Sequence[int], where: 
     if max(steps) >= len(times):
         raise _video_error(where, f"{len(times)} frames", f"at least {max(steps) + 1}")
     if len(set(times)) < len(times):
-        raise _video_error(where, "frames shown at the same time", "a time for each")
+        raise _video_error(where, "several frames with the same presentation time", "a different time for each frame")
     return [times[step] for step in steps]
 
 
@@ -114,17 +114,17 @@ def _frame_times_by_clock(video: _Video, clock: Clock, steps: Sequence[int]) -> 
     """Return the presentation time of the frame nearest to the time of each step."""
     targets = [round((clock.start_s + step / clock.rate_hz) / video.unit_s) for step in steps]
     if len(set(targets)) < len(set(steps)):
-        found = f"times in units of {video.unit_s:g} s for {clock.rate_hz:g} frames a second"
-        raise _video_error(video.where, found, "a time for each")
+        found = f"a time unit of {video.unit_s:g} s, which is too coarse for {clock.rate_hz:g} frames per second"
+        raise _video_error(video.where, found, "a different time for each frame")
     nearest = video.nearest_times(sorted(set(targets)), max(0, int(0.49 / clock.rate_hz / video.unit_s)))
     if not (missing := set(targets) - nearest.keys()):
         return [nearest[target] for target in targets]
     found, rate_hz = f"no frame at {min(missing) * video.unit_s:.3f} s", video.header().rate_hz
     if 0 < rate_hz < _SAME_RATE * clock.rate_hz:
-        found += f": the video has {rate_hz:.4g} frames a second, and {clock.source} says {clock.rate_hz:g}"
-        fix = "Change the rate of the video or that of the steps, or leave the episode out"
+        found += f": the video has {rate_hz:.4g} frames per second, but {clock.source} states {clock.rate_hz:g}"
+        fix = "Correct the frame rate of the video or the rate of the steps, or exclude the episode"
         raise InputError(where=video.where, found=found, needed="a frame for each step", fix=fix)
-    needed = f"one for each of {len(targets)} times from {min(targets) * video.unit_s:.3f} s on"
+    needed = f"a frame at each of {len(targets)} times, starting at {min(targets) * video.unit_s:.3f} s"
     raise _video_error(video.where, found, needed)
 
 
@@ -183,8 +183,8 @@ def _stream_of(container: Any, where: str) -> VideoStream:
         found, fix = "a codec that this build of PyAV cannot decode", "Install PyAV from PyPI, or convert the video"
         raise InputError(where=where, found=found, needed="H.264, H.265 or AV1", fix=fix)
     if is_depth_format(str(stream.pix_fmt)):
-        found = f"frames of {stream.pix_fmt}: one channel of more than 8 bits, as depth is stored"
-        raise InputError(where=where, found=found, needed="what a camera saw", fix="Name another camera")
+        found = f"frames of {stream.pix_fmt}: one channel of more than 8 bits, as in depth videos"
+        raise InputError(where=where, found=found, needed="a colour video", fix="Choose another camera")
     stream.codec_context.thread_count = 1
     stream.codec_context.options = _STRICT
     return cast("VideoStream", stream)
@@ -346,7 +346,8 @@ def _upright(image: Frame, frame: VideoFrame, where: str) -> UInt8[np.ndarray, "
     if matrix[0, 0] == matrix[1, 1] == 0:
         image, matrix = image.swapaxes(0, 1), matrix[::-1]  # x becomes y
     if np.count_nonzero(matrix) != 2 or not matrix.diagonal().all():
-        found, needed = "a display matrix that is no rotation by 90, 180 or 270 degrees", "one that is, or none"
+        found = "a display matrix that is not a rotation by a multiple of 90 degrees"
+        needed = "a rotation by 90, 180 or 270 degrees, or no display matrix"
         raise InputError(where=where, found=found, needed=needed, fix="Convert the video")
     return image[:: int(np.sign(matrix[1, 1])), :: int(np.sign(matrix[0, 0]))]
 

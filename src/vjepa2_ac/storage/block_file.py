@@ -191,7 +191,7 @@ class DiskCache:
         if isinstance(error, FileNotFoundError):
             return
         if not self._refused:
-            text = "%s: cannot be used (%s); its data are fetched again"
+            text = "%s: the disk cache cannot be used (%s). Its data are fetched again"
             logger.warning(text, error.filename or self._folder, describe_refusal(error)[0])
         self._refused.add(path)
 

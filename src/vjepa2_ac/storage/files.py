@@ -136,7 +136,7 @@ def require_regular_file(path: str | Path, size: int | None = None) -> None:
             if is_url(path) or stat.S_ISDIR((status := Path(path).stat()).st_mode):
                 return
             if not stat.S_ISREG(status.st_mode):
-                raise InputError(where=str(path), found="a pipe or a device", needed="a file")
+                raise InputError(where=str(path), found="a pipe or a device", needed="a regular file")
             size = status.st_size
         if size < _POINTER_BYTES:
             remote.refuse_pointer(str(path), read_range(path, 0, size))
@@ -221,7 +221,7 @@ def read_small_file(path: str | Path, max_bytes: int) -> bytes:
     length = min(file_size(path), max_bytes + 1) if is_url(path) else max_bytes + 1
     data = read_range(path, 0, length)
     if len(data) > max_bytes:
-        raise InputError(where=str(path), found=f"more than {max_bytes:,} bytes", needed="a file that small")
+        raise InputError(where=str(path), found="the file is too large", needed=f"at most {max_bytes:,} bytes")
     return data
 
 
@@ -317,7 +317,7 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
     with translate_write_errors(folder):
         is_folder = target.is_dir()
         if target.exists() and not is_folder:
-            raise NotADirectoryError(errno.ENOTDIR, "it is a file")
+            raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a folder")
         temporary = _new_partial(target if is_folder else target.parent, target.name)
         temporary.mkdir()
     try:
@@ -365,7 +365,7 @@ def translate_write_errors(path: str | Path, errors: frozenset[int] = _UNWRITABL
         if error.errno not in errors:
             raise
         full = error.errno in _FULL
-        fix = "Free some space, or name a place on another disk" if full else "Name a place that can be written"
+        fix = "Free some space, or choose a path on another disk" if full else "Choose a path that can be written"
         raise InputError(where=str(path), found=f"cannot be written: {error.strerror}", fix=fix) from None
 
 
@@ -383,7 +383,7 @@ def require_new_folder(folder: Path) -> None:
     with translate_write_errors(folder):
         in_use = folder.is_dir() and not is_empty(folder)
     if in_use:
-        found, fix = "already there and not empty", "Delete it, or name another folder"
+        found, fix = "the folder exists and is not empty", "Delete it, or choose another folder"
         raise InputError(where=str(folder), found=found, fix=fix)
 
 

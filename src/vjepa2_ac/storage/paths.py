@@ -42,7 +42,7 @@ def resolve_path_or_url(path: str) -> str:
     if is_url(path):
         return path.rstrip("/")
     if _SCHEME.match(path):
-        raise ValueError("looks like a URL, which has two slashes behind the colon")
+        raise ValueError("looks like a URL, but has only one slash after the colon")
     return resolve_local_path(path)
 
 
@@ -55,10 +55,10 @@ def resolve_local_path(path: str) -> str:
     if not path.strip():
         raise ValueError("is empty")
     if is_url(path) or _SCHEME.match(path):
-        raise ValueError("is a URL (or looks like one), and only a path of this machine will do")
+        raise ValueError("is a URL or looks like one, but must be a local path")
     expanded = os.path.expanduser(path)  # noqa: PTH111 - Path would remove a leading `./`
     if expanded.startswith("~"):
-        raise ValueError(f"names the home of a user who is not here; for a folder of that name write ./{path}")
+        raise ValueError(f"starts with the home folder of an unknown user; for a folder with this name write ./{path}")
     return expanded.rstrip("/") or "/"
 
 
@@ -80,7 +80,7 @@ def resolve_encoder_path(name: str) -> str:
     if not name.startswith(HUB):
         return resolve_model_path(name)
     if not _REPOSITORY.fullmatch(name):
-        raise ValueError(f"needs {HUB}owner/name, and @revision if it is not the newest")
+        raise ValueError(f"must have the form {HUB}owner/name or {HUB}owner/name@revision")
     return name
 
 

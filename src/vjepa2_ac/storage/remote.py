@@ -27,7 +27,7 @@ _VERSION_KEYS = ("generation", "etag", "ETag", "blob_id", "mtime", "last_modifie
 
 _LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
 _EXTRAS = {"gs": "gcs", "hf": ""}  # extra of this package per protocol; empty: always installed
-_KNOWN = "a folder of this machine, or gs://, hf://, s3://"
+_KNOWN = "a local folder, or a gs://, hf:// or s3:// URL"
 _CHAINED_PROTOCOLS = frozenset({  # chained fsspec protocols, which wrap other file systems; some execute templates
     "async_wrapper", "asyncwrapper", "blockcache", "cached", "dask", "data", "dir", "filecache", "generic",
     "libarchive", "reference", "simplecache", "tar", "zip",
@@ -63,8 +63,8 @@ def refuse_pointer(path: str, beginning: bytes) -> None:
         InputError: The file is a pointer.
     """
     if beginning.startswith(_POINTER):
-        fix = "Run `git lfs pull` in the cloned repository, which downloads the files"
-        raise InputError(where=path, found="a git-lfs pointer", needed="the file that it stands for", fix=fix)
+        fix = "Run `git lfs pull` in the cloned repository to download the files"
+        raise InputError(where=path, found="a git-lfs pointer", needed="the content of the file", fix=fix)
 
 
 # ---- requests, with retries ----
@@ -260,7 +260,7 @@ def _retry(url: str, action: Callable[[float], _T], operation: str = "read", tim
     try:
         return retries.call_with_retries(url, action, policy=policy, access=login_hint(url), operation=operation)
     except NotImplementedError:
-        raise RefusedError(where=url, found=f"{_protocol(url)}:// cannot be {operation}", needed=_KNOWN) from None
+        raise RefusedError(where=url, found=f"{_protocol(url)}:// URLs cannot be {operation}", needed=_KNOWN) from None
 
 
 # ---- fsspec's file systems, and their credentials ----
@@ -283,9 +283,9 @@ def _call_filesystem(filesystem: Any, method: str, timeout_s: float, *arguments:
 def login_hint(url: str) -> str:
     """Return the fix for missing permission, as a sentence."""
     protocol = _protocol(url)
-    log_in = f"Log in with `{_LOG_IN[protocol]}`, or check the name" if protocol in _LOG_IN else "Check the login"
+    log_in = f"Log in with `{_LOG_IN[protocol]}`, or check the name" if protocol in _LOG_IN else "Check your login"
     if protocol == "hf":
-        log_in += ". Or set HF_TOKEN. A gated data set must be asked for on its page first"
+        log_in += ". Or set HF_TOKEN. For a gated data set, first request access on its page"
     return f"You are not logged in. {log_in}" if protocol == "gs" and google_token() == "anon" else log_in
 
 
@@ -328,7 +328,9 @@ def _filesystem(url: str, *, writing: bool = False) -> Any:
             try:
                 opened = _google(kind, options) if protocol == "gs" else kind(**options, skip_instance_cache=True)
             except TypeError as error:  # this file system needs more arguments than a URL holds
-                raise InputError(where=url, found=f"an address alone does not do ({error})", needed=_KNOWN) from None
+                raise InputError(
+                    where=url, found=f"{protocol}:// needs options that a URL cannot hold ({error})", needed=_KNOWN
+                ) from None
             _filesystems[key] = opened
         return _filesystems[key]
 
@@ -345,14 +347,16 @@ def _kind(url: str, protocol: str) -> Any:
     import fsspec
 
     if protocol in _CHAINED_PROTOCOLS:
-        raise InputError(where=url, found=f"{protocol}://, which is no place but a way to another", needed=_KNOWN)
+        raise InputError(
+            where=url, found=f"{protocol}:// only wraps another protocol and is not supported", needed=_KNOWN
+        )
     try:
         return fsspec.get_filesystem_class(protocol)
     except ImportError as error:
         fix = f"Install it: {pip_install(_EXTRAS[protocol])}" if protocol in _EXTRAS else str(error)
         raise InputError(where=url, found=f"the library for {protocol}:// is not installed", fix=fix) from None
     except ValueError:
-        raise InputError(where=url, found=f"nothing reads {protocol}://", needed=_KNOWN) from None
+        raise InputError(where=url, found=f"unknown protocol {protocol}://", needed=_KNOWN) from None
 
 
 def _google(kind: Any, options: dict[str, Any]) -> Any:

@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TypeVar
 
-from vjepa2_ac.errors import RefusedError, UnreachableError, UserError
+from vjepa2_ac.errors import RefusedError, UnreachableError, UserError, counted
 
 logger = logging.getLogger(__name__)
 
@@ -89,17 +89,17 @@ def call_with_retries(
             if not _is_temporary(error):
                 is_denied = http_status(error) in _NO_ACCESS or _is_login_error(error)
                 found = f"{'no permission' if is_denied else f'cannot be {operation}'} ({_summary(error)})"
-                fix = access if is_denied else "Check the address"
+                fix = access if is_denied else "Check the URL"
                 raise RefusedError(where=where, found=found, fix=fix) from error
             if progress() > before:
                 begin, failures = time.monotonic(), 0
             before, failures = progress(), failures + 1
             wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
             if failures >= policy.attempts or seconds + wait_s > policy.total_s:
-                found = f"not reached in {failures} attempts over {seconds:.0f} s; the last: {_summary(error)}"
-                fix = "Check the network, and start again: a run goes on from its last checkpoint"
+                found = f"{counted(failures, 'attempt')} in {seconds:.0f} s failed. Last error: {_summary(error)}"
+                fix = "Check the network and run the command again; training resumes from the newest checkpoint"
                 raise UnreachableError(where=where, found=found, fix=fix) from error
-            _log_failure(failures, "%s: %s; trying again in %.1f s", where, _summary(error), wait_s)
+            _log_failure(failures, "%s: %s. Next attempt in %.1f s", where, _summary(error), wait_s)
         time.sleep(wait_s)
 
 

@@ -58,7 +58,7 @@ def parse_json_object(data: bytes | str, *, where: str, needed: str = "a JSON ob
     try:
         value = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise InputError(where=where, found=f"not JSON: {error}", needed=needed, fix=fix) from None
+        raise InputError(where=where, found=f"invalid JSON: {error}", needed=needed, fix=fix) from None
     if not isinstance(value, dict):
         raise InputError(where=where, found=f"a JSON {type(value).__name__}", needed=needed, fix=fix)
     return value
@@ -181,7 +181,7 @@ def parse_yaml(text: str, *, where: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         place = f"{where}: line {mark.line + 1}, column {mark.column + 1}" if mark else where
         problem = getattr(error, "problem", None) or str(error)
-        raise InputError(where=place, found=f"not YAML: {problem}") from None
+        raise InputError(where=place, found=f"invalid YAML: {problem}") from None
 
 
 class _Loader(yaml.SafeLoader):
@@ -191,7 +191,7 @@ class _Loader(yaml.SafeLoader):
         """Compose a node; refuse aliases, because a few lines of them can expand to more than fits into memory."""
         if self.check_event(yaml.AliasEvent):
             mark = self.peek_event().start_mark  # type: ignore[no-untyped-call] # PyYAML's
-            raise yaml.MarkedYAMLError(problem="an alias; write it out", problem_mark=mark)
+            raise yaml.MarkedYAMLError(problem="an alias, which is not supported; repeat the value", problem_mark=mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: MappingNode, deep: bool = False) -> dict[Any, Any]:  # noqa: ARG002 - PyYAML's
@@ -199,10 +199,12 @@ class _Loader(yaml.SafeLoader):
         mapping: dict[str, Any] = {}
         for key, value in node.value:
             if not isinstance(key, ScalarNode):
-                problem = "a key that is a mapping or a list itself; fill in the template, if it is {{ NAME }} of one"
+                problem = (
+                    "a key that is a mapping or a list; replace template placeholders such as {{ NAME }} by values"
+                )
                 raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
             if key.value in mapping:
-                raise yaml.MarkedYAMLError(problem=f"key {key.value!r} is given twice", problem_mark=key.start_mark)
+                raise yaml.MarkedYAMLError(problem=f"duplicate key {key.value!r}", problem_mark=key.start_mark)
             mapping[key.value] = self.construct_object(value, deep=True)
         return mapping
 

@@ -83,7 +83,7 @@ def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
         except (SafetensorError, OSError, TypeError) as error:  # TypeError: a dtype that torch does not have
             if storage.is_os_read_error(error):
                 raise
-            found = f"not a whole safetensors file ({error})"
+            found = f"not a complete safetensors file ({error})"
             raise InputError(where=str(path), found=found, needed=needed, fix=again) from None
 
 
@@ -96,14 +96,14 @@ def check_tensors(
         InputError: Names the first four such tensors.
     """
     problems = [f"missing: {name}" for name in needed.keys() - found.keys()]
-    problems += [f"unknown: {name}" for name in found.keys() - needed.keys()]
+    problems += [f"unexpected: {name}" for name in found.keys() - needed.keys()]
     for name in needed.keys() & found.keys():
         if found[name] != needed[name]:
-            problems.append(f"{name} is {list(found[name])}, not {list(needed[name])}")
+            problems.append(f"{name} has shape {list(found[name])}, not {list(needed[name])}")
     if problems:
         shown = "; ".join(sorted(problems)[:4]) + (f"; and {len(problems) - 4} more" if len(problems) > 4 else "")
-        found_text = f"{len(problems)} tensors do not fit ({shown})"
-        raise InputError(where=where, found=found_text, needed="every tensor of the model, and no other", fix=fix)
+        found_text = f"{len(problems)} tensors do not match ({shown})"
+        raise InputError(where=where, found=found_text, needed="exactly the tensors of the model", fix=fix)
 
 
 def require_floats(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> None:
@@ -114,7 +114,9 @@ def require_floats(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> No
     """
     for name, value in tensors.items():
         if value.dtype not in _FLOATS or value.layout is not torch.strided:
-            raise InputError(where=where, found=f"{name} is {value.dtype}, {value.layout}", needed=_FLOAT, fix=fix)
+            raise InputError(
+                where=where, found=f"{name} has type {value.dtype} and layout {value.layout}", needed=_FLOAT, fix=fix
+            )
 
 
 def require_finite(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> None:
@@ -128,4 +130,4 @@ def require_finite(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> No
     """
     for name, value in tensors.items():
         if value.is_floating_point() and value.numel() and not torch.stack(torch.aminmax(value)).isfinite().all():
-            raise InputError(where=where, found=f"{name} holds NaN or infinity", needed="finite weights", fix=fix)
+            raise InputError(where=where, found=f"{name} contains NaN or infinity", needed="finite weights", fix=fix)

@@ -162,12 +162,12 @@ def _write_errors_as_user_errors(path: str) -> Iterator[None]:
     except OSError as error:
         kind = UnreachableError if error.errno in _TEMPORARY_ERRORS else RefusedError
         found = f"cannot be written: {error.strerror or error}"
-        raise kind(where=path, found=found, fix="Check its permissions, and the disk") from error
+        raise kind(where=path, found=found, fix="Check the permissions and the disk") from error
 
 
 def _no_bucket(url: str) -> RefusedError:
     bucket = url.partition("://")[2].split("/", 1)[0]
-    return RefusedError(where=url, found=f"there is no bucket {bucket}", fix="Make it, or check its name")
+    return RefusedError(where=url, found=f"bucket {bucket} does not exist", fix="Create the bucket, or check its name")
 
 
 def download_from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
@@ -189,12 +189,17 @@ def download_from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
     try:
         return Path(snapshot_download(model, revision=revision or None, allow_patterns=list(files)))
     except (errors.RepositoryNotFoundError, errors.RevisionNotFoundError):  # or gated
-        fix = "Check the name (hf://owner/name@revision). A gated model must be asked for on its page; for one that is"
-        found = "no such model or revision, or none for you"
-        raise RefusedError(where=where, found=found, fix=f"{fix} not public, `hf auth login` or set HF_TOKEN") from None
+        fix = (
+            "Check the name (hf://owner/name@revision). For a gated model, request access on its page. For a model that"
+        )
+        found = "the model or revision does not exist, or you have no access"
+        fix = f"{fix} is not public, run `hf auth login` or set HF_TOKEN"
+        raise RefusedError(where=where, found=found, fix=fix) from None
     except errors.LocalEntryNotFoundError:
-        fix = "Check the network, or name a folder of this machine"
+        fix = "Check the network, or use a local folder"
         raise UnreachableError(where=where, found="the Hub cannot be reached", fix=fix) from None
     except (errors.HfHubHTTPError, OSError, ValueError) as error:
         message = next(iter(str(error).strip().splitlines()), type(error).__name__)
-        raise InputError(where=where, found=message, needed="the files of a model", fix="Check name and disk") from None
+        raise InputError(
+            where=where, found=message, needed="the files of a model", fix="Check the name and the disk"
+        ) from None

@@ -170,7 +170,7 @@ BROKEN = {
     "out of reach": (put(POSE, STATES[:, :6] + [6, 0, 0, 0, 0, 0]), "5 m"),
     "all steps skipped": (put("observation/timestamp/skip_action", np.ones(STEPS, bool)), "no steps"),
     "cut trajectory": (cut("trajectory.h5", 0.5), "trajectory.h5: .*HDF5"),
-    "cut metadata": (cut("*.json", 0.5), "not JSON"),
+    "cut metadata": (cut("*.json", 0.5), "invalid JSON"),
     "no such camera": (lambda folder: next(folder.glob("*.json")).write_text("{}"), "left_mp4_path"),
     "cut video": (cut(MP4, 0.5), f"{LEFT}.mp4"),
     "video two frames short": (lambda folder: write_mp4(folder / MP4, FRAMES[LEFT][:-2]), "but 22 frames"),

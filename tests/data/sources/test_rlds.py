@@ -232,7 +232,7 @@ def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "not JSON"),
+        ("{", "invalid JSON"),
         ('{"name": "a", "splits": []}', "no episodes"),
         ('{"name": "a", "splits": [{"name": "train", "shardLengths": ["x"]}]}', "not a description"),
         (

@@ -286,8 +286,8 @@ def truncate(folder: Path) -> None:
         (lambda folder: (folder / "vjepa2_ac.json").unlink(), r"vjepa2_ac\.json: cannot be read: No such"),
         (lambda folder: (folder / "vjepa2_ac.json").write_text("[]"), r"vjepa2_ac\.json: a JSON list"),
         (lambda folder: (folder / "adapter_config.json").unlink(), r"adapter_config\.json: cannot be read: No such"),
-        (truncate, "not a whole safetensors file"),
-        (change_rank, r"24 tensors do not fit .*is \[4, 36\], not \[8, 36\]"),
+        (truncate, "not a complete safetensors file"),
+        (change_rank, r"24 tensors do not match .*has shape \[4, 36\], not \[8, 36\]"),
     ],
 )
 def test_a_folder_that_is_not_a_whole_adapter_is_named(

@@ -140,7 +140,10 @@ def test_the_same_from_the_hub_and_then_without_a_network(tmp_path: Path, monkey
         model = model_of("hf://facebook/tiny")
         assert model.encoder_fingerprint() == model_of(V2).encoder_fingerprint()
         assert str(model.encoder_origin) == "hf://facebook/tiny"
-        for wrong, said in (("facebook/none", "no such model"), ("facebook/tiny@v9", "no such model or revision")):
+        for wrong, said in (
+            ("facebook/none", "does not exist"),
+            ("facebook/tiny@v9", "model or revision does not exist"),
+        ):
             with pytest.raises(RefusedError, match=said):
                 model_of(f"hf://{wrong}")
     again = model_of("hf://facebook/tiny")  # out of the cache
@@ -200,7 +203,7 @@ def with_another_tensor(whole: dict[str, Any]) -> None:
     ("change", "message"),
     [
         (without_last_norm, r"missing: norms_block\.3\.bias.*Get the original"),
-        (with_another_tensor, r"ema_encoder: 1 tensors do not fit \(unknown: cls_token\)"),
+        (with_another_tensor, r"ema_encoder: 1 tensors do not match \(unexpected: cls_token\)"),
         (lambda _: {"encoder": {"a": 1}}, "no weights under 'encoder'"),
         (lambda _: {"encoder": {"a": torch.zeros(1)}}, "no tensor 'patch_embed.proj.weight' in encoder"),
     ],
@@ -229,7 +232,7 @@ def test_a_config_that_contradicts_the_file_is_refused(path: Path, encoder: dict
     [
         ({"model_type": "vit"}, "model_type: Input should be 'vjepa2'"),
         ({"num_attention_heads": 4}, "48"),
-        ({"hidden_size": 96}, "do not fit"),
+        ({"hidden_size": 96}, "do not match"),
         ({"tubelet_size": 4}, "tubelet_size"),
         ({"hidden_size": 10**9}, "hidden_size"),
     ],

@@ -64,7 +64,7 @@ def test_a_weight_that_is_not_finite_is_named(model: WorldModel, tmp_path: Path,
     name = sorted(weights)[-1]
     weights[name].flatten()[-1] = float("nan")
     save_file(weights, tmp_path / part)
-    with pytest.raises(InputError, match=rf"{part}: {name} holds NaN or infinity"):
+    with pytest.raises(InputError, match=rf"{part}: {name} contains NaN or infinity"):
         load_with(tmp_path, SizesConfig())
 
 
@@ -106,7 +106,7 @@ def test_it_predicts_as_the_model_that_was_written_and_its_licence_is_told_once(
 
 
 def test_what_does_not_fit_is_refused(file: Path, encoder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"predictor\.use_extrinsics|predictor: 2 tensors do not fit"):
+    with pytest.raises(InputError, match=r"predictor\.use_extrinsics|predictor: 2 tensors do not match"):
         loaded(file, encoder, sizes={"image_size": 48, "predictor": {"width": 36, "heads": 3, "use_extrinsics": True}})
     with pytest.raises(InputError, match=r"no encoder \(keys: predictor, opt, scaler, epoch\)"):
         load_official(file, MODEL.sizes)
@@ -119,7 +119,7 @@ def test_what_does_not_fit_is_refused(file: Path, encoder: Path, tmp_path: Path)
         seed=0,
     )
     wider.save_pretrained(tmp_path / "wider")
-    with pytest.raises(InputError, match=r"predictor_embed.weight is \[36, 24\], not \[36, 48\].*model.encoder"):
+    with pytest.raises(InputError, match=r"predictor_embed.weight has shape \[36, 24\], not \[36, 48\].*model.encoder"):
         loaded(file, tmp_path / "wider")
     with pytest.raises(InputError, match=r"an encoder of its own, and model.encoder names another"):
         loaded(tmp_path / "wider", encoder)
@@ -128,5 +128,5 @@ def test_what_does_not_fit_is_refused(file: Path, encoder: Path, tmp_path: Path)
     whole = torch.load(file, weights_only=True)
     whole["predictor"]["module.predictor_proj.bias"][0] = float("nan")
     torch.save(whole, file)
-    with pytest.raises(InputError, match=r"predictor_proj\.bias holds NaN"):
+    with pytest.raises(InputError, match=r"predictor_proj\.bias contains NaN"):
         loaded(file, encoder)

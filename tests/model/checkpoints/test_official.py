@@ -170,9 +170,9 @@ def drop_head(whole: Whole) -> None:
     [
         (
             rename_one,
-            r"encoder: 2 tensors do not fit \(missing: blocks.1.norm1.weight; unknown: blocks.1.norm1.scale\)",
+            r"encoder: 2 tensors do not match \(missing: blocks.1.norm1.weight; unexpected: blocks.1.norm1.scale\)",
         ),
-        (drop_head, r"predictor: 1 tensors do not fit \(missing: state_encoder.weight\)"),
+        (drop_head, r"predictor: 1 tensors do not match \(missing: state_encoder.weight\)"),
         (lambda _: [1, 2], "changed.pt: a list. needed: a checkpoint of V-JEPA"),
         (lambda whole: {"encoder": whole["encoder"]}, r"no predictor \(keys: encoder\)\. needed: both parts"),
         (lambda whole: whole["predictor"], r"no encoder \(keys: module\.\w+\..*needed: both parts.*torch\.save\("),

@@ -55,10 +55,10 @@ def break_sizes(folder: Path) -> None:
             lambda folder: (folder / "config.json").write_text('{"model_type": "vjepa2"}'),
             "config.json: not the config of a world model",
         ),
-        (break_sizes, r"model.safetensors: 16 tensors do not fit \(missing: blocks.2.attn.k.bias"),
+        (break_sizes, r"model.safetensors: 16 tensors do not match \(missing: blocks.2.attn.k.bias"),
         (
             lambda folder: os.truncate(folder / "encoder.safetensors", 1000),
-            "encoder.safetensors: not a whole safetensors file",
+            "encoder.safetensors: not a complete safetensors file",
         ),
     ],
 )
