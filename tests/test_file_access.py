@@ -126,7 +126,9 @@ def test_weights_of_another_type_are_refused_by_name(files: Path, name: str, dty
     weights = load_file(files / name)
     tensor = sorted(weights)[0]
     save_file({**weights, tensor: weights[tensor].to(dtype)}, files / name, metadata={"format": "pt"})
-    with pytest.raises(InputError, match=rf"{re.escape(tensor)} has type {dtype} and .*needed: dense weights in float16"):
+    with pytest.raises(
+        InputError, match=rf"{re.escape(tensor)} has type {dtype} and .*needed: dense weights in float16"
+    ):
         READERS[name](files)
 
 

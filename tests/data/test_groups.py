@@ -65,7 +65,9 @@ def count_of_groups(dataset: Dataset) -> int:
 
 def test_an_identity_without_a_group_is_named_and_refused() -> None:
     names = [*NAMES[:20], "elsewhere/one", "elsewhere/two"]
-    with pytest.raises(InputError, match=r"split_by: day: .*in the identities of 2 of 22 episodes: elsewhere/one, "):
+    with pytest.raises(
+        InputError, match=r"split_by: day: .*does not match the identities of 2 of 22 episodes: elsewhere/one, "
+    ):
         opened(names, split_by="day")
     with pytest.raises(InputError, match=r"2 of 22 episodes: elsewhere/one, elsewhere/two.*data\.exclude"):
         opened(names, split_by=r"LAB(\d?)")

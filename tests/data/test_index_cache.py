@@ -88,7 +88,7 @@ def test_the_index_of_another_data_set_is_not_used_under_this_name(
     other = index_key({"files": 4}, "/data/set")
     path.rename(path.with_name(f"{other}.index"))
     assert ids(kept(tmp_path, other, table=EpisodeTable.from_infos([EpisodeInfo("other", 1)]))) == ["other"]
-    assert "of other data" in caplog.text
+    assert "for other data" in caplog.text
     assert ids(kept(tmp_path, other)) == ["other"]
 
 

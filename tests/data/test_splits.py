@@ -112,8 +112,8 @@ def test_a_missing_split_is_drawn_from_train_alone(opened: Opened, tmp_path: Pat
     ("names", "changes", "why"),
     [
         (("train", "val"), {"splits": "hash"}, "data.splits is hash"),
-        (("part_1", "part_2"), {}, "do not include both train and a held-out split"),
-        (("val", "test"), {}, "do not include both train and a held-out split"),
+        (("part_1", "part_2"), {}, "they do not include both train and a held-out split"),
+        (("val", "test"), {}, "they do not include both train and a held-out split"),
     ],
 )
 def test_other_splits_are_pooled_and_drawn_by_hash_as_is_said(
@@ -122,7 +122,7 @@ def test_other_splits_are_pooled_and_drawn_by_hash_as_is_said(
     dataset = opened(write_rlds_splits(tmp_path / "set", *names), **changes)
     assert members(dataset) == {one.id: split_of(one.id, dataset.config) for one in dataset.table}
     text = describe_splits(dataset.table, dataset.config)
-    assert text.endswith(why)
+    assert f"because {why}: " in text
     assert all(f"{name} (4 episodes)" in text for name in names)
 
 

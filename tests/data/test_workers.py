@@ -61,7 +61,7 @@ def test_a_system_without_shared_memory_is_not_checked(monkeypatch: pytest.Monke
 def test_a_run_is_refused_before_its_first_step(make_config: Any, shared_memory: Any) -> None:
     frames = 2 * 4 * 36 * 49 * 3  # a batch of two clips of 4 frames, and 49 numbers of states and actions each
     shared_memory(2 * loader.PREFETCH * (frames + 2 * 4 * (4 * 7 + 3 * 7)) - 1)
-    with pytest.raises(UnreachableError, match=r"2 workers x 2 batches of 0\.0427 MB"):
+    with pytest.raises(UnreachableError, match=r"2 workers x 2 prefetched batches of 0\.0427 MB"):
         set_up(make_config(data__workers=2))
     set_up(make_config(data__workers=0))
 
@@ -75,9 +75,7 @@ def test_a_batch_without_room_in_shared_memory_is_an_error_of_the_worker(monkeyp
     with contextlib.closing(loader.training_loader(dataset, seed=0, batch_size=2)) as batches:
         assert next(batches).frames.is_shared()
         monkeypatch.setattr(torch.Tensor, "share_memory_", full)
-        with pytest.raises(
-            UnreachableError, match=r"not enough space for a batch .* MB .*unable to allocate.*--ipc"
-        ):
+        with pytest.raises(UnreachableError, match=r"not enough space for a batch .* MB .*unable to allocate.*--ipc"):
             next(batches)
 
 

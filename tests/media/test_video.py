@@ -112,9 +112,7 @@ def test_a_frame_half_a_step_away_is_not_the_steps_frame(tmp_path: Path) -> None
     times[20] += 10
     path = write_mp4(tmp_path / "a.mp4", FRAMES, times=times)
     assert len(read_frames(path, [19, 21], where="a", clock=Clock(0.0, 15.0))) == 2
-    with pytest.raises(
-        InputError, match=r"a: no frame at 1\.333 s\. .*each of 3 times, starting at 1\.267 s"
-    ):
+    with pytest.raises(InputError, match=r"a: no frame at 1\.333 s\. .*each of 3 times, starting at 1\.267 s"):
         read_frames(path, [19, 20, 21], where="a", clock=Clock(0.0, 15.0))
 
 
