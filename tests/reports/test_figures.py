@@ -36,7 +36,7 @@ def test_every_run_is_drawn_under_its_own_name_and_style(tmp_path, monkeypatch) 
     comparison = Comparison("errors", (), np.array([0.5, 1.0]), curves, (), {}, {})
     assert plot_comparison(comparison, tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     (legend,) = drawn[0].legends
-    assert [text.get_text() for text in legend.get_texts()] == ["persistence", *NAMES]
+    assert [text.get_text() for text in legend.get_texts()] == ["persistence (copy the last frame)", *NAMES]
     lines = drawn[0].axes[0].get_lines()[1:]
     assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == len(NAMES)
 

@@ -95,7 +95,7 @@ def test_the_first_screen_shows_the_summary_of_the_console_and_numbers_that_it_d
         assert ("<dt>action-ranking error" in first) == bool(changes), "a tile repeats a verdict"
         tiles = re.findall("<dt>(.*?)</dt>", first)
         assert len(set(tiles)) == len(tiles) == 3 + bool(changes)
-        assert first.count("is better)") + first.count("1 = as varied as the truth; lower = smoother") == len(tiles)
+        assert first.count("is better)") + first.count("1: as varied as the true frames; lower: smoother") == len(tiles)
 
 
 def test_a_bar_shows_a_number_its_interval_and_its_baseline_in_their_order() -> None:
@@ -104,7 +104,7 @@ def test_a_bar_shows_a_number_its_interval_and_its_baseline_in_their_order() -> 
         bar = bar_positions(verdict)
         assert 0 < min(bar.values()) < max(bar.values()) < 100
         assert bar["low"] < bar["point"] < bar["high"]
-        assert (bar["against"] < bar["low"]) == (baseline < value)
+        assert (bar["baseline"] < bar["low"]) == (baseline < value)
         assert len(set(bar_positions(replace(verdict, low=None, high=None)).values())) == 2
     assert not bar_positions(replace(verdict, value=None))
 
@@ -185,7 +185,7 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
     noted = replace(bare, notes=("--ranking-clips is 0: no energy landscapes.",))
     shown = Page(page_of(noted)).shown
     for what in (
-        "Compared with the base", "Energy landscapes", "Example clips", "Distribution of the predictions",
+        "Comparison with the base model", "Energy landscapes", "Example clips", "Distribution of the predictions",
         "Decoded images",
     ):  # fmt: skip
         assert f"{what}: not measured." in shown
@@ -227,7 +227,7 @@ def test_the_page_opens_from_its_file_without_complaint_or_request(tmp_path) -> 
     (tmp_path / "report.html").write_text(page(), encoding="utf-8")
     seen = open_page(tmp_path / "report.html", tmp_path)
     assert (seen.console, seen.requests) == ((), ())
-    assert "What was measured" in seen.dom
+    assert "Model and data" in seen.dom
 
 
 @pytest.mark.slow

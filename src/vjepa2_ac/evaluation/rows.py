@@ -35,7 +35,7 @@ from vjepa2_ac.intervals import Estimate
 _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]  # null in JSON: NaN
 _MOST_HORIZONS = 8  # number of horizons in the console's tables
 _SIMILARITIES = {"psnr_db": ("PSNR (dB)", ".1f"), "ssim": ("SSIM", ".3f")}
-_REGIONS = {"whole": "whole image", "moving": "where something moves"}
+_REGIONS = {"whole": "whole image", "moving": "moving region"}
 _GAIN: dict[str, Any] = {"form": ".1%", "better": "higher", "chance": 0.0}
 
 
@@ -71,6 +71,7 @@ class RowTable:
 
     title: str
     columns: tuple[str, ...]
+    better: tuple[str, ...]  # direction of each line: "lower", "higher", or "" if neither is better
     lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, value by chance or of persistence, cells by column
 
 
@@ -93,7 +94,8 @@ def _section(title: str, lines: Sequence[Mapping[str, Row]]) -> RowTable:
         chance = "" if first.chance is None else f"{first.chance:{first.form}}"
         chance = str(line.get(PERSISTENCE, chance))
         cells.append((first.name, chance, tuple(str(line.get(model, "")) for model in columns)))
-    return RowTable(title, columns, tuple(cells))
+    better = tuple(next(iter(line.values())).better for line in lines)
+    return RowTable(title, columns, better, tuple(cells))
 
 
 def make_rows(evaluation: Evaluation) -> list[Row]:
@@ -144,7 +146,10 @@ class _Rows(list[Row]):
         for metric in self.evaluation.metrics:
             shown = {1, *range(every, last + 1, every), last} if metric is L1 else {last}
             curves = {name: over_persistence(errors, "rollout", metric) for name, errors in self.errors.items()}
-            group, key = f"{metric.label} error / persistence, open loop", f"rollout.{metric.name}.over_persistence"
+            group, key = (
+                f"{metric.label} error relative to persistence, open loop (ratio)",
+                f"rollout.{metric.name}.over_persistence",
+            )
             better = "lower" if metric.smaller_is_better else "higher"
             self.curves(group, key, curves, shown, better=better, chance=1.0)
         if self.base is None:
@@ -153,7 +158,10 @@ class _Rows(list[Row]):
         compared = {name: errors for name, errors in self.errors.items() if name != self.base.name}
         for metric in self.evaluation.metrics:
             gains = {name: gain_over(errors, base, "rollout", metric) for name, errors in compared.items()}
-            group, key = f"Gain over the base by {metric.label}, open loop", f"rollout.{metric.name}.gain_over_base"
+            group, key = (
+                f"Improvement over the base model in {metric.label}, open loop",
+                f"rollout.{metric.name}.gain_over_base",
+            )
             self.curves(group, key, gains, **_GAIN)
 
     def add_distributions(self) -> None:
@@ -166,13 +174,19 @@ class _Rows(list[Row]):
             return
         distributions = {PERSISTENCE: evaluation.copies, **models}
         spreads, last = {name: each.spread for name, each in distributions.items()}, {evaluation.horizon}
-        self.curves("Spread / that of the truth, open loop (1: as varied)", "spread", spreads, last, better="")
+        self.curves(
+            "Spread of the predictions relative to the true latents, open loop (ratio, 1: as varied)",
+            "spread",
+            spreads,
+            last,
+            better="",
+        )
         sample = f"{counted(len(clips), 'clip')} of {counted(clips.episodes, 'episode')}"
-        group = f"Squared MMD of latents to the truth, x 100, open loop ({sample}; unbiased)"
+        group = f"Squared MMD between predicted and true latents x 100, open loop ({sample}; unbiased)"
         self.curves(group, "latent_mmd", {name: each.mmd for name, each in distributions.items()})
         of_halves = evaluation.fvd_of_halves
         halves = f"; two halves of the true clips: {of_halves:.3g}" if math.isfinite(of_halves) else ""
-        group = f"Fréchet distance of latents to the truth (FVD; {sample}; biased upwards{halves})"
+        group = f"Fréchet distance between predicted and true latents (FVD; {sample}; biased upwards{halves})"
         style: dict[str, Any] = {"form": ".3g", "detail": True}
         distances = {name: each.fvd for name, each in distributions.items()}
         self.line(group, "predicted frames", "fvd.predicted", _without_intervals(distances), **style)
@@ -181,7 +195,10 @@ class _Rows(list[Row]):
 
     def add_one_steps(self) -> None:
         """Add teacher-forced errors of one step: with zero and shuffled actions, and for moving and idle steps."""
-        group, moving = "One step, teacher-forced: L1 error / persistence", self.evaluation.clips.moving
+        group, moving = (
+            "One-step L1 error relative to persistence, teacher-forced (ratio)",
+            self.evaluation.clips.moving,
+        )
         for actions in ACTIONS:
             ratios = {name: one_step_over_persistence(errors, actions) for name, errors in self.errors.items()}
             self.line(group, f"{actions} actions", f"one_step.{actions}", ratios, chance=1.0)
@@ -192,7 +209,10 @@ class _Rows(list[Row]):
                 }
                 label = f"{name} ({counted(int(steps.sum()), 'step')})"
                 self.line(group, label, f"one_step.{name}", ratios, chance=1.0)
-        grown, gap = "Growth of the one-step error without the true actions", "The same, over the error of persistence"
+        grown, gap = (
+            "Increase of the one-step error without the true actions",
+            "The same increase relative to persistence (ratio)",
+        )
         for actions in ACTIONS[1:]:
             name = f"{actions} actions"
             costs = {model: cost_of_actions(errors, actions) for model, errors in self.errors.items()}
@@ -202,19 +222,22 @@ class _Rows(list[Row]):
 
     def add_ranking(self, model: str, ranking: ActionRanking) -> None:
         """Add the action-ranking error, and the changes of prediction and energy with the action."""
-        group = "Action-ranking error: alternative actions with a lower energy than the true one"
+        group = "Action-ranking error: share of alternative actions with a lower energy than the true action"
         share: dict[str, Any] = {"form": ".1%", "chance": 0.5}
-        self.line(group, "of all alternatives", "ranking.rank", {model: ranking.rank}, **share)
-        self.line(group, "of those in the box", "ranking.box", {model: ranking.box}, **share)
-        self.line(group, "of those of the same length", "ranking.shell", {model: ranking.shell}, **share)
+        self.line(group, "all alternatives", "ranking.rank", {model: ranking.rank}, **share)
+        self.line(group, "alternatives in the box", "ranking.box", {model: ranking.box}, **share)
+        self.line(group, "alternatives as long as the true action", "ranking.shell", {model: ranking.shell}, **share)
         for key, label, estimate in (
-            ("change", "change of the prediction with the action / persistence", ranking.change),
-            ("spread", "spread of the energy / persistence", ranking.spread),
+            ("change", "change of the prediction with the action, relative to persistence", ranking.change),
+            ("spread", "spread of the energy over actions, relative to persistence", ranking.spread),
         ):
             self.line(group, label, f"ranking.{key}", {model: estimate}, better="higher", chance=0.0)
         base = None if self.base is None else self.base.ranking
         if base is not None and base is not ranking:
-            label, difference = "of all alternatives, minus the base model's", {model: rank_difference(ranking, base)}
+            label, difference = (
+                "all alternatives, difference from the base model",
+                {model: rank_difference(ranking, base)},
+            )
             self.line(group, label, "ranking.difference_to_base", difference, form="+.1%", chance=0.0, detail=True)
 
     def add_landscapes(self, model: str, landscapes: Landscapes) -> None:
@@ -222,11 +245,14 @@ class _Rows(list[Row]):
         group, unit = f"Energy landscapes of {counted(len(landscapes.maps), 'clip')}", landscapes.unit
         labels: dict[LandscapeMeasure, tuple[str, dict[str, Any]]] = {
             "distance": (
-                f"lowest energy to the true action{f', {unit}' if unit else ''}",
+                f"distance of the energy minimum from the true action{f' ({unit})' if unit else ''}",
                 {"chance": landscapes.chance_distance, "unit": unit},
             ),
-            "rank": ("grid points with a lower energy than the true action", {"form": ".1%", "chance": 0.5}),
-            "sharpness": ("sharpness: (highest - lowest) / mean energy", {"better": "higher", "chance": 0.0}),
+            "rank": (
+                "rank: share of grid points with a lower energy than the true action",
+                {"form": ".1%", "chance": 0.5},
+            ),
+            "sharpness": ("sharpness: (highest - lowest) / mean energy (ratio)", {"better": "higher", "chance": 0.0}),
         }
         base = None if self.base is None else self.base.landscapes
         for measure in get_args(LandscapeMeasure):
@@ -236,7 +262,7 @@ class _Rows(list[Row]):
             if base is not None and base is not landscapes:
                 difference = {model: landscapes.difference(base, measure)}
                 style = {"form": "+.1%" if measure == "rank" else "+.3f", "better": style.get("better", "lower")}
-                name = f"{measure}, minus the base model's"
+                name = f"{measure}, difference from the base model"
                 self.line(group, name, f"{key}.difference_to_base", difference, chance=0.0, detail=True, **style)
 
     def add_decoded(self) -> None:
@@ -249,7 +275,7 @@ class _Rows(list[Row]):
         for reference, (name, (label, form)), (region, where) in every:
             metric = f"{name}.{region}.{reference}"
             if metric in measured:
-                group = f"Decoded images against the {reference.replace('_', ' ')}: {label}, {where}"
+                group = f"Decoded images compared with the {reference.replace('_', ' ')}: {label}, {where}"
                 curves = {source.replace("_", " "): decoded.curves[source, metric] for source in decoded.sources}
                 shown = {self.evaluation.horizon} if reference == main else ()
                 self.curves(group, f"decoded.{metric}", curves, shown, form=form, better="higher")

@@ -1,4 +1,4 @@
-"""Plots of an evaluation (errors by horizon, use of the actions, landscapes, example clips) and of a comparison."""
+"""Plots of an evaluation (error by horizon, sensitivity to actions, landscapes, example clips) and of a comparison."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ _COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE}
 _RUNS = (BLUE, ORANGE, GREEN, "#8f5bb0", RED, "#0b7f8a", "#8a6d0b", "#333333")
 _DASHES = ("-", "--", ":")  # the next line style is used after all colours
 _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
+_PERSISTENCE = "persistence (copy the last frame)"
 _GREY_PX = 224  # side of the grey image that is shown if a cache has no frames
 
 
@@ -53,7 +54,7 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
         left, right = figure.subfigures(1, 2, width_ratios=[4, 5], wspace=0.02)
         upper, lower = left.subfigures(2, 1, height_ratios=[3, 2])
         draw_errors(upper, evaluation)
-        draw_use_of_actions(lower, evaluation)
+        draw_sensitivity(lower, evaluation)
         if evaluation.decoded is not None and evaluation.decoded.strips:
             draw_rows(right, decoded_strip(evaluation, evaluation.decoded.strips[0]))
         elif evaluation.examples:
@@ -67,9 +68,9 @@ def plot_comparison(comparison: Comparison, path: Path) -> Path:
     with save_figure(path, 9.2, 4.7, dpi=130) as figure:
         axes = figure.subplots()
         drawn = _curves(axes, comparison.seconds, zip(comparison.curves.values(), styles, strict=False))
-        axes.set(title=f"{comparison.title} (band: 95 % over episodes)", ylabel="latent error / persistence")
+        axes.set(title=f"{comparison.title} (band: 95 % over episodes)", ylabel="L1 error / persistence")
         axes.set_ylim(0, None)
-        names = [PERSISTENCE, *(textwrap.fill(replace_hidden_characters(name), 34) for name in comparison.curves)]
+        names = [_PERSISTENCE, *(textwrap.fill(replace_hidden_characters(name), 34) for name in comparison.curves)]
         figure.legend(drawn, names, loc="outside right upper")
     return path
 
@@ -79,8 +80,13 @@ Draw = Callable[[Any, Evaluation], None]  # draws an evaluation on a Matplotlib 
 
 def evaluation_plots(evaluation: Evaluation) -> Iterator[tuple[str, str, tuple[float, float], Draw]]:
     """Yield the plots of an evaluation: part of the page, description, width and height in inches, draw function."""
-    yield "errors", "Open-loop L1 error over persistence by horizon", (6.4, 3.6), draw_errors
-    yield "actions", "One-step error with other actions", (6.4, 3.0), draw_use_of_actions
+    yield "errors", "Open-loop L1 error relative to persistence by horizon", (6.4, 3.6), draw_errors
+    yield (
+        "actions",
+        "One-step L1 error relative to persistence with true, zero and shuffled actions",
+        (6.4, 3.0),
+        draw_sensitivity,
+    )
     if clips := _landscape_clips(evaluation):
         rows = len(clips) * (2 if evaluation.base and evaluation.models[evaluation.base].landscapes else 1)
         described = "Energy around the true action: cross; lowest energy: ring"
@@ -95,24 +101,29 @@ def draw_errors(figure: Any, evaluation: Evaluation) -> None:
     drawn = _curves(axes, seconds, [(curves[name], {"color": colour}) for name, colour in _colours(curves).items()])
     shown = seconds[:: -(-len(seconds) // 8)]
     axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
-    axes.legend(drawn, [PERSISTENCE, *map(_short, curves)], loc="best")
-    axes.set(title="L1 error by horizon, open loop (band: 95 % over episodes)", ylabel="latent error / persistence")
+    axes.legend(drawn, [_PERSISTENCE, *map(_short, curves)], loc="best")
+    axes.set(title="L1 error by horizon, lower is better (band: 95 % CI)", ylabel="L1 error / persistence")
     axes.set_ylim(0, None)
 
 
-def draw_use_of_actions(figure: Any, evaluation: Evaluation) -> None:
+def draw_sensitivity(figure: Any, evaluation: Evaluation) -> None:
     """Draw the one-step error of each model with true, zero and shuffled actions."""
     axes = figure.subplots()
     width = 0.8 / len(evaluation.models)
     for i, (name, colour) in enumerate(_colours(evaluation.models).items()):
         ratios = [one_step_over_persistence(evaluation.models[name].errors, actions) for actions in ACTIONS]
-        places = np.arange(len(ratios)) + (i - (len(evaluation.models) - 1) / 2) * width
+        positions = np.arange(len(ratios)) + (i - (len(evaluation.models) - 1) / 2) * width
         spread = np.array([(r.value - r.low, r.high - r.value) for r in ratios]).T
         spread = np.nan_to_num(spread.clip(min=0))  # rounding could make it negative; NaN: there is no interval
-        axes.bar(places, [r.value for r in ratios], width, color=colour, yerr=spread, error_kw={"elinewidth": 1})
+        style = {"color": colour, "error_kw": {"elinewidth": 1}, "label": _short(name)}
+        axes.bar(positions, [r.value for r in ratios], width, yerr=spread, **style)
     axes.axhline(1.0, color=GREY, linestyle="--")
+    axes.set_ylim(0, 1.3 * axes.get_ylim()[1])  # room for the legend
+    axes.legend(loc="upper left", ncols=min(len(evaluation.models), 3))
     axes.set_xticks(range(len(ACTIONS)), ACTIONS)
-    axes.set(title="Does it use the actions?", xlabel="actions given", ylabel="one-step error / persistence")
+    axes.set(
+        title="One-step error with other actions (bars: 95 % CI)", xlabel="actions", ylabel="L1 error / persistence"
+    )
 
 
 def _draw_landscapes(figure: Any, evaluation: Evaluation) -> None:
@@ -123,7 +134,8 @@ def _draw_landscapes(figure: Any, evaluation: Evaluation) -> None:
     grid = figure.subplots(len(places) * len(drawn), 3, squeeze=False)
     for row, (place, (name, found)) in zip(grid, itertools.product(places, drawn.items()), strict=True):
         for axes, (first, second) in zip(row, itertools.combinations(range(3), 2), strict=True):
-            _plane(axes, found, place, first, second)
+            mesh = _plane(axes, found, place, first, second)
+        figure.colorbar(mesh, ax=list(row), label="energy (L1)")
         row[0].set_title(f"{_short(name)}, clip {place + 1}", loc="left")
 
 
@@ -136,18 +148,20 @@ def _landscape_clips(evaluation: Evaluation) -> list[int]:
     return sorted({0: order[0], 1: order[len(order) // 2], 2: order[-1]}.values())
 
 
-def _plane(axes: Any, landscapes: Landscapes, place: int, first: int, second: int) -> None:
+def _plane(axes: Any, landscapes: Landscapes, place: int, first: int, second: int) -> Any:
+    """Draw the energy over two components of the action; return the mesh for a colour bar."""
     one = landscapes.maps[place]
     third = ({0, 1, 2} - {first, second}).pop()
     energy = np.take(one.energy, int(np.abs(one.axes[third] - one.true[third]).argmin()), axis=third)
     limits = {"vmin": float(one.energy.min()), "vmax": float(one.energy.max())}
-    axes.pcolormesh(one.axes[first], one.axes[second], energy.T, shading="nearest", rasterized=True, **limits)
+    mesh = axes.pcolormesh(one.axes[first], one.axes[second], energy.T, shading="gouraud", rasterized=True, **limits)
     axes.axhline(0, color="white", linewidth=0.6, linestyle=":")
     axes.axvline(0, color="white", linewidth=0.6, linestyle=":")
     axes.plot(one.true[first], one.true[second], "+", color="white", markersize=9, markeredgewidth=2)
     axes.plot(one.minimum[first], one.minimum[second], "o", color="white", markerfacecolor="none", markersize=10)
     unit = f" ({landscapes.unit})" if landscapes.unit else ""
     axes.set(xlabel=landscapes.axis_names[first] + unit, ylabel=landscapes.axis_names[second] + unit)
+    return mesh
 
 
 def example_strip(evaluation: Evaluation, example: Example) -> RolloutStrip:
@@ -158,7 +172,7 @@ def example_strip(evaluation: Evaluation, example: Example) -> RolloutStrip:
     rows = [] if example.frames is None else [StripRow("ground truth", "recorded", frames)]
     for name, errors in example.errors.items():
         shown = [_overlay(frame, of_frame, worst) for frame, of_frame in zip(frames, (None, *errors), strict=True)]
-        captions = ("", *(f"mean {of_frame.mean():.3f}" for of_frame in errors))
+        captions = ("", *(f"mean L1 {of_frame.mean():.3f}" for of_frame in errors))
         rows.append(StripRow(f"error of {_short(name)}", "error", np.stack(shown), captions))
     seconds = tuple(time * evaluation.about.seconds_per_step for time in range(len(frames)))
     return RolloutStrip(
@@ -184,11 +198,18 @@ def decoded_strip(evaluation: Evaluation, strip: DecodedStrip) -> RolloutStrip:
 def _overlay(
     frame: UInt8[np.ndarray, "height width 3"], errors: Float[np.ndarray, "grid grid"] | None, worst: float
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw errors as colours over a greyscale frame."""
+    """Draw patch errors, interpolated between patch centres, as colours over a greyscale frame."""
     grey = np.repeat(frame.mean(axis=-1, keepdims=True), 3, axis=-1)
     if errors is None:
         return grey.astype(np.uint8)
-    return np.asarray(0.35 * grey + 0.65 * colour_errors(errors, frame.shape[:2], worst)).astype(np.uint8)
+    smooth = _interpolate(_interpolate(errors, frame.shape[0]).T, frame.shape[1]).T
+    return np.asarray(0.35 * grey + 0.65 * colour_errors(smooth, frame.shape[:2], worst)).astype(np.uint8)
+
+
+def _interpolate(errors: Float[np.ndarray, "rows columns"], size: int) -> Float[np.ndarray, "size columns"]:
+    """Interpolate linearly between the centres of patches, along the first axis."""
+    centres, pixels = (np.arange(len(errors)) + 0.5) * size / len(errors), np.arange(size) + 0.5
+    return np.stack([np.interp(pixels, centres, column) for column in errors.T], axis=1)
 
 
 def _curves(axes: Any, seconds: np.ndarray, curves: Iterable[tuple[Curve, dict[str, str]]]) -> list[Any]:
@@ -198,7 +219,7 @@ def _curves(axes: Any, seconds: np.ndarray, curves: Iterable[tuple[Curve, dict[s
         low, high = [one.low for one in curve], [one.high for one in curve]
         axes.fill_between(seconds, low, high, color=style["color"], alpha=0.15, linewidth=0)
         drawn += axes.plot(seconds, [one.value for one in curve], marker="o", **style)
-    axes.set(xlabel="seconds ahead")
+    axes.set(xlabel="time ahead (s)")
     return drawn
 
 

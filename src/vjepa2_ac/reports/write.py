@@ -35,7 +35,7 @@ from vjepa2_ac.storage import write_atomically
 PLOT, REPORT = "evaluation.png", "report.html"
 MAX_CLIPS = 4  # largest number of example clips, and of decoded clips
 _BYTES = 3_000_000  # largest size of all clips together
-_AT_AN_END = 10.0  # margin on both sides of a bar, in percent of its width
+_BAR_MARGIN = 10.0  # margin on both sides of a bar, in percent of its width
 MAX_VIDEO_S = 6.0  # longest duration of the video, in seconds
 MAX_VIDEO_BYTES = 600_000  # largest size of the video
 _STEP_S, _FIRST_S, _LAST_S = 0.5, 1.2, 1.8  # display times of the middle, first and last frames
@@ -44,8 +44,8 @@ _THIN = 32  # width of an image divided by the width of a gap or the height of t
 _GREY, _PASSED = 170, (31, 111, 180)  # colours of gaps and progress bar, visible on white and on black
 _PARTS = {  # title, and a pattern for the keys of the rows
     "errors": ("Error by horizon", r"rollout\.\w+\.over_persistence"),
-    "base": ("Compared with the base", r"rollout\."),
-    "actions": ("Use of the actions", "one_step|cost_of|gap_of|ranking"),
+    "base": ("Comparison with the base model", r"rollout\."),
+    "actions": ("Sensitivity to actions", "one_step|cost_of|gap_of|ranking"),
     "examples": ("Example clips", "$^"),
     "decoded": ("Decoded images", "decoded"),
     "distribution": ("Distribution of the predictions", "spread|latent_mmd|fvd"),
@@ -59,7 +59,7 @@ class PageImage(NamedTuple):
     """An image of the page."""
 
     url: str
-    described: str  # text for `alt`
+    alt: str  # description for screen readers
     clip: Example | DecodedStrip | None = None  # the clip that the image shows
 
 
@@ -99,8 +99,8 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         "percent": format_percent,
         "interval": format_interval,
     }
-    environment.filters |= {"coded": code_markup, "count": counted}
-    environment.filters["figure"] = lambda row: f"{format_percent(row.value)} %" if row.better else f"{row.value:.2f}"
+    environment.filters |= {"code": code_markup, "count": counted}
+    environment.filters["number"] = lambda row: f"{format_percent(row.value)} %" if row.better else f"{row.value:.2f}"
     environment.filters["baseline"] = lambda one: (
         f"{100 * one.baseline:.0f} %" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
     )
@@ -108,7 +108,7 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         evaluation=evaluation,
         verdicts=summary,
         tiles=_tiles(evaluation, rows, summary),
-        film=make_video(evaluation),
+        video=make_video(evaluation),
         parts=_parts(evaluation, rows),
         missing=missing_parts(evaluation),
         short=short_names(evaluation.clips.episode_ids),
@@ -130,10 +130,10 @@ def bar_positions(verdict: Verdict) -> dict[str, float]:
     if value is None:
         return {}
     low, high = (value if end is None else end for end in (verdict.low, verdict.high))
-    places = {"point": value, "against": verdict.baseline, "low": low, "high": high}
-    least = min(places.values())
-    inside = (100 - 2 * _AT_AN_END) / (max(places.values()) - least or 1.0)
-    return {name: round(_AT_AN_END + inside * (place - least), 1) for name, place in places.items()}
+    values = {"point": value, "baseline": verdict.baseline, "low": low, "high": high}
+    least = min(values.values())
+    inside = (100 - 2 * _BAR_MARGIN) / (max(values.values()) - least or 1.0)
+    return {name: round(_BAR_MARGIN + inside * (position - least), 1) for name, position in values.items()}
 
 
 def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
@@ -141,8 +141,8 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
     for row in rows:
         of_part[next(name for name, (_, keys) in _PARTS.items() if re.match(keys, row.key))].append(row)
     images: dict[str, list[PageImage]] = {name: [] for name in _PARTS} | _clips(evaluation)
-    for part, described, (width, height), draw in evaluation_plots(evaluation):
-        images[part].append(PageImage(figure_to_svg(draw, width, height, evaluation), described))
+    for part, alt, (width, height), draw in evaluation_plots(evaluation):
+        images[part].append(PageImage(figure_to_svg(draw, width, height, evaluation), alt))
     notes = {"decoded": () if evaluation.decoded is None else evaluation.decoded.notes}
     return [
         PagePart(name, title, arrange_tables(of_part[name]), images[name], notes.get(name, ()))
@@ -157,9 +157,9 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
     """
     last, ahead = evaluation.horizon, f"{evaluation.seconds_ahead:.1f} s ahead"
     labels = {
-        f"rollout.{L1.name}.over_persistence.{last}": f"L1 error / persistence, {ahead}",
+        f"rollout.{L1.name}.over_persistence.{last}": f"L1 error relative to persistence, {ahead}",
         "ranking.rank": "action-ranking error",
-        "one_step.moving": "one-step L1 error / persistence, moving steps",
+        "one_step.moving": "one-step L1 error relative to persistence, moving steps",
         f"spread.{last}": f"spread of the predictions, {ahead}",
     }
     if evaluation.base is None:  # the first verdict already shows this error
@@ -175,17 +175,20 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
 
 
 def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
-    """Return images of the example clips and of their decoded frames, in the best quality within the size limit."""
-    examples = evaluation.examples[:MAX_CLIPS]
+    """Return images of the example clips, in the best quality within the size limit.
+
+    Decoded frames are shown if there are any, otherwise the errors of each patch over the true frames.
+    """
     decoded = () if evaluation.decoded is None else evaluation.decoded.strips[:MAX_CLIPS]
+    examples = () if decoded else evaluation.examples[:MAX_CLIPS]
     strips = [example_strip(evaluation, one) for one in examples] + [decoded_strip(evaluation, one) for one in decoded]
     urls = webp_urls([[draw_strip(strip)] for strip in strips], at_most=_BYTES)
     images: dict[str, list[PageImage]] = {"examples": [], "decoded": []}
     shown: list[Example | DecodedStrip] = [*examples, *decoded]
     for url, one, strip in zip(urls, shown, strips, strict=True):
-        described = "; ".join(row.label.replace("\n", " ") for row in strip.rows)
+        alt = "; ".join(row.label.replace("\n", " ") for row in strip.rows)
         part = "examples" if isinstance(one, Example) else "decoded"
-        images[part].append(PageImage(url, f"{described}: row by row", one))
+        images[part].append(PageImage(url, f"Rows of images: {alt}", one))
     return images
 
 
