@@ -80,8 +80,8 @@ def detect_machine() -> Machine:
     if not torch.cuda.is_available():
         return Machine(None, USUAL_GPU, False, cores, free)
     device = torch.device("cuda", cuda_index())
-    card = torch.cuda.get_device_properties(device)
-    return Machine(card.name, card.total_memory, has_bf16(), cores, free)
+    gpu = torch.cuda.get_device_properties(device)
+    return Machine(gpu.name, gpu.total_memory, has_bf16(), cores, free)
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,9 @@ class Draft:
             *self.costs,
             "All other config keys keep their defaults: `vjepa2-ac config show CONFIG` prints every value, and",
             "`vjepa2-ac config schema` describes every key. docs/training.md explains the choices for training.",
-            "(sim) marks results that were measured on the simulated arm with its tiny model.",
         ]
+        if "(sim)" in format_yaml([], self.config_values):
+            header.append("(sim) marks results that were measured on the simulated arm with its tiny model.")
         if guessed_keys := list_guesses(self.config_values):
             header.append(f"Check the values marked GUESSED: {', '.join(guessed_keys)}.")
         return format_yaml(header, self.config_values)
@@ -164,14 +165,14 @@ def make_draft(data: DatasetProperties, machine: Machine, model: ModelChoice, *,
     Raises:
         InputError: The values are not a valid config.
     """
-    training = _training(data, machine, model)
+    training = _make_training_section(data, machine, model)
     every = max(20, min(1_000, int(plain_values(training)["steps"]) // 10))
     values: DraftValues = {
         "run_dir": DraftValue(run_dir),
         "seed": DraftValue(0),
-        "data": _data(data, machine, model),
-        "model": _model(model, machine),
-        "adapter": _adapter(model, data),
+        "data": _make_data_section(data, machine, model),
+        "model": _make_model_section(model, machine),
+        "adapter": _make_adapter_section(model, data),
         "training": training,
         "validation": {
             "every": DraftValue(every, "in steps; the best checkpoint is rarely the last one"),
@@ -188,13 +189,15 @@ def make_draft(data: DatasetProperties, machine: Machine, model: ModelChoice, *,
     config = parse_config(plain_values(values), where="vjepa2-ac init")
     costs: list[str] = []
     if data.steps and config.data.uses_cached_latents:
-        costs.append(f"Disk space for cached latents: at most {_gigabytes(data.steps * model.bytes_per_frame)} GB.")
+        costs.append(
+            f"Disk space for cached latents: at most {_format_gigabytes(data.steps * model.bytes_per_frame)} GB."
+        )
     if model.is_tiny:
         return Draft(values, config, costs)
-    batch, checkpointing, needed = _fit(config, machine)
-    is_fit = "fits into" if needed <= machine.gpu_bytes else "does NOT fit into"
+    batch, checkpointing, needed = _choose_batch(config, machine)
+    verdict = "fits into" if needed <= machine.gpu_bytes else "does not fit into"
     fitted = {
-        "batch_size": DraftValue(batch, f"{is_fit} {machine.memory_text}"),
+        "batch_size": DraftValue(batch, f"{verdict} {machine.memory_text}"),
         "accumulation": DraftValue(
             _CLIPS_PER_STEP // batch, f"micro-batches per optimizer step; {_CLIPS_PER_STEP} clips per step"
         ),
@@ -203,17 +206,17 @@ def make_draft(data: DatasetProperties, machine: Machine, model: ModelChoice, *,
         ),
     }
     values = {**values, "training": {**training, **fitted}}
-    costs.insert(0, f"Estimated peak GPU memory: {needed / GIGABYTE:.1f} GB, which {is_fit} {machine.memory_text}.")
+    costs.insert(0, f"Estimated peak GPU memory: {needed / GIGABYTE:.1f} GB, which {verdict} {machine.memory_text}.")
     if machine.gpu is None:
         costs.append("Run `vjepa2-ac init` on the training machine to choose batch size and precision for its GPU.")
     return Draft(values, parse_config(plain_values(values), where="vjepa2-ac init"), costs)
 
 
-def _gigabytes(size: float) -> str:
+def _format_gigabytes(size: float) -> str:
     return f"{max(0.1, size / GIGABYTE):,.1f}"
 
 
-def _fit(config: Config, machine: Machine) -> tuple[int, bool, int]:
+def _choose_batch(config: Config, machine: Machine) -> tuple[int, bool, int]:
     """Return the first candidate that fits, or the last: batch size, gradient checkpointing, estimated peak bytes."""
     sizes = base_sizes(config.model)
     for batch, checkpointing in _BATCHES_ON_GPU if machine.gpu else _BATCHES_WITHOUT_GPU:
@@ -225,7 +228,7 @@ def _fit(config: Config, machine: Machine) -> tuple[int, bool, int]:
     return batch, checkpointing, needed
 
 
-def _data(data: DatasetProperties, machine: Machine, model: ModelChoice) -> DraftValues:
+def _make_data_section(data: DatasetProperties, machine: Machine, model: ModelChoice) -> DraftValues:
     """Return the section `data`."""
     stride = max(1, round(data.rate_hz.value * _MODEL_STEP_S))
     stride_reason = (
@@ -234,7 +237,7 @@ def _data(data: DatasetProperties, machine: Machine, model: ModelChoice) -> Draf
     )
     size = (data.steps or math.inf) * model.bytes_per_frame
     is_cached = size <= machine.free_bytes * _CACHE_SHARE
-    cache_reason = f"each frame is encoded once ({_gigabytes(size)} GB at most); training then needs no encoder"
+    cache_reason = f"each frame is encoded once ({_format_gigabytes(size)} GB at most); training then needs no encoder"
     workers = max(1, min(4 if is_cached else 8, machine.cores - 1))
     vector = DraftValue("vector", "states are vectors of measured numbers; actions are their differences")
     return {
@@ -242,9 +245,13 @@ def _data(data: DatasetProperties, machine: Machine, model: ModelChoice) -> Draf
         "path": DraftValue(data.path),
         **({} if data.states == "pose" else {"states": vector}),
         **data.config_values,
-        "frames": _frames(data, model, stride),
+        "frames": _choose_num_frames(data, model, stride),
         "stride": DraftValue(stride, stride_reason, data.rate_hz.is_guess),
-        **{f"{split}_share": value for split, value in _shares(data).items() if split not in data.predefined_splits},
+        **{
+            f"{split}_share": value
+            for split, value in _choose_shares(data).items()
+            if split not in data.predefined_splits
+        },
         **(
             {"idle": data.idle}
             if data.idle and (data.median_steps or _MIN_STEPS_FOR_IDLE_FILTER) >= _MIN_STEPS_FOR_IDLE_FILTER
@@ -255,7 +262,7 @@ def _data(data: DatasetProperties, machine: Machine, model: ModelChoice) -> Draf
     }
 
 
-def _model(model: ModelChoice, machine: Machine) -> DraftValues:
+def _make_model_section(model: ModelChoice, machine: Machine) -> DraftValues:
     """Return the section `model`."""
     dtype = DraftValue("float32" if model.is_tiny or machine.precision != "bf16" else "bfloat16")
     path = DraftValue(model.path, ": ".join(model.download or ()))
@@ -263,7 +270,7 @@ def _model(model: ModelChoice, machine: Machine) -> DraftValues:
         return {
             "base": DraftValue(RANDOM, "a new predictor, initialised so that it copies the last frame"),
             "encoder": {"path": path} if model.is_tiny else {"path": path, "frame": DraftValue("tubelet")},
-            "sizes": _new_predictor(model),
+            "sizes": _make_predictor_sizes(model),
             "dtype": dtype,
         }
     if model.is_tiny:
@@ -273,7 +280,7 @@ def _model(model: ModelChoice, machine: Machine) -> DraftValues:
     return {"base": path, "dtype": dtype}
 
 
-def _adapter(model: ModelChoice, data: DatasetProperties) -> DraftValues:
+def _make_adapter_section(model: ModelChoice, data: DatasetProperties) -> DraftValues:
     """Return the section `adapter`."""
     if model.is_scratch:
         return {"kind": DraftValue("none", "all weights of a new predictor are trained")}
@@ -293,7 +300,7 @@ def _adapter(model: ModelChoice, data: DatasetProperties) -> DraftValues:
     }
 
 
-def _training(data: DatasetProperties, machine: Machine, model: ModelChoice) -> DraftValues:
+def _make_training_section(data: DatasetProperties, machine: Machine, model: ModelChoice) -> DraftValues:
     """Return the section `training`, with a batch size that does not depend on the GPU yet."""
     batch, accumulation = (8, 1) if model.is_tiny else (4, _CLIPS_PER_STEP // 4)
     learning_rate = DraftValue(1e-4, "also try 3e-4")
@@ -307,7 +314,7 @@ def _training(data: DatasetProperties, machine: Machine, model: ModelChoice) -> 
     no_gpu = "no GPU; on Ampere or newer GPUs use bf16" + ("" if model.is_tiny else " and model.dtype: bfloat16")
     precision_reason = {"fp32": no_gpu, "fp16": "this GPU does not support bf16", "bf16": ""}[machine.precision]
     return {
-        "steps": _steps(data, batch * accumulation),
+        "steps": _choose_num_steps(data, batch * accumulation),
         "batch_size": DraftValue(batch),
         "accumulation": DraftValue(accumulation),
         "rollout_steps": DraftValue(2),
@@ -318,7 +325,7 @@ def _training(data: DatasetProperties, machine: Machine, model: ModelChoice) -> 
     }
 
 
-def _frames(data: DatasetProperties, model: ModelChoice, stride: int) -> DraftValue:
+def _choose_num_frames(data: DatasetProperties, model: ModelChoice, stride: int) -> DraftValue:
     frames = 4 if model.is_tiny else 16 if (data.episodes or 0) > _FEW_EPISODES else 8
     if data.median_steps is None or data.p10_steps is None:
         return DraftValue(frames, "per clip, one per model step")
@@ -328,7 +335,7 @@ def _frames(data: DatasetProperties, model: ModelChoice, stride: int) -> DraftVa
     return DraftValue(frames, f"a clip spans {counted((frames - 1) * stride + 1, 'control step')}; {lengths}")
 
 
-def _shares(data: DatasetProperties) -> dict[Split, DraftValue]:
+def _choose_shares(data: DatasetProperties) -> dict[Split, DraftValue]:
     """Return the shares of validation and test; with few episodes the test share is raised for a usable interval."""
     share, test_share, reason = 0.05, 0.05, "share of the episodes, selected by a hash; at least one episode"
     if data.episodes is not None:
@@ -343,7 +350,7 @@ def _shares(data: DatasetProperties) -> dict[Split, DraftValue]:
     }
 
 
-def _steps(data: DatasetProperties, clips_per_step: int) -> DraftValue:
+def _choose_num_steps(data: DatasetProperties, clips_per_step: int) -> DraftValue:
     if data.steps is None:
         return DraftValue(_MIN_STEPS, "for a first run; docs/training.md explains how to choose the number")
     steps_for_passes = (
@@ -354,7 +361,7 @@ def _steps(data: DatasetProperties, clips_per_step: int) -> DraftValue:
     return DraftValue(steps, f"{clips:.2g} clips per control step of the data; more steps may make planning worse")
 
 
-def _new_predictor(model: ModelChoice) -> DraftValues:
+def _make_predictor_sizes(model: ModelChoice) -> DraftValues:
     if model.is_tiny:
         return {
             "image_size": DraftValue(96),

@@ -31,15 +31,19 @@ def read_lerobot_properties(path: str) -> DatasetProperties:
         InputError: The data set cannot be read, or has no camera or no measured numbers of the robot.
     """
     info = read_info(path)
-    cameras = [name for name, one in info.features.items() if one.is_camera and not is_not_camera(name)]
-    depth = [name for name, one in info.features.items() if one.is_depth or (one.is_camera and is_not_camera(name))]
+    cameras = [name for name, feature in info.features.items() if feature.is_camera and not is_not_camera(name)]
+    depth = [
+        name
+        for name, feature in info.features.items()
+        if feature.is_depth or (feature.is_camera and is_not_camera(name))
+    ]
     camera, all_cameras = make_camera_values(cameras, depth, info.where)
     columns = {
-        name: Column(one.width, one.names)
-        for name, one in info.features.items()
-        if one.is_numbers and name not in _BOOKKEEPING_COLUMNS
+        name: Column(feature.width, feature.names)
+        for name, feature in info.features.items()
+        if feature.is_numbers and name not in _BOOKKEEPING_COLUMNS
     }
-    samples = _sampled_rows(info, select_measured_columns(columns))
+    samples = _read_sampled_rows(info, select_measured_columns(columns))
     pose = find_pose(columns, samples, control_rate_hz=info.fps)
     if pose and _DROID_GRIPPER in pose["state"].value and info.features.keys() >= _DROID_COLUMNS:
         pose |= {"gripper_open": DraftValue(0.0, "DROID's convention"), "gripper_closed": DraftValue(1.0)}
@@ -67,19 +71,21 @@ def read_lerobot_properties(path: str) -> DatasetProperties:
     )
 
 
-def _sampled_rows(info: DatasetInfo, columns: Mapping[str, Column]) -> Samples:
+def _read_sampled_rows(info: DatasetInfo, columns: Mapping[str, Column]) -> Samples:
     """Return the numbers of the first episodes, by column.
 
     Reading stops at an episode that cannot be read, without an error: `data check` reports it later.
     """
-    read: dict[str, list[np.ndarray]] = {name: [] for name in columns}
+    values: dict[str, list[np.ndarray]] = {name: [] for name in columns}
     with suppress(UserError, OSError, KeyError):
         files = list_by_template(info.root, info.data_path)
         first = next(iter(files.values()))
-        rows_in = ParquetRows(EpisodeFiles(LeRobotData(path=info.root)), list(columns), f"{first.version} {first.size}")
+        parquet_rows = ParquetRows(
+            EpisodeFiles(LeRobotData(path=info.root)), list(columns), f"{first.version} {first.size}"
+        )
         for number in range(min(_SAMPLED, info.episodes)):
             file = filled(info.data_path, number // info.chunk_episodes, number if info.version == "v2.1" else 0)
-            rows = rows_in.rows(storage.join(info.root, file), number)
+            rows = parquet_rows.rows(storage.join(info.root, file), number)
             for name in columns:
-                read[name].append(rows[name].astype(np.float64))
-    return {name: episodes for name, episodes in read.items() if episodes}
+                values[name].append(rows[name].astype(np.float64))
+    return {name: episodes for name, episodes in values.items() if episodes}

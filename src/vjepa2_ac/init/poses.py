@@ -47,7 +47,7 @@ _KINDS = (  # kind of a number by the end of its name; the regex group is the ax
     ("position", r"(?:pos|position|trans|translation|xyz)_?([xyz0-3])$"),
     ("position", r"(?:^|_)(?:p_?)?([xyz])$"),
 )
-_COUNTS = {"rotation": (3, 4), "quaternion": (4,)}  # valid numbers of axes; 3 for all other kinds
+_NUM_AXES = {"rotation": (3, 4), "quaternion": (4,)}  # valid numbers of axes; 3 for all other kinds
 _AXES = {"roll": "x", "pitch": "y", "yaw": "z"}
 _UNITS = frozenset({"mm", "cm", "m", "rad", "radians", "deg", "degrees"})
 _NEUTRAL = re.compile(  # parts of names that do not distinguish arms
@@ -91,15 +91,17 @@ def find_pose(
         control_rate_hz: Control steps per second.
     """
     measured, samples = select_measured_columns(columns), samples or {}
-    numbers = [number for name, one in measured.items() for number in _numbers_of(name, one, samples.get(name, ()))]
-    chosen = min(_candidates(numbers), key=_rank, default=None)
+    numbers = [
+        number for name, column in measured.items() for number in _find_numbers(name, column, samples.get(name, ()))
+    ]
+    chosen = min(_find_candidates(numbers), key=_make_sort_key, default=None)
     if chosen is None:
         return None
-    keys = _make_pose_values(chosen, _left_out(chosen, numbers), measured, samples, control_rate_hz)
+    keys = _make_pose_values(chosen, _list_unused(chosen, numbers), measured, samples, control_rate_hz)
     column, index = chosen[-1].column, chosen[-1].index
     names = measured[column].names
     name = names[index] if index < len(names) else _last_part(column)
-    values = np.concatenate(_values(chosen[-1:], samples) or [np.zeros((0, 1))])
+    values = np.concatenate(_get_finite_values(chosen[-1:], samples) or [np.zeros((0, 1))])
     return {**keys, **guess_gripper_values(name, (float(values.min()), float(values.max())) if len(values) else None)}
 
 
@@ -125,8 +127,8 @@ def select_vector_state(columns: Mapping[str, Column], where: str) -> dict[str, 
 def select_measured_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
     """Return the columns that may contain a measured pose or gripper: no actions, joints or velocities."""
     return {
-        name: one
-        for name, one in columns.items()
+        name: column
+        for name, column in columns.items()
         if not _NO_STATE.search(name) and not (_NO_RATE if _GRIPPER.search(name) else _NO_POSE).search(name)
     }
 
@@ -138,53 +140,53 @@ def _last_part(column: str) -> str:
     return re.split(r"[./]", column)[-1]
 
 
-def _words(name: str) -> str:
+def _to_snake_case(name: str) -> str:
     """Return a name in snake case: ee.gripperPos becomes ee_gripper_pos."""
     return re.sub(r"[^a-z0-9]+", "_", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()).strip("_")
 
 
-def _group_in(words: str) -> str:
+def _find_group(words: str) -> str:
     words = re.sub(r"_?(?:in|to|wrt|from)_(?:base|world|robot)(?:_frame)?", "", words)
     parts = dict.fromkeys(words.split("_"))
     return "_".join(part for part in parts if part and not _NEUTRAL.fullmatch(part))
 
 
-def _numbers_of(name: str, column: Column, samples: Sequence[Numbers]) -> list[_Number]:
+def _find_numbers(name: str, column: Column, samples: Sequence[Numbers]) -> list[_Number]:
     """Return the numbers in a column that may be part of a pose, by their names, or else by the column's width."""
     if len(column.names) == column.width and (column.width > 1 or not _GRIPPER.search(name)):
-        numbers = _named(name, column.names)
-        quaternions = [part for part in _parts(numbers) if len(part) == 4]
-        if not samples or all(_are_unit(samples, [number.index for number in part]) for part in quaternions):
+        numbers = _parse_names(name, column.names)
+        quaternions = [part for part in _group_axes(numbers) if len(part) == 4]
+        if not samples or all(_have_unit_norm(samples, [number.index for number in part]) for part in quaternions):
             return numbers
     elif any(map(_NO_POSE.search, column.names)):
         return []
-    names = _usual_names(name, column.width, samples)
+    names = _propose_names(name, column.width, samples)
     is_named = len(names) == 1 or names == _NAMES_OF_DROID  # a single number is a gripper
-    return [replace(number, name=f"{name}[{number.index}]", is_named=is_named) for number in _named(name, names)]
+    return [replace(number, name=f"{name}[{number.index}]", is_named=is_named) for number in _parse_names(name, names)]
 
 
-def _named(column: str, names: Sequence[str]) -> list[_Number]:
+def _parse_names(column: str, names: Sequence[str]) -> list[_Number]:
     """Return the numbers of a column whose names are those of a position, a rotation or a gripper."""
     numbers = []
-    all_words = [_words(name) for name in names]
+    all_words = [_to_snake_case(name) for name in names]
     has_rates = any(re.search(r"(?:^|_)v[xyz]$", words) for words in all_words)
     has_six = any(re.search(r"(?:^|_)(?:r|rot|rotation)_?[4-9]$", words) for words in all_words)
     for index, (name, words) in enumerate(zip(names, all_words, strict=True)):
         head, _, unit = words.rpartition("_")
         words = head if unit in _UNITS else words
-        words = f"{_words(_last_part(column))}_{words}" if words in {"x", "y", "z", "w"} else words
-        kind, axis, prefix = _kind_of(words)
+        words = f"{_to_snake_case(_last_part(column))}_{words}" if words in {"x", "y", "z", "w"} else words
+        kind, axis, prefix = _parse_kind(words)
         if kind == "euler_xyz" and unit.startswith("deg"):
             kind = "euler_xyz_degrees"
         is_rate = has_rates and re.search(r"(?:^|_)w[xyz]$", words)  # next to a velocity: an angular velocity
         is_of_six = has_six and kind == "rotation"  # six numbers of a rotation matrix
         if kind and not is_rate and not is_of_six:
-            group = _group_in(f"{_words(column)}_{prefix}")
+            group = _find_group(f"{_to_snake_case(column)}_{prefix}")
             numbers.append(_Number(column, index, name, kind, axis, group, prefix, unit))
     return numbers
 
 
-def _kind_of(words: str) -> tuple[str, str, str]:
+def _parse_kind(words: str) -> tuple[str, str, str]:
     """Return kind, axis and prefix of a number from its name in snake case; an empty kind means no part of a pose."""
     if _GRIPPER.search(words):
         return ("", "", "") if _NO_RATE.search(words) else ("gripper", "", words.rstrip("0123456789"))
@@ -196,7 +198,7 @@ def _kind_of(words: str) -> tuple[str, str, str]:
     return "", "", ""
 
 
-def _usual_names(column: str, width: int, samples: Sequence[Numbers]) -> list[str]:
+def _propose_names(column: str, width: int, samples: Sequence[Numbers]) -> list[str]:
     """Return the usual names of the numbers in an unnamed column, from its name, width and sampled values."""
     name = _last_part(column)
     if _GRIPPER.search(name):
@@ -208,15 +210,15 @@ def _usual_names(column: str, width: int, samples: Sequence[Numbers]) -> list[st
     if width not in {6, 7, 8} or not _POSE.search(column) or re.search(r"rot|axis|euler|quat|angle", name, re.I):
         return []
     if samples:
-        has_quaternion = width > 6 and _are_unit(samples, [3, 4, 5, 6])
+        has_quaternion = width > 6 and _have_unit_norm(samples, [3, 4, 5, 6])
     else:
         has_quaternion = width == 8 or (width == 7 and not name.lower().endswith("state"))
     rotation = ["quat_0", "quat_1", "quat_2", "quat_3"] if has_quaternion else ["rot_0", "rot_1", "rot_2"]
-    is_padded = width == 8 and len(rotation) == 3 and not any(np.ptp(one[:, 6]) for one in samples)
+    is_padded = width == 8 and len(rotation) == 3 and not any(np.ptp(episode[:, 6]) for episode in samples)
     return ["pos_0", "pos_1", "pos_2", *rotation, *["padding"] * is_padded, "gripper"][:width]
 
 
-def _are_unit(samples: Sequence[Numbers], indexes: list[int]) -> bool:
+def _have_unit_norm(samples: Sequence[Numbers], indexes: list[int]) -> bool:
     """Return whether the vectors at some indexes have length 1 at 90 % of the steps, without NaN and zero vectors."""
     lengths = np.linalg.norm(np.concatenate(list(samples))[:, indexes], axis=1)
     lengths = lengths[np.isfinite(lengths) & (lengths > 0)]
@@ -228,41 +230,41 @@ def _are_unit(samples: Sequence[Numbers], indexes: list[int]) -> bool:
 _Numbers = tuple[_Number, ...]  # a candidate: position (3), rotation (3 or 4), gripper (1)
 
 
-def _parts(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
+def _group_axes(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
     """Yield positions and rotations: the numbers of one arm, column and kind in the order of their axes, w last."""
     parts: dict[tuple[str, str, str, str], dict[str, _Number]] = {}
     for number in numbers:
         key = number.group, number.column, number.kind, number.prefix
         parts.setdefault(key, {}).setdefault(number.axis, number)
     for (_, _, kind, _), by_axis in parts.items():
-        if len(by_axis) in _COUNTS.get(kind, (3,)):
+        if len(by_axis) in _NUM_AXES.get(kind, (3,)):
             yield tuple(by_axis[axis] for axis in "01234xyzw" if axis in by_axis)
 
 
-def _candidates(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
+def _find_candidates(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
     """Yield position, rotation and gripper of each arm."""
-    parts, all_grippers = list(_parts(numbers)), [one for one in numbers if one.kind == "gripper"]
+    parts, all_grippers = list(_group_axes(numbers)), [number for number in numbers if number.kind == "gripper"]
     positions = [part for part in parts if part[0].kind == "position"]
     for position in (part for part in positions if not any(map(_NO_HAND.fullmatch, part[0].group.split("_")))):
         group, column = position[0].group, position[0].column
         rotations = [part for part in parts if part[0].kind != "position" and part[0].group == group]
-        grippers = [one for one in all_grippers if one.group in {group, ""} or len(all_grippers) == 1]
+        grippers = [number for number in all_grippers if number.group in {group, ""} or len(all_grippers) == 1]
         if rotations and grippers:
             rotation = min(
                 rotations,
                 key=lambda part: (part[0].column != column, _may_be_rate(part[0]), part[0].kind not in FORMATS),
             )
-            gripper = min(grippers, key=lambda one: (one.group != group, one.column != column))
+            gripper = min(grippers, key=lambda number: (number.group != group, number.column != column))
             yield (*position, *rotation, gripper)
 
 
 def _may_be_rate(number: _Number) -> bool:
     """Return whether a number is called wx, wy or wz: an angular velocity, or a rotation vector if nothing else is."""
-    return re.search(r"(?:^|_)w[xyz]$", _words(number.name)) is not None
+    return re.search(r"(?:^|_)w[xyz]$", _to_snake_case(number.name)) is not None
 
 
-def _rank(candidate: _Numbers) -> tuple[bool, bool, bool, int]:
-    """Return a sort key: measured before commanded, named before unnamed, no arm name before one, few columns first."""
+def _make_sort_key(candidate: _Numbers) -> tuple[bool, bool, bool, int]:
+    """Return a sort key that prefers measured poses, then named numbers, then no arm name, then few columns."""
     is_named = all(number.is_named for number in candidate)
     columns = {number.column for number in candidate}
     return _is_not_measured(candidate), not is_named, bool(candidate[0].group), len(columns)
@@ -272,24 +274,27 @@ def _is_not_measured(candidate: _Numbers) -> bool:
     return any(_NOT_MEASURED.fullmatch(part) for number in candidate for part in number.group.split("_"))
 
 
-def _left_out(chosen: _Numbers, numbers: Sequence[_Number]) -> list[str]:
-    """Return the names of numbers that are not used: those of other arms or commands, or of the same columns."""
-    columns = {one.column for one in chosen}
-    rest = [one for one in numbers if one not in chosen and (one.group != chosen[0].group or one.column in columns)]
-    groups = {one.group for one in rest if one.kind == "position"}
-    return [one.name if one.column in columns else f"{one.column}: {one.name}" for one in rest if one.group in groups]
+def _list_unused(chosen: _Numbers, numbers: Sequence[_Number]) -> list[str]:
+    """Return the names of the unused numbers of other arms, of commands, and of the same columns."""
+    columns, group = {number.column for number in chosen}, chosen[0].group
+    rest = [
+        number for number in numbers if number not in chosen and (number.group != group or number.column in columns)
+    ]
+    groups = {number.group for number in rest if number.kind == "position"}
+    unused = [number for number in rest if number.group in groups]
+    return [number.name if number.column in columns else f"{number.column}: {number.name}" for number in unused]
 
 
 # ---- units and rotation formats ----
 
 
 def _make_pose_values(
-    chosen: _Numbers, left_out: Sequence[str], columns: Mapping[str, Column], samples: Samples, control_rate_hz: float
+    chosen: _Numbers, unused: Sequence[str], columns: Mapping[str, Column], samples: Samples, control_rate_hz: float
 ) -> dict[str, DraftValue]:
     """Return the config keys that select the chosen numbers, with formats that were checked with the samples."""
-    used = list(dict.fromkeys(one.column for one in chosen))
-    concatenated = [(name, index) for name in used for index in range(columns[name].width)]
-    select = [concatenated.index((one.column, one.index)) for one in chosen]
+    pose_columns = list(dict.fromkeys(number.column for number in chosen))
+    concatenated = [(name, index) for name in pose_columns for index in range(columns[name].width)]
+    select = [concatenated.index((number.column, number.index)) for number in chosen]
     unnamed_columns = [columns[number.column] for number in chosen if not number.is_named]
     group = chosen[0].group
     doubts = []
@@ -306,51 +311,51 @@ def _make_pose_values(
         doubts.append(f"no measured pose was found, {group or chosen[0].name} may be commanded or relative")
     elif not _HAND.fullmatch(group):
         doubts.append(f"if {group} is not the end effector, set states: vector")
-    if left_out:
-        shown = ", ".join(left_out[:8]) + (", …" if len(left_out) > 8 else "")
+    if unused:
+        shown = ", ".join(unused[:8]) + (", …" if len(unused) > 8 else "")
         doubts.append(f"left out: {shown}; to use all numbers, set states: vector")
     reason = "; ".join([reason, *doubts])
     is_guess = bool(unnamed_columns or doubts)
-    keys = {"state": DraftValue(used, reason, is_guess)}
+    keys = {"state": DraftValue(pose_columns, reason, is_guess)}
     if select != list(range(len(concatenated))):
         keys["select"] = DraftValue(select, reason, is_guess)
-    keys["rotation"] = _rotation_format(chosen[3:-1], samples, control_rate_hz)
-    unit = _position_unit(chosen[:3], samples)
+    keys["rotation"] = _choose_rotation_format(chosen[3:-1], samples, control_rate_hz)
+    unit = _choose_position_unit(chosen[:3], samples)
     return keys if unit.value == "m" else {**keys, "position_unit": unit}
 
 
-def _values(numbers: _Numbers, samples: Samples) -> list[Numbers]:
+def _get_finite_values(numbers: _Numbers, samples: Samples) -> list[Numbers]:
     """Return the finite sampled values of some numbers of one column, for each episode; empty if it was not read."""
-    indexes = [one.index for one in numbers]
+    indexes = [number.index for number in numbers]
     episodes = [episode[:, indexes] for episode in samples.get(numbers[0].column, ())]
-    return [finite for one in episodes if len(finite := one[np.isfinite(one).all(axis=1)])]
+    return [finite for episode in episodes if len(finite := episode[np.isfinite(episode).all(axis=1)])]
 
 
-def _usual_size(values: Sequence[Numbers]) -> float:
+def _measure_magnitude(values: Sequence[Numbers]) -> float:
     """Return the 95th percentile over steps of the largest absolute value; single wrong values do not affect it."""
-    return float(np.quantile(np.concatenate([abs(one).max(axis=1) for one in values]), 0.95)) if values else 0.0
+    return float(np.quantile(np.concatenate([abs(episode).max(axis=1) for episode in values]), 0.95)) if values else 0.0
 
 
-def _rotation_format(rotation: _Numbers, samples: Samples, control_rate_hz: float) -> DraftValue:
+def _choose_rotation_format(rotation: _Numbers, samples: Samples, control_rate_hz: float) -> DraftValue:
     if len(rotation) == 4:
         is_guess = rotation[-1].axis != "w"
         reason = "w last; alternative: quaternion_wxyz (w first), which the values cannot rule out" if is_guess else ""
         return DraftValue("quaternion_xyzw", reason, is_guess)
-    formats = [one for one in FORMATS if one == rotation[0].kind]
+    formats = [name for name in FORMATS if name == rotation[0].kind]
     if not formats:  # UR robots write rotation vectors as rx, ry, rz; Euler angles usually are roll, pitch, yaw
-        is_r = re.search(r"(?:^|_)r[xyz]$", _words(rotation[0].name))
+        is_r = re.search(r"(?:^|_)r[xyz]$", _to_snake_case(rotation[0].name))
         formats = ["rotation_vector", "euler_xyz"] if is_r else ["euler_xyz", "rotation_vector"]
-    values, proposed, is_guess = _values(rotation, samples), formats[0], len(formats) > 1
+    values, proposed, is_guess = _get_finite_values(rotation, samples), formats[0], len(formats) > 1
     reason = f"alternative: {formats[1]}; the names fit both" if is_guess else ""
     if is_guess and not values:
         reason += "; the values were not read"
-    largest = _usual_size(values)
+    largest = _measure_magnitude(values)
     if proposed != "euler_xyz_degrees" and largest > ANGLE_RAD:
         reason = f"the values reach {largest:.0f}, which is too large for radians"
         if proposed == "rotation_vector":
             reason += "; rotation vectors in degrees are not supported"
         return DraftValue("euler_xyz_degrees", reason, is_guess or proposed == "rotation_vector")
-    values = [one[abs(one).max(axis=1) <= max(largest, ANGLE_RAD)] for one in values]
+    values = [episode[abs(episode).max(axis=1) <= max(largest, ANGLE_RAD)] for episode in values]
     smoother = (
         find_smoother_format(measure_rotation_speeds(values, control_rate_hz), proposed, FASTEST_RAD_S)
         if values
@@ -362,11 +367,11 @@ def _rotation_format(rotation: _Numbers, samples: Samples, control_rate_hz: floa
     return DraftValue(smoother, reason if is_guess else f"{reason}, which the names suggest", is_guess=True)
 
 
-def _position_unit(position: _Numbers, samples: Samples) -> DraftValue:
+def _choose_position_unit(position: _Numbers, samples: Samples) -> DraftValue:
     """Return the unit of the position, from the names or else from the largest values that an arm can reach."""
     if position[0].unit in {"m", "cm", "mm"}:
         return DraftValue(position[0].unit)
-    largest = _usual_size(_values(position, samples))
+    largest = _measure_magnitude(_get_finite_values(position, samples))
     if largest <= REACH_M:
         return DraftValue("m")
     unit = "mm" if largest > 100 * REACH_M / 2 else "cm"

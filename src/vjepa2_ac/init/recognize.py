@@ -119,7 +119,11 @@ def read_raw_droid_properties(path: str) -> DatasetProperties:
         },
         rate_hz=DraftValue(15.0, "DROID's control rate"),
         episodes=episodes,
-        idle={"rule": DraftValue("commands", "openpi's rule: removes steps without commanded joint velocities")},
+        idle={
+            "rule": DraftValue(
+                "commands", "openpi's rule: removes steps in which the commanded joint velocities do not change"
+            )
+        },
         descriptions=(f"raw DROID, {size}, 15 control steps per second",),
     )
 

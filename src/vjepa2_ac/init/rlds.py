@@ -67,32 +67,40 @@ def read_rlds_properties(path: str) -> DatasetProperties:
         InputError: The data set cannot be read, or has no images or no measured numbers of the robot.
     """
     shards = find_shards(path)
-    features = dict(_features(path))
+    features = dict(_read_features(path))
     episodes = sum(shard.episodes for shard in shards)
     name = dataset_name(path)
     if name in _DROID_NAMES and _DROID_FEATURE in features:
         is_simulated = storage.exists(storage.join(path, SIMULATION_FILE))
         return make_droid_properties(path, episodes, "simulated arm" if is_simulated else "DROID")
-    images, depth = _cameras(features)
+    images, depth = _find_cameras(features)
     where = storage.join(path, "features.json")
     camera, all_cameras = make_camera_values(images, depth, where)
     is_bridge = name in _BRIDGE_NAMES and _BRIDGE_FEATURE in features
-    rate = _rate(features, is_bridge=is_bridge)
+    rate = _choose_control_rate(features, is_bridge=is_bridge)
     has_velocities = _VELOCITIES in features
     texts = [name for name, feature in features.items() if feature.kind == "text"]
     columns = {
-        name: Column(one.width)
-        for name, one in features.items()
-        if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith(_NUMBER_DTYPES) and one.width > 0
+        name: Column(feature.width)
+        for name, feature in features.items()
+        if name.startswith("steps/")
+        and feature.kind == "tensor"
+        and feature.dtype.startswith(_NUMBER_DTYPES)
+        and feature.width > 0
     }
-    texts_of_episode = [
+    episode_texts = [
         name
-        for name, one in features.items()
-        if name.startswith("episode_metadata/") and (one.kind == "text" or one.dtype.startswith(("int", "uint", "str")))
+        for name, feature in features.items()
+        if name.startswith("episode_metadata/")
+        and (feature.kind == "text" or feature.dtype.startswith(("int", "uint", "str")))
     ]
     measured = select_measured_columns(columns)
-    records = _sample_records(shards, [*measured, *texts_of_episode])
-    pose = _BRIDGE_POSE if is_bridge else find_pose(columns, _samples(records, measured), control_rate_hz=rate.value)
+    records = _sample_records(shards, [*measured, *episode_texts])
+    pose = (
+        _BRIDGE_POSE
+        if is_bridge
+        else find_pose(columns, _collect_samples(records, measured), control_rate_hz=rate.value)
+    )
     control_rate = f"{rate.value:g} control steps per second{' (guessed)' if rate.is_guess else ''}"
     return DatasetProperties(
         source="rlds",
@@ -101,7 +109,7 @@ def read_rlds_properties(path: str) -> DatasetProperties:
             "camera": camera,
             "fields": {
                 **(pose or select_vector_state(columns, where)),
-                "identity": _identity(records, texts_of_episode),
+                "identity": _choose_identity(records, episode_texts),
                 "cameras": all_cameras,
                 "language": DraftValue(next((name for name in texts if "instruction" in name), None)),
                 "joint_velocity": DraftValue(_VELOCITIES if has_velocities else None),
@@ -125,12 +133,16 @@ def make_droid_properties(path: str, episodes: int, title: str) -> DatasetProper
         config_values={"camera": DraftValue(_DROID_CAMERA)},
         rate_hz=DraftValue(_DROID_RATE_HZ),
         episodes=episodes,
-        idle={"rule": DraftValue("commands", "openpi's rule: removes steps without commanded joint velocities")},
+        idle={
+            "rule": DraftValue(
+                "commands", "openpi's rule: removes steps in which the commanded joint velocities do not change"
+            )
+        },
         descriptions=(f"RLDS ({title}), {counted(episodes, 'episode')}, {_DROID_RATE_HZ:g} control steps per second",),
     )
 
 
-def _rate(features: Mapping[str, _Feature], *, is_bridge: bool) -> DraftValue:
+def _choose_control_rate(features: Mapping[str, _Feature], *, is_bridge: bool) -> DraftValue:
     """Return the control rate, which RLDS does not store: it is known only for known data sets, otherwise a guess."""
     if is_bridge:
         return DraftValue(_BRIDGE_RATE_HZ, "BridgeData's control rate, which RLDS does not store")
@@ -144,7 +156,7 @@ def _rate(features: Mapping[str, _Feature], *, is_bridge: bool) -> DraftValue:
     )
 
 
-def _features(path: str) -> Iterator[tuple[str, _Feature]]:
+def _read_features(path: str) -> Iterator[tuple[str, _Feature]]:
     """Yield the features of an RLDS data set with their names in a record.
 
     Raises:
@@ -174,20 +186,23 @@ def _nested_features(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
         yield from _nested_features(content["sequence"].get("feature"), name)
     else:
         kind = next((kind for kind in ("image", "text", "tensor") if kind in content), "")
-        about = content.get(kind) or {}
-        sizes = [int(size) for size in about.get("shape", {}).get("dimensions", [])]
-        yield name, _Feature(kind, str(about.get("dtype", "")), math.prod(sizes), sizes[-1] if len(sizes) == 3 else 0)
+        description = content.get(kind) or {}
+        sizes = [int(size) for size in description.get("shape", {}).get("dimensions", [])]
+        yield (
+            name,
+            _Feature(kind, str(description.get("dtype", "")), math.prod(sizes), sizes[-1] if len(sizes) == 3 else 0),
+        )
 
 
-def _cameras(features: Mapping[str, _Feature]) -> tuple[list[str], list[str]]:
+def _find_cameras(features: Mapping[str, _Feature]) -> tuple[list[str], list[str]]:
     """Return the features with camera images (colour, or grey if there are none), and those with depth maps."""
-    images = {name: feature for name, feature in features.items() if feature.kind == "image" and _is_of_step(name)}
+    images = {name: feature for name, feature in features.items() if feature.kind == "image" and _is_step_feature(name)}
     depth = [name for name, image in images.items() if is_not_camera(name) or image.dtype not in {"", "uint8"}]
     colour = [name for name, image in images.items() if name not in depth and image.channels != 1]
     return colour or [name for name in images if name not in depth], depth
 
 
-def _is_of_step(name: str) -> bool:
+def _is_step_feature(name: str) -> bool:
     return name.startswith("steps/")
 
 
@@ -209,7 +224,7 @@ def _sample_records(shards: Sequence[Shard], names: Sequence[str]) -> list[dict[
     return records
 
 
-def _samples(records: Sequence[Mapping[str, tuple[Any, ...]]], columns: Mapping[str, Column]) -> Samples:
+def _collect_samples(records: Sequence[Mapping[str, tuple[Any, ...]]], columns: Mapping[str, Column]) -> Samples:
     """Return the numbers of each record, by column; columns whose width differs from the description are left out."""
     return {
         name: [np.array(record[name], np.float64).reshape(-1, column.width) for record in records]
@@ -218,7 +233,7 @@ def _samples(records: Sequence[Mapping[str, tuple[Any, ...]]], columns: Mapping[
     }
 
 
-def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[str]) -> DraftValue:
+def _choose_identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[str]) -> DraftValue:
     """Return the features that identify the sampled episodes; `record` if no features do."""
     paths = [name for name in names if name.rsplit("/", 1)[-1] in _PATHS]
     for candidates in (paths, names):

@@ -417,12 +417,12 @@ function drawPose(header) {
  */
 function drawPath(path, truth) {
   const [x0, y0, z0] = path[0];
-  const ways = [...path, truth ?? path[0]].map(([x, y, z]) => [y0 - y, x0 - x, z0 - z]);
-  const scale = 78 / Math.max(0.12, ...ways.flat().map(Math.abs));
-  const at = (/** @type {number[]} */ way) => way.map((item) => item * scale);
-  const points = ways.slice(0, -1).map(at);
+  const offsets = [...path, truth ?? path[0]].map(([x, y, z]) => [y0 - y, x0 - x, z0 - z]);
+  const scale = 78 / Math.max(0.12, ...offsets.flat().map(Math.abs));
+  const at = (/** @type {number[]} */ offset) => offset.map((item) => item * scale);
+  const points = offsets.slice(0, -1).map(at);
   const [u, v, w] = points[points.length - 1];
-  const [tu, tv, tw] = at(ways[ways.length - 1]);
+  const [tu, tv, tw] = at(offsets[offsets.length - 1]);
   const grid = [-0.2, -0.15, -0.1, -0.05, 0, 0.05, 0.1, 0.15, 0.2].map((item) => item * scale).filter((item) => Math.abs(item) < 92);
   const lines = grid.map((item) => `M${item - 8} -92V92M-100 ${item}H84`).join("");
   const shapes = [
@@ -534,7 +534,7 @@ function energyMap(map, action) {
 }
 
 /**
- * Make item button of a group reachable by Tab, and the others by the arrow keys.
+ * Make one button of a group reachable by Tab, and the others by the arrow keys.
  *
  * @param {HTMLElement} group
  * @param {HTMLElement | undefined} item
@@ -543,10 +543,10 @@ function setTabStop(group, item) {
   for (const button of /** @type {HTMLElement[]} */ ([...group.children])) button.tabIndex = button === item ? 0 : -1;
   group.onkeydown = (event) => {
     const columns = Number(group.dataset.columns ?? group.children.length);
-    const ways = /** @type {{[key: string]: number}} */ ({ ArrowLeft: -1, ArrowRight: 1, ArrowUp: -columns, ArrowDown: columns });
-    if (!(event.key in ways) || event.ctrlKey || event.altKey || event.metaKey) return;
+    const offsets = /** @type {{[key: string]: number}} */ ({ ArrowLeft: -1, ArrowRight: 1, ArrowUp: -columns, ArrowDown: columns });
+    if (!(event.key in offsets) || event.ctrlKey || event.altKey || event.metaKey) return;
     const buttons = /** @type {HTMLButtonElement[]} */ ([...group.children]);
-    const next = buttons[buttons.indexOf(/** @type {any} */ (event.target)) + ways[event.key]];
+    const next = buttons[buttons.indexOf(/** @type {any} */ (event.target)) + offsets[event.key]];
     event.preventDefault();
     event.stopPropagation(); // the key does not command a motion
     if (!next || next.disabled) return;
