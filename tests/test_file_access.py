@@ -17,7 +17,7 @@ from run_fixtures import TINY, TINY_CONFIG, MakeConfig
 from vjepa2_ac.config import AdapterConfig, DiskCacheConfig, EncoderConfig, ModelConfig, ModelSizes, SizesConfig
 from vjepa2_ac.data.index import EpisodeTable, get_or_build_index
 from vjepa2_ac.data.sources.latent_files import LatentFiles
-from vjepa2_ac.data.sources.latents import EPISODES, read_table
+from vjepa2_ac.data.sources.latents import EPISODES_FILE, read_table
 from vjepa2_ac.decoding.decoder import load_decoder
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError, RefusedError, describe_error
@@ -61,7 +61,7 @@ def write_all(root: Path) -> None:
     write_prior(root / "prior")
     get_or_build_index(DiskCacheConfig(dir=str(root)), "key", "/data", lambda: TABLE)
     (root / "latents").mkdir()
-    (root / "latents" / EPISODES).write_bytes(TABLE.to_bytes())
+    (root / "latents" / EPISODES_FILE).write_bytes(TABLE.to_bytes())
     (root / "metrics.json").write_text("{}")
 
 
@@ -77,7 +77,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "index/key.index": lambda root: get_or_build_index(
         DiskCacheConfig(dir=str(root)), "key", "/data", lambda: pytest.fail("built again")
     ),
-    f"latents/{EPISODES}": lambda root: read_table(str(root / "latents" / EPISODES), EpisodeTable),
+    f"latents/{EPISODES_FILE}": lambda root: read_table(str(root / "latents" / EPISODES_FILE), EpisodeTable),
     "metrics.json": read_metrics,
 }
 CACHED = "index/key.index"  # it is built again where it was read and found wrong

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.indexed_source import measured_space, spaces_of
+from vjepa2_ac.data.sources.indexed_source import get_spaces, get_state_space
 from vjepa2_ac.episode import POSE_WIDTHS, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import (
@@ -88,15 +88,15 @@ def test_any_finite_numbers_may_be_a_vector_and_an_episode_has_steps() -> None:
 def test_which_state_follows_from_an_action_is_what_the_config_says_of_it(
     knobs: dict[str, object], widths: Widths, follows: str
 ) -> None:
-    spaces = spaces_of(DataConfig(path="d", source="npz", states="vector", **knobs), widths)
+    spaces = get_spaces(DataConfig(path="d", source="npz", states="vector", **knobs), widths)
     assert (spaces.action.follows, spaces.widths) == (follows, widths)
 
 
 def test_poses_are_in_the_frame_of_the_config_and_read_in_that_of_the_base() -> None:
     camera = DataConfig(path="d", source="npz", pose_frame="camera")
-    assert spaces_of(DataConfig(path="d"), POSE_WIDTHS) == POSES
-    assert spaces_of(camera, POSE_WIDTHS) == Spaces(CAMERA_POSE, POSE_CHANGE)
-    assert measured_space(camera, 7) == POSE
+    assert get_spaces(DataConfig(path="d"), POSE_WIDTHS) == POSES
+    assert get_spaces(camera, POSE_WIDTHS) == Spaces(CAMERA_POSE, POSE_CHANGE)
+    assert get_state_space(camera, 7) == POSE
 
 
 # What is given to plan from

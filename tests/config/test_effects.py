@@ -20,7 +20,7 @@ from vjepa2_ac.config.section import Affects, Component, Section, collect_effect
 from vjepa2_ac.data import idle as idle_ranges
 from vjepa2_ac.data.index import EpisodeInfo, EpisodeTable
 from vjepa2_ac.data.sources.indexed_source import open_source
-from vjepa2_ac.data.sources.latents import key_of_cache
+from vjepa2_ac.data.sources.latents import build_cache_key
 from vjepa2_ac.encoding.batch import get_encoding
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.world_model import WorldModel
@@ -153,7 +153,7 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
             return dict.fromkeys(("index", "idle", "latents"))
         table = replace(EpisodeTable.from_infos([EpisodeInfo("one", 9, None)]), texts={"index": index})
         ranges = found(lambda: idle_ranges.find_ranges(open_source(config.data), table, config.data, None))
-        latents = key_of_cache(config.data, index, get_encoding(world_model(), config))
+        latents = build_cache_key(config.data, index, get_encoding(world_model(), config))
         return {"index": index, "idle": ranges, "latents": latents.digest}
 
     return keys
@@ -181,7 +181,7 @@ def test_the_options_of_a_plug_in_are_a_part_of_the_key_of_a_cache(monkeypatch: 
 
     encoding = get_encoding(world_model(), config_of("rlds", "x", Path()))
     options = (WallOptions(size=size) for size in (32, 64))
-    keys = [key_of_cache(WallData(path="x", wall=wall), "its episodes", encoding) for wall in options]
+    keys = [build_cache_key(WallData(path="x", wall=wall), "its episodes", encoding) for wall in options]
     assert keys[0].digest != keys[1].digest
 
 

@@ -32,7 +32,7 @@ from vjepa2_ac.data.sources.latent_files import (
     pack_latents,
     unpack_latents,
 )
-from vjepa2_ac.data.sources.latents import CACHE, EPISODES, KEPT, CacheKey, require_own_folder
+from vjepa2_ac.data.sources.latents import CACHE_FILE, EPISODES_FILE, STEPS_FILE, CacheKey, require_matching_folder
 from vjepa2_ac.encoding import batch
 from vjepa2_ac.encoding.latent_cache import LatentCache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
@@ -77,14 +77,14 @@ def written(folder: Path, kind: CacheType = "fp32", *, exact: bool = False) -> L
 
 def read_all(files: LatentFiles) -> tuple[StoredLatents, np.ndarray]:
     file, everything = files.open(0, "left"), range(len(FRAMES))
-    return file.latents(everything), file.pictures(everything)
+    return file.read_latents(everything), file.read_images(everything)
 
 
 @pytest.mark.parametrize(("kind", "largest_error"), [("fp32", 0.0), ("bf16", 2**-8), ("int8", 0.5)])
 def test_latents_come_back_in_the_precision_that_they_are_kept_in(
     tmp_path: Path, kind: CacheType, largest_error: float
 ) -> None:
-    found = written(tmp_path, kind).open(0, "left").latents([3, 0])
+    found = written(tmp_path, kind).open(0, "left").read_latents([3, 0])
     true = drawn_latents()[[3, 0]]
     unit = {"fp32": 1.0, "bf16": true.abs(), "int8": true.abs().amax(-1, keepdim=True) / 127}[kind]
     assert unpack_latents(found).dtype == torch.float32
@@ -96,12 +96,12 @@ def test_latents_come_back_in_the_precision_that_they_are_kept_in(
 def test_everything_else_of_an_episode_comes_back_bit_for_bit(tmp_path: Path, exact: bool) -> None:
     file, true = written(tmp_path, exact=exact).open(0, "left"), episode()
     for name in ("states", *OPTIONAL):
-        assert file.array(name).dtype == getattr(true, name).dtype
-        np.testing.assert_array_equal(file.array(name), getattr(true, name))
+        assert file.read_array(name).dtype == getattr(true, name).dtype
+        np.testing.assert_array_equal(file.read_array(name), getattr(true, name))
     assert file.metadata == true.metadata
     assert file.frame_steps.tolist() == list(FRAMES)
-    assert file.places_of([11, 0]) == [3, 0]
-    assert abs(file.pictures([3, 1]).mean(axis=(1, 2, 3)) - [220, 40]).max() < (1e-6 if exact else 3)
+    assert file.find_frames([11, 0]) == [3, 0]
+    assert abs(file.read_images([3, 1]).mean(axis=(1, 2, 3)) - [220, 40]).max() < (1e-6 if exact else 3)
 
 
 # ---- a damaged file ----------------------------------------------------------------------------------------------
@@ -180,7 +180,7 @@ def test_only_the_frames_that_are_asked_for_are_read(tmp_path: Path, monkeypatch
         return read(path, ranges)
 
     monkeypatch.setattr(storage, "read_ranges", counted)
-    kept = files.open(0, "left").latents([17, 190])
+    kept = files.open(0, "left").read_latents([17, 190])
     assert 2 * frame < sum(lengths) <= 2 * frame + (32 << 10)
     assert kept.values.shape == (2, 64, 1024)
 
@@ -385,16 +385,16 @@ def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
 def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_path: Path) -> None:
     original, through = cached(droid_with_rests, tmp_path, idle=IDLE)
     folder = Path(through.config.path)
-    for name in (EPISODES, KEPT, CACHE):
+    for name in (EPISODES_FILE, STEPS_FILE, CACHE_FILE):
         sound = (folder / name).read_bytes()
         (folder / name).write_bytes(sound[:-40])
         with pytest.raises(InputError, match=name):
             alone(through)
         (folder / name).write_bytes(sound)
-    (folder / KEPT).rename(folder / "other")
+    (folder / STEPS_FILE).rename(folder / "other")
     with pytest.raises(InputError, match=r"kept\.npz"):
         alone(through)
-    (folder / "other").rename(folder / KEPT)
+    (folder / "other").rename(folder / STEPS_FILE)
     next(folder.rglob("*.safetensors")).unlink()
     for read in (lambda: alone(through), lambda: LatentCache.for_dataset(original, NUMBERS).open_dataset()):
         with pytest.raises(InputError, match=r"no latents of 1 of \d+ episodes.*vjepa2-ac encode"):
@@ -408,4 +408,4 @@ def test_key_of_an_older_version_has_removed_config_keys_with_the_values_of_toda
     for noise, is_accepted in ((0.0, True), (0.5, False)):
         (tmp_path / "key.json").write_text(json.dumps({"key": {"decoder": {"size": "small", "noise": noise}}}))
         with nullcontext() if is_accepted else pytest.raises(InputError, match=r"noise: 0\.5"):
-            require_own_folder(tmp_path, "key.json", key, where="decoder.folder")
+            require_matching_folder(tmp_path, "key.json", key, where="decoder.folder")

@@ -51,7 +51,7 @@ def test_each_episode_gets_its_own_frames_which_are_read_once(run: Run) -> None:
     for number, steps in enumerate(LENGTHS):
         file = files.open(number, "left")
         assert file.frame_steps.tolist() == list(range(steps))
-        pixels = unpack_latents(file.latents(range(steps)))[:, 0] * 255 * torch.tensor([0.229, 0.224, 0.225])
+        pixels = unpack_latents(file.read_latents(range(steps)))[:, 0] * 255 * torch.tensor([0.229, 0.224, 0.225])
         found = (pixels + 255 * torch.tensor([0.485, 0.456, 0.406])).numpy()
         expected = np.stack([np.full(steps, number), np.arange(steps)], axis=1)
         np.testing.assert_allclose(found[:, :2], expected, atol=0.6)

@@ -41,7 +41,7 @@ def write_cache(dataset: Dataset, encoding: Encoding = NUMBERS, encode: Encode =
             episode = dataset.source.read(one.episode, one.camera)
             frames = crop_frames(episode.read_frames(one.steps.tolist()), dataset.config.crop)
         except InputError as error:
-            cache.files.note_broken(one.episode, one.camera, str(error))
+            cache.files.record_broken(one.episode, one.camera, str(error))
             continue
         latents = pack_latents(encode(frames), dataset.config.cache_dtype)
         encoded = EncodedEpisode(episode, one.camera, one.steps.tolist(), latents, _squashed(frames, 16))

@@ -15,8 +15,8 @@ from vjepa2_ac.data.sources.tfrecord import (
     encode_entry,
     encode_field,
     iterate_features,
-    require_intact,
-    span_at,
+    parse_header,
+    verify_crc,
     write_record,
 )
 
@@ -28,7 +28,7 @@ def index_records(path: str | Path) -> list[RecordSpan]:
     offset = 0
     while offset < len(data):
         header = data[offset : offset + HEADER_BYTES]
-        spans.append(span_at(header, str(path), len(spans), offset, len(data)))
+        spans.append(parse_header(header, str(path), len(spans), offset, len(data)))
         offset = spans[-1].end
     return spans
 
@@ -43,7 +43,7 @@ def read_record(span: RecordSpan) -> bytes:
     with Path(span.path).open("rb") as file:
         file.seek(span.offset)
         data = file.read(span.end - span.offset)
-    require_intact(lambda offset, length: data[offset - span.offset :][:length], span)
+    verify_crc(lambda offset, length: data[offset - span.offset :][:length], span)
     return data[HEADER_BYTES:][: span.length]
 
 

@@ -65,12 +65,12 @@ def _plan(options: argparse.Namespace) -> int:
     that the plan is worse than the zero action or than the current frame. The first line of the output then states
     this.
     """
-    from vjepa2_ac.data.sources.indexed_source import measured_space
+    from vjepa2_ac.data.sources.indexed_source import get_state_space
     from vjepa2_ac.planning.goals import require_ends
 
     state = options.state
     config = cli.require_to_plan(options)
-    measured_space(config.data, len(state)).require_state(state, "--state")  # the model checks the width later
+    get_state_space(config.data, len(state)).require_state(state, "--state")  # the model checks the width later
     cli.make_folder(options.out)
     goals = _goals_of(options, config)
     require_ends(goals, first=1)

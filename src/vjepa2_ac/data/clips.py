@@ -16,7 +16,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import map_in_threads
 from vjepa2_ac.data.selection import add_exclusion_fix
-from vjepa2_ac.data.sources.indexed_source import measured_space
+from vjepa2_ac.data.sources.indexed_source import get_state_space
 from vjepa2_ac.data.transforms import crop_frames
 from vjepa2_ac.episode import Batch, Clip, Episode, StoredLatents, Widths
 from vjepa2_ac.errors import InputError
@@ -107,7 +107,7 @@ def compute_actions(
         ValueError: Commands are required and the episode has none.
     """
     if config.actions == "difference":
-        return measured_space(config, states.shape[1]).differences(states)
+        return get_state_space(config, states.shape[1]).differences(states)
     if commands is None:
         raise ValueError("the episode has no recorded commands")
     return join_commands(commands[steps[0] : steps[-1]], config.model_stride, config.join_actions)

@@ -20,8 +20,8 @@ from jaxtyping import Float32, Shaped, UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, IdleConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.sources.lerobot_meta import INFO, TABLES, filled
-from vjepa2_ac.data.sources.parquet import parquet_library
+from vjepa2_ac.data.sources.lerobot_meta import INFO, TABLES, fill_template
+from vjepa2_ac.data.sources.parquet import import_pyarrow
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError, counted
@@ -124,7 +124,7 @@ class LeRobotWriter:
 
     def __init__(self, folder: Path, rate_hz: float, names: Mapping[str, Sequence[str]]) -> None:
         self._folder, self._names, self._form = folder, names, json.loads(_FORM.read_text())
-        self._pa = parquet_library("data convert")
+        self._pa = import_pyarrow("data convert")
         self._rate_hz = int(rate_hz) if float(rate_hz).is_integer() else rate_hz  # LeRobot writes integers
         self._features: dict[str, Any] = {}
         self._statistics: dict[str, Statistics] = {}
@@ -162,7 +162,9 @@ class LeRobotWriter:
         row = {"episode_index": number, "tasks": [task], "length": steps, **_place("data", 0, 0)}
         row |= {"dataset_from_index": start, "dataset_to_index": start + steps}
         chunk, file = divmod(number, self._form["info"]["chunks_size"])
-        videos = {key: self._folder / filled(self._form["info"]["video_path"], chunk, file, key) for key in frames}
+        videos = {
+            key: self._folder / fill_template(self._form["info"]["video_path"], chunk, file, key) for key in frames
+        }
         try:
             for key, path in videos.items():
                 statistics[key] = self._write_video(path, key, frames[key], steps)
@@ -173,7 +175,7 @@ class LeRobotWriter:
                 path.unlink(missing_ok=True)
             raise
         rows = {name: self._column(values) for name, values in columns.items()}
-        self._append(filled(self._form["info"]["data_path"], 0, 0), rows)
+        self._append(fill_template(self._form["info"]["data_path"], 0, 0), rows)
         for name, new in statistics.items():
             row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in new.items()}
             self._statistics[name] = (
@@ -234,7 +236,7 @@ class LeRobotWriter:
 
     def _write_rows(self) -> None:
         if rows := self._rows:
-            self._append(filled(TABLES["v3.0"], 0, 0), {name: [row[name] for row in rows] for name in rows[0]})
+            self._append(fill_template(TABLES["v3.0"], 0, 0), {name: [row[name] for row in rows] for name in rows[0]})
             rows.clear()
 
     def _append(self, name: str, columns: Mapping[str, Any], about: Mapping[str, str] | None = None) -> None:

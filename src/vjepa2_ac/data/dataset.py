@@ -27,7 +27,7 @@ from vjepa2_ac.data.selection import (
     select_outcome,
     select_split,
 )
-from vjepa2_ac.data.sources.indexed_source import open_source, spaces_of
+from vjepa2_ac.data.sources.indexed_source import get_spaces, open_source
 from vjepa2_ac.data.windows import Windows, draw_uniform, find_clip_windows, require_stride, select_split_windows
 from vjepa2_ac.episode import POSE_WIDTHS, Batch, Clip, Episode, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError, counted
@@ -203,7 +203,7 @@ class Dataset:
     @cached_property
     def spaces(self) -> Spaces:
         """The spaces of states and actions."""
-        return spaces_of(self.config, self.widths)
+        return get_spaces(self.config, self.widths)
 
     @cached_property
     def widths(self) -> Widths:
@@ -268,7 +268,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     broken.record_problems([problem for problem in table.problems if problem.name not in config.exclude])
     kept = StepSelection.all_steps(table, chosen)
     if config.idle.rule != "none":
-        ranges = source.kept_ranges() if config.is_cache else find_ranges(source, table, config, progress)
+        ranges = source.read_selected_steps() if config.is_cache else find_ranges(source, table, config, progress)
         broken.record_problems([problem for index, problem in ranges.problems if chosen[index]])
         kept = ranges.select_episodes(chosen)
     dataset = Dataset(config, source, table, kept, broken)
@@ -299,7 +299,9 @@ def open_cached_latents(dataset: Dataset, folder: Path | str) -> Dataset:
 def _settled(dataset: Dataset) -> Dataset:
     """Check that a latent cache has the files of all clips, and set its cameras in the config."""
     source: Any = dataset.source
-    return replace(dataset, config=source.settle(dataset.starts.episode)) if dataset.config.is_cache else dataset
+    return (
+        replace(dataset, config=source.resolve_cameras(dataset.starts.episode)) if dataset.config.is_cache else dataset
+    )
 
 
 def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:

@@ -48,7 +48,7 @@ class FramePairs:
     @classmethod
     def of(cls, dataset: Dataset, wanted: Sequence[FramesToEncode], files: LatentFiles) -> FramePairs:
         """Return those of the wanted frames that could be encoded."""
-        there = tuple(one for one in wanted if files.has(one.episode, one.camera))
+        there = tuple(one for one in wanted if files.has_file(one.episode, one.camera))
         return cls(files, there, tuple(dataset.table.identity(one.episode) for one in there))
 
     @cached_property
@@ -69,8 +69,8 @@ class FramePairs:
         latents, images = list[Tensor](), list[Tensor]()
         for number, owner in zip(numbers, owners, strict=True):
             row = int(number - self._ends[owner]) + len(self.frames[owner].steps)
-            latents.append(unpack_latents(files[owner].latents([row])))
-            images.append(torch.from_numpy(files[owner].pictures([row])).permute(0, 3, 1, 2))
+            latents.append(unpack_latents(files[owner].read_latents([row])))
+            images.append(torch.from_numpy(files[owner].read_images([row])).permute(0, 3, 1, 2))
         ids = tuple(self.episode_ids[owner] for owner in owners)
         return Pairs(torch.cat(latents), torch.cat(images).contiguous(), ids)
 

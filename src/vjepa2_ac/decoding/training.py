@@ -25,7 +25,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.selection import SPLIT_LABEL
 from vjepa2_ac.data.sources.latent_files import LatentFiles, bytes_per_frame
-from vjepa2_ac.data.sources.latents import CacheKey, Encoding, require_own_folder
+from vjepa2_ac.data.sources.latents import CacheKey, Encoding, require_matching_folder
 from vjepa2_ac.data.windows import permute_index, require_frames, require_stride
 from vjepa2_ac.decoding.decoder import (
     CARD,
@@ -194,7 +194,7 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
         "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
         **({"data.splits": config.data.splits} if SPLIT_LABEL in dataset.table.labels else {}),
     })  # fmt: skip
-    require_own_folder(folder, KEY, key, where=f"decoder.folder {folder}")
+    require_matching_folder(folder, KEY, key, where=f"decoder.folder {folder}")
     shape = DecoderShape(decoder.size, model.latent_dim, size // patch, patch)
     return Setup(
         config, folder, shape, encoding, key, dataset, EncoderOnDevice.from_model(config, model, device), wanted
@@ -205,7 +205,7 @@ def _require_space(ready: Setup, reporter: Reporter) -> None:
     encoding, kind = ready.encoding, ready.config.data.cache_dtype
     per_frame = bytes_per_frame(encoding.tokens, encoding.dim, kind) + 3 * encoding.image_size**2
     everything = [one for some in ready.wanted.values() for one in some]
-    left = count_frames([one for one in everything if not ready.files.has(one.episode, one.camera)])
+    left = count_frames([one for one in everything if not ready.files.has_file(one.episode, one.camera)])
     fix = "Lower decoder.frames, set data.cache_dtype: int8, or put decoder.folder on a larger disk"
     require_space(ready.folder, left, per_frame, fix=fix)
     size = f"{left * per_frame / 1e9:.3g} GB of disk for them and their latents, while training"

@@ -15,7 +15,7 @@ from torch import Tensor
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latent_files import unpack_latents
-from vjepa2_ac.data.sources.latents import Encoding, LatentSource, another_cache
+from vjepa2_ac.data.sources.latents import Encoding, LatentSource, cache_mismatch_error
 from vjepa2_ac.data.transforms import Crop, crop_frames, pixels_to_input, split_views
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
@@ -114,9 +114,9 @@ def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Conf
         InputError: Lists the differences.
     """
     if isinstance(dataset.source, LatentSource):  # the weights are hashed only for caches
-        differing = dataset.source.key.differences_of(get_encoding(world_model, config))
+        differing = dataset.source.key.list_encoding_differences(get_encoding(world_model, config))
         if differing:
-            raise another_cache(Path(dataset.config.path), differing)
+            raise cache_mismatch_error(Path(dataset.config.path), differing)
 
 
 def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> None:

@@ -80,7 +80,7 @@ def encode_config(
             f"All {counted(count_frames(cache.requests), 'frame')} are cached in {cache.folder}; nothing to encode."
         )
     table, broken, files = cache.dataset.table, cache.broken, cache.files
-    sizes = [(request, files.size(request.episode, request.camera)) for request in cache.requests]
+    sizes = [(request, files.get_file_size(request.episode, request.camera)) for request in cache.requests]
     absent = {request.episode for request, size in sizes if not size}
     return EncodingResult(
         folder=cache.folder,

@@ -31,14 +31,14 @@ from vjepa2_ac.data.idle import find_ranges
 from vjepa2_ac.data.index import cache_folder, compute_fingerprint
 from vjepa2_ac.data.sources.latent_files import CacheType, EncodedEpisode, LatentFiles, bytes_per_frame, pack_latents
 from vjepa2_ac.data.sources.latents import (
-    CACHE,
-    EPISODES,
-    KEPT,
+    CACHE_FILE,
+    EPISODES_FILE,
+    STEPS_FILE,
     CacheKey,
     Encoding,
-    key_of_cache,
-    read_key,
-    require_own_folder,
+    build_cache_key,
+    read_cache_key,
+    require_matching_folder,
 )
 from vjepa2_ac.data.transforms import crop_frames, input_to_pixels, pixels_to_input
 from vjepa2_ac.distributed import autocast
@@ -103,7 +103,7 @@ class LatentCache:
             folder: The folder of the cache; None: a folder in `data.cache_dir`, or in the machine's default cache.
         """
         config = dataset.config
-        key = key_of_cache(config, compute_fingerprint(dataset.table), encoding)
+        key = build_cache_key(config, compute_fingerprint(dataset.table), encoding)
         parent = config.cache_dir or cache_folder(config.disk_cache) / "latents"
         path = storage.join(parent, key.digest) if folder is None else str(folder)
         return cls(dataset, encoding, key, storage.parse_folder(path))
@@ -128,7 +128,7 @@ class LatentCache:
         if not self.is_begun:
             return list(self.requests)
         files = self.files
-        is_present = files.has if retry else files.is_done
+        is_present = files.has_file if retry else files.is_done
         results = map_in_threads(
             lambda request: is_present(request.episode, request.camera), self.requests, CONNECTIONS
         )
@@ -137,12 +137,12 @@ class LatentCache:
     @property
     def is_begun(self) -> bool:
         """Whether the files that describe the cache exist (`begin` writes them)."""
-        return all(storage.exists(storage.join(self.folder, name)) for name in (CACHE, EPISODES))
+        return all(storage.exists(storage.join(self.folder, name)) for name in (CACHE_FILE, EPISODES_FILE))
 
     @property
     def broken(self) -> dict[int, str]:
         """The reasons of the episodes that any process could not read, by the index of the episode."""
-        reasons, episodes = self.files.broken, {request.episode for request in self.requests}
+        reasons, episodes = self.files.broken_reasons, {request.episode for request in self.requests}
         return {number: reason for number, reason in reasons.items() if number in episodes}
 
     @property
@@ -164,7 +164,7 @@ class LatentCache:
         Raises:
             InputError: Lists how the other cache differs.
         """
-        require_own_folder(self.folder, CACHE, self.key, where=f"latent cache {self.folder}")
+        require_matching_folder(self.folder, CACHE_FILE, self.key, where=f"latent cache {self.folder}")
 
     def begin(self) -> None:
         """Write the files that describe the cache, unless they exist.
@@ -179,10 +179,10 @@ class LatentCache:
         dataset = self.dataset
         texts = {"control_rate_hz": str(dataset.control_rate_hz), "widths": " ".join(map(str, dataset.widths))}
         table = replace(dataset.table, texts={**dataset.table.texts, **texts}, locators={})
-        content: dict[str, bytes | str] = {CACHE: json.dumps({"key": dict(self.key.parts)}, indent=1) + "\n"}
+        content: dict[str, bytes | str] = {CACHE_FILE: json.dumps({"key": dict(self.key.parts)}, indent=1) + "\n"}
         if dataset.config.idle.rule != "none":
-            content[KEPT] = find_ranges(dataset.source, dataset.table, dataset.config, None).to_bytes()
-        for name, data in {**content, EPISODES: table.to_bytes()}.items():
+            content[STEPS_FILE] = find_ranges(dataset.source, dataset.table, dataset.config, None).to_bytes()
+        for name, data in {**content, EPISODES_FILE: table.to_bytes()}.items():
             storage.write(storage.join(self.folder, name), data)
 
     def require_space(self, left: Sequence[FramesToEncode]) -> None:
@@ -209,8 +209,8 @@ class LatentCache:
             return open_cached_latents(self.dataset, self.folder)
         parent, others = str(self.folder).rpartition("/")[0], []
         for name in storage.list_names(parent):
-            if storage.exists(storage.join(other := storage.join(parent, name), CACHE)):
-                differing = read_key(other).differences(self.key.parts)
+            if storage.exists(storage.join(other := storage.join(parent, name), CACHE_FILE)):
+                differing = read_cache_key(other).list_differences(self.key.parts)
                 others.append((len(differing), f"{name}, which differs: {'; '.join(differing)}"))
         nearest = (
             f". Number of other caches in its folder: {len(others)}. Most similar: {min(others)[1]}" if others else ""
@@ -318,7 +318,7 @@ def encode_files(
                     encoded = _encode(encoder, request, parts, dataset.config.cache_dtype)
                 except InputError as error:
                     dataset.skip_episode(request.episode, error)
-                    files.note_broken(request.episode, request.camera, str(error))
+                    files.record_broken(request.episode, request.camera, str(error))
                 else:
                     writes.append(
                         writer.submit(_write, files, request.episode, encoded, lossless_images=lossless_images)

@@ -137,7 +137,7 @@ class _Actor:
         try:
             cache, encoder = self._opened
             # An actor that died may have written some of the files.
-            left = [request for request in requests if not cache.files.has(request.episode, request.camera)]
+            left = [request for request in requests if not cache.files.has_file(request.episode, request.camera)]
             encode_files(cache.dataset, left, encoder, cache.files)
         except Exception as error:
             error.add_note(traceback.format_exc())

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from vjepa2_ac.config import Config, LimitsConfig
 from vjepa2_ac.data.dataset import Dataset, find_episode, open_dataset
 from vjepa2_ac.data.loader import read_batches, validation_windows
-from vjepa2_ac.data.sources.indexed_source import measured_space
+from vjepa2_ac.data.sources.indexed_source import get_state_space
 from vjepa2_ac.data.transforms import crop_frames, split_views, to_display_frames
 from vjepa2_ac.data.windows import require_frames, spread_indices_with_ends
 from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
@@ -83,7 +83,7 @@ def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservat
     decoder = load_decoder(options.decoder)
     warnings = decoder.require_fit(model, config.data, subject=session.name)
     decoder.to(model.device)
-    space = measured_space(config.data, len(seen.state))
+    space = get_state_space(config.data, len(seen.state))
     _require_directions(space, where="--state")
     limits = config.planning.limits
     chosen = {name: _actions_by_name(name, options.steps, options.size_m, limits) for name in options.actions}

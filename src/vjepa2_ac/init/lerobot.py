@@ -11,7 +11,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.sources import JOINT_VELOCITY
 from vjepa2_ac.data.files import EpisodeFiles
-from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo, filled, list_by_template, read_info
+from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo, fill_template, list_by_template, read_info
 from vjepa2_ac.data.sources.parquet import ParquetRows
 from vjepa2_ac.errors import UserError, counted
 from vjepa2_ac.init.dataset_properties import DatasetProperties, is_not_camera, make_camera_values, make_idle_section
@@ -84,8 +84,8 @@ def _read_sampled_rows(info: DatasetInfo, columns: Mapping[str, Column]) -> Samp
             EpisodeFiles(LeRobotData(path=info.root)), list(columns), f"{first.version} {first.size}"
         )
         for number in range(min(_SAMPLED, info.episodes)):
-            file = filled(info.data_path, number // info.chunk_episodes, number if info.version == "v2.1" else 0)
-            rows = parquet_rows.rows(storage.join(info.root, file), number)
+            file = fill_template(info.data_path, number // info.chunk_episodes, number if info.version == "v2.1" else 0)
+            rows = parquet_rows.read_rows(storage.join(info.root, file), number)
             for name in columns:
                 values[name].append(rows[name].astype(np.float64))
     return {name: episodes for name, episodes in values.items() if episodes}

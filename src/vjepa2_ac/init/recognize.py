@@ -20,7 +20,7 @@ from vjepa2_ac.data.selection import describe_splits, held_out_splits
 from vjepa2_ac.data.sources.droid_raw import find_episodes
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.lerobot_meta import INFO
-from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
+from vjepa2_ac.data.sources.npz import FORMAT_HELP, open_npz
 from vjepa2_ac.episode import STATE_DIM, Progress
 from vjepa2_ac.errors import InputError, UserError, counted, shell_command
 from vjepa2_ac.init.dataset_properties import DatasetProperties, make_idle_section, pick_camera
@@ -67,15 +67,15 @@ def read_npz_properties(path: str) -> DatasetProperties:
     if not files:
         raise InputError(where=path, found="no .npz files", needed="one .npz file per episode", fix=FORMAT_HELP)
     where = storage.join(path, files[0])
-    with opened_npz(where, where) as file:
-        headers = {name: file.header(name) for name in file.names}
+    with open_npz(where, where) as file:
+        headers = {name: file.read_header(name) for name in file.names}
         missing = [name for name in ("states", "fps_hz") if name not in headers]
         cameras = [name for name, array in headers.items() if array.dtype == np.uint8 and len(array.shape) == 4]
         if missing or not cameras or len(headers["states"].shape) != 2:
             arrays = ", ".join(f"{name} {list(array.shape)} {array.dtype}" for name, array in headers.items())
             needed = "states [steps, 7], fps_hz and frames [steps, height, width, 3] of uint8"
             raise InputError(where=where, found=arrays or "no arrays", needed=needed, fix=FORMAT_HELP)
-        rate = float(np.asarray(file.array("fps_hz")).reshape(-1)[0])
+        rate = float(np.asarray(file.read_array("fps_hz")).reshape(-1)[0])
     steps, width = headers["states"].shape
     first = "frames" if "frames" in cameras else pick_camera(cameras)
     is_pose, has_several = width == STATE_DIM, len(cameras) > 1

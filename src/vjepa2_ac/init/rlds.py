@@ -12,8 +12,8 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds_episode import Record
-from vjepa2_ac.data.sources.rlds_shards import Shard, dataset_name, find_shards, open_shard
-from vjepa2_ac.data.sources.tfrecord import HEADER_BYTES, Kind, span_at
+from vjepa2_ac.data.sources.rlds_shards import Shard, find_shards, open_shard, read_dataset_name
+from vjepa2_ac.data.sources.tfrecord import HEADER_BYTES, Kind, parse_header
 from vjepa2_ac.errors import InputError, MissingFileError, UserError, counted
 from vjepa2_ac.init.dataset_properties import DatasetProperties, is_not_camera, make_camera_values, make_idle_section
 from vjepa2_ac.init.draft_values import DraftValue
@@ -69,7 +69,7 @@ def read_rlds_properties(path: str) -> DatasetProperties:
     shards = find_shards(path)
     features = dict(_read_features(path))
     episodes = sum(shard.episodes for shard in shards)
-    name = dataset_name(path)
+    name = read_dataset_name(path)
     if name in _DROID_NAMES and _DROID_FEATURE in features:
         is_simulated = storage.exists(storage.join(path, SIMULATION_FILE))
         return make_droid_properties(path, episodes, "simulated arm" if is_simulated else "DROID")
@@ -217,10 +217,10 @@ def _sample_records(shards: Sequence[Shard], names: Sequence[str]) -> list[dict[
             with open_shard(shard) as read:
                 offset = 0
                 for number in range(min(shard.episodes, -(-_SAMPLED // len(shards)))):
-                    span = span_at(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
+                    span = parse_header(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
                     record, offset = Record(read, span), span.end
-                    present = [name for name in names if name in record.located]
-                    records.append({name: tuple(record.values(name, *_ALL_KINDS)) for name in present})
+                    present = [name for name in names if name in record.feature_ranges]
+                    records.append({name: tuple(record.read_values(name, *_ALL_KINDS)) for name in present})
     return records
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.data.sources.indexed_source import spaces_of
+from vjepa2_ac.data.sources.indexed_source import get_spaces
 from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
@@ -193,7 +193,7 @@ class Controller:
             seed=config.seed if seed is None else seed,
             crop=config.data.crop,
             extrinsics=extrinsics,
-            spaces=spaces_of(config.data, get_model_widths(subject.world_model.sizes)),
+            spaces=get_spaces(config.data, get_model_widths(subject.world_model.sizes)),
         )
 
     @property

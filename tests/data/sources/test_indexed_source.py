@@ -13,7 +13,7 @@ import pytest
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.sources import NpzData
 from vjepa2_ac.data.index import EpisodeTable
-from vjepa2_ac.data.sources.indexed_source import IndexedSource, Scanned, table_of
+from vjepa2_ac.data.sources.indexed_source import IndexedSource, IndexEntry, build_table
 from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
@@ -38,7 +38,7 @@ class EveryOther(IndexedSource[DataConfig, NpzSource]):
 
     looks = 0
 
-    def _look(self, progress: Progress) -> tuple[EpisodeTable, NpzSource]:
+    def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, NpzSource]:
         type(self).looks += 1
         inner = NpzSource(self._config)
         return EpisodeTable.from_infos(list(inner.infos(progress))[::2]), inner
@@ -76,8 +76,8 @@ def test_a_source_that_contains_another_opens_and_is_pickled_with_its_index(tmp_
 
 @pytest.mark.parametrize("identity", ["a\0", "\0", "a\0b"])
 def test_an_identity_with_a_nul_is_a_problem_of_that_episode(identity: str, tmp_path: Path) -> None:
-    found = [Scanned(EpisodeInfo(name, 30), f"file {name!r}") for name in ("a", identity, "é")]
-    table = table_of(found, DataConfig(path=str(tmp_path)), 3)
+    found = [IndexEntry(EpisodeInfo(name, 30), f"file {name!r}") for name in ("a", identity, "é")]
+    table = build_table(found, DataConfig(path=str(tmp_path)), 3)
     assert [info.id for info in table] == ["a", "é"]
     [problem] = table.problems
     assert problem.name == identity

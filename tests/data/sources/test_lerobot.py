@@ -152,13 +152,13 @@ def test_frames_may_be_in_the_table(
 
 def count_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return a list that gets the number of images of each read of a table."""
-    counts, images = list[int](), ParquetRows.images
+    counts, images = list[int](), ParquetRows.read_images
 
     def counted(self: ParquetRows, *place: Any) -> list[bytes]:
         counts.append(len(found := images(self, *place)))
         return found
 
-    monkeypatch.setattr(ParquetRows, "images", counted)
+    monkeypatch.setattr(ParquetRows, "read_images", counted)
     return counts
 
 

@@ -103,7 +103,7 @@ def test_what_claims_more_than_an_episode_holds_is_refused_before_it_is_unpacked
 def test_frames_that_unpack_to_far_more_bytes_than_the_file_has_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(npz, "_MOST_UNPACKED", 1 << 20)
+    monkeypatch.setattr(npz, "_MAX_UNPACKED_BYTES", 1 << 20)
     folder = tmp_path / "set"
     folder.mkdir()
     noise = np.random.default_rng(0).integers(0, 8, (STEPS, 150, 150, 3)).astype(np.uint8)

@@ -31,7 +31,7 @@ def test_texts_that_repeat_without_end_are_refused_before_python_has_them(
     lists = pa.ListArray.from_arrays(pa.array(np.arange(3001, dtype=np.int32)), repeated("x" * 100_000, 3000))
     pq.write_table(pa.table({"tasks": lists, "length": np.arange(3000)}), path, compression="zstd")
     assert path.stat().st_size < 100_000
-    monkeypatch.setattr(parquet, "MOST_TABLE_BYTES", 16 * _MB)
+    monkeypatch.setattr(parquet, "MAX_TABLE_BYTES", 16 * _MB)
     tracemalloc.start()
     try:
         with pytest.raises(InputError, match=r"tasks.parquet: more than 16,777,216 bytes of tasks, length"):
@@ -52,7 +52,7 @@ def test_a_footer_that_contradicts_itself_is_damage_and_does_not_end_the_process
     """Asked for this column's account in the footer, pyarrow 26 would abort this very process."""
     columns = ("frame_index", "timestamp", "observation.state.cartesian_position", "action.joint_velocity")
     with pytest.raises(InputError, match=rf"{name}\.parquet: damaged: {message}"):
-        rows_of(tmp_path, *columns).rows(str(GOLDEN / f"{name}.parquet"), 0)
+        rows_of(tmp_path, *columns).read_rows(str(GOLDEN / f"{name}.parquet"), 0)
 
 
 def rows_of(path: Path, *columns: str) -> ParquetRows:
@@ -69,17 +69,17 @@ def write(path: Path, rows: int, width: int = 7, row_group: int | None = None) -
 
 def test_lists_without_end_are_refused_by_what_the_footer_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "rows.parquet", 10, width=70)
-    assert rows_of(path).rows(str(path), 0)[STATE].shape == (10, 70)
-    monkeypatch.setattr(parquet, "MOST_NUMBERS", 600)
+    assert rows_of(path).read_rows(str(path), 0)[STATE].shape == (10, 70)
+    monkeypatch.setattr(parquet, "MAX_NUMBERS", 600)
     with pytest.raises(InputError, match=r"observation\.state.*: 700 numbers in a row group\. needed: at most 600"):
-        rows_of(path).rows(str(path), 0)
+        rows_of(path).read_rows(str(path), 0)
 
 
 def test_images_that_repeat_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, picture = tmp_path / "rows.parquet", b"\xff\xd8" + bytes(99_998)
     table = pa.table({"episode_index": np.repeat([0, 1], 50), "image": repeated(picture, 100)})
     pq.write_table(table, path, compression="zstd")
-    assert rows_of(path).images(str(path), "image", 1) == [picture] * 50
-    monkeypatch.setattr(parquet, "MOST_IMAGE_BYTES", 5 * _MB)
+    assert rows_of(path).read_images(str(path), "image", 1) == [picture] * 50
+    monkeypatch.setattr(parquet, "MAX_IMAGE_BYTES", 5 * _MB)
     with pytest.raises(InputError, match="more than 5,242,880 bytes of episode_index, image"):
-        rows_of(path).images(str(path), "image", 1)
+        rows_of(path).read_images(str(path), "image", 1)

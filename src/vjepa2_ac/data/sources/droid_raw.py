@@ -20,7 +20,7 @@ from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.sources import RAW_CAMERAS, RAW_RATE_HZ
 from vjepa2_ac.data.files import CONNECTIONS, DEEPEST, list_folder, map_in_threads
 from vjepa2_ac.data.index import EpisodeTable, get_or_build_index, hash_key, index_key, summarize_states
-from vjepa2_ac.data.sources.indexed_source import IndexedSource, Scanned, frames_by_step, require_as_indexed
+from vjepa2_ac.data.sources.indexed_source import IndexedSource, IndexEntry, make_frame_reader, require_indexed_length
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted, require_library
 from vjepa2_ac.media.video import read_frame_times, read_frames, read_header
@@ -33,7 +33,7 @@ VIDEOS = "recordings/MP4"
 
 _OUTCOMES = ("success", "failure")
 _FIX = "Copy the episode again"
-_MOST_STEPS = 1_000_000  # a damaged header may claim any number
+_MAX_STEPS = 1_000_000  # a damaged header may claim any number
 _REQUIRED = {
     "pose": ("observation/robot_state/cartesian_position", 6),
     "gripper": ("observation/robot_state/gripper_position", 1),
@@ -47,7 +47,7 @@ Arrays = Mapping[str, Shaped[np.ndarray, "steps *numbers"]]  # pose, gripper, ..
 
 
 @dataclass(frozen=True)
-class _Place:
+class _EpisodeLocation:
     """Location of an episode, and facts from its metadata and videos."""
 
     folder: str
@@ -61,7 +61,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
 
     `infos` reads every trajectory and the headers of the MP4s of the config's cameras, once; data behind a URL is not
     checked again until folders are added or removed. An episode's identity is LAB/outcome/DATE/TIME
-    (`identity_of`). The numbers of a trajectory and the times of a video's frames are stored in the disk cache, so
+    (`get_identity`). The numbers of a trajectory and the times of a video's frames are stored in the disk cache, so
     that each machine parses the HDF5 file and reads the packets of a video with B-frames only once.
 
     An MP4 holds one frame per control step, in order, whatever rate its header states; the last frame may be missing.
@@ -77,26 +77,26 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         table = self.infos()
         info, place = (
             table[index],
-            _Place(**parse_json_object(table.locators["place"][index].decode(), where="the index")),
+            _EpisodeLocation(**parse_json_object(table.locators["place"][index].decode(), where="the index")),
         )
-        serial = _serial(place.serials, camera or self._config.cameras[0], info.id)
-        numbers = self._numbers(place, (serial,))
-        states = _states_of(numbers)
-        require_as_indexed(len(states), info, self._path(place.folder, TRAJECTORY))
+        serial = _select_serial(place.serials, camera or self._config.cameras[0], info.id)
+        numbers = self._read_arrays(place, (serial,))
+        states = _join_states(numbers)
+        require_indexed_length(len(states), info, self._path(place.folder, TRAJECTORY))
         video = self._path(place.folder, f"{VIDEOS}/{serial}.mp4")
         task = table.label("task", index)
-        frames = partial(self._frames, video, place.version, numbers["frame"].tolist())
+        frames = partial(self._read_frames, video, place.version, numbers["frame"].tolist())
         return Episode(
             info=info,
             states=states,
-            read_frames=frames_by_step(info.num_steps, video, frames),
+            read_frames=make_frame_reader(info.num_steps, video, frames),
             control_rate_hz=RAW_RATE_HZ,
             extrinsics=numbers.get(serial),
             joint_velocities=numbers.get("velocities"),
             metadata={} if task is None else {"language": task},
         )
 
-    def _frames(
+    def _read_frames(
         self, video: str, version: str, frames: Sequence[int], steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
         opened = partial(self._files.open, video, version=version)
@@ -104,7 +104,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         times = self._files.read_parsed(f"times {video} {version}", walk)["times"].tolist()
         return read_frames(opened(), [frames[step] for step in steps], where=video, times=times)
 
-    def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
+    def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, None]:
         """Return the cached table, or scan all episodes; a changed local file changes the key."""
         config, root = self._config, self._config.path
         folders = find_episodes(root, CONNECTIONS)
@@ -122,13 +122,13 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             "pose_frame": config.pose_frame,
             "folders": listed,
         }
-        key = index_key(parts, root, named=identity_of(root, folders[0]))
-        identities = {folder: identity_of(root, folder) for folder in folders}
-        build = partial(self._scanned, self._scan, identities, progress)
+        key = index_key(parts, root, named=get_identity(root, folders[0]))
+        identities = {folder: get_identity(root, folder) for folder in folders}
+        build = partial(self._scan_all, self._scan, identities, progress)
         return get_or_build_index(config.disk_cache, key, root, build), None
 
-    def _scan(self, folder: str) -> Scanned:
-        identity = identity_of(self._config.path, folder)
+    def _scan(self, folder: str) -> IndexEntry:
+        identity = get_identity(self._config.path, folder)
         listed = list_episode(self._config.path, folder)
         has_trajectory = any(file.name == TRAJECTORY for file in listed.files)
         if not has_trajectory or listed.metadata is None:
@@ -138,9 +138,9 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         metadata = parse_json_object(
             self._files.read(path, version=version), where=path, needed="the metadata of an episode"
         )
-        named = {camera: _named(metadata, camera) for camera in RAW_CAMERAS}
+        named = {camera: _parse_serial(metadata, camera) for camera in RAW_CAMERAS}
         known = {camera: serial for camera, serial in named.items() if serial}
-        serials, counts = tuple(_serial(known, camera, path) for camera in self._config.cameras), {}
+        serials, counts = tuple(_select_serial(known, camera, path) for camera in self._config.cameras), {}
         for serial in serials:
             video = self._path(folder, f"{VIDEOS}/{serial}.mp4")
             if not any(one.name == f"{serial}.mp4" for one in listed.videos):
@@ -148,20 +148,20 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
                 needed = f"the MP4 that {listed.metadata} or data.camera names; there are {there}"
                 raise InputError(where=video, found="no such file", needed=needed, fix=_FIX)
             counts[serial] = read_header(video, where=video).num_frames
-        place = _Place(folder, version, known, counts)
-        states = _states_of(self._numbers(place, serials))
+        place = _EpisodeLocation(folder, version, known, counts)
+        states = _join_states(self._read_arrays(place, serials))
         success = metadata.get("success")
-        outcome = success if isinstance(success, bool) else success_of(identity)
-        return Scanned(
+        outcome = success if isinstance(success, bool) else parse_outcome(identity)
+        return IndexEntry(
             EpisodeInfo(identity, len(states), outcome),
             self._path(folder, TRAJECTORY),
-            place={"place": json.dumps(vars(place)).encode()},
+            locator={"place": json.dumps(vars(place)).encode()},
             states=summarize_states(states),
-            labels=_labels(metadata),
+            labels=_parse_labels(metadata),
             rate_hz=RAW_RATE_HZ,
         )
 
-    def _numbers(self, place: _Place, serials: tuple[str, ...]) -> Arrays:
+    def _read_arrays(self, place: _EpisodeLocation, serials: tuple[str, ...]) -> Arrays:
         """Return the arrays of the used steps, with the poses of some cameras and the index of each frame.
 
         Raises:
@@ -183,7 +183,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         if "skipped" in found:
             used = used[found["skipped"][used, 0] == 0]
         numbers = {name: values[used] for name, values in found.items()} | {"frame": used}
-        POSE.require_plausible(_states_of(numbers), path, fix=_FIX)
+        POSE.require_plausible(_join_states(numbers), path, fix=_FIX)
         return numbers
 
     def _path(self, folder: str, name: str) -> str:
@@ -209,7 +209,7 @@ def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[st
         with h5py.File(h5py.h5f.open_file_image(data)) as file:
             for name, (place, width) in (_REQUIRED | _OPTIONAL | poses).items():
                 if place in file:
-                    found[name] = _array(file[place], width, f"{where}: {place}")
+                    found[name] = _read_array(file[place], width, f"{where}: {place}")
                 elif name in _REQUIRED:
                     there = ", ".join(sorted(file))[:200]
                     raise InputError(where=f"{where}: {place}", found=f"no such array; there are {there}", fix=_FIX)
@@ -223,11 +223,11 @@ def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[st
     return found
 
 
-def _array(data: Any, width: int, where: str) -> Float[np.ndarray, "steps width"]:
+def _read_array(data: Any, width: int, where: str) -> Float[np.ndarray, "steps width"]:
     """Read an HDF5 array of `width` finite numbers per step; for width 1 the second axis may be missing."""
     shape, kind = tuple(getattr(data, "shape", None) or ()), getattr(getattr(data, "dtype", None), "kind", "?")
     fits = shape[1:] == (width,) or (width == 1 and len(shape) == 1)
-    if not fits or shape[0] > _MOST_STEPS or kind not in "fiub":
+    if not fits or shape[0] > _MAX_STEPS or kind not in "fiub":
         found, needed = f"shape {shape} of kind {kind!r}", f"{width} numbers for each step"
         raise InputError(where=where, found=found, needed=needed, fix=_FIX)
     values = np.asarray(data[()], dtype=np.float64).reshape(-1, width)
@@ -235,18 +235,18 @@ def _array(data: Any, width: int, where: str) -> Float[np.ndarray, "steps width"
     return values
 
 
-def _states_of(numbers: Arrays) -> Float[np.ndarray, "steps 7"]:
+def _join_states(numbers: Arrays) -> Float[np.ndarray, "steps 7"]:
     return np.concatenate([numbers["pose"], numbers["gripper"]], axis=1)
 
 
-def _named(metadata: Mapping[str, Any], camera: str) -> str | None:
+def _parse_serial(metadata: Mapping[str, Any], camera: str) -> str | None:
     """Return the serial number of a camera, from the name of its MP4 in the metadata; None if it is missing."""
     path = metadata.get(f"{camera}_mp4_path")
     name = PurePosixPath(path).name if isinstance(path, str) else ""
     return name.removesuffix(".mp4") if name.endswith(".mp4") else None
 
 
-def _serial(serials: Mapping[str, str], camera: str, where: str) -> str:
+def _select_serial(serials: Mapping[str, str], camera: str, where: str) -> str:
     """Return the serial number of a camera, given by a name (left, right, wrist, ext1, ext2) or a serial number."""
     if camera in RAW_CAMERAS and camera not in serials:
         found, fix = f"no {camera}_mp4_path with an MP4", "Set data.camera to one that every episode has"
@@ -254,7 +254,7 @@ def _serial(serials: Mapping[str, str], camera: str, where: str) -> str:
     return serials.get(camera, camera)
 
 
-def _labels(metadata: Mapping[str, Any]) -> dict[str, str | None]:
+def _parse_labels(metadata: Mapping[str, Any]) -> dict[str, str | None]:
     """Return the labels scene, building, operator and task of an episode; None where unknown."""
     texts = {key: str(value) for key, value in metadata.items() if isinstance(value, str | int)}
     return {
@@ -293,7 +293,7 @@ def find_episodes(root: str, connections: int) -> list[str]:
     found: list[str] = []
     folders = [""]
     for _ in range(DEEPEST):
-        children = map_in_threads(lambda folder: _children(root, folder), folders, connections)
+        children = map_in_threads(lambda folder: _list_children(root, folder), folders, connections)
         together = [child for group in children for child in group]
         found += [path for path, is_episode in together if is_episode]
         folders = [path for path, is_episode in together if not is_episode]
@@ -311,32 +311,32 @@ def list_episode(root: str, folder: str) -> EpisodeFolder:
     return EpisodeFolder(folder, tuple(storage.list_files(path)), tuple(videos))
 
 
-def identity_of(root: str, folder: str) -> str:
+def get_identity(root: str, folder: str) -> str:
     """Return the identity of an episode: LAB/outcome/DATE/TIME if its full path ends so, for any `root` in the tree.
 
     Otherwise the identity is the path relative to `root`.
     """
     base = root.split("://", 1)[1] if storage.is_url(root) else str(Path(root).resolve())
     parts = [part for part in f"{base}/{folder}".split("/") if part]
-    return "/".join(parts[-4:]) if _ends_as_in_droid(parts) else folder or parts[-1]
+    return "/".join(parts[-4:]) if _has_droid_layout(parts) else folder or parts[-1]
 
 
-def success_of(identity: str) -> bool | None:
+def parse_outcome(identity: str) -> bool | None:
     """Return whether the episode succeeded according to its identity, or None."""
     parts = identity.split("/")
-    return parts[-3] == "success" if _ends_as_in_droid(parts) else None
+    return parts[-3] == "success" if _has_droid_layout(parts) else None
 
 
-def _children(root: str, folder: str) -> list[tuple[str, bool]]:
+def _list_children(root: str, folder: str) -> list[tuple[str, bool]]:
     """Return (path, whether it is an episode) of the folders in a folder.
 
     In DROID's layout the depth of a path identifies episodes, so they need not be listed.
     """
     children = [storage.join(folder, name) for name in list_folder(root, folder)[1]]
-    return [(path, success_of(identity_of(root, path)) is not None or _is_episode(root, path)) for path in children]
+    return [(path, parse_outcome(get_identity(root, path)) is not None or _is_episode(root, path)) for path in children]
 
 
-def _ends_as_in_droid(parts: Sequence[str]) -> bool:
+def _has_droid_layout(parts: Sequence[str]) -> bool:
     return len(parts) >= 4 and parts[-3] in _OUTCOMES
 
 

@@ -31,12 +31,12 @@ def open_source(config: DataConfig) -> EpisodeSource:
     return source
 
 
-def measured_space(config: DataConfig, width: int) -> StateSpace:
+def get_state_space(config: DataConfig, width: int) -> StateSpace:
     """Return the space of measured states: poses in the base frame, or vectors of the given width."""
     return POSE if config.states == "pose" else vector_states(width)
 
 
-def spaces_of(config: DataConfig, widths: Widths) -> Spaces:
+def get_spaces(config: DataConfig, widths: Widths) -> Spaces:
     """Return the spaces of the states and actions of clips."""
     if config.states == "pose":
         return Spaces(POSE if config.pose_frame == "base" else CAMERA_POSE, POSE_CHANGE)
@@ -44,22 +44,24 @@ def spaces_of(config: DataConfig, widths: Widths) -> Spaces:
 
 
 @dataclass(frozen=True)
-class Scanned:
+class IndexEntry:
     """The entry of a usable episode in the index."""
 
     info: EpisodeInfo
     where: str  # the file of the episode, for messages
-    place: Mapping[str, Any] = field(default_factory=dict)  # numbers or bytes by which the source finds the episode
+    locator: Mapping[str, Any] = field(default_factory=dict)  # numbers or bytes that locate the episode
     states: StatesSummary = STATES_NOT_READ
     labels: Mapping[str, str | None] = field(default_factory=dict)
     rate_hz: float | None = None  # control steps per second; None: unknown
     kind: str = ""  # description of the properties that all episodes must share
 
 
-Found = Scanned | EpisodeProblem
+ScanResult = IndexEntry | EpisodeProblem
 
 
-def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: Progress = no_progress) -> EpisodeTable:
+def build_table(
+    found: Iterable[ScanResult], config: DataConfig, total: int, progress: Progress = no_progress
+) -> EpisodeTable:
     """Build the table of all episodes from the results of a scan.
 
     If several episodes have the same identity, the first is used. Episodes whose kind differs from the most frequent
@@ -74,7 +76,7 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
     Raises:
         InputError: No episode can be used; raises the error of the first one.
     """
-    usable: dict[str, Scanned] = {}
+    usable: dict[str, IndexEntry] = {}
     problems: list[EpisodeProblem] = []
     kinds: dict[str, int] = {}
     for done, one in enumerate(found, start=1):
@@ -102,7 +104,7 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
     return replace(
         EpisodeTable.from_infos([one.info for one in rows]),
         problems=tuple(problems),
-        locators={name: np.array([one.place[name] for one in rows]) for name in rows[0].place},
+        locators={name: np.array([one.locator[name] for one in rows]) for name in rows[0].locator},
         texts={} if rate is None else {"control_rate_hz": str(rate)},
         state_hash=np.array(hashes, np.uint64) if any(hashes) else None,
         motion=np.array([one.states.motion for one in rows], np.float32),
@@ -111,23 +113,23 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
 
 
 Config = TypeVar("Config", bound=DataConfig)
-More = TypeVar("More")
+State = TypeVar("State")
 
 
-class IndexedSource(ABC, Generic[Config, More]):
+class IndexedSource(ABC, Generic[Config, State]):
     """A source that opens its data set on the first call; its pickle for loader workers includes the index.
 
-    Any number of threads may use a source. It holds the index and the source-specific state that `_look` returns.
+    Any number of threads may use a source. It holds the index and the state that `_open_data_set` returns.
     """
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._opening = threading.Lock()  # one lock per source, because `_look` may open another source
-        self._known: tuple[EpisodeTable, More] | None = None
+        self._opening = threading.Lock()  # one lock per source, because `_open_data_set` may open another source
+        self._index_and_state: tuple[EpisodeTable, State] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle for a loader worker, with the index."""
-        return type(self), (self._config,), {"_known": self._known}
+        return type(self), (self._config,), {"_index_and_state": self._index_and_state}
 
     def infos(self, progress: Progress | None = None) -> EpisodeTable:
         """Return identity, length and outcome of every usable episode, and the problems of the others.
@@ -141,21 +143,21 @@ class IndexedSource(ABC, Generic[Config, More]):
     def with_raw_states(self) -> Self:
         """Return a source of the same episodes that reads states as unconverted vectors; the index is shared."""
         other = type(self)(self._config.model_copy(update={"states": "vector"}))
-        other._known = self._known
+        other._index_and_state = self._index_and_state
         return other
 
     @cached_property
     def _files(self) -> EpisodeFiles:
         return EpisodeFiles(self._config)
 
-    def _open(self, progress: Progress = no_progress) -> tuple[EpisodeTable, More]:
+    def _open(self, progress: Progress = no_progress) -> tuple[EpisodeTable, State]:
         with self._opening:
-            if self._known is None:
-                self._known = self._look(progress)
-            return self._known
+            if self._index_and_state is None:
+                self._index_and_state = self._open_data_set(progress)
+            return self._index_and_state
 
-    def _scanned(
-        self, scan: Callable[[str], Scanned], identities: Mapping[str, str], progress: Progress
+    def _scan_all(
+        self, scan: Callable[[str], IndexEntry], identities: Mapping[str, str], progress: Progress
     ) -> EpisodeTable:
         """Scan all episodes and return their table.
 
@@ -169,21 +171,21 @@ class IndexedSource(ABC, Generic[Config, More]):
             OSError: Data behind a URL cannot be read.
         """
 
-        def scan_one(key: str) -> Found:
+        def scan_one(key: str) -> ScanResult:
             try:
                 return scan(key)
             except InputError as error:
                 return EpisodeProblem.from_error(error, identities[key])
 
         found = map_in_threads(scan_one, [*identities], num_connections(self._config))
-        return table_of(found, self._config, len(identities), progress)
+        return build_table(found, self._config, len(identities), progress)
 
     @abstractmethod
-    def _look(self, progress: Progress) -> tuple[EpisodeTable, More]:
+    def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, State]:
         """Open the data set; return its index, from the cache or by a scan, and the source-specific state."""
 
 
-def frames_by_step(num_steps: int, where: str, decode: FrameReader) -> FrameReader:
+def make_frame_reader(num_steps: int, where: str, decode: FrameReader) -> FrameReader:
     """Return a reader of the frames of one camera of an episode that refuses steps outside the episode.
 
     Args:
@@ -200,7 +202,7 @@ def frames_by_step(num_steps: int, where: str, decode: FrameReader) -> FrameRead
     return read
 
 
-def require_as_indexed(found: int, info: EpisodeInfo, where: str) -> None:
+def require_indexed_length(found: int, info: EpisodeInfo, where: str) -> None:
     """Refuse an episode whose length differs from its length in the index.
 
     Raises:

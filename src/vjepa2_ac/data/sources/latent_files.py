@@ -51,7 +51,7 @@ DTYPES: dict[CacheType, torch.dtype] = {"bf16": torch.bfloat16, "fp32": torch.fl
 OPTIONAL = ("commands", "extrinsics", "joint_velocities")
 Ranges = Sequence[tuple[int, int]]  # (start, length) in bytes
 
-_LARGEST = 127  # largest quantised value
+_MAX_INT8 = 127  # largest quantised value
 _JPEG_QUALITY = 85
 _HEAD_BYTES = 32 << 10  # bytes read when a file is opened: the header and most small tensors
 _LENGTH_BYTES = 8  # length of the number before the header that states the header's length
@@ -59,7 +59,7 @@ _TENSOR_TYPES = {
     "BF16": torch.bfloat16, "F16": torch.float16, "F32": torch.float32, "F64": torch.float64, "BOOL": torch.bool,
     "U8": torch.uint8, "I8": torch.int8, "I16": torch.int16, "I32": torch.int32, "I64": torch.int64,
 }  # fmt: skip
-_WHOLE, _BROKEN = ".safetensors", ".broken"
+_LATENTS_SUFFIX, _BROKEN_SUFFIX = ".safetensors", ".broken"
 FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
 
 
@@ -72,9 +72,9 @@ def pack_latents(latents: Float[Tensor, "*batch tokens dim"], kind: CacheType) -
     if kind != "int8":
         return StoredLatents(latents.to(DTYPES[kind]))
     latents = latents.float()
-    scales = latents.abs().amax(dim=-1) / _LARGEST
+    scales = latents.abs().amax(dim=-1) / _MAX_INT8
     divisor = torch.where(scales > 0, scales, torch.ones_like(scales))  # a token of zeros stays zero
-    values = (latents / divisor[..., None]).round().clamp(-_LARGEST, _LARGEST)
+    values = (latents / divisor[..., None]).round().clamp(-_MAX_INT8, _MAX_INT8)
     return StoredLatents(values.to(torch.int8), scales)
 
 
@@ -113,9 +113,9 @@ class LatentFiles:
 
     def path(self, number: int, camera: str) -> str:
         """Return the path of the file of an episode (by its index in the data set) and a camera."""
-        return storage.join(self.folder, _name(number, camera))
+        return storage.join(self.folder, _file_name(number, camera))
 
-    def has(self, number: int, camera: str) -> bool:
+    def has_file(self, number: int, camera: str) -> bool:
         """Return whether a file exists, is complete and belongs to this cache, by reading its header.
 
         Raises:
@@ -127,12 +127,12 @@ class LatentFiles:
             return False
         return True
 
-    def size(self, number: int, camera: str) -> int:
+    def get_file_size(self, number: int, camera: str) -> int:
         """Return the size of a file in bytes; 0 if the file is missing."""
-        found = self._found(_name(number, camera))
+        found = self._find_file(_file_name(number, camera))
         return 0 if found is None else found.size
 
-    def episodes_without_file(self, numbers: Sequence[int], cameras: Sequence[str]) -> list[int]:
+    def find_missing(self, numbers: Sequence[int], cameras: Sequence[str]) -> list[int]:
         """Return the episodes that have neither a file of latents nor a `.broken` file for some camera.
 
         The folder is listed once and no file is opened, so a damaged file is reported when it is first read.
@@ -141,13 +141,15 @@ class LatentFiles:
             UnreachableError: The folder cannot be listed now.
         """
         sizes = self._sizes()
-        done = {name.rpartition(".")[0] for name, size in sizes.items() if size > 0 or name.endswith(_BROKEN)}
-        return [number for number in numbers if any(_name(number, camera, "") not in done for camera in cameras)]
+        done = {name.rpartition(".")[0] for name, size in sizes.items() if size > 0 or name.endswith(_BROKEN_SUFFIX)}
+        return [number for number in numbers if any(_file_name(number, camera, "") not in done for camera in cameras)]
 
     def is_done(self, number: int, camera: str) -> bool:
         """Return whether a file of latents or a `.broken` file exists; behind a URL only the listing is checked."""
-        is_there = self.size(number, camera) > 0 if storage.is_url(self.folder) else self.has(number, camera)
-        return is_there or self._found(_name(number, camera, _BROKEN)) is not None
+        is_there = (
+            self.get_file_size(number, camera) > 0 if storage.is_url(self.folder) else self.has_file(number, camera)
+        )
+        return is_there or self._find_file(_file_name(number, camera, _BROKEN_SUFFIX)) is not None
 
     def open(self, number: int, camera: str) -> EpisodeFile:
         """Open the file of an episode and camera.
@@ -158,11 +160,11 @@ class LatentFiles:
         """
         place, file, note = (
             self.path(number, camera),
-            self._found(_name(number, camera)),
-            _name(number, camera, _BROKEN),
+            self._find_file(_file_name(number, camera)),
+            _file_name(number, camera, _BROKEN_SUFFIX),
         )
-        if file is None and self._found(note) is not None:
-            found = f"no latents: it could not be read when they were encoded ({self._reason(note).rstrip('.')})"
+        if file is None and self._find_file(note) is not None:
+            found = f"no latents: it could not be read when they were encoded ({self._read_reason(note).rstrip('.')})"
             raise InputError(where=place, found=found)
         if file is None:
             raise InputError(where=place, found="no such file", needed="latents of an episode", fix=FIX)
@@ -197,20 +199,22 @@ class LatentFiles:
         metadata = json.dumps(dict(episode.metadata), sort_keys=True)
         about = {"id": episode.info.id, "camera": encoded.camera, "metadata": metadata, "key": self.key}
         storage.write(self.path(number, camera), save(tensors, metadata=about))
-        if self._found(note := _name(number, camera, _BROKEN)) is not None:
+        if self._find_file(note := _file_name(number, camera, _BROKEN_SUFFIX)) is not None:
             storage.remove(storage.join(self.folder, note))
 
-    def note_broken(self, number: int, camera: str, reason: str) -> None:
+    def record_broken(self, number: int, camera: str, reason: str) -> None:
         """Record that an episode cannot be read, for other processes and for readers of the cache."""
-        storage.write(storage.join(self.folder, _name(number, camera, _BROKEN)), reason)
+        storage.write(storage.join(self.folder, _file_name(number, camera, _BROKEN_SUFFIX)), reason)
 
     @property
-    def broken(self) -> dict[int, str]:
+    def broken_reasons(self) -> dict[int, str]:
         """The reasons of the episodes that could not be read, by the index of the episode."""
         sizes = self._sizes()
-        notes = sorted(name for name in sizes if name.endswith(_BROKEN))
-        broken = [note for note in notes if note.removesuffix(_BROKEN) + _WHOLE not in sizes]  # else encoded later
-        return {int(note.rpartition("/")[2].partition("-")[0]): self._reason(note) for note in broken}
+        notes = sorted(name for name in sizes if name.endswith(_BROKEN_SUFFIX))
+        broken = [
+            note for note in notes if note.removesuffix(_BROKEN_SUFFIX) + _LATENTS_SUFFIX not in sizes
+        ]  # else encoded later
+        return {int(note.rpartition("/")[2].partition("-")[0]): self._read_reason(note) for note in broken}
 
     def _sizes(self) -> Mapping[str, int]:
         """Return the size in bytes of every file by its name in the folder; a local folder is listed again."""
@@ -222,18 +226,18 @@ class LatentFiles:
     def _listed(self) -> Mapping[str, storage.FileInfo]:
         return storage.list_files_below(str(self.folder))
 
-    def _found(self, name: str) -> storage.FileInfo | None:
+    def _find_file(self, name: str) -> storage.FileInfo | None:
         if storage.is_url(self.folder):
             return self._listed.get(name)
         with suppress(FileNotFoundError, NotADirectoryError):
             return storage.FileInfo(name, Path(self.folder, name).stat().st_size, "")
         return None
 
-    def _reason(self, note: str) -> str:
+    def _read_reason(self, note: str) -> str:
         return storage.read_bytes(storage.join(self.folder, note)).decode(errors="replace")
 
 
-def _name(number: int, camera: str, ending: str = _WHOLE) -> str:
+def _file_name(number: int, camera: str, ending: str = _LATENTS_SUFFIX) -> str:
     return f"episodes/{number // 1000:03d}/{number:06d}-{quote(camera, safe='')}{ending}"
 
 
@@ -255,37 +259,37 @@ class EpisodeFile:
 
     def __init__(self, path: str, key: str, size: int, read: Callable[[Ranges], list[bytes]]) -> None:
         self.path, self._read, self._head = path, read, b""
-        with self._reading():
-            self._head = self._pieces([(0, min(size, _HEAD_BYTES))])[0]
+        with self._translate_errors():
+            self._head = self._read_pieces([(0, min(size, _HEAD_BYTES))])[0]
             begin = _LENGTH_BYTES + int.from_bytes(self._head[:_LENGTH_BYTES], "little")
             if not _LENGTH_BYTES < begin <= min(size, MAX_BYTES):
                 raise ValueError("no header")
-            header = parse_json_object(self._pieces([(_LENGTH_BYTES, begin - _LENGTH_BYTES)])[0], where=path)
+            header = parse_json_object(self._read_pieces([(_LENGTH_BYTES, begin - _LENGTH_BYTES)])[0], where=path)
             about = header.pop("__metadata__", {})
-            self._tensors = {name: _Tensor.of(entry, begin) for name, entry in header.items()}
+            self._tensors = {name: _Tensor.from_header(entry, begin) for name, entry in header.items()}
             if (end := max([begin, *(one.end for one in self._tensors.values())])) != size:
                 raise ValueError(f"{size:,} bytes of {end:,}")
             self.metadata = {name: str(text) for name, text in parse_json_object(about["metadata"], where=path).items()}
         self.names = self._tensors.keys()
         if about.get("key") != key:
-            raise self._damaged("a file of another cache", "a file that was made with this one's cache.json")
+            raise self._damage_error("a file of another cache", "a file that was made with this one's cache.json")
 
     @cached_property
     def frame_steps(self) -> Int[np.ndarray, " frames"]:
         """The control steps that have a frame, ascending."""
-        return self.array("frame_steps")
+        return self.read_array("frame_steps")
 
-    def array(self, name: str) -> np.ndarray:
+    def read_array(self, name: str) -> np.ndarray:
         """Read a whole tensor, such as states.
 
         Raises:
             InputError: There is no tensor of this name.
         """
-        with self._reading():
+        with self._translate_errors():
             one = self._tensors[name]
-            return np.asarray(one.joined(self._pieces([(one.start, one.end - one.start)]), one.shape).numpy())
+            return np.asarray(one.to_tensor(self._read_pieces([(one.start, one.end - one.start)]), one.shape).numpy())
 
-    def places_of(self, steps: Sequence[int]) -> list[int]:
+    def find_frames(self, steps: Sequence[int]) -> list[int]:
         """Return the indices of the frames at these control steps.
 
         Raises:
@@ -297,38 +301,38 @@ class EpisodeFile:
             raise InputError(where=self.path, found=f"no frame of control step {absent[0]}", needed=needed)
         return [there[step] for step in steps]
 
-    def latents(self, places: Sequence[int]) -> StoredLatents:
+    def read_latents(self, places: Sequence[int]) -> StoredLatents:
         """Read the latents of frames, given by their indices.
 
         Raises:
             InputError: There are no such latents.
         """
         names = [name for name in ("latents", "scales") if name == "latents" or name in self.names]
-        with self._reading():
-            return StoredLatents(*self._rows(names, places))
+        with self._translate_errors():
+            return StoredLatents(*self._read_rows(names, places))
 
-    def pictures(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames size size 3"]:
+    def read_images(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames size size 3"]:
         """Read the encoder's input images of frames, given by their indices.
 
         Raises:
             InputError: An image is damaged.
         """
-        with self._reading():
+        with self._translate_errors():
             stored = self._tensors["pictures"]
             if len(stored.shape) > 1:
-                return np.asarray(self._rows(["pictures"], places)[0].numpy())
-            ends = [0, *self.array("picture_ends").tolist()]
-            jpegs = self._pieces([stored.range_of(ends[place], ends[place + 1]) for place in places])
+                return np.asarray(self._read_rows(["pictures"], places)[0].numpy())
+            ends = [0, *self.read_array("picture_ends").tolist()]
+            jpegs = self._read_pieces([stored.get_row_range(ends[place], ends[place + 1]) for place in places])
         return decode_images(jpegs, self.frame_steps[list(places)].tolist(), self.path)
 
-    def _rows(self, names: Sequence[str], places: Sequence[int]) -> list[Tensor]:
+    def _read_rows(self, names: Sequence[str], places: Sequence[int]) -> list[Tensor]:
         """Read the same rows of several tensors together."""
         tensors, count = [self._tensors[name] for name in names], len(places)
-        pieces = self._pieces([one.range_of(place, place + 1) for one in tensors for place in places])
+        pieces = self._read_pieces([one.get_row_range(place, place + 1) for one in tensors for place in places])
         parts = (pieces[number * count : (number + 1) * count] for number in range(len(tensors)))
-        return [one.joined(part, (count, *one.shape[1:])) for one, part in zip(tensors, parts, strict=True)]
+        return [one.to_tensor(part, (count, *one.shape[1:])) for one, part in zip(tensors, parts, strict=True)]
 
-    def _pieces(self, ranges: Ranges) -> list[bytes]:
+    def _read_pieces(self, ranges: Ranges) -> list[bytes]:
         known, there = len(self._head), dict[tuple[int, int], bytes]()
         for start, length in ranges:
             if start + length <= known or not length:
@@ -338,15 +342,15 @@ class EpisodeFile:
         return [there[one] for one in ranges]
 
     @contextmanager
-    def _reading(self) -> Iterator[None]:
+    def _translate_errors(self) -> Iterator[None]:
         """Raise an error for the user if the file is missing, truncated, not safetensors, or lacks a tensor."""
         try:
             with storage.translate_read_errors(self.path, needed="latents of an episode", fix=FIX):
                 yield
         except (AttributeError, KeyError, IndexError, RuntimeError, ValueError, TypeError) as error:
-            raise self._damaged(f"not a whole file of latents ({error})") from None
+            raise self._damage_error(f"not a whole file of latents ({error})") from None
 
-    def _damaged(self, found: str, needed: str = "") -> InputError:
+    def _damage_error(self, found: str, needed: str = "") -> InputError:
         return InputError(where=self.path, found=found, needed=needed, fix=FIX)
 
 
@@ -359,7 +363,7 @@ class _Tensor:
     start: int  # position in the file
 
     @classmethod
-    def of(cls, about: Mapping[str, Any], begin: int) -> _Tensor:
+    def from_header(cls, about: Mapping[str, Any], begin: int) -> _Tensor:
         """Create a tensor from its entry in the header; `begin` is the position after the header."""
         start, end = about["data_offsets"]
         one = cls(_TENSOR_TYPES[about["dtype"]], tuple(about["shape"]), begin + start)
@@ -372,14 +376,14 @@ class _Tensor:
         """Position after the tensor in the file."""
         return self.start + prod(self.shape) * self.dtype.itemsize
 
-    def range_of(self, start: int, stop: int) -> tuple[int, int]:
+    def get_row_range(self, start: int, stop: int) -> tuple[int, int]:
         """Return (start, length) in the file of the rows from `start` to `stop`."""
         if not 0 <= start <= stop <= self.shape[0]:
             raise IndexError(f"rows {start} to {stop} of {self.shape[0]}")
         row = prod(self.shape[1:]) * self.dtype.itemsize
         return self.start + start * row, (stop - start) * row
 
-    def joined(self, pieces: Sequence[bytes], shape: tuple[int, ...]) -> Tensor:
+    def to_tensor(self, pieces: Sequence[bytes], shape: tuple[int, ...]) -> Tensor:
         """Join pieces of the tensor's bytes to a tensor of a shape."""
         data = bytearray().join(pieces)  # torch requires a writable buffer
         return torch.frombuffer(data, dtype=self.dtype).reshape(shape) if data else torch.empty(shape, dtype=self.dtype)

@@ -18,7 +18,7 @@ from vjepa2_ac.config.removed import REMOVED
 from vjepa2_ac.config.section import Affects, values_that_affect
 from vjepa2_ac.data.files import open_download_cache
 from vjepa2_ac.data.index import EpisodeTable, InvalidTableError, StepSelection, T
-from vjepa2_ac.data.sources.indexed_source import IndexedSource, measured_space
+from vjepa2_ac.data.sources.indexed_source import IndexedSource, get_state_space
 from vjepa2_ac.data.sources.latent_files import FIX, OPTIONAL, LatentFiles
 from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, MissingFileError, counted
@@ -26,11 +26,11 @@ from vjepa2_ac.spaces import vector_states
 from vjepa2_ac.storage.structured import read_json_object
 
 FORMAT = 2  # of the files of a cache
-CACHE, EPISODES, KEPT = "cache.json", "episodes.npz", "kept.npz"  # files, see `latent_files`
+CACHE_FILE, EPISODES_FILE, STEPS_FILE = "cache.json", "episodes.npz", "kept.npz"  # files, see `latent_files`
 
-_OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # config keys that affect frames, not clips
-_NOT_OF_ENCODING = ("data", "format")  # prefixes of parts that are unrelated to the encoder
-_MOST_BYTES = 1 << 30  # size limit of a table
+_FRAME_KEYS = {"source", "camera", "pose_frame", "cache_dtype"}  # config keys that affect frames, not clips
+_NON_ENCODING_PREFIXES = ("data", "format")  # prefixes of parts that are unrelated to the encoder
+_MAX_BYTES = 1 << 30  # size limit of a table
 _ENCODE = "Run `vjepa2-ac encode`, which resumes where it was stopped; or copy the cache again"
 
 
@@ -64,19 +64,21 @@ class CacheKey:
         """The cameras of a cache."""
         return tuple(map(str, self.parts["data.camera"]))
 
-    def differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
+    def list_differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
         """Return the differences from other parts, such as "data.stride: 8, not 4", for some names or for all."""
         wanted = json.loads(json.dumps(dict(wanted)))  # types as in a file
         names = sorted(self.parts.keys() | wanted) if names is None else names
-        return [text for name in names for text in _differences(name, self.parts.get(name), wanted.get(name))]
+        return [text for name in names for text in _compare_values(name, self.parts.get(name), wanted.get(name))]
 
-    def differences_of(self, encoding: Encoding) -> list[str]:
+    def list_encoding_differences(self, encoding: Encoding) -> list[str]:
         """Return the differences in the settings by which frames became latents."""
         names = sorted(self.parts.keys() | encoding.parts)
-        return self.differences(encoding.parts, [one for one in names if not one.startswith(_NOT_OF_ENCODING)])
+        return self.list_differences(
+            encoding.parts, [one for one in names if not one.startswith(_NON_ENCODING_PREFIXES)]
+        )
 
 
-def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> CacheKey:
+def build_cache_key(config: DataConfig, fingerprint: str, encoding: Encoding) -> CacheKey:
     """Return the cache key of an open data set, whose stride is a number.
 
     Args:
@@ -87,7 +89,7 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
     return CacheKey({
         "format": FORMAT,
         **encoding.parts,
-        **clip_parts(config),
+        **get_clip_parts(config),
         "data.cache_dtype": config.cache_dtype,
         "data.camera": list(config.cameras),
         "data.pose_frame": config.pose_frame,
@@ -95,14 +97,14 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
     })  # fmt: skip
 
 
-def clip_parts(config: DataConfig) -> dict[str, Any]:
+def get_clip_parts(config: DataConfig) -> dict[str, Any]:
     """Return the parts that determine the frames and other data of clips, to check a cache that is used by itself."""
     values = values_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
-    names = values.keys() - _OF_THE_FRAMES - config.format_sections().keys()
+    names = values.keys() - _FRAME_KEYS - config.format_sections().keys()
     return {f"data.{name}": values[name] for name in sorted(names)}
 
 
-def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: str) -> None:
+def require_matching_folder(folder: Path | str, name: str, key: CacheKey, *, where: str) -> None:
     """Refuse a folder that was begun with another key, or that holds other files; a missing folder is accepted.
 
     Args:
@@ -126,32 +128,35 @@ def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: s
             found = f"a folder with other things in it, such as {others[0]}"
             raise InputError(where=where, found=found, needed="a new or empty one", fix=fix) from None
         return
-    if differing := CacheKey(there.get("key") or {}).differences(key.parts):
+    if differing := CacheKey(there.get("key") or {}).list_differences(key.parts):
         found, needed = f"made otherwise: {'; '.join(differing)}", "a new folder, or one made with these settings"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 
-def _differences(name: str, here: Any, there: Any) -> list[str]:
+def _compare_values(name: str, here: Any, there: Any) -> list[str]:
     if here == there or (there is None and name in REMOVED and here in REMOVED[name].values):
         return []  # equal, or a config key that was removed since and whose value equals today's behaviour
     if isinstance(here, dict) and isinstance(there, dict):
         inner = sorted(here.keys() | there)
-        return [text for key in inner for text in _differences(f"{name}.{key}", here.get(key), there.get(key))]
-    return [f"{name}: {_as_text(here)}, not {_as_text(there)}"]
+        return [text for key in inner for text in _compare_values(f"{name}.{key}", here.get(key), there.get(key))]
+    return [f"{name}: {_format_value(here)}, not {_format_value(there)}"]
 
 
-def _as_text(value: Any) -> str:
+def _format_value(value: Any) -> str:
     text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def read_key(folder: Path | str) -> CacheKey:
+def read_cache_key(folder: Path | str) -> CacheKey:
     """Read the key of a latent cache.
 
     Raises:
         InputError: The folder has no key, or one of another format.
     """
-    where, needed = storage.join(folder, CACHE), f"a folder with the {CACHE} of a latent cache, format {FORMAT}"
+    where, needed = (
+        storage.join(folder, CACHE_FILE),
+        f"a folder with the {CACHE_FILE} of a latent cache, format {FORMAT}",
+    )
     try:
         key = read_json_object(where, fix=_ENCODE).get("key")
     except MissingFileError:
@@ -172,7 +177,7 @@ def read_table(path: str, kind: type[T]) -> T:
     """
     try:
         with storage.translate_read_errors(path, fix=_ENCODE):
-            return kind.from_bytes(storage.read_small_file(path, _MOST_BYTES))
+            return kind.from_bytes(storage.read_small_file(path, _MAX_BYTES))
     except InvalidTableError as error:
         raise InputError(where=path, found=f"damaged ({error})", fix=_ENCODE) from None
 
@@ -201,7 +206,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         """The cameras that clips are drawn from: the config's, or all of the cache."""
         return self.key.cameras if self._config.camera is None else self._config.cameras
 
-    def kept_ranges(self) -> StepSelection | None:
+    def read_selected_steps(self) -> StepSelection | None:
         """Return the ranges that `data.idle` keeps, from the cache; None if the rule is none.
 
         Raises:
@@ -219,15 +224,15 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         table, opened = self._open()
         camera = camera or self.cameras[0]
         record, info = opened.files.open(index, camera), table[index]
-        arrays = {name: record.array(name) for name in OPTIONAL if name in record.names}
-        arrays["states"] = record.array("states")
+        arrays = {name: record.read_array(name) for name in OPTIONAL if name in record.names}
+        arrays["states"] = record.read_array("states")
         self._require_plausible(arrays, info, f"{record.path}: {info.id}")
         return Episode(
             info=info,
-            read_frames=lambda steps: record.pictures(record.places_of(steps)),
+            read_frames=lambda steps: record.read_images(record.find_frames(steps)),
             control_rate_hz=float(table.texts["control_rate_hz"]),
             metadata=record.metadata,
-            read_latents=lambda steps: record.latents(record.places_of(steps)),
+            read_latents=lambda steps: record.read_latents(record.find_frames(steps)),
             frame_steps=record.frame_steps,
             **arrays,
         )
@@ -243,11 +248,11 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
             if values.shape != (info.num_steps, width):
                 needed = f"{info.num_steps} x {width}, as the other files of the cache say"
                 raise InputError(where=f"{where}: {name}", found=f"shape {values.shape}", needed=needed, fix=FIX)
-            space = measured_space(self._config, width) if name == "states" else vector_states(width)
+            space = get_state_space(self._config, width) if name == "states" else vector_states(width)
             if name != "joint_velocities":  # only the idle filter reads them, and checks them
                 space.require_plausible(values, f"{where}: {name}", fix=FIX)
 
-    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
+    def resolve_cameras(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
         """Check that some episodes have files, and return the config with the names of the cameras.
 
         Raises:
@@ -256,31 +261,31 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         """
         table, opened = self._open()
         numbers = np.unique(episodes).tolist()
-        if missing := opened.files.episodes_without_file(numbers, self.cameras):
+        if missing := opened.files.find_missing(numbers, self.cameras):
             such = f"{len(missing)} of {counted(len(numbers), 'episode')}, such as {table.identity(missing[0])}"
             fix = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
             fix += " episodes out (data.outcome, data.exclude)"
             raise InputError(where=self._config.path, found=f"no latents of {such}", fix=fix)
         return self._config.model_copy(update={"camera": self.cameras})
 
-    def _look(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - opening a cache is fast
+    def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - opening a cache is fast
         folder = storage.parse_folder(self._config.path)
-        key = read_key(folder)
-        parts = clip_parts(self._config)
-        differing = key.differences(parts, parts)
+        key = read_cache_key(folder)
+        parts = get_clip_parts(self._config)
+        differing = key.list_differences(parts, parts)
         for camera in () if self._config.camera is None else self._config.cameras:
             if camera not in key.cameras:
                 differing.append(f"data.camera: {', '.join(key.cameras)}, not {camera}")
         if differing:  # the clips of the cache differ from the config's
-            raise another_cache(folder, differing)
+            raise cache_mismatch_error(folder, differing)
         has_idle_rule = self._config.idle.rule != "none"
-        kept = read_table(storage.join(folder, KEPT), StepSelection) if has_idle_rule else None
+        kept = read_table(storage.join(folder, STEPS_FILE), StepSelection) if has_idle_rule else None
         cache = open_download_cache(self._config.disk_cache) if storage.is_url(folder) else None
-        table = read_table(storage.join(folder, EPISODES), EpisodeTable)
+        table = read_table(storage.join(folder, EPISODES_FILE), EpisodeTable)
         return table, _Cache(key, LatentFiles(folder, key.digest, cache), kept)
 
 
-def another_cache(folder: Path | str, differing: Sequence[str]) -> InputError:
+def cache_mismatch_error(folder: Path | str, differing: Sequence[str]) -> InputError:
     """Return the error of a cache with other settings than those in use."""
     found = f"a latent cache that was made otherwise: {'; '.join(differing)}"
     needed = "one that was made with this model and these settings"

@@ -24,22 +24,22 @@ from vjepa2_ac.data.index import (
 )
 from vjepa2_ac.data.poses import convert_poses
 from vjepa2_ac.data.selection import add_split_labels
-from vjepa2_ac.data.sources.indexed_source import Found, IndexedSource, Scanned, frames_by_step, table_of
+from vjepa2_ac.data.sources.indexed_source import IndexedSource, IndexEntry, ScanResult, build_table, make_frame_reader
 from vjepa2_ac.data.sources.lerobot_meta import (
     FIX_EPISODE,
     TABLES,
     DatasetInfo,
     EpisodeRow,
     find_overlaps,
+    get_row,
     list_by_template,
-    missing,
-    read_episodes,
+    missing_error,
+    read_episode_rows,
     read_info,
     require_files,
-    require_long_videos,
-    row_of,
+    require_video_lengths,
 )
-from vjepa2_ac.data.sources.parquet import EPISODE, Columns, ParquetRows
+from vjepa2_ac.data.sources.parquet import EPISODE_COLUMN, Columns, ParquetRows
 from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_image, stack_frames
@@ -47,14 +47,14 @@ from vjepa2_ac.media.video import Clock, import_pyav, read_frames, read_header
 from vjepa2_ac.spaces import require_finite
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
-FRAME, TIME = "frame_index", "timestamp"
+FRAME_COLUMN, TIME_COLUMN = "frame_index", "timestamp"
 
 _DATA_BYTES = "data_bytes"  # total size of the Parquet files with rows
 _CHECKS = 2  # version of the checks during indexing and of the choice of frames; a new number rebuilds all indexes
 
 _FIX_VECTORS = "Leave the episode out, or check data.lerobot: state, action"
 
-Content = dict[str, Any]
+EpisodeArrays = dict[str, Any]
 """The data of an episode except its frames, by the names of `Episode`: states, commands, joint_velocities."""
 
 
@@ -75,13 +75,13 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             OSError: The rows are remote and cannot be read.
         """
         table = self.infos()
-        info, row = table[index], row_of(table, index)
-        content, _ = self._content(row)
+        info, row = table[index], get_row(table, index)
+        content, _ = self._read_arrays(row)
         task = table.label("task", index)
-        key = self._info.camera_key(self._config.lerobot, camera or self._config.cameras[0])
+        key = self._info.get_camera_key(self._config.lerobot, camera or self._config.cameras[0])
         return Episode(
             info=info,
-            read_frames=self._frames(row, key),
+            read_frames=self._make_frame_reader(row, key),
             control_rate_hz=self._info.fps,
             metadata={"language": task} if task else {},
             **content,
@@ -89,24 +89,24 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
 
     @cached_property
     def _info(self) -> DatasetInfo:
-        return read_info(self._config.path) if self._known is None else self._known[1]
+        return read_info(self._config.path) if self._index_and_state is None else self._index_and_state[1]
 
     @cached_property
     def _parquet(self) -> ParquetRows:
-        return ParquetRows(self._files, wanted_columns(self._config), self._data_version)
+        return ParquetRows(self._files, select_columns(self._config), self._data_version)
 
     @property
     def _data_version(self) -> str:
         """A version that changes with the data set's files and the required columns."""
-        return self._version if self._known is None else self._known[0].texts["index"]
+        return self._version if self._index_and_state is None else self._index_and_state[0].texts["index"]
 
     def _open_file(self, path: str) -> str | BlockCachedFile:
         return self._files.open(path, version=self._data_version)
 
-    def _look(self, progress: Progress) -> tuple[EpisodeTable, DatasetInfo]:
+    def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, DatasetInfo]:
         info, config = self._info, self._config
         info.require_mapping(config)
-        keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
+        keys = [info.get_camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
             import_pyav(info.where)
         listed = partial(list_by_template, info.root, connections=num_connections(config))
@@ -118,7 +118,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         fields = config.format_values["lerobot"]
         fields.pop("action")  # included in the columns if it matters
         parts = {
-            **({"vector": wanted_columns(config)} if config.states == "vector" else {}),
+            **({"vector": select_columns(config)} if config.states == "vector" else {}),
             "source": "lerobot",
             "checks": _CHECKS,
             "fields": fields,
@@ -128,17 +128,17 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             "files": [(path, file.size, file.version) for path, file in [*tables.items(), *files.items()]],
         }
         self._version = index_key(parts, config.path)
-        build = partial(self._built, list(tables), files.keys(), keys, progress)
+        build = partial(self._build_table, list(tables), files.keys(), keys, progress)
         table = get_or_build_index(config.disk_cache, self._version, config.path, build)
         table = replace(table, texts={**table.texts, _DATA_BYTES: str(num_bytes)})
-        return add_split_labels(table, [info.split_of(number) for number in table.locators["index"].tolist()]), info
+        return add_split_labels(table, [info.get_split(number) for number in table.locators["index"].tolist()]), info
 
-    def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
+    def _build_table(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, config, fields = self._info, self._config, self._config.lerobot
         is_far, connections = storage.is_url(config.path), num_connections(config)
         of_config = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
         videos = [key for key in of_config if info.features[key].dtype == "video"]
-        rows = read_episodes(info, tables, videos, fields.success, self._open_file)
+        rows = read_episode_rows(info, tables, videos, fields.success, self._open_file)
         if not rows:
             raise InputError(where=info.where, found="no episodes", needed="a data set with episodes")
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
@@ -146,47 +146,47 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         overlaps = find_overlaps(info, rows, keys)
         header_of = cache(lambda path: read_header(path, where=path))
 
-        def look(row: EpisodeRow) -> Found:
+        def look(row: EpisodeRow) -> ScanResult:
             success, summary = row.success, STATES_NOT_READ
             try:
                 require_files(info, row, files, keys)
                 if row.id in overlaps:
                     raise overlaps[row.id]
                 if reads_rows:
-                    content, outcome = self._content(row)
+                    content, outcome = self._read_arrays(row)
                     success = success if outcome is None else outcome
                     summary = summarize_states(content["states"])
                 if not is_far:
-                    require_long_videos(info, row, keys, header_of)
+                    require_video_lengths(info, row, keys, header_of)
             except InputError as error:
                 return EpisodeProblem.from_error(error, row.id)
             facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
-            return Scanned(facts, self._where(row), row.place, summary, labels, self._info.fps)
+            return IndexEntry(facts, self._where(row), row.locator, summary, labels, self._info.fps)
 
         by_file: dict[str, list[EpisodeRow]] = {}  # grouped, so that each row group is decoded once
         for row in rows:
             by_file.setdefault(row.data_file(info), []).append(row)
-        found: dict[str, Found] = {}
+        found: dict[str, ScanResult] = {}
         seen = map_in_threads(lambda some: [(row.id, look(row)) for row in some], [*by_file.values()], connections)
         for of_file in seen:
             found.update(of_file)
             progress(len(found), len(rows))
-        return table_of([found[row.id] for row in rows], config, len(rows))
+        return build_table([found[row.id] for row in rows], config, len(rows))
 
-    def _content(self, row: EpisodeRow) -> tuple[Content, bool | None]:
+    def _read_arrays(self, row: EpisodeRow) -> tuple[EpisodeArrays, bool | None]:
         """Return the data in the rows of an episode, and whether the episode succeeded (None: unknown).
 
         Raises:
             InputError: Rows or columns are missing, have another width, or are implausible states.
         """
         info, config, where = self._info, self._config, self._where(row)
-        rows = self._parquet.rows(storage.join(info.root, row.data_file(info)), row.index)
+        rows = self._parquet.read_rows(storage.join(info.root, row.data_file(info)), row.index)
         fields = config.lerobot
         _require_rows(rows, row.length, info.fps, where)
 
         def column(name: str) -> Float[np.ndarray, "steps width"]:
             if name not in rows:
-                raise missing("data.lerobot", "column", name, where, rows)
+                raise missing_error("data.lerobot", "column", name, where, rows)
             feature, width = info.features.get(name), rows[name].shape[1]
             if feature is not None and width != feature.width:
                 found, needed = f"{width} numbers a row", f"{feature.width}, says {info.where}"
@@ -214,20 +214,20 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         }
         return content, None if success is None else bool(success.any())
 
-    def _frames(self, row: EpisodeRow, key: str) -> FrameReader:
+    def _make_frame_reader(self, row: EpisodeRow, key: str) -> FrameReader:
         info = self._info
         if info.features[key].dtype == "image":
             path = storage.join(info.root, row.data_file(info))
-            read_all = cache(partial(self._parquet.images, path, key, row.index))
-            read = partial(self._stored_frames, row, key, read_all)
-            return frames_by_step(row.length, f"{self._where(row)}: {key}", read)
-        path, start_s = storage.join(info.root, row.video_file(info, key)), row.place[f"{key}.start_s"]
+            read_all = cache(partial(self._parquet.read_images, path, key, row.index))
+            read = partial(self._read_stored_frames, row, key, read_all)
+            return make_frame_reader(row.length, f"{self._where(row)}: {key}", read)
+        path, start_s = storage.join(info.root, row.video_file(info, key)), row.locator[f"{key}.start_s"]
         clock, where = Clock(start_s=start_s, rate_hz=info.fps, source=info.where), f"{path}: {row.id}"
-        return frames_by_step(
+        return make_frame_reader(
             row.length, where, lambda steps: read_frames(self._open_file(path), steps, where=where, clock=clock)
         )
 
-    def _stored_frames(
+    def _read_stored_frames(
         self, row: EpisodeRow, key: str, read_all: Callable[[], list[bytes]], steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
         """Return frames from an episode's PNG or JPEG images in the table.
@@ -253,26 +253,28 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         return f"{storage.join(self._info.root, row.data_file(self._info))}: {row.id}"
 
 
-def wanted_columns(config: LeRobotData) -> list[str]:
+def select_columns(config: LeRobotData) -> list[str]:
     """Return the names of the columns that are read if a file has them."""
     fields = config.lerobot
     optional = [JOINT_VELOCITY, *((fields.success,) if fields.success else ())]
     commands = fields.action if config.actions == "recorded" else ()
-    return [EPISODE, FRAME, TIME, *fields.state, *commands, *optional]
+    return [EPISODE_COLUMN, FRAME_COLUMN, TIME_COLUMN, *fields.state, *commands, *optional]
 
 
 def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
     """Check that the rows of an episode are complete, in order, and at the data set's rate."""
-    count = len(rows[EPISODE]) if rows else 0
+    count = len(rows[EPISODE_COLUMN]) if rows else 0
     if count != length:
         raise InputError(where=where, found=f"{count} rows", needed=f"{length}, says the data set", fix=FIX_EPISODE)
     order = np.arange(length)
-    if FRAME in rows and not np.array_equal(rows[FRAME][:, 0], order):
-        found = f"{FRAME} that is not 0 to {length - 1} in order"
+    if FRAME_COLUMN in rows and not np.array_equal(rows[FRAME_COLUMN][:, 0], order):
+        found = f"{FRAME_COLUMN} that is not 0 to {length - 1} in order"
         raise InputError(where=where, found=found, needed="a row for each step", fix=FIX_EPISODE)
-    if TIME in rows and not (wrong := abs(rows[TIME][:, 0] - order / fps)).max() < 0.5 / fps:  # NaN is wrong, too
+    if (
+        TIME_COLUMN in rows and not (wrong := abs(rows[TIME_COLUMN][:, 0] - order / fps)).max() < 0.5 / fps
+    ):  # NaN is wrong, too
         step = int(np.argmax(~(wrong < 0.5 / fps)))
-        found = f"the {TIME} {rows[TIME][step, 0]:.4g} s"
+        found = f"the {TIME_COLUMN} {rows[TIME_COLUMN][step, 0]:.4g} s"
         needed = f"{step / fps:.4g} s, at the {fps:g} rows per second that meta/info.json says"
         fix = "Correct fps in meta/info.json, or leave the episode out"
         raise InputError(where=f"{where}: step {step}", found=found, needed=needed, fix=fix)

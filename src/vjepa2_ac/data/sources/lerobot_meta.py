@@ -27,20 +27,20 @@ from vjepa2_ac.storage.structured import parse_json_object, read_json_object
 INFO = "meta/info.json"
 VERSIONS = ("v2.1", "v3.0")
 
-_PLACE = re.compile(r"\{(?:(video_key)|(?:chunk_index|file_index|episode_chunk|episode_index)(?::0\dd)?)\}")
+_PLACEHOLDER = re.compile(r"\{(?:(video_key)|(?:chunk_index|file_index|episode_chunk|episode_index)(?::0\dd)?)\}")
 _FIX = "Get meta/info.json again"
 _FIX_VERSION = (
     "lerobot 0.3.3's convert_dataset_v1_to_v2.py and convert_dataset_v20_to_v21.py make v2.1 of older ones; for newer "
     "ones update vjepa2-ac"
 )
 _FIX_STORAGE = "`vjepa2-ac data converter lance_to_files` prints a script that writes the files a Lance table is of"
-_WAY_TO_HUB = "Check the name in hf://datasets/owner/name; for a private data set, `hf auth login` or set HF_TOKEN"
+_FIX_HUB = "Check the name in hf://datasets/owner/name; for a private data set, `hf auth login` or set HF_TOKEN"
 TABLES = {  # path templates of the files that list the episodes
     "v2.1": "meta/episodes.jsonl",
     "v3.0": "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
 }
 FIX_EPISODE = "Copy the data set again, or leave the episode out"
-_MOST_BYTES = 1 << 28  # size limit of meta/episodes.jsonl
+_MAX_BYTES = 1 << 28  # size limit of meta/episodes.jsonl
 _FIX_TABLES = "Get the files in meta again"
 _FIX_RANGES = (
     "Correct file_index, from_timestamp and to_timestamp in meta/episodes (they may be wrong for other episodes of the "
@@ -94,7 +94,7 @@ class DatasetInfo:
         """The path of meta/info.json."""
         return storage.join(self.root, INFO)
 
-    def split_of(self, episode: int) -> str | None:
+    def get_split(self, episode: int) -> str | None:
         """Return the name of the split that contains an episode number, or None."""
         return next((name for name, episodes in self.splits.items() if episode in episodes), None)
 
@@ -110,7 +110,7 @@ class DatasetInfo:
         for knob, names in wanted.items():
             for name in names:
                 if name not in columns:
-                    raise missing(f"data.lerobot.{knob}", "column of numbers", name, self.where, columns)
+                    raise missing_error(f"data.lerobot.{knob}", "column of numbers", name, self.where, columns)
         columns_of_state = {}
         for name in fields.state:
             feature = self.features[name]
@@ -118,26 +118,26 @@ class DatasetInfo:
             columns_of_state[f"{name} [{described}]"] = feature.width
         require_selection(columns_of_state, fields, "data.lerobot", is_pose=config.states == "pose")
         for camera in config.cameras:
-            self.camera_key(fields, camera)
+            self.get_camera_key(fields, camera)
 
-    def camera_key(self, fields: LeRobotFields, camera: str) -> str:
+    def get_camera_key(self, fields: LeRobotFields, camera: str) -> str:
         """Return the name of the feature with a camera's frames.
 
         Raises:
             InputError: The config or the data set has no such camera.
         """
         if camera not in fields.cameras:
-            raise missing("data.camera", "camera", camera, "data.lerobot.cameras", fields.cameras)
+            raise missing_error("data.camera", "camera", camera, "data.lerobot.cameras", fields.cameras)
         key = fields.cameras[camera]
         cameras = [name for name, feature in self.features.items() if feature.is_camera]
         if key not in cameras:
-            raise missing(f"data.lerobot.cameras.{camera}", "camera", key, self.where, cameras)
+            raise missing_error(f"data.lerobot.cameras.{camera}", "camera", key, self.where, cameras)
         if self.features[key].dtype == "video" and self.video_path is None:
             raise InputError(where=self.where, found=f"no video_path, and {key} is a video", needed="one", fix=_FIX)
         return key
 
 
-def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
+def missing_error(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
     """Return an error about a missing name, with the existing names and a suggestion."""
     known = list(known)
     fix = f"{did_you_mean(name, known)}It has: {', '.join(known) or 'none'}"
@@ -155,7 +155,7 @@ def read_info(root: str) -> DatasetInfo:
     try:
         content = read_json_object(where, needed="a description of a data set", fix=_FIX)
     except MissingFileError:
-        fix = _WAY_TO_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos"
+        fix = _FIX_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos"
         found = f"no {INFO} in {root}"
         raise InputError(where="data.path", found=found, needed="a LeRobot data set", fix=fix) from None
     if (version := content.get("codebase_version")) not in VERSIONS:
@@ -165,13 +165,13 @@ def read_info(root: str) -> DatasetInfo:
         found = f"storage_format {stored_as!r}"
         raise InputError(where=where, found=found, needed="Parquet files and MP4 videos", fix=_FIX_STORAGE)
     try:
-        return _parsed(root, content)
+        return _parse_info(root, content)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         found = f"not a description of a data set ({error!r})"
         raise InputError(where=where, found=found, needed="LeRobot's own", fix=_FIX) from None
 
 
-def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
+def _parse_info(root: str, content: Mapping[str, Any]) -> DatasetInfo:
     video_path = content.get("video_path")
     fps, episodes, chunk = float(content["fps"]), content["total_episodes"], content.get("chunks_size", 1000)
     frames = content.get("total_frames")
@@ -184,21 +184,21 @@ def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
         episodes=episodes,
         frames=frames if type(frames) is int else None,
         chunk_episodes=chunk,
-        data_path=_template(content["data_path"]),
-        video_path=None if video_path is None else _template(video_path),
-        features={name: _feature(feature) for name, feature in content["features"].items()},
-        splits=_splits(content.get("splits")),
+        data_path=_require_safe_template(content["data_path"]),
+        video_path=None if video_path is None else _require_safe_template(video_path),
+        features={name: _parse_feature(feature) for name, feature in content["features"].items()},
+        splits=_parse_splits(content.get("splits")),
     )
 
 
-def _splits(content: object) -> dict[str, range]:
+def _parse_splits(content: object) -> dict[str, range]:
     """Parse the ranges of episodes of each split, such as {"train": "0:50"}; other notations are ignored."""
     texts = content if isinstance(content, Mapping) else {}
     ranges = {str(name): re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)) for name, text in texts.items()}
     return {name: range(int(part[1]), int(part[2])) for name, part in ranges.items() if part}
 
 
-def _feature(content: Mapping[str, Any]) -> Feature:
+def _parse_feature(content: Mapping[str, Any]) -> Feature:
     """Parse a feature; depth maps are recognised by the marks of any LeRobot version, or by their pixel format.
 
     Source: huggingface/lerobot @ 7427f31, src/lerobot/configs/video.py, is_depth_map.
@@ -218,15 +218,15 @@ def _feature(content: Mapping[str, Any]) -> Feature:
     return Feature(dtype, shape, tuple(map(str, names)) if isinstance(names, list) else (), is_depth)
 
 
-def _template(template: str) -> str:
+def _require_safe_template(template: str) -> str:
     """Check a path template such as `chunk-{chunk_index:03d}`, which must stay inside the data set, and return it."""
-    rest = _PLACE.sub("", template)
+    rest = _PLACEHOLDER.sub("", template)
     if not template or template.startswith("/") or ".." in template.split("/") or "{" in rest or "}" in rest:
         raise ValueError(f"the path template {template!r}")
     return template
 
 
-def filled(template: str, chunk: int, file: int, key: str = "") -> str:
+def fill_template(template: str, chunk: int, file: int, key: str = "") -> str:
     """Return the path of a file in the data set: in v3.0 by chunk and file, in v2.1 by chunk and episode."""
     return template.format(chunk_index=chunk, episode_chunk=chunk, file_index=file, episode_index=file, video_key=key)
 
@@ -238,7 +238,7 @@ def list_by_template(root: str, template: str, key: str = "", *, connections: in
         InputError: A file is a git-lfs pointer.
         OSError: A folder cannot be listed.
     """
-    pattern = _PLACE.sub(lambda place: glob.escape(key) if place[1] else "[0-9]*", template)
+    pattern = _PLACEHOLDER.sub(lambda place: glob.escape(key) if place[1] else "[0-9]*", template)
     *folders, name = pattern.split("/")
     found = [""]
     for part in folders:
@@ -260,7 +260,7 @@ class EpisodeRow:
     """The entry of one episode in the data set's tables."""
 
     length: int
-    place: Mapping[str, float]  # index; chunk and file of its rows; KEY.chunk, KEY.file and KEY.start_s of each video
+    locator: Mapping[str, float]  # index; chunk and file of its rows; KEY.chunk, KEY.file and KEY.start_s of each video
     task: str = ""
     lengths_s: Mapping[str, float] = field(default_factory=dict)  # duration in each video, if the table has it
     success: bool | None = None
@@ -268,7 +268,7 @@ class EpisodeRow:
     @property
     def index(self) -> int:
         """The number of the episode."""
-        return int(self.place["index"])
+        return int(self.locator["index"])
 
     @property
     def id(self) -> str:
@@ -277,15 +277,15 @@ class EpisodeRow:
 
     def data_file(self, info: DatasetInfo) -> str:
         """Return the path, in the data set, of the file with the episode's rows."""
-        return filled(info.data_path, int(self.place["chunk"]), int(self.place["file"]))
+        return fill_template(info.data_path, int(self.locator["chunk"]), int(self.locator["file"]))
 
     def video_file(self, info: DatasetInfo, key: str) -> str:
         """Return the path, in the data set, of the video with the episode's frames."""
-        chunk, file = (int(self.place[f"{key}.{part}"]) for part in ("chunk", "file"))
-        return filled(info.video_path or "", chunk, file, key)
+        chunk, file = (int(self.locator[f"{key}.{part}"]) for part in ("chunk", "file"))
+        return fill_template(info.video_path or "", chunk, file, key)
 
 
-def read_episodes(
+def read_episode_rows(
     info: DatasetInfo,
     tables: Sequence[str],
     videos: Sequence[str],
@@ -312,13 +312,13 @@ def read_episodes(
     for table in tables:
         path = storage.join(info.root, table)
         if info.version == "v2.1":
-            values = list(_lines(path))
+            values = list(_read_lines(path))
         else:
             columns = read_table(open_file(path), path, lambda name: name in own or name.startswith(prefixes))
             values = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         for number, row in enumerate(values):
             try:
-                rows.append(_row_of(info, row, videos, row.get(outcome)))
+                rows.append(_parse_row(info, row, videos, row.get(outcome)))
             except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
                 found, needed = f"not an episode ({error!r})", "LeRobot's own tables"
                 raise InputError(where=f"{path}: row {number}", found=found, needed=needed, fix=_FIX_TABLES) from None
@@ -332,15 +332,15 @@ def read_episodes(
     return rows
 
 
-def _lines(path: str) -> Iterator[dict[str, Any]]:
+def _read_lines(path: str) -> Iterator[dict[str, Any]]:
     """Yield the object on each line of meta/episodes.jsonl."""
-    for number, line in enumerate(storage.read_small_file(path, _MOST_BYTES).splitlines(), start=1):
+    for number, line in enumerate(storage.read_small_file(path, _MAX_BYTES).splitlines(), start=1):
         if line.strip():
             where = f"{path}: line {number}"
             yield parse_json_object(line, where=where, needed="an episode", fix=_FIX_TABLES)
 
 
-def _row_of(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], outcome: object) -> EpisodeRow:
+def _parse_row(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], outcome: object) -> EpisodeRow:
     index = int(row["episode_index"])
     if info.version == "v2.1":  # one file per episode
         places = ("data", *(f"videos/{key}" for key in videos))
@@ -366,7 +366,7 @@ def _row_of(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], ou
             lengths_s[key] = float(end) - start
     return EpisodeRow(
         length=int(row["length"]),
-        place=place,
+        locator=place,
         task="; ".join(map(str, tasks)) if isinstance(tasks, list | tuple) else str(tasks),
         lengths_s=lengths_s,
         success=bool(outcome) if isinstance(outcome, bool | int | float) else None,
@@ -392,7 +392,7 @@ def require_files(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Seq
         where, needed = f"{storage.join(info.root, rows_in)}: {row.id}", f"the {row.length} rows of the episode"
         raise InputError(where=where, found="no such file", needed=needed, fix=FIX_EPISODE)
     for key in keys:
-        if f"{key}.file" not in row.place:
+        if f"{key}.file" not in row.locator:
             continue
         shown_in = row.video_file(info, key)
         where, of_rows = f"{storage.join(info.root, shown_in)}: {row.id}", f"for {row.length} rows in {rows_in}"
@@ -406,7 +406,7 @@ def require_files(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Seq
             raise InputError(where=where, found=found, needed=needed, fix="Leave the episode out")
 
 
-def require_long_videos(
+def require_video_lengths(
     info: DatasetInfo, row: EpisodeRow, keys: Sequence[str], header_of: Callable[[str], VideoHeader]
 ) -> None:
     """Refuse an episode whose video ends before its last step according to the header of the video.
@@ -421,9 +421,9 @@ def require_long_videos(
         InputError: A video is too short, or cannot be read.
     """
     for key in keys:
-        if f"{key}.file" in row.place:
+        if f"{key}.file" in row.locator:
             path = storage.join(info.root, row.video_file(info, key))
-            header, last_s = header_of(path), row.place[f"{key}.start_s"] + (row.length - 1) / info.fps
+            header, last_s = header_of(path), row.locator[f"{key}.start_s"] + (row.length - 1) / info.fps
             if header.num_frames < row.length or header.span_s < last_s - 0.5 / info.fps:
                 found = f"{header.num_frames} frames at {header.rate_hz:.4g} a second, up to {header.span_s:.3f} s"
                 needed = f"one for each of {row.length} rows at {info.fps:g} a second, up to {last_s:.3f} s"
@@ -442,8 +442,8 @@ def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[
     for key in keys:
         claims = []
         for row in rows:
-            if f"{key}.file" in row.place:
-                start_s = row.place[f"{key}.start_s"]
+            if f"{key}.file" in row.locator:
+                start_s = row.locator[f"{key}.start_s"]
                 end_s = start_s + row.lengths_s.get(key, row.length / info.fps)
                 claims.append((row.video_file(info, key), start_s, end_s, row.id))
         latest = ("", 0.0, 0.0, "")
@@ -460,7 +460,7 @@ def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[
     return errors
 
 
-def row_of(table: EpisodeTable, index: int) -> EpisodeRow:
+def get_row(table: EpisodeTable, index: int) -> EpisodeRow:
     """Return the length and location of an episode of a table, without its task."""
     return EpisodeRow(
         int(table.num_steps[index]), {name: column[index].item() for name, column in table.locators.items()}

@@ -42,10 +42,10 @@ from vjepa2_ac.data.files import CONNECTIONS, walk
 from vjepa2_ac.data.index import EpisodeTable, get_or_build_index, index_key, summarize_states
 from vjepa2_ac.data.sources.indexed_source import (
     IndexedSource,
-    Scanned,
-    frames_by_step,
-    measured_space,
-    require_as_indexed,
+    IndexEntry,
+    get_state_space,
+    make_frame_reader,
+    require_indexed_length,
 )
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, UserError
@@ -55,12 +55,12 @@ from vjepa2_ac.storage.block_file import BlockCachedFile
 FORMAT_HELP = "docs/data.md says what an episode holds"
 
 _SUFFIX = ".npz"
-_MOST_NUMBERS = 1 << 25  # limit for arrays other than frames: 88 hours of 7 numbers at 15 Hz; 256 MB as float64
-_MOST_TEXT_BYTES = 1 << 18
+_MAX_NUMBERS = 1 << 25  # limit for arrays other than frames: 88 hours of 7 numbers at 15 Hz; 256 MB as float64
+_MAX_TEXT_BYTES = 1 << 18
 _LABELS = ("scene", "building", "operator", "day")
 _LOCAL_HEADER_BYTES = 30
-_MOST_BYTES = 1 << 30  # limit for an array that is read completely
-_MOST_UNPACKED, _MOST_RATIO = 1 << 30, 100  # above the first size, limit of the ratio of unpacked to packed bytes
+_MAX_BYTES = 1 << 30  # limit for an array that is read completely
+_MAX_UNPACKED_BYTES, _MAX_RATIO = 1 << 30, 100  # above the first size, limit of the ratio of unpacked to packed bytes
 _KINDS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # as numpy writes; others may expand without limit
 _FIX = "Write the file again, with numpy.savez"
 
@@ -80,56 +80,62 @@ class NpzSource(IndexedSource[DataConfig, None]):
         """
         table = self.infos()
         info = table[index]
-        episode, _ = self._episode(info.id, table.texts["index"], (camera or self._config.cameras[0],))
-        require_as_indexed(len(episode.states), info, self._path(info.id))
+        episode, _ = self._read_episode(info.id, table.texts["index"], (camera or self._config.cameras[0],))
+        require_indexed_length(len(episode.states), info, self._path(info.id))
         return episode
 
-    def _episode(self, identity: str, version: str, cameras: Sequence[str]) -> tuple[Episode, dict[str, str | None]]:
+    def _read_episode(
+        self, identity: str, version: str, cameras: Sequence[str]
+    ) -> tuple[Episode, dict[str, str | None]]:
         """Return an episode with the frames of the first of some cameras, and the labels of the episode.
 
         Raises:
             InputError: The file is not an episode, or its numbers are implausible.
         """
         path, config = self._path(identity), self._config
-        with opened_npz(self._files.open(path, version=version), path) as file:
+        with open_npz(self._files.open(path, version=version), path) as file:
             names = file.names
-            states = file.numbers("states", (None, STATE_DIM if config.states == "pose" else None))
+            states = file.read_numbers("states", (None, STATE_DIM if config.states == "pose" else None))
             steps = len(states)
-            measured_space(config, states.shape[1]).require_plausible(states, path, fix=FORMAT_HELP)
+            get_state_space(config, states.shape[1]).require_plausible(states, path, fix=FORMAT_HELP)
             for camera in cameras:
                 file.require_frames(camera, steps)
-            extrinsics = [file.extrinsics(camera, steps) for camera in cameras]
+            extrinsics = [file.read_extrinsics(camera, steps) for camera in cameras]
             if config.pose_frame == "camera" and any(one is None for one in extrinsics):
                 found, needed = "no poses of the camera", "extrinsics, or extrinsics_CAMERA for each of data.camera"
                 raise InputError(where=path, found=found, needed=needed, fix="Set data.pose_frame: base")
-            fps_hz = float(file.numbers("fps_hz", ()))
+            fps_hz = float(file.read_numbers("fps_hz", ()))
             if fps_hz <= 0:
-                raise file.refused("fps_hz", f"{fps_hz:g}", "control steps per second")
+                raise file.array_error("fps_hz", f"{fps_hz:g}", "control steps per second")
             joints = "joint_velocities"
-            language = file.text("language") if "language" in names else None
+            language = file.read_text("language") if "language" in names else None
             episode = Episode(
-                info=EpisodeInfo(identity, steps, bool(file.numbers("success", ())) if "success" in names else None),
+                info=EpisodeInfo(
+                    identity, steps, bool(file.read_numbers("success", ())) if "success" in names else None
+                ),
                 states=states,
-                read_frames=frames_by_step(steps, path, partial(self._frames, path, version, cameras[0], steps)),
+                read_frames=make_frame_reader(
+                    steps, path, partial(self._read_frames, path, version, cameras[0], steps)
+                ),
                 control_rate_hz=fps_hz,
                 extrinsics=extrinsics[0],
-                joint_velocities=file.numbers(joints, (steps, None)) if joints in names else None,
+                joint_velocities=file.read_numbers(joints, (steps, None)) if joints in names else None,
                 metadata={} if language is None else {"language": language},
-                commands=file.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
+                commands=file.read_numbers("actions", (steps, None)) if config.actions == "recorded" else None,
             )
-            headers = {name: file.header(name) for name in _LABELS if name in names}  # a camera may have this name
+            headers = {name: file.read_header(name) for name in _LABELS if name in names}  # a camera may have this name
             is_text = {name: one.shape == () and one.dtype.kind == "U" for name, one in headers.items()}
-            labels = {name: file.text(name) for name in headers if is_text[name]}
+            labels = {name: file.read_text(name) for name in headers if is_text[name]}
             return episode, {"task": language, **labels}
 
-    def _frames(
+    def _read_frames(
         self, path: str, version: str, camera: str, num_steps: int, steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
-        with opened_npz(self._files.open(path, version=version), path) as file:
+        with open_npz(self._files.open(path, version=version), path) as file:
             file.require_frames(camera, num_steps, count=len(set(steps)))
-            return np.asarray(file.rows(camera, steps))
+            return np.asarray(file.read_rows(camera, steps))
 
-    def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
+    def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, None]:
         """Return the cached table, or read all episodes; a changed file changes the key."""
         config, root = self._config, self._config.path
         listed = sorted(
@@ -145,22 +151,22 @@ class NpzSource(IndexedSource[DataConfig, None]):
             knobs |= {"states": config.states, "actions": config.actions}
         key = index_key({"source": "npz", **knobs, "listed": listed}, root)
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
-        build = partial(self._scanned, partial(self._scan, key), dict(zip(ids, ids, strict=True)), progress)
+        build = partial(self._scan_all, partial(self._scan, key), dict(zip(ids, ids, strict=True)), progress)
         return get_or_build_index(config.disk_cache, key, root, build), None
 
-    def _scan(self, version: str, identity: str) -> Scanned:
-        episode, labels = self._episode(identity, version, self._config.cameras)
+    def _scan(self, version: str, identity: str) -> IndexEntry:
+        episode, labels = self._read_episode(identity, version, self._config.cameras)
         action = "" if episode.commands is None else f", {episode.commands.shape[1]} an action"
         kind = f"{episode.control_rate_hz:g} steps a second (fps_hz), {episode.states.shape[1]} numbers a state{action}"
         where, states = self._path(identity), summarize_states(episode.states)
-        return Scanned(episode.info, where, {}, states, labels, episode.control_rate_hz, kind)
+        return IndexEntry(episode.info, where, {}, states, labels, episode.control_rate_hz, kind)
 
     def _path(self, identity: str) -> str:
         return storage.join(self._config.path, identity + _SUFFIX)
 
 
 @contextmanager
-def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
+def open_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
     """Open an .npz file, given by its path or as an open remote file, for reading.
 
     Raises:
@@ -205,7 +211,7 @@ class NpzFile:
 
     def __init__(self, file: storage.ByteReader, where: str) -> None:
         self._file, self._where = file, where
-        with self._damage_is_named():
+        with self._translate_errors():
             self._archive = zipfile.ZipFile(cast("IO[bytes]", file))
             members = [info for info in self._archive.infolist() if info.compress_type in _KINDS]
         self._members = {info.filename.removesuffix(".npy"): info for info in members if info.filename.endswith(".npy")}
@@ -215,10 +221,10 @@ class NpzFile:
         """The names of the arrays."""
         return tuple(self._members)
 
-    def header(self, name: str) -> ArrayHeader:
+    def read_header(self, name: str) -> ArrayHeader:
         """Read shape and type of an array without its values; refuse a shape that does not match the stored size."""
         member = self._members[name]
-        with self._damage_is_named(name), self._archive.open(member) as file:
+        with self._translate_errors(name), self._archive.open(member) as file:
             # Version 1.0 limits the length of a header. Numpy writes other versions only for records of many fields.
             if np.lib.format.read_magic(file) != (1, 0):
                 raise ValueError("an array in another format than numpy writes")
@@ -228,30 +234,30 @@ class NpzFile:
                 raise ValueError("an array of Python objects, which would have to be executed")
             if header.start + header.nbytes != member.file_size:
                 raise ValueError(f"shape {header.shape} of {header.dtype} in {member.file_size} bytes")
-            if member.file_size > max(_MOST_UNPACKED, _MOST_RATIO * member.compress_size):
+            if member.file_size > max(_MAX_UNPACKED_BYTES, _MAX_RATIO * member.compress_size):
                 unpacked = f"{member.compress_size:,} bytes that unpack to {member.file_size:,}"
-                raise ValueError(f"{unpacked}; above {_MOST_UNPACKED:,} bytes at most {_MOST_RATIO} times as many")
+                raise ValueError(f"{unpacked}; above {_MAX_UNPACKED_BYTES:,} bytes at most {_MAX_RATIO} times as many")
             return header
 
-    def array(self, name: str) -> Shaped[np.ndarray, ...]:
+    def read_array(self, name: str) -> Shaped[np.ndarray, ...]:
         """Read a complete array and verify its checksum."""
-        header = self.header(name)
-        with self._damage_is_named(name), self._archive.open(self._members[name]) as member:
-            if header.nbytes > _MOST_BYTES:
+        header = self.read_header(name)
+        with self._translate_errors(name), self._archive.open(self._members[name]) as member:
+            if header.nbytes > _MAX_BYTES:
                 raise ValueError(f"shape {header.shape}, more than is ever read at once")
             values = np.frombuffer(member.read(), header.dtype, offset=header.start)
             return values.reshape(header.shape, order="F" if header.by_columns else "C")
 
-    def rows(self, name: str, rows: Sequence[int]) -> Shaped[np.ndarray, "rows ..."]:
+    def read_rows(self, name: str, rows: Sequence[int]) -> Shaped[np.ndarray, "rows ..."]:
         """Read some rows of an array in C order, in the requested order.
 
         From an uncompressed array only these rows are read, without verifying the checksum, which covers the whole
         array. A compressed array is decompressed up to the last of these rows, without storing other rows.
         """
-        header, member = self.header(name), self._members[name]
-        with self._damage_is_named(name), self._archive.open(member) as unpacked:
+        header, member = self.read_header(name), self._members[name]
+        with self._translate_errors(name), self._archive.open(member) as unpacked:
             stored = member.compress_type == zipfile.ZIP_STORED
-            file, start = (self._file, self._start_of(member)) if stored else (unpacked, 0)
+            file, start = (self._file, self._find_content(member)) if stored else (unpacked, 0)
             ordered, places = np.unique(rows, return_inverse=True)
             found = np.empty((len(ordered), *header.shape[1:]), header.dtype)
             for place, row in enumerate(ordered.tolist()):
@@ -259,61 +265,61 @@ class NpzFile:
                 found[place] = np.frombuffer(file.read(header.row_bytes), header.dtype).reshape(header.shape[1:])
             return found if (places == np.arange(len(rows))).all() else found[places]
 
-    def refused(self, name: str, found: str, needed: str) -> InputError:
+    def array_error(self, name: str, found: str, needed: str) -> InputError:
         """Return an error about an array."""
         return InputError(where=f"{self._where}: {name}", found=found, needed=needed, fix=FORMAT_HELP)
 
-    def numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
+    def read_numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
         """Read an array of finite numbers of a shape, in which None stands for any length."""
         self._require(name, shape, "biuf", "numbers")
-        if (count := prod(self.header(name).shape)) > _MOST_NUMBERS:
-            raise self.refused(name, f"{count:,} numbers", f"at most {_MOST_NUMBERS:,} in an episode")
-        values = self.array(name).astype(np.float64)
+        if (count := prod(self.read_header(name).shape)) > _MAX_NUMBERS:
+            raise self.array_error(name, f"{count:,} numbers", f"at most {_MAX_NUMBERS:,} in an episode")
+        values = self.read_array(name).astype(np.float64)
         if not np.isfinite(values).all():
             step = np.argwhere(~np.isfinite(values))[0][:1].tolist()
-            raise self.refused(name, f"NaN or infinity{f' at step {step[0]}' if step else ''}", "numbers")
+            raise self.array_error(name, f"NaN or infinity{f' at step {step[0]}' if step else ''}", "numbers")
         return values
 
-    def text(self, name: str) -> str:
+    def read_text(self, name: str) -> str:
         """Read a text."""
         self._require(name, (), "U", "one text")
-        if (size := self.header(name).nbytes) > _MOST_TEXT_BYTES:
-            raise self.refused(name, f"a text of {size:,} bytes", f"at most {_MOST_TEXT_BYTES:,}")
-        return str(self.array(name))
+        if (size := self.read_header(name).nbytes) > _MAX_TEXT_BYTES:
+            raise self.array_error(name, f"a text of {size:,} bytes", f"at most {_MAX_TEXT_BYTES:,}")
+        return str(self.read_array(name))
 
-    def extrinsics(self, camera: str, steps: int) -> Float64[np.ndarray, "steps 6"] | None:
+    def read_extrinsics(self, camera: str, steps: int) -> Float64[np.ndarray, "steps 6"] | None:
         """Return the poses of a camera at all steps (repeated for a fixed camera), or None if there are none."""
         for name in (f"extrinsics_{camera}", "extrinsics"):
             if name in self.names:
-                one_pose = len(self.header(name).shape) == 1
-                values = self.numbers(name, (EXTRINSICS_DIM,) if one_pose else (steps, EXTRINSICS_DIM))
+                one_pose = len(self.read_header(name).shape) == 1
+                values = self.read_numbers(name, (EXTRINSICS_DIM,) if one_pose else (steps, EXTRINSICS_DIM))
                 return np.broadcast_to(values, (steps, EXTRINSICS_DIM))
         return None
 
     def require_frames(self, camera: str, steps: int, *, count: int = 1) -> None:
         """Refuse an array that cannot be the frames of a camera, by its header; `count` frames are read together."""
         self._require(camera, (steps, None, None, 3), "u", "frames (steps, height, width, 3)")
-        header = self.header(camera)
+        header = self.read_header(camera)
         require_decodable_size(header.shape[1], header.shape[2], f"{self._where}: {camera}", count=count)
         if header.dtype != np.uint8:
-            raise self.refused(camera, f"frames of {header.dtype}", "uint8, 0 to 255")
+            raise self.array_error(camera, f"frames of {header.dtype}", "uint8, 0 to 255")
         if header.by_columns:
-            raise self.refused(camera, "frames in Fortran order", "C order, as by numpy.ascontiguousarray")
+            raise self.array_error(camera, "frames in Fortran order", "C order, as by numpy.ascontiguousarray")
 
     def _require(self, name: str, shape: tuple[int | None, ...], kinds: str, meaning: str) -> None:
         """Refuse an array that is missing or has another shape or type."""
         if name not in self.names:
             there = ", ".join(self.names)[:200] or "none"
-            raise self.refused(name, "no such array", f"{meaning}; there are {there}")
-        header = self.header(name)
+            raise self.array_error(name, "no such array", f"{meaning}; there are {there}")
+        header = self.read_header(name)
         alike = len(header.shape) == len(shape) and all(
             b in {a, None} for a, b in zip(header.shape, shape, strict=True)
         )
         if not alike or header.dtype.kind not in kinds or (0 in header.shape[1:]):
             wanted = " x ".join("any" if size is None else str(size) for size in shape) or "a single one"
-            raise self.refused(name, f"shape {header.shape} of {header.dtype}", f"{meaning}: {wanted}")
+            raise self.array_error(name, f"shape {header.shape} of {header.dtype}", f"{meaning}: {wanted}")
 
-    def _start_of(self, member: zipfile.ZipInfo) -> int:
+    def _find_content(self, member: zipfile.ZipInfo) -> int:
         """Return the offset in the file of the content of an uncompressed member."""
         self._file.seek(member.header_offset)
         local = self._file.read(_LOCAL_HEADER_BYTES)
@@ -321,7 +327,7 @@ class NpzFile:
         return member.header_offset + _LOCAL_HEADER_BYTES + names
 
     @contextmanager
-    def _damage_is_named(self, name: str = "") -> Iterator[None]:
+    def _translate_errors(self, name: str = "") -> Iterator[None]:
         try:
             yield
         except UserError:

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 Columns = Mapping[str, Shaped[np.ndarray, "rows _"]]
 
-EPISODE = "episode_index"
+EPISODE_COLUMN = "episode_index"
 
 # All limits are far beyond any real data set.
-MOST_NUMBERS = 1 << 25  # numbers in one column of a row group
-MOST_TABLE_BYTES = 1 << 28  # size of a table of episodes or tasks
-MOST_IMAGE_BYTES = 1 << 32  # size of the images in one row group
+MAX_NUMBERS = 1 << 25  # numbers in one column of a row group
+MAX_TABLE_BYTES = 1 << 28  # size of a table of episodes or tasks
+MAX_IMAGE_BYTES = 1 << 32  # size of the images in one row group
 _ROWS_AT_ONCE = 64  # rows per read if a value may be as large as an image
 _BUFFER_BYTES = 4096  # buffer of a column whose values are not read
 _FIX = "Copy the file again, or leave its episodes out"
@@ -49,11 +49,11 @@ class ParquetRows:
 
     def __init__(self, files: EpisodeFiles, columns: Sequence[str], version: str) -> None:
         self._files, self._version = files, version
-        self._columns = list(dict.fromkeys([EPISODE, *columns]))
+        self._columns = list(dict.fromkeys([EPISODE_COLUMN, *columns]))
         self._ranges: dict[str, list[tuple[float, float]]] = {}  # of each row group, by file
         self._last = threading.local()
 
-    def rows(self, path: str, episode: int) -> Columns:
+    def read_rows(self, path: str, episode: int) -> Columns:
         """Return the rows of one episode, as columns of shape [rows, numbers].
 
         Raises:
@@ -63,16 +63,16 @@ class ParquetRows:
 
         def read() -> Columns:
             parts: list[Columns] = []
-            with self._groups_with(path, episode) as (file, groups):
+            with self._open_groups(path, episode) as (file, groups):
                 for number in groups:
-                    group = self._group(path, file, number)
-                    of_episode = group[EPISODE][:, 0] == episode
+                    group = self._read_group(path, file, number)
+                    of_episode = group[EPISODE_COLUMN][:, 0] == episode
                     parts.append({name: column[of_episode] for name, column in group.items()})
             return {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
 
         return self._files.read_parsed(f"rows {self._version} {path} {episode}", read)
 
-    def images(self, path: str, column: str, episode: int) -> list[bytes]:
+    def read_images(self, path: str, column: str, episode: int) -> list[bytes]:
         """Read the encoded images of one episode from a column of {bytes, path}.
 
         Raises:
@@ -80,10 +80,10 @@ class ParquetRows:
             OSError: A remote file cannot be read.
         """
         found: list[Any] = []
-        with self._groups_with(path, episode) as (file, groups):
+        with self._open_groups(path, episode) as (file, groups):
             for number in groups:
-                for part in _parts_of(file, path, [EPISODE, column], MOST_IMAGE_BYTES, row_groups=[number]):
-                    rows = zip(part[column], part[EPISODE], strict=True)
+                for part in _read_parts(file, path, [EPISODE_COLUMN, column], MAX_IMAGE_BYTES, row_groups=[number]):
+                    rows = zip(part[column], part[EPISODE_COLUMN], strict=True)
                     found += [row.get("bytes") if isinstance(row, dict) else row for row, its in rows if its == episode]
         if not all(isinstance(image, bytes) for image in found):
             wrong, needed = "no images, or names of files in their place", "PNG or JPEG bytes in the column"
@@ -91,19 +91,19 @@ class ParquetRows:
         return found
 
     @contextmanager
-    def _groups_with(self, path: str, episode: int) -> Iterator[tuple[parquet.ParquetFile, list[int]]]:
+    def _open_groups(self, path: str, episode: int) -> Iterator[tuple[parquet.ParquetFile, list[int]]]:
         """Open a file; yield it and the row groups that may have rows of an episode, by its statistics."""
         opened = self._files.open(path, version=self._version)
         with _opened(opened, path) as file:
             if path not in self._ranges:
-                self._ranges[path] = _episodes_of_groups(file, path, opened, self._columns)
+                self._ranges[path] = _read_episode_ranges(file, path, opened, self._columns)
             yield file, [n for n, (first, last) in enumerate(self._ranges[path]) if first <= episode <= last]
 
-    def _group(self, path: str, file: parquet.ParquetFile, number: int) -> Columns:
+    def _read_group(self, path: str, file: parquet.ParquetFile, number: int) -> Columns:
         if getattr(self._last, "place", None) != (path, number):
             present = [name for name in self._columns if name in file.schema_arrow.names]
             table = file.read_row_group(number, columns=present, use_threads=False)
-            self._last.group = {name: numbers_in(table.column(name), f"{path}: {name}") for name in present}
+            self._last.group = {name: to_numbers(table.column(name), f"{path}: {name}") for name in present}
             self._last.place = path, number
         group: Columns = self._last.group
         return group
@@ -119,13 +119,13 @@ def read_table(opened: str | BlockCachedFile, path: str, wanted: Callable[[str],
     with _opened(opened, path) as file:
         present = [name for name in file.schema_arrow.names if wanted(name)]
         values: dict[str, list[Any]] = {name: [] for name in present}
-        for part in _parts_of(file, path, present, MOST_TABLE_BYTES):
+        for part in _read_parts(file, path, present, MAX_TABLE_BYTES):
             for name in part:
                 values[name] += part[name]
         return values
 
 
-def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows _"]:
+def to_numbers(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows _"]:
     """Convert a column of numbers, or of lists of equal length, to an array [rows, numbers].
 
     Raises:
@@ -139,7 +139,7 @@ def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
         array = array.storage
     while pa.types.is_nested(array.type):
         if array.null_count or not hasattr(array, "value_lengths"):
-            raise _no_numbers(where, str(column.type), array.null_count)
+            raise _not_numeric_error(where, str(column.type), array.null_count)
         lengths = np.unique(array.value_lengths().to_numpy(zero_copy_only=False))
         if len(lengths) > 1:
             found = f"{lengths[0]} numbers in one row and {lengths[-1]} in another"
@@ -148,11 +148,11 @@ def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
         array = array.flatten()
     kind = array.type
     if array.null_count or not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)):
-        raise _no_numbers(where, str(column.type), array.null_count)
+        raise _not_numeric_error(where, str(column.type), array.null_count)
     return np.asarray(array.to_numpy(zero_copy_only=False)).reshape(rows, width)
 
 
-def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
+def _not_numeric_error(where: str, kind: str, gaps: int) -> InputError:
     found = f"{gaps} rows without a value" if gaps else f"values of type {kind}"
     return InputError(where=where, found=found, needed="numbers, as many in each row", fix=_FIX)
 
@@ -160,7 +160,7 @@ def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
 @contextmanager
 def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.ParquetFile]:
     """Open a Parquet file with verified page checksums, and convert its errors to errors for the user."""
-    pa = parquet_library(path)
+    pa = import_pyarrow(path)
     try:
         with pa.parquet.ParquetFile(
             opened, page_checksum_verification=True, pre_buffer=not isinstance(opened, str), memory_map=False
@@ -175,7 +175,7 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
         raise InputError(where=path, found=found, needed="a whole Parquet file", fix=_FIX) from None
 
 
-def _episodes_of_groups(
+def _read_episode_ranges(
     file: parquet.ParquetFile, path: str, opened: str | BlockCachedFile, columns: Sequence[str]
 ) -> list[tuple[float, float]]:
     """Return the least and the greatest episode number of each row group; infinite if the file has no statistics.
@@ -187,16 +187,16 @@ def _episodes_of_groups(
     paths = [file.metadata.schema.column(place).path for place in range(file.metadata.num_columns)]
     places = [n for n, one in enumerate(paths) if any(f"{one}.".startswith(f"{name}.") for name in columns)]
     _require_consistent(file, opened, places)
-    if EPISODE not in paths:
-        raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=_FIX)
+    if EPISODE_COLUMN not in paths:
+        raise InputError(where=path, found=f"no column {EPISODE_COLUMN}", needed="one", fix=_FIX)
     ranges: list[tuple[float, float]] = []
     for number in range(file.num_row_groups):
         group = file.metadata.row_group(number)
         for place in places:
-            if (count := group.column(place).num_values) > MOST_NUMBERS:
-                found, needed = f"{count:,} numbers in a row group", f"at most {MOST_NUMBERS:,}"
+            if (count := group.column(place).num_values) > MAX_NUMBERS:
+                found, needed = f"{count:,} numbers in a row group", f"at most {MAX_NUMBERS:,}"
                 raise InputError(where=f"{path}: {paths[place]}", found=found, needed=needed, fix=_FIX)
-        known = group.column(paths.index(EPISODE)).statistics
+        known = group.column(paths.index(EPISODE_COLUMN)).statistics
         is_known = known is not None and known.has_min_max and isinstance(known.min, int)
         ranges.append((known.min, known.max) if is_known else (-inf, inf))
     return ranges
@@ -209,14 +209,14 @@ def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile
     Reading one row makes the same checks and raises a Python error. For a remote file no row is read, which finds fewer
     errors, because the blocks of every row group would be fetched.
     """
-    parquet = parquet_library(str(opened)).parquet
+    parquet = import_pyarrow(str(opened)).parquet
     rows = 1 if isinstance(opened, str) else 0
     with parquet.ParquetFile(opened, metadata=file.metadata, buffer_size=_BUFFER_BYTES, pre_buffer=False) as light:
         for group in range(file.num_row_groups):
             next(light.reader.iter_batches(rows, row_groups=[group], column_indices=places, use_threads=False), None)
 
 
-def _parts_of(
+def _read_parts(
     file: parquet.ParquetFile, path: str, columns: list[str], max_bytes: int, **which: list[int]
 ) -> Iterator[dict[str, list[Any]]]:
     """Yield some columns as Python values, a few rows at a time, up to a limit of their total size.
@@ -226,23 +226,23 @@ def _parts_of(
     total = 0
     for part in file.iter_batches(_ROWS_AT_ONCE, columns=columns, use_threads=False, **which):
         values = part.to_pydict()
-        total += _bytes_in(values)
+        total += _estimate_bytes(values)
         if total > max_bytes:
             found = f"more than {max_bytes:,} bytes of {', '.join(columns)[:200]}"
             raise InputError(where=path, found=found, needed="a table that fits into memory", fix=_FIX)
         yield values
 
 
-def _bytes_in(value: Any) -> int:
+def _estimate_bytes(value: Any) -> int:
     """Return the approximate size in bytes of nested lists and dicts of numbers, texts and images."""
     if isinstance(value, str | bytes):
         return len(value)
     if isinstance(value, dict):
-        return sum(map(_bytes_in, value.values()))
-    return sum(map(_bytes_in, value)) if isinstance(value, list) else 8
+        return sum(map(_estimate_bytes, value.values()))
+    return sum(map(_estimate_bytes, value)) if isinstance(value, list) else 8
 
 
-def parquet_library(where: str) -> Any:
+def import_pyarrow(where: str) -> Any:
     """Import and return pyarrow, with its module `parquet`."""
     called = "pyarrow, which reads and writes LeRobot data sets"
     require_library("pyarrow.parquet", where=where, called=called, extra="lerobot")

@@ -24,10 +24,17 @@ from vjepa2_ac.config import DiskCacheConfig, RldsData
 from vjepa2_ac.data.files import open_cache, open_download_cache
 from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build_index, index_key
 from vjepa2_ac.data.selection import add_split_labels
-from vjepa2_ac.data.sources.indexed_source import IndexedSource, frames_by_step
-from vjepa2_ac.data.sources.rlds_episode import STEP_FLAG, Record, build_index, episode_of, position_of, step_features
-from vjepa2_ac.data.sources.rlds_shards import NEEDED, Shard, find_shards, open_shard
-from vjepa2_ac.data.sources.tfrecord import NotAnExampleError, Place, Read, RecordSpan, item_places, require_intact
+from vjepa2_ac.data.sources.indexed_source import IndexedSource, make_frame_reader
+from vjepa2_ac.data.sources.rlds_episode import (
+    STEP_FLAG,
+    Record,
+    build_index,
+    list_step_features,
+    locate_record,
+    read_episode,
+)
+from vjepa2_ac.data.sources.rlds_shards import NEEDED_FILE, Shard, find_shards, open_shard
+from vjepa2_ac.data.sources.tfrecord import ByteRange, NotAnExampleError, ReadBytes, RecordSpan, find_items, verify_crc
 from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_images
@@ -60,26 +67,26 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
         config, fields = self._config, self._config.fields
         camera = camera or config.cameras[0]
         feature, info = fields.cameras[camera], table[index]
-        shard, span = position_of(table, shards, index)
+        shard, span = locate_record(table, shards, index)
         where = f"{span} ({info.id})"
         of_images = f"{where}: {feature}"
         if storage.is_url(shard.path):
             remote = RemoteEpisode(shard, span, config.disk_cache)
-            names = [STEP_FLAG, *step_features(config), fields.joint_velocity, fields.language]
-            record = remote.record([name for name in names if name])
-            place = record.place_of(feature)
-            images = remote.images(feature, place, info.num_steps, needed, of_images)
-            return episode_of(record, config, info, images, where)
+            names = [STEP_FLAG, *list_step_features(config), fields.joint_velocity, fields.language]
+            record = remote.fetch_record([name for name in names if name])
+            place = record.find_feature(feature)
+            images = remote.make_image_reader(feature, place, info.num_steps, needed, of_images)
+            return read_episode(record, config, info, images, where)
         with open_shard(shard) as read:
             checked = cache_folder(config.disk_cache) / "index" / f"{table.texts['index']}.checked"
-            if not _is_marked(checked, index):
-                require_intact(read, span)
-                _mark(checked, index)
+            if not _is_checked(checked, index):
+                verify_crc(read, span)
+                _mark_checked(checked, index)
             record = Record(read, span)
-            images = images_here(shard, record.place_of(feature), info.num_steps, of_images)
-            return episode_of(record, config, info, images, where)
+            images = make_local_image_reader(shard, record.find_feature(feature), info.num_steps, of_images)
+            return read_episode(record, config, info, images, where)
 
-    def _look(self, progress: Progress) -> tuple[EpisodeTable, tuple[Shard, ...]]:
+    def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, tuple[Shard, ...]]:
         config, fields = self._config, self._config.fields
         shards = tuple(find_shards(config.path))
         cameras = [fields.cameras[camera] for camera in config.cameras]
@@ -97,7 +104,7 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
         return replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)}), shards
 
 
-def _is_marked(file: Path, number: int) -> bool:
+def _is_checked(file: Path, number: int) -> bool:
     """Return whether a record has been checked; a mark that cannot be read counts as missing."""
     try:
         with file.open("rb") as marks:
@@ -107,7 +114,7 @@ def _is_marked(file: Path, number: int) -> bool:
         return False
 
 
-def _mark(file: Path, number: int) -> None:
+def _mark_checked(file: Path, number: int) -> None:
     """Mark a record as checked; where that cannot be written, it is checked again next time."""
     with suppress(OSError):
         handle = os.open(file, os.O_WRONLY | os.O_CREAT, 0o666)
@@ -117,15 +124,15 @@ def _mark(file: Path, number: int) -> None:
             os.close(handle)
 
 
-def images_here(shard: Shard, feature: Place, num_steps: int, where: str) -> FrameReader:
+def make_local_image_reader(shard: Shard, feature: ByteRange, num_steps: int, where: str) -> FrameReader:
     """Return a reader of the images in a local shard; `where` (file, record, identity, feature) is for messages."""
 
     def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
         with open_shard(shard) as read:
-            places = _places_of(read, feature, num_steps, where)
+            places = _find_images(read, feature, num_steps, where)
             return decode_images([read(*places[step]) for step in steps], steps, where)
 
-    return frames_by_step(num_steps, where, decode)
+    return make_frame_reader(num_steps, where, decode)
 
 
 class RemoteEpisode:
@@ -139,26 +146,28 @@ class RemoteEpisode:
 
     def __init__(self, shard: Shard, span: RecordSpan, config: DiskCacheConfig) -> None:
         self._shard, self._span = shard, span
-        self._places, self._contents = open_cache(cache_folder(config) / "places", None), open_download_cache(config)
+        self._positions, self._contents = open_cache(cache_folder(config) / "places", None), open_download_cache(config)
         self._key = f"{shard.path} {shard.version} {shard.size} {span.offset}"
 
-    def record(self, names: Sequence[str]) -> Record:
+    def fetch_record(self, names: Sequence[str]) -> Record:
         """Fetch these features of the record, if it has them, and return the record.
 
         Raises:
             InputError: The record cannot be read, or is not an Example.
             UnreachableError: The network fails.
         """
-        located = self._located()
-        places = [located[name] for name in names if name in located]
+        feature_ranges = self._find_features()
+        places = [feature_ranges[name] for name in names if name in feature_ranges]
         key = f"{self._key} {' '.join(names)}"
-        with storage.translate_read_errors(self._shard.path, needed=NEEDED):
+        with storage.translate_read_errors(self._shard.path, needed=NEEDED_FILE):
             data = self._contents.read_or_create(key, lambda: b"".join(storage.read_ranges(self._shard.path, places)))
         ends = np.cumsum([length for _, length in places]).tolist()
         pieces = {place: data[end - place[1] : end] for place, end in zip(places, ends, strict=True)}
-        return Record(lambda *place: pieces[place], self._span, located)
+        return Record(lambda *place: pieces[place], self._span, feature_ranges)
 
-    def images(self, name: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str) -> FrameReader:
+    def make_image_reader(
+        self, name: str, feature: ByteRange, num_steps: int, needed: StepRanges | None, where: str
+    ) -> FrameReader:
         """Return a reader of one camera's images.
 
         Args:
@@ -171,27 +180,27 @@ class RemoteEpisode:
         key = f"{self._key} {name}"
 
         def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-            with storage.translate_read_errors(self._shard.path, needed=NEEDED):
-                stored = self._places.read(key)
+            with storage.translate_read_errors(self._shard.path, needed=NEEDED_FILE):
+                stored = self._positions.read(key)
                 if stored is None:
                     images = self._fetch_all(key, feature, num_steps, needed, where)
                 else:
                     places = np.frombuffer(stored, np.uint32).reshape(-1, 2) + np.array([feature[0], 0])
-                    images = self._some(key, list(map(tuple, places.tolist())), steps)
+                    images = self._read_images(key, list(map(tuple, places.tolist())), steps)
             return decode_images([images[step] for step in steps], steps, where)
 
-        return frames_by_step(num_steps, where, decode)
+        return make_frame_reader(num_steps, where, decode)
 
-    def _located(self) -> dict[str, Place]:
+    def _find_features(self) -> dict[str, ByteRange]:
         def locate() -> bytes:
             with open_shard(self._shard) as read:
-                return json.dumps(Record(read, self._span).located).encode()
+                return json.dumps(Record(read, self._span).feature_ranges).encode()
 
-        located = json.loads(self._places.read_or_create(self._key, locate))
-        return {name: tuple(place) for name, place in located.items()}
+        feature_ranges = json.loads(self._positions.read_or_create(self._key, locate))
+        return {name: tuple(place) for name, place in feature_ranges.items()}
 
     def _fetch_all(
-        self, key: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str
+        self, key: str, feature: ByteRange, num_steps: int, needed: StepRanges | None, where: str
     ) -> dict[int, bytes]:
         """Fetch all images of a camera; cache their positions and the images of the needed steps."""
         start, end = feature[0], sum(feature)
@@ -201,14 +210,14 @@ class RemoteEpisode:
         def read(offset: int, length: int) -> bytes:
             return data[offset - start : offset - start + length]
 
-        places = _places_of(read, feature, num_steps, where)
-        self._places.write(key, (np.array(places) - (start, 0)).astype(np.uint32).tobytes())
+        places = _find_images(read, feature, num_steps, where)
+        self._positions.write(key, (np.array(places) - (start, 0)).astype(np.uint32).tobytes())
         images = {step: read(*place) for step, place in enumerate(places)}
         steps = {step for first, stop in needed or [(0, num_steps)] for step in range(first, stop)}
         self._contents.write_parts(key, [image if step in steps else b"" for step, image in images.items()])
         return images
 
-    def _some(self, key: str, places: list[Place], steps: Sequence[int]) -> dict[int, bytes]:
+    def _read_images(self, key: str, places: list[ByteRange], steps: Sequence[int]) -> dict[int, bytes]:
         """Return images whose positions are known, from the cache or fetched, neighbouring images with one request."""
         images = dict(zip(steps, self._contents.read_parts(key, len(places), steps) or [b""] * len(steps), strict=True))
         lacking = sorted(step for step, image in images.items() if not image)
@@ -216,14 +225,14 @@ class RemoteEpisode:
         return images | dict(zip(lacking, fetched, strict=True))
 
 
-def _places_of(read: Read, feature: Place, num_steps: int, where: str) -> list[Place]:
+def _find_images(read: ReadBytes, feature: ByteRange, num_steps: int, where: str) -> list[ByteRange]:
     """Return the position of each image of a feature.
 
     Raises:
         InputError: The feature is not a list of images, or does not have one image per step.
     """
     try:
-        places = item_places(read, feature, num_steps + 1)
+        places = find_items(read, feature, num_steps + 1)
     except NotAnExampleError as error:
         raise InputError(where=where, found=str(error), needed="a list of images") from None
     if len(places) != num_steps:

@@ -20,19 +20,19 @@ from vjepa2_ac.config.sources import RECORD
 from vjepa2_ac.data.files import CONNECTIONS, map_in_threads
 from vjepa2_ac.data.index import STATES_NOT_READ, EpisodeProblem, EpisodeTable, summarize_states
 from vjepa2_ac.data.poses import convert_poses, num_rotation_numbers, require_selection
-from vjepa2_ac.data.sources.indexed_source import Found, Scanned, require_as_indexed, table_of
+from vjepa2_ac.data.sources.indexed_source import IndexEntry, ScanResult, build_table, require_indexed_length
 from vjepa2_ac.data.sources.rlds_shards import Shard, open_shard
 from vjepa2_ac.data.sources.tfrecord import (
     HEADER_BYTES,
+    ByteRange,
     Kind,
     NotAnExampleError,
-    Place,
-    Read,
+    ReadBytes,
     RecordSpan,
     decode_feature,
     iterate_features,
-    require_intact,
-    span_at,
+    parse_header,
+    verify_crc,
 )
 from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress
 from vjepa2_ac.errors import InputError, counted, did_you_mean
@@ -40,12 +40,12 @@ from vjepa2_ac.spaces import require_finite, zero_steps
 
 IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
 STEP_FLAG = "steps/is_first"
-_MOST_BYTES = 1 << 28  # size limit of a feature of numbers or texts, which is read completely
+_MAX_BYTES = 1 << 28  # size limit of a feature of numbers or texts, which is read completely
 _IN_FLIGHT = 128  # concurrent reads behind a URL, which are small, and sequential within a shard
 _SAMPLES = 4  # shards whose first record is checked before a remote data set is indexed
 _NUMBERS: tuple[Kind, ...] = ("float_list", "int64_list")  # booleans are stored as integers
 _FIX_IDENTITY = "Name text or integer features in data.fields.identity, or set data.fields.identity: record"
-_PLACE = ("shard", "record", "offset", "length")  # columns of the table
+_LOCATOR_COLUMNS = ("shard", "record", "offset", "length")  # columns of the table
 
 
 class Record:
@@ -54,31 +54,31 @@ class Record:
     Args:
         read: Returns bytes of the file.
         span: The position of the record in the file.
-        located: The position of each feature, if already known.
+        feature_ranges: The position of each feature, if already known.
     """
 
-    def __init__(self, read: Read, span: RecordSpan, located: dict[str, Place] | None = None) -> None:
+    def __init__(self, read: ReadBytes, span: RecordSpan, feature_ranges: dict[str, ByteRange] | None = None) -> None:
         self._read, self._span = read, span
-        if located is not None:
-            self.located = located
+        if feature_ranges is not None:
+            self.feature_ranges = feature_ranges
 
     @property
-    def place(self) -> str:
+    def position(self) -> str:
         """The name of the record's file (with split and number of the shard), and the record's number in the file."""
         return f"{self._span.path.rsplit('/', 1)[-1]}: record {self._span.number}"
 
     @cached_property
-    def located(self) -> dict[str, Place]:
+    def feature_ranges(self) -> dict[str, ByteRange]:
         """The position of each feature."""
         return self.locate()
 
-    def locate(self, enough: Sequence[set[str]] = ()) -> dict[str, Place]:
+    def locate(self, enough: Sequence[set[str]] = ()) -> dict[str, ByteRange]:
         """Return the positions of the features, reading until all features of one of the sets `enough` are found.
 
         Raises:
             InputError: The record is not an Example.
         """
-        found: dict[str, Place] = {}
+        found: dict[str, ByteRange] = {}
         try:
             for name, place in iterate_features(self._read, self._span.data_offset, self._span.length):
                 found[name] = place
@@ -89,28 +89,28 @@ class Record:
             raise InputError(where=str(self._span), found=found_text, needed="an RLDS data set") from None
         return found
 
-    def place_of(self, name: str) -> Place:
+    def find_feature(self, name: str) -> ByteRange:
         """Return the position of a feature.
 
         Raises:
             InputError: The record lacks the feature; names the existing ones.
         """
-        if name not in self.located:
-            known = sorted(self.located)
+        if name not in self.feature_ranges:
+            known = sorted(self.feature_ranges)
             found = f"no feature {name}; the record has {', '.join(known) or 'none'}"
             raise InputError(where=str(self._span), found=found, fix=f"{did_you_mean(name, known)}Set data.fields")
-        return self.located[name]
+        return self.feature_ranges[name]
 
-    def values(self, name: str, *kinds: Kind) -> Sequence[Any] | np.ndarray:
+    def read_values(self, name: str, *kinds: Kind) -> Sequence[Any] | np.ndarray:
         """Read the values of a feature.
 
         Raises:
             InputError: The feature is missing, has another type or is too large, or the file ends within it.
         """
-        offset, length = self.place_of(name)
+        offset, length = self.find_feature(name)
         where = f"{self._span}: {name}"
-        if length > _MOST_BYTES:
-            raise InputError(where=where, found=f"{length:,} bytes", needed=f"at most {_MOST_BYTES:,}")
+        if length > _MAX_BYTES:
+            raise InputError(where=where, found=f"{length:,} bytes", needed=f"at most {_MAX_BYTES:,}")
         data = self._read(offset, length)
         if len(data) < length:
             raise InputError(where=where, found=f"{len(data)} bytes at {offset}", needed=f"{length} bytes")
@@ -123,33 +123,33 @@ class Record:
         return values
 
 
-def identity_of(record: Record, fields: RldsFields) -> str:
+def read_identity(record: Record, fields: RldsFields) -> str:
     """Return the identity of an episode: the values of some features, or the position of the record.
 
     Raises:
         InputError: A feature of the identity is missing, empty, or neither text nor integers.
     """
     if fields.identity == RECORD:
-        return record.place
+        return record.position
     parts: list[str] = []
     for name in fields.identity:
         try:
-            values = record.values(name, "bytes_list", "int64_list")
+            values = record.read_values(name, "bytes_list", "int64_list")
         except InputError as error:
             raise InputError(where=error.where, found=error.found, needed=error.needed, fix=_FIX_IDENTITY) from None
         parts += [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
     if not any(parts):
         found = f"empty: {', '.join(fields.identity)}"
-        raise InputError(where=record.place, found=found, needed="the identity of the episode", fix=_FIX_IDENTITY)
+        raise InputError(where=record.position, found=found, needed="the identity of the episode", fix=_FIX_IDENTITY)
     return IDENTITY_SEPARATOR.join(parts)
 
 
-def step_features(config: RldsData) -> tuple[str, ...]:
+def list_step_features(config: RldsData) -> tuple[str, ...]:
     """Return the features of states and recorded actions."""
     return config.fields.state + (config.fields.action if config.actions == "recorded" else ())
 
 
-def num_steps_of(record: Record, config: RldsData) -> int:
+def read_num_steps(record: Record, config: RldsData) -> int:
     """Return the number of steps: the length of the flag `is_first`, or of the states if they are complete poses.
 
     Raises:
@@ -157,14 +157,14 @@ def num_steps_of(record: Record, config: RldsData) -> int:
     """
     fields = config.fields
     if config.states == "vector" or fields.select is not None:  # only the flag gives the count
-        record.place_of(STEP_FLAG)
-    if STEP_FLAG in record.located:
-        return len(record.values(STEP_FLAG, "int64_list"))
-    count = sum(len(record.values(name, *_NUMBERS)) for name in fields.state)
+        record.find_feature(STEP_FLAG)
+    if STEP_FLAG in record.feature_ranges:
+        return len(record.read_values(STEP_FLAG, "int64_list"))
+    count = sum(len(record.read_values(name, *_NUMBERS)) for name in fields.state)
     return count // (4 + num_rotation_numbers(fields.rotation))
 
 
-def episode_of(record: Record, config: RldsData, info: EpisodeInfo, read_frames: FrameReader, where: str) -> Episode:
+def read_episode(record: Record, config: RldsData, info: EpisodeInfo, read_frames: FrameReader, where: str) -> Episode:
     """Read the episode in a record; joint velocities and instruction are optional.
 
     Args:
@@ -177,21 +177,21 @@ def episode_of(record: Record, config: RldsData, info: EpisodeInfo, read_frames:
     Raises:
         InputError: The record does not match the index, lacks a feature, or has implausible numbers.
     """
-    require_as_indexed(num_steps_of(record, config), info, where)
+    require_indexed_length(read_num_steps(record, config), info, where)
     steps, velocity, language = info.num_steps, config.fields.joint_velocity, config.fields.language
-    texts = record.values(language, "bytes_list") if language in record.located else None
+    texts = record.read_values(language, "bytes_list") if language in record.feature_ranges else None
     return Episode(
         info=info,
-        states=states_of(record, config, steps, where),
+        states=read_states(record, config, steps, where),
         read_frames=read_frames,
         control_rate_hz=config.fields.control_rate_hz,
-        joint_velocities=_of_every_step(record, velocity, steps, where) if velocity in record.located else None,
+        joint_velocities=_read_per_step(record, velocity, steps, where) if velocity in record.feature_ranges else None,
         metadata={} if texts is None else {"language": b"".join(texts[:1]).decode(errors="replace")},
-        commands=commands_of(record, config, steps, where),
+        commands=read_commands(record, config, steps, where),
     )
 
 
-def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float[np.ndarray, "steps state_dim"]:
+def read_states(record: Record, config: RldsData, steps: int, where: str) -> Float[np.ndarray, "steps state_dim"]:
     """Read the measured states (conventions: `vjepa2_ac.episode`) and check that they are plausible.
 
     Raises:
@@ -200,7 +200,7 @@ def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float
     if steps == 0:
         raise zero_steps(where)
     fields = config.fields
-    columns = [_of_every_step(record, name, steps, where) for name in fields.state]
+    columns = [_read_per_step(record, name, steps, where) for name in fields.state]
     widths = {name: column.shape[1] for name, column in zip(fields.state, columns, strict=True)}
     described = {f"{name} [{width}]": width for name, width in widths.items()}
     require_selection(described, fields, "data.fields", is_pose=config.states == "pose", episode=where)
@@ -213,7 +213,7 @@ def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float
     return convert_poses(numbers, fields, where, section="data.fields")
 
 
-def commands_of(
+def read_commands(
     record: Record, config: RldsData, steps: int, where: str
 ) -> Float[np.ndarray, "steps action_dim"] | None:
     """Read the recorded actions if `data.actions` is recorded, otherwise return None.
@@ -224,13 +224,13 @@ def commands_of(
     """
     if config.actions != "recorded":
         return None
-    commands = np.concatenate([_of_every_step(record, name, steps, where) for name in config.fields.action], axis=1)
+    commands = np.concatenate([_read_per_step(record, name, steps, where) for name in config.fields.action], axis=1)
     require_finite(commands, f"{where}: {', '.join(config.fields.action)}", fix="Check data.fields.action")
     return commands
 
 
-def _of_every_step(record: Record, name: str, steps: int, where: str) -> Float[np.ndarray, "steps width"]:
-    values = np.asarray(record.values(name, *_NUMBERS), np.float64)
+def _read_per_step(record: Record, name: str, steps: int, where: str) -> Float[np.ndarray, "steps width"]:
+    values = np.asarray(record.read_values(name, *_NUMBERS), np.float64)
     if len(values) == 0 or len(values) % steps:
         found, needed = f"{len(values)} numbers", f"as many for each of {counted(steps, 'step')}"
         raise InputError(where=f"{where}: {name}", found=found, needed=needed)
@@ -258,70 +258,74 @@ def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str
     is_far = storage.is_url(config.path)
     threads = _IN_FLIGHT if is_far else CONNECTIONS
     if is_far:
-        _require_fitting(shards, config, cameras)
+        _require_usable_sample(shards, config, cameras)
 
-    def scan(number: int) -> list[Found]:
+    def scan(number: int) -> list[ScanResult]:
         with open_shard(shards[number]) as read:
-            return list(_scan(shards[number], number, read, config, cameras))
+            return list(_scan_shard(shards[number], number, read, config, cameras))
 
     found = (one for of_shard in map_in_threads(scan, range(len(shards)), threads) for one in of_shard)
-    return table_of(found, config, sum(shard.episodes for shard in shards), progress)
+    return build_table(found, config, sum(shard.episodes for shard in shards), progress)
 
 
-def position_of(table: EpisodeTable, shards: Sequence[Shard], index: int) -> tuple[Shard, RecordSpan]:
+def locate_record(table: EpisodeTable, shards: Sequence[Shard], index: int) -> tuple[Shard, RecordSpan]:
     """Return the shard and the position of an episode's record."""
-    number, *place = (int(table.locators[name][index]) for name in _PLACE)
+    number, *place = (int(table.locators[name][index]) for name in _LOCATOR_COLUMNS)
     return shards[number], RecordSpan(shards[number].path, *place)
 
 
-def _scan(shard: Shard, place: int, read: Read, config: RldsData, cameras: Sequence[str]) -> Iterator[Found]:
+def _scan_shard(
+    shard: Shard, place: int, read: ReadBytes, config: RldsData, cameras: Sequence[str]
+) -> Iterator[ScanResult]:
     """Yield the result of each expected record of a shard; records behind a damaged length are problems."""
     offset = 0
     for number in range(shard.episodes):
         hidden = range(number, shard.episodes)
         if offset == shard.size:
-            yield from (_wrong_count(shard, one, f"the file ends after {number} records") for one in hidden)
+            yield from (_make_count_problem(shard, one, f"the file ends after {number} records") for one in hidden)
             return
         try:
-            span = span_at(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
+            span = parse_header(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
         except InputError as error:
             yield from (EpisodeProblem.from_error(error, f"{shard.name}: record {one}") for one in hidden)
             return
-        yield _examine(read, span, place, f"{shard.name}: record {number}", config, cameras)
+        yield _scan_record(read, span, place, f"{shard.name}: record {number}", config, cameras)
         offset = span.end
     if offset != shard.size:
-        yield _wrong_count(shard, shard.episodes, f"{shard.size - offset:,} bytes after the last record")
+        yield _make_count_problem(shard, shard.episodes, f"{shard.size - offset:,} bytes after the last record")
 
 
-def _wrong_count(shard: Shard, number: int, found: str) -> EpisodeProblem:
+def _make_count_problem(shard: Shard, number: int, found: str) -> EpisodeProblem:
     name, where = f"{shard.name}: record {number}", f"{shard.path}: record {number}"
     needed = f"{shard.episodes} records, says dataset_info.json"
     return EpisodeProblem(name, where, found, needed, "Download the file again")
 
 
-def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsData, cameras: Sequence[str]) -> Found:
+def _scan_record(
+    read: ReadBytes, span: RecordSpan, shard: int, name: str, config: RldsData, cameras: Sequence[str]
+) -> ScanResult:
     """Return the index entry or the problem of a record; a problem has the name `name` if the identity is unknown."""
     is_far, fields, record = storage.is_url(span.path), config.fields, Record(read, span)
     try:
         if is_far:
             by_states = [{*fields.identity_features, *fields.state}] if config.states == "pose" else []
             record = Record(read, span, record.locate([{*fields.identity_features, STEP_FLAG}, *by_states]))
-        name = identity_of(record, fields)
-        states = None if is_far else _checked_states(record, config, cameras, f"{span} ({name})")
-        steps = num_steps_of(record, config) if states is None else len(states)
+        name = read_identity(record, fields)
+        states = None if is_far else _read_checked_states(record, config, cameras, f"{span} ({name})")
+        steps = read_num_steps(record, config) if states is None else len(states)
         if steps == 0:
             raise zero_steps(f"{span} ({name})")
     except InputError as error:
-        return EpisodeProblem.from_error(error if is_far else _damage_or(error, read, span), name)
-    place = dict(zip(_PLACE, (shard, span.number, span.offset, span.length), strict=True))
+        return EpisodeProblem.from_error(error if is_far else _prefer_crc_error(error, read, span), name)
+    place = dict(zip(_LOCATOR_COLUMNS, (shard, span.number, span.offset, span.length), strict=True))
     success = (
         True if "/success/" in name else False if "/failure/" in name else None
     )  # only DROID's identities contain the outcome
     info = EpisodeInfo(id=name, num_steps=steps, success=success)
-    return Scanned(info, str(span), place, STATES_NOT_READ if states is None else summarize_states(states))
+    return IndexEntry(info, str(span), place, STATES_NOT_READ if states is None else summarize_states(states))
 
 
-def _checked_states(
+def _read_checked_states(
     record: Record, config: RldsData, cameras: Sequence[str], where: str
 ) -> Float[np.ndarray, "steps _"]:
     """Return the states of a record after checking that it has all features of an episode.
@@ -329,23 +333,23 @@ def _checked_states(
     Raises:
         InputError: A feature is missing, does not have equally many numbers per step, or has implausible numbers.
     """
-    for name in (*config.fields.identity_features, *step_features(config), *cameras):
-        record.place_of(name)
-    states = states_of(record, config, num_steps_of(record, config), where)
-    commands_of(record, config, len(states), where)
+    for name in (*config.fields.identity_features, *list_step_features(config), *cameras):
+        record.find_feature(name)
+    states = read_states(record, config, read_num_steps(record, config), where)
+    read_commands(record, config, len(states), where)
     return states
 
 
-def _damage_or(error: InputError, read: Read, span: RecordSpan) -> InputError:
+def _prefer_crc_error(error: InputError, read: ReadBytes, span: RecordSpan) -> InputError:
     """Return an error about the CRC if the record is damaged, otherwise the original error."""
     try:
-        require_intact(read, span)
+        verify_crc(read, span)
     except InputError as damage:
         return damage
     return error
 
 
-def _require_fitting(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str]) -> None:
+def _require_usable_sample(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str]) -> None:
     """Check the first record of some remote shards as thoroughly as a local one, before all shards are read.
 
     Raises:
@@ -355,8 +359,8 @@ def _require_fitting(shards: Sequence[Shard], config: RldsData, cameras: Sequenc
     for shard in shards[:: max(1, len(shards) // _SAMPLES)]:
         try:
             with open_shard(shard) as read:
-                span = span_at(read(0, HEADER_BYTES), shard.path, 0, 0, shard.size)
-                _checked_states(Record(read, span), config, cameras, str(span))
+                span = parse_header(read(0, HEADER_BYTES), shard.path, 0, 0, shard.size)
+                _read_checked_states(Record(read, span), config, cameras, str(span))
                 return
         except InputError as error:
             errors.append(error)

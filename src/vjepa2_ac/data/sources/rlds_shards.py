@@ -12,14 +12,14 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.selection import format_identities
-from vjepa2_ac.data.sources.tfrecord import Read
+from vjepa2_ac.data.sources.tfrecord import ReadBytes
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.storage.structured import read_json_object
 
-NEEDED = "a TFRecord file"
+NEEDED_FILE = "a TFRecord file"
 _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
-_MOST_EPISODES = 100_000  # limit per shard; DROID's shards have about 50
+_MAX_EPISODES = 100_000  # limit per shard; DROID's shards have about 50
 _WINDOW_BYTES = 1 << 15  # transferring this many bytes takes as long as the latency of a request
 _WINDOWS = 8  # number of recent windows that are kept, for example the head of the next record
 
@@ -51,7 +51,7 @@ def find_shards(folder: str) -> list[Shard]:
     if (form := info.get("fileFormat", "tfrecord")) != "tfrecord":
         raise InputError(where=where, found=f"fileFormat {form}", needed="tfrecord", fix="Convert it with TFDS")
     try:
-        listed = [shard for split in info["splits"] for shard in _listed(split, str(info["name"]))]
+        listed = [shard for split in info["splits"] for shard in _list_shards(split, str(info["name"]))]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         found = f"not a description of a data set ({error!r})"
         raise InputError(where=where, found=found, needed="TFDS's own") from None
@@ -69,7 +69,7 @@ def find_shards(folder: str) -> list[Shard]:
     ]
 
 
-def dataset_name(folder: str) -> str:
+def read_dataset_name(folder: str) -> str:
     """Return the name of a data set in dataset_info.json, which may differ from the name of its folder.
 
     Raises:
@@ -83,11 +83,11 @@ def _read_info(folder: str, where: str) -> dict[str, Any]:
         return read_json_object(where, needed="a description as TFDS writes it")
     except MissingFileError:
         fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
-        found, needed = _nothing_in(folder), f"a folder with {_INFO}"
+        found, needed = _describe_missing_info(folder), f"a folder with {_INFO}"
         raise InputError(where="data.path", found=found, needed=needed, fix=fix) from None
 
 
-def _nothing_in(folder: str) -> str:
+def _describe_missing_info(folder: str) -> str:
     names = storage.list_names(folder)
     if not names:
         return f"{folder} {'is empty' if storage.exists(folder) else 'does not exist'}"
@@ -99,11 +99,11 @@ def _nothing_in(folder: str) -> str:
     return f"no {_INFO} in {folder}, only {format_identities(names)}"
 
 
-def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int, str]]:
+def _list_shards(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int, str]]:
     """Yield (name, number of episodes, split) of each shard; TFDS writes numbers as numbers or as strings."""
     counts = [int(str(count)) for count in split.get("shardLengths", [])]
     for number, count in enumerate(counts):
-        if not 0 <= count <= _MOST_EPISODES:
+        if not 0 <= count <= _MAX_EPISODES:
             raise ValueError(f"a shard of {count:,} episodes")
         index, total = f"{number:05d}", f"{len(counts):05d}"
         values = {
@@ -121,7 +121,7 @@ def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int, str
 
 
 @contextmanager
-def open_shard(shard: Shard) -> Iterator[Read]:
+def open_shard(shard: Shard) -> Iterator[ReadBytes]:
     """Open a shard for reads of small parts; a local shard may be read by several threads, a remote one by one.
 
     The file is not mapped into memory, so that truncating a local file during use causes short reads, not a crash.
@@ -130,7 +130,7 @@ def open_shard(shard: Shard) -> Iterator[Read]:
         InputError: The file cannot be read, or a local one has changed since the data set was opened.
         UnreachableError: The network fails.
     """
-    with storage.translate_read_errors(shard.path, needed=NEEDED):
+    with storage.translate_read_errors(shard.path, needed=NEEDED_FILE):
         if storage.is_url(shard.path):
             yield _RemoteWindows(shard)
             return

@@ -25,8 +25,8 @@ import numpy as np
 
 from vjepa2_ac.errors import InputError
 
-Read = Callable[[int, int], bytes]  # (offset, length) -> bytes of a file; fewer if the file ends
-Place = tuple[int, int]  # offset and length of a part of a file
+ReadBytes = Callable[[int, int], bytes]  # (offset, length) -> bytes of a file; fewer if the file ends
+ByteRange = tuple[int, int]  # offset and length of a part of a file
 Kind = Literal["bytes_list", "float_list", "int64_list"]
 
 HEADER_BYTES = 12
@@ -64,7 +64,7 @@ class RecordSpan:
         return f"{self.path}: record {self.number} at byte {self.offset}"
 
 
-def span_at(header: bytes, path: str, number: int, offset: int, size: int) -> RecordSpan:
+def parse_header(header: bytes, path: str, number: int, offset: int, size: int) -> RecordSpan:
     """Parse the header of a record and return the record's position.
 
     Args:
@@ -79,18 +79,18 @@ def span_at(header: bytes, path: str, number: int, offset: int, size: int) -> Re
     """
     where = f"{path}: record {number} at byte {offset}"
     if len(header) < HEADER_BYTES:
-        raise _truncated(where, size, offset + HEADER_BYTES)
+        raise _truncated_error(where, size, offset + HEADER_BYTES)
     length, crc = struct.unpack_from("<QI", header)
     if crc != _masked_crc(header[:8]):
         found = "the CRC of the length does not match: not a TFRecord file, or a damaged one"
         raise InputError(where=where, found=found, needed="a TFRecord file as TFDS writes it")
     span = RecordSpan(path=path, number=number, offset=offset, length=length)
     if span.end > size:
-        raise _truncated(where, size, span.end)
+        raise _truncated_error(where, size, span.end)
     return span
 
 
-def require_intact(read: Read, span: RecordSpan) -> None:
+def verify_crc(read: ReadBytes, span: RecordSpan) -> None:
     """Check the CRC of a record's data, read in pieces.
 
     Raises:
@@ -100,12 +100,12 @@ def require_intact(read: Read, span: RecordSpan) -> None:
     while position < end:
         piece = read(position, min(_PIECE_BYTES, end - position))
         if not piece:
-            raise _truncated(str(span), position, span.end)
+            raise _truncated_error(str(span), position, span.end)
         crc = google_crc32c.extend(crc, piece)
         position += len(piece)
     footer = read(end, _FOOTER_BYTES)
     if len(footer) < _FOOTER_BYTES:
-        raise _truncated(str(span), end + len(footer), span.end)
+        raise _truncated_error(str(span), end + len(footer), span.end)
     if _mask(crc) != struct.unpack("<I", footer)[0]:
         found = "the CRC of the data does not match: the file is damaged"
         raise InputError(where=str(span), found=found, fix="Download the file again")
@@ -115,7 +115,7 @@ class NotAnExampleError(ValueError):
     """The bytes are not a serialised tf.train.Example."""
 
 
-def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str, Place]]:
+def iterate_features(read: ReadBytes, start: int, length: int) -> Iterator[tuple[str, ByteRange]]:
     """Yield the name and position of each feature in file order, reading only as far as the caller iterates.
 
     A position is the position of the serialised tf.train.Feature. No CRC is checked.
@@ -124,13 +124,13 @@ def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str,
         NotAnExampleError: The bytes are not an Example.
     """
     end = start + length
-    position = _content(read(start, _HEAD_BYTES), start, end, _FIRST) if length else end
+    position = _find_content(read(start, _HEAD_BYTES), start, end, _FIRST) if length else end
     while position < end:
         head = read(position, _ENTRY_HEAD_BYTES)
-        size, used = _delimited(head, 0, _FIRST)
-        name_length, name_start = _delimited(head, used, _FIRST)
+        size, used = _parse_field_head(head, 0, _FIRST)
+        name_length, name_start = _parse_field_head(head, used, _FIRST)
         name_end = name_start + name_length
-        feature_length, feature_start = _delimited(head, name_end, _SECOND)
+        feature_length, feature_start = _parse_field_head(head, name_end, _SECOND)
         entry_end = position + used + size
         if position + feature_start + feature_length != entry_end or entry_end > end:
             raise NotAnExampleError(f"the parts of the feature at byte {position} do not fit together")
@@ -141,17 +141,17 @@ def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str,
         position = entry_end
 
 
-def item_places(read: Read, feature: Place, count: int | None = None) -> list[Place]:
+def find_items(read: ReadBytes, feature: ByteRange, count: int | None = None) -> list[ByteRange]:
     """Return the positions of all (or the first `count`) images or texts of a feature, without reading them.
 
     Raises:
         NotAnExampleError: The feature is not a list of bytes, or damaged.
     """
-    places: list[Place] = []
+    places: list[ByteRange] = []
     start, end = feature[0], sum(feature)
-    position = _content(read(start, _HEAD_BYTES), start, end, _FIRST) if start < end else end
+    position = _find_content(read(start, _HEAD_BYTES), start, end, _FIRST) if start < end else end
     while position < end and len(places) != count:
-        length, used = _delimited(read(position, _HEAD_BYTES), 0, _FIRST)
+        length, used = _parse_field_head(read(position, _HEAD_BYTES), 0, _FIRST)
         places.append((position + used, length))
         position += used + length
     if position > end:
@@ -168,12 +168,12 @@ def decode_feature(data: bytes) -> tuple[Kind | None, Sequence[Any] | np.ndarray
     if not data:
         return None, ()
     if data[0] == _FIRST:
-        places = item_places(lambda offset, length: data[offset : offset + length], (0, len(data)))
+        places = find_items(lambda offset, length: data[offset : offset + length], (0, len(data)))
         return "bytes_list", [data[offset : offset + length] for offset, length in places]
-    content = data[_content(data, 0, len(data), _SECOND if data[0] == _SECOND else _THIRD) :]
-    packed = content[_content(content, 0, len(content), _FIRST) :] if content else b""
+    content = data[_find_content(data, 0, len(data), _SECOND if data[0] == _SECOND else _THIRD) :]
+    packed = content[_find_content(content, 0, len(content), _FIRST) :] if content else b""
     if data[0] == _THIRD:
-        return "int64_list", _integers(packed)
+        return "int64_list", _decode_integers(packed)
     if len(packed) % 4:
         raise NotAnExampleError(f"{len(packed)} bytes of floats")
     return "float_list", np.frombuffer(packed, "<f4")
@@ -201,12 +201,12 @@ def encode_entry(name: str, kind: Kind, values: Sequence[Any] | np.ndarray) -> b
     elif kind == "float_list":
         content = encode_field(_FIRST, np.asarray(values, "<f4").tobytes()) if len(values) else b""
     else:
-        content = encode_field(_FIRST, b"".join(_varint_of(int(value)) for value in values)) if len(values) else b""
+        content = encode_field(_FIRST, b"".join(_encode_varint(int(value)) for value in values)) if len(values) else b""
     feature = encode_field((_KINDS.index(kind) + 1) << 3 | 2, content)
     return encode_field(_FIRST, encode_field(_FIRST, name.encode()) + encode_field(_SECOND, feature))
 
 
-def _truncated(where: str, size: int, needed: int) -> InputError:
+def _truncated_error(where: str, size: int, needed: int) -> InputError:
     found = f"the file ends after {size:,} bytes, within this record: it is truncated"
     return InputError(where=where, found=found, needed=f"at least {needed:,} bytes", fix="Download the file again")
 
@@ -219,34 +219,34 @@ def _mask(crc: int) -> int:
     return ((crc >> 15 | crc << 17) + _MASK_DELTA) & 0xFFFFFFFF
 
 
-def _delimited(data: bytes, place: int, tag: int) -> tuple[int, int]:
+def _parse_field_head(data: bytes, place: int, tag: int) -> tuple[int, int]:
     """Parse the head of a length-delimited field at an offset; return its length and the offset of its content."""
     if place < len(data) and data[place] == tag:
-        return _varint(data, place + 1)
+        return _decode_varint(data, place + 1)
     raise NotAnExampleError(f"no field {tag >> 3} where one must start")
 
 
-def _content(head: bytes, start: int, end: int, tag: int) -> int:
+def _find_content(head: bytes, start: int, end: int, tag: int) -> int:
     """Return the offset of the content of a field that must fill its message from `start` to `end`."""
-    length, used = _delimited(head, 0, tag)
+    length, used = _parse_field_head(head, 0, tag)
     if start + used + length != end:
         raise NotAnExampleError(f"the field at byte {start} does not end where its message does")
     return start + used
 
 
-def _integers(packed: bytes) -> Sequence[int] | np.ndarray:
+def _decode_integers(packed: bytes) -> Sequence[int] | np.ndarray:
     """Decode packed varints to signed 64-bit integers."""
     if packed.isascii():  # one byte each, as flags
         return np.frombuffer(packed, np.uint8)
     found, place = [], 0
     while place < len(packed):
-        value, place = _varint(packed, place)
+        value, place = _decode_varint(packed, place)
         value &= (1 << 64) - 1
         found.append(value - (1 << 64) if value >> 63 else value)
     return found
 
 
-def _varint(data: bytes, start: int) -> tuple[int, int]:
+def _decode_varint(data: bytes, start: int) -> tuple[int, int]:
     """Decode a varint; return its value and the offset of its end."""
     value = 0
     for place, byte in enumerate(data[start : start + _VARINT_BYTES]):
@@ -256,7 +256,7 @@ def _varint(data: bytes, start: int) -> tuple[int, int]:
     raise NotAnExampleError("a number does not end")
 
 
-def _varint_of(value: int) -> bytes:
+def _encode_varint(value: int) -> bytes:
     value &= (1 << 64) - 1
     digits = bytearray()
     while value >= 0x80:
@@ -267,4 +267,4 @@ def _varint_of(value: int) -> bytes:
 
 def encode_field(tag: int, content: bytes) -> bytes:
     """Serialise a length-delimited field."""
-    return bytes([tag]) + _varint_of(len(content)) + content
+    return bytes([tag]) + _encode_varint(len(content)) + content
