@@ -159,7 +159,7 @@ def test_first_of_two_arms_is_guessed_and_unused_numbers_are_listed(
     parts = [name.removeprefix(chosen).strip("._") for name in selected_names]
     assert parts == [*ONE_ARM, "gripper"], selected_names
     assert pose["state"].is_guess
-    assert left_out in pose["state"].reason.split("left out:")[1]
+    assert left_out in pose["state"].reason.split("Unused:")[1]
     assert "states: vector" in pose["state"].reason
 
 

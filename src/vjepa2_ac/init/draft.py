@@ -233,7 +233,7 @@ def _make_data_section(data: DatasetProperties, machine: Machine, model: ModelCh
     stride = max(1, round(data.rate_hz.value * _MODEL_STEP_S))
     stride_reason = (
         f"{stride / data.rate_hz.value:.2f} s per model step at {data.rate_hz.value:g} control steps per second; "
-        "the released model may suit 0.27, 0.53 or 1 s: compare with `data calibrate`"
+        "the released model may suit 0.27, 0.53 or 1 s, which `data calibrate` compares"
     )
     size = (data.steps or math.inf) * model.bytes_per_frame
     is_cached = size <= machine.free_bytes * _CACHE_SHARE
@@ -268,7 +268,7 @@ def _make_model_section(model: ModelChoice, machine: Machine) -> DraftValues:
     path = DraftValue(model.path, ": ".join(model.download or ()))
     if model.is_scratch:
         return {
-            "base": DraftValue(RANDOM, "a new predictor, initialised so that it copies the last frame"),
+            "base": DraftValue(RANDOM, "a new predictor, initialised close to copying the last frame"),
             "encoder": {"path": path} if model.is_tiny else {"path": path, "frame": DraftValue("tubelet")},
             "sizes": _make_predictor_sizes(model),
             "dtype": dtype,

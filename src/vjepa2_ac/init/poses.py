@@ -120,7 +120,9 @@ def select_vector_state(columns: Mapping[str, Column], where: str) -> dict[str, 
             needed="columns of the robot's state, named observation… or state, of type float, int or bool",
         )
     chosen = max(measured, key=lambda name: (_last_part(name) == "state", columns[name].width))
-    reason = f"{columns[chosen].width} numbers; no pose was recognised; columns: {', '.join(measured)}"
+    reason = (
+        f"no pose was recognised. This column has {columns[chosen].width} numbers. All columns: {', '.join(measured)}"
+    )
     return {"state": DraftValue([chosen], reason, is_guess=True)}
 
 
@@ -301,24 +303,24 @@ def _make_pose_values(
     names = dict.fromkeys(re.sub(r"\[\d+\]$", "", number.name) for number in chosen)
     reason = f"recognised by the names {', '.join(names)}"
     if unnamed_columns:
-        reason = "recognised by the number of values: the names do not match a quaternion"
+        reason = "recognised by the number of values, because the names do not match a quaternion"
         if not all(column.names for column in unnamed_columns):
             reason = "recognised by the number of values, which have no names"
-        reason += "; if they are joint positions, set states: vector"
+        doubts.append("If they are joint positions, set states: vector")
     if chosen[-1].group not in {group, ""}:
-        doubts.append(f"the gripper is {chosen[-1].name}")
+        doubts.append(f"The gripper is {chosen[-1].name}")
     if _is_not_measured(chosen):
-        doubts.append(f"no measured pose was found, {group or chosen[0].name} may be commanded or relative")
+        doubts.append(f"No measured pose was found: {group or chosen[0].name} may be commanded or relative")
     elif not _HAND.fullmatch(group):
-        doubts.append(f"if {group} is not the end effector, set states: vector")
+        doubts.append(f"If {group} is not the end effector, set states: vector")
     if unused:
         shown = ", ".join(unused[:8]) + (", …" if len(unused) > 8 else "")
-        doubts.append(f"left out: {shown}; to use all numbers, set states: vector")
-    reason = "; ".join([reason, *doubts])
+        doubts += [f"Unused: {shown}", "To use all numbers, set states: vector"]
+    reason = ". ".join([reason, *doubts])
     is_guess = bool(unnamed_columns or doubts)
     keys = {"state": DraftValue(pose_columns, reason, is_guess)}
     if select != list(range(len(concatenated))):
-        keys["select"] = DraftValue(select, reason, is_guess)
+        keys["select"] = DraftValue(select, "indices of the pose's numbers in the columns of state", is_guess)
     keys["rotation"] = _choose_rotation_format(chosen[3:-1], samples, control_rate_hz)
     unit = _choose_position_unit(chosen[:3], samples)
     return keys if unit.value == "m" else {**keys, "position_unit": unit}
@@ -339,21 +341,21 @@ def _measure_magnitude(values: Sequence[Numbers]) -> float:
 def _choose_rotation_format(rotation: _Numbers, samples: Samples, control_rate_hz: float) -> DraftValue:
     if len(rotation) == 4:
         is_guess = rotation[-1].axis != "w"
-        reason = "w last; alternative: quaternion_wxyz (w first), which the values cannot rule out" if is_guess else ""
+        reason = "w is last; quaternion_wxyz (w first) is also possible" if is_guess else ""
         return DraftValue("quaternion_xyzw", reason, is_guess)
     formats = [name for name in FORMATS if name == rotation[0].kind]
     if not formats:  # UR robots write rotation vectors as rx, ry, rz; Euler angles usually are roll, pitch, yaw
         is_r = re.search(r"(?:^|_)r[xyz]$", _to_snake_case(rotation[0].name))
         formats = ["rotation_vector", "euler_xyz"] if is_r else ["euler_xyz", "rotation_vector"]
     values, proposed, is_guess = _get_finite_values(rotation, samples), formats[0], len(formats) > 1
-    reason = f"alternative: {formats[1]}; the names fit both" if is_guess else ""
+    reason = f"{formats[1]} is also possible" if is_guess else ""
     if is_guess and not values:
-        reason += "; the values were not read"
+        reason += ". The values were not read"
     largest = _measure_magnitude(values)
     if proposed != "euler_xyz_degrees" and largest > ANGLE_RAD:
         reason = f"the values reach {largest:.0f}, which is too large for radians"
         if proposed == "rotation_vector":
-            reason += "; rotation vectors in degrees are not supported"
+            reason += ". Rotation vectors in degrees are not supported"
         return DraftValue("euler_xyz_degrees", reason, is_guess or proposed == "rotation_vector")
     values = [episode[abs(episode).max(axis=1) <= max(largest, ANGLE_RAD)] for episode in values]
     smoother = (
@@ -407,7 +409,7 @@ def guess_gripper_values(name: str, ranges: Range | None) -> dict[str, DraftValu
                 "gripper_open": DraftValue(opened, f"recognised by the name {name}"),
                 "gripper_closed": DraftValue(closed),
             }
-    reason = f"{reason}; `data check CONFIG --model RUN_OR_MODEL` detects an inverted gripper"
+    reason = f"{reason}. `data check CONFIG --model RUN_OR_MODEL` detects an inverted gripper"
     return {
         "gripper_open": DraftValue(opened, reason, is_guess=True),
         "gripper_closed": DraftValue(closed, "see gripper_open", is_guess=True),

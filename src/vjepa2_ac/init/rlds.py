@@ -120,7 +120,7 @@ def read_rlds_properties(path: str) -> DatasetProperties:
         states="pose" if pose else "vector",
         episodes=episodes,
         idle=make_idle_section(has_velocities=has_velocities) if pose else None,
-        descriptions=(f"RLDS {name}, {counted(episodes, 'episode')}, {control_rate}",)
+        descriptions=(f"RLDS ({name}), {counted(episodes, 'episode')}, {control_rate}",)
         + ((f"unused depth maps: {', '.join(depth)}",) if depth else ()),
     )
 
