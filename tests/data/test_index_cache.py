@@ -59,7 +59,7 @@ def test_an_index_of_a_folder_is_found_wherever_it_is_moved_and_its_problems_are
     kept(tmp_path, table=broken)
     table = kept(tmp_path, index_key({"files": 3}, "/mnt/set"), "/mnt/set")
     assert [problem.where for problem in table.problems] == ["/mnt/set/a.npz: x"]
-    others = [index_key({"files": 4}, "/data/set"), index_key({"files": 3}, "/data/set", named="other/success")]
+    others = [index_key({"files": 4}, "/data/set"), index_key({"files": 3}, "/data/set", identity="other/success")]
     others += [index_key({"files": 3}, f"gs://{bucket}/set") for bucket in "ab"]  # servers say little of versions
     assert len({KEY, *others}) == 5
 

@@ -121,7 +121,7 @@ def test_an_error_of_an_actor_is_the_error_that_one_process_would_end_with(start
 def test_an_actor_that_does_not_see_the_folder_or_sees_another_cache_there_says_so(
     make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(encode_dataset, "_LONGEST_UNSEEN_S", 0.0)
+    monkeypatch.setattr(encode_dataset, "_VISIBILITY_TIMEOUT_S", 0.0)
     config = make_config()
     wanted = _Task(list(needed_frames(open_dataset(config.data))))
     encode_config(make_config(data__crop="square"), out=tmp_path / "other")

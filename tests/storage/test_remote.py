@@ -173,7 +173,7 @@ def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     for name in ("STORAGE_EMULATOR_HOST", "GOOGLE_APPLICATION_CREDENTIALS"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("CLOUDSDK_CONFIG", str(tmp_path))
-    monkeypatch.setattr(remote, "_MACHINE", tmp_path / "product_name")
+    monkeypatch.setattr(remote, "_PRODUCT_NAME_FILE", tmp_path / "product_name")
     return tmp_path
 
 

@@ -36,7 +36,7 @@ Frames = Iterable[UInt8[np.ndarray, "height width 3"]]
 Statistics = dict[str, np.ndarray]
 """min, max, mean, std, count and quantiles of a feature, by LeRobot's names."""
 
-_FORM = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "lerobot" / "v30.json"
+_TEMPLATE = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "lerobot" / "v30.json"
 _TASK = "__index_level_0__"  # the task texts are the index of a pandas table, by which LeRobot looks tasks up
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _CRF, _KEY_FRAME_EVERY = 18, 2
@@ -80,7 +80,7 @@ def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> 
     ):
         for done, index in enumerate(episodes, start=1):
             try:
-                _add(writer, dataset, index, has_success=bool(is_known.all()))
+                _write_episode(writer, dataset, index, has_success=bool(is_known.all()))
             except InputError as error:
                 dataset.skip_episode(index, error)
             progress(done, len(episodes))
@@ -88,13 +88,13 @@ def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> 
     return writer.num_episodes, writer.num_steps
 
 
-def _add(writer: LeRobotWriter, dataset: Dataset, index: int, *, has_success: bool) -> None:
+def _write_episode(writer: LeRobotWriter, dataset: Dataset, index: int, *, has_success: bool) -> None:
     by_camera = {camera: dataset.read(index, camera) for camera in dataset.config.cameras}
     recording = next(iter(by_camera.values()))
     columns = {STATE: recording.states.astype(np.float32), ACTION: _actions(recording, dataset)}
     if has_success:
         columns[SUCCESS] = np.full((len(recording.states), 1), dataset.table[index].success)
-    frames = {CAMERA + camera: _frames(one) for camera, one in by_camera.items()}
+    frames = {CAMERA + camera: _frames(episode) for camera, episode in by_camera.items()}
     writer.add(columns, frames, recording.metadata.get("language", ""))
 
 
@@ -123,7 +123,7 @@ class LeRobotWriter:
     """
 
     def __init__(self, folder: Path, rate_hz: float, names: Mapping[str, Sequence[str]]) -> None:
-        self._folder, self._names, self._form = folder, names, json.loads(_FORM.read_text())
+        self._folder, self._names, self._template = folder, names, json.loads(_TEMPLATE.read_text())
         self._pa = import_pyarrow("data convert")
         self._rate_hz = int(rate_hz) if float(rate_hz).is_integer() else rate_hz  # LeRobot writes integers
         self._features: dict[str, Any] = {}
@@ -159,29 +159,29 @@ class LeRobotWriter:
             about = {"dtype": str(values.dtype), "shape": [values.shape[1]], "names": self._names.get(name)}
             self._features.setdefault(name, about)
         statistics = {name: compute_statistics(values) for name, values in columns.items()}
-        row = {"episode_index": number, "tasks": [task], "length": steps, **_place("data", 0, 0)}
+        row = {"episode_index": number, "tasks": [task], "length": steps, **_file_indices("data", 0, 0)}
         row |= {"dataset_from_index": start, "dataset_to_index": start + steps}
-        chunk, file = divmod(number, self._form["info"]["chunks_size"])
+        chunk, file = divmod(number, self._template["info"]["chunks_size"])
         videos = {
-            key: self._folder / fill_template(self._form["info"]["video_path"], chunk, file, key) for key in frames
+            key: self._folder / fill_template(self._template["info"]["video_path"], chunk, file, key) for key in frames
         }
         try:
             for key, path in videos.items():
                 statistics[key] = self._write_video(path, key, frames[key], steps)
                 times = {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": steps / self._rate_hz}
-                row |= {**_place(f"videos/{key}", chunk, file), **times}
+                row |= {**_file_indices(f"videos/{key}", chunk, file), **times}
         except BaseException:
             for path in videos.values():
                 path.unlink(missing_ok=True)
             raise
         rows = {name: self._column(values) for name, values in columns.items()}
-        self._append(fill_template(self._form["info"]["data_path"], 0, 0), rows)
+        self._append(fill_template(self._template["info"]["data_path"], 0, 0), rows)
         for name, new in statistics.items():
             row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in new.items()}
             self._statistics[name] = (
                 combine_statistics(self._statistics[name], new) if name in self._statistics else new
             )
-        self._rows.append(row | _place("meta/episodes", 0, 0))
+        self._rows.append(row | _file_indices("meta/episodes", 0, 0))
         self._tasks.setdefault(task, len(self._tasks))
         self.num_episodes, self.num_steps = number + 1, start + steps
         if len(self._rows) == _EPISODES_AT_ONCE:
@@ -190,11 +190,11 @@ class LeRobotWriter:
     def finish(self) -> None:
         """Write the metadata of the data set, meta/info.json last."""
         self._write_rows()
-        pandas = {"pandas": json.dumps(self._form["pandas_of_tasks"])}
+        pandas = {"pandas": json.dumps(self._template["pandas_of_tasks"])}
         self._append("meta/tasks.parquet", {"task_index": [*self._tasks.values()], _TASK: [*self._tasks]}, pandas)
         self.close()
         counts = {"episodes": self.num_episodes, "frames": self.num_steps, "tasks": len(self._tasks)}
-        info = self._form["info"] | {f"total_{name}": count for name, count in counts.items()}
+        info = self._template["info"] | {f"total_{name}": count for name, count in counts.items()}
         info |= {"fps": self._rate_hz, "splits": {"train": f"0:{self.num_episodes}"}, "features": self._features}
         for name, content in (("meta/stats.json", self._statistics), (INFO, info)):
             storage.write_atomically(self._folder / name, json.dumps(content, indent=4, default=np.ndarray.tolist))
@@ -211,9 +211,9 @@ class LeRobotWriter:
         def sampled() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
             for step, frame in enumerate(frames):
                 height, width = (size // 2 * 2 for size in frame.shape[:2])
-                of_first = self._features.setdefault(key, self._camera(height, width))["shape"]
-                if of_first[:2] != [height, width]:
-                    needed = f"{of_first[0]}x{of_first[1]}, as in the first episode"
+                first_shape = self._features.setdefault(key, self._camera(height, width))["shape"]
+                if first_shape[:2] != [height, width]:
+                    needed = f"{first_shape[0]}x{first_shape[1]}, as in the first episode"
                     fix = "Convert recordings of different cameras to different data sets"
                     raise InputError(where=key, found=f"frames of {height}x{width}", needed=needed, fix=fix)
                 if step % (steps // _SAMPLED_FRAMES + 1) == 0:
@@ -222,13 +222,15 @@ class LeRobotWriter:
                 yield frame
 
         write_video(path, sampled(), rate_hz=float(self._rate_hz), crf=_CRF, key_frame_every=_KEY_FRAME_EVERY)
-        of_pixels = compute_statistics(np.stack(sample).reshape(-1, 3) / 255) | {"count": np.array([len(sample)])}
-        return {name: value if name == "count" else value.reshape(3, 1, 1) for name, value in of_pixels.items()}
+        pixel_statistics = compute_statistics(np.stack(sample).reshape(-1, 3) / 255) | {
+            "count": np.array([len(sample)])
+        }
+        return {name: value if name == "count" else value.reshape(3, 1, 1) for name, value in pixel_statistics.items()}
 
     def _camera(self, height: int, width: int) -> dict[str, Any]:
         sizes = {"video.height": height, "video.width": width, "video.fps": self._rate_hz}
         shape, names = [height, width, 3], ["height", "width", "channels"]
-        return {"dtype": "video", "shape": shape, "names": names, "info": self._form["camera"] | sizes}
+        return {"dtype": "video", "shape": shape, "names": names, "info": self._template["camera"] | sizes}
 
     def _column(self, values: Shaped[np.ndarray, "steps numbers"]) -> Any:
         flat, width = self._pa.array(values.ravel()), values.shape[1]
@@ -261,11 +263,11 @@ def combine_statistics(known: Statistics, new: Statistics) -> Statistics:
     """Combine the statistics of two sets of steps; quantiles are averaged with weights, as in LeRobot."""
     share = new["count"] / (known["count"] + new["count"])
     averages = {name: known[name] + (new[name] - known[name]) * share for name in ("mean", *_QUANTILES)}
-    variances = [one["std"] ** 2 + (one["mean"] - averages["mean"]) ** 2 for one in (known, new)]
+    variances = [part["std"] ** 2 + (part["mean"] - averages["mean"]) ** 2 for part in (known, new)]
     std, count = np.sqrt(variances[0] * (1 - share) + variances[1] * share), known["count"] + new["count"]
     extremes = {"min": np.minimum(known["min"], new["min"]), "max": np.maximum(known["max"], new["max"])}
     return {**extremes, "std": std, "count": count, **averages}
 
 
-def _place(kind: str, chunk: int, file: int) -> dict[str, Any]:
+def _file_indices(kind: str, chunk: int, file: int) -> dict[str, Any]:
     return {f"{kind}/chunk_index": chunk, f"{kind}/file_index": file}

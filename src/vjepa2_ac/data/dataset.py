@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # PyTorch is imported when clips are read
 
 logger = logging.getLogger(__name__)
 
-_MOST_EPISODES_READ = 8  # episodes to try in order to determine the widths
+_MAX_EPISODES_READ = 8  # episodes to try in order to determine the widths
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class Dataset:
     @cached_property
     def is_selected(self) -> Bool[np.ndarray, " episodes"]:
         """A mask of the episodes that are used; the idle filter may still remove all steps of such an episode."""
-        chosen = np.asarray(select_included(self.table, self.config) & select_outcome(self.table, self.config))
-        chosen[[index for index, _ in self.kept_steps.problems]] = False
-        return chosen
+        selected = np.asarray(select_included(self.table, self.config) & select_outcome(self.table, self.config))
+        selected[[index for index, _ in self.kept_steps.problems]] = False
+        return selected
 
     @property
     def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
@@ -162,8 +162,8 @@ class Dataset:
     def removed(self) -> tuple[Removed, ...]:
         """The parts that the filters removed, in the order of the filters."""
         not_excluded = select_included(self.table, self.config)
-        chosen = not_excluded & select_outcome(self.table, self.config)
-        masks = np.ones(len(self.table), bool), not_excluded, chosen, self.is_selected
+        selected = not_excluded & select_outcome(self.table, self.config)
+        masks = np.ones(len(self.table), bool), not_excluded, selected, self.is_selected
         left = [self._count(StepSelection.all_steps(self.table, mask)) for mask in masks]
         removed = -np.diff([*left, self._count(self.kept_steps)], axis=0)
         excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
@@ -216,7 +216,7 @@ class Dataset:
             return POSE_WIDTHS
         if widths := self.table.texts.get("widths"):
             return Widths(*map(int, widths.split()))
-        for episode in self.episodes[:_MOST_EPISODES_READ].tolist():
+        for episode in self.episodes[:_MAX_EPISODES_READ].tolist():
             with suppress(InputError):
                 return get_widths(self.source.read(episode))
         return get_widths(self.source.read(int(self.episodes[0])))
@@ -261,16 +261,16 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     """
     source: Any = open_source(config)
     table = EpisodeTable.from_infos(source.infos(progress))
-    chosen = select_included(table, config)
-    require_distinct(table, chosen, config)
-    chosen &= select_outcome(table, config)
-    broken = BrokenEpisodes(config, len(table) + len(table.problems), table.id_hash[chosen])
+    selected = select_included(table, config)
+    require_distinct(table, selected, config)
+    selected &= select_outcome(table, config)
+    broken = BrokenEpisodes(config, len(table) + len(table.problems), table.id_hash[selected])
     broken.record_problems([problem for problem in table.problems if problem.name not in config.exclude])
-    kept = StepSelection.all_steps(table, chosen)
+    kept = StepSelection.all_steps(table, selected)
     if config.idle.rule != "none":
         ranges = source.read_selected_steps() if config.is_cache else find_ranges(source, table, config, progress)
-        broken.record_problems([problem for index, problem in ranges.problems if chosen[index]])
-        kept = ranges.select_episodes(chosen)
+        broken.record_problems([problem for index, problem in ranges.problems if selected[index]])
+        kept = ranges.select_episodes(selected)
     dataset = Dataset(config, source, table, kept, broken)
     dataset = replace(dataset, groups=hash_groups(table, dataset.is_selected, config))
     if not len(dataset.episodes):

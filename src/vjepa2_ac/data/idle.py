@@ -77,21 +77,23 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     """
     where = f"data.idle.ranges: {path}"
     needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
-    another = "Use the list for this version of the data set, or set data.idle.rule: commands or motion"
-    lists = read_json_object(path, max_bytes=_MOST_BYTES, needed=needed)
+    fix = "Use the list for this version of the data set, or set data.idle.rule: commands or motion"
+    ranges_by_identity = read_json_object(path, max_bytes=_MOST_BYTES, needed=needed)
     names = [table.identity(index) for index in range(len(table))]
-    listed = sum(name in lists for name in names)
+    listed = sum(name in ranges_by_identity for name in names)
     if not listed:
-        first = next(iter(lists), "missing")
+        first = next(iter(ranges_by_identity), "missing")
         found = f"the list has none of the {counted(len(table), 'episode')} of the data set. Its first entry is {first}"
         needed = "the identities of the episodes" + (f", such as {names[0]}" if names else "")
-        raise InputError(where=where, found=found, needed=needed, fix=another)
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
     ranges: list[RangesOrProblem] = []
     for name, steps in zip(names, table.num_steps.tolist(), strict=True):
-        pairs = _pairs(lists.get(name, []), steps)
+        pairs = _pairs(ranges_by_identity.get(name, []), steps)
         if pairs is None:
             needed = f"pairs [start, end) of steps from 0 to {steps}, the episode's length, that do not overlap"
-            raise InputError(where=f"{where}: {name}", found=short_repr(lists[name]), needed=needed, fix=another)
+            raise InputError(
+                where=f"{where}: {name}", found=short_repr(ranges_by_identity[name]), needed=needed, fix=fix
+            )
         ranges.append(pairs)
     logger.log(
         logging.INFO if listed == len(table) else logging.WARNING,

@@ -210,7 +210,9 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             columns = {name: arrays[name] for name in _COLUMNS}
             unknown = np.array([_NO_MOTION for _ in columns["ids"]], np.float32)
             columns |= {_MOTION: arrays.get(_MOTION, unknown).reshape(-1, len(_NO_MOTION))}
-            locators = {name.removeprefix(_LOCATOR): one for name, one in arrays.items() if name.startswith(_LOCATOR)}
+            locators = {
+                name.removeprefix(_LOCATOR): column for name, column in arrays.items() if name.startswith(_LOCATOR)
+            }
             table = cls(
                 **columns,
                 problems=tuple(EpisodeProblem(**problem) for problem in text["problems"]),
@@ -362,7 +364,7 @@ def hash_key(parts: Mapping[str, object]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def index_key(parts: Mapping[str, object], place: str, *, named: str = "") -> str:
+def index_key(parts: Mapping[str, object], path: str, *, identity: str = "") -> str:
     """Return the key of an index, on which the keys of other cached data of its episodes depend.
 
     A local folder is identified by its content, so that it may be moved. For a URL the path is part of the key, too,
@@ -370,10 +372,10 @@ def index_key(parts: Mapping[str, object], place: str, *, named: str = "") -> st
 
     Args:
         parts: The files of the data set, and how they are read.
-        place: The folder of the data set.
-        named: An episode's identity, if identities depend on the name of the folder.
+        path: The folder of the data set.
+        identity: An episode's identity, if identities depend on the name of the folder.
     """
-    return hash_key({**parts, "path": place} if storage.is_url(place) else {**parts, "named": named})
+    return hash_key({**parts, "path": path} if storage.is_url(path) else {**parts, "named": identity})
 
 
 def compute_fingerprint(table: EpisodeTable) -> str:
@@ -381,14 +383,12 @@ def compute_fingerprint(table: EpisodeTable) -> str:
     return table.texts.get("index") or hashlib.sha256(table.to_bytes()).hexdigest()
 
 
-def get_or_build_index(
-    config: DiskCacheConfig, key: str, place: str, build: Callable[[], EpisodeTable]
-) -> EpisodeTable:
+def get_or_build_index(config: DiskCacheConfig, key: str, path: str, build: Callable[[], EpisodeTable]) -> EpisodeTable:
     """Return the table cached under a key; build and cache it if it is missing or damaged. `texts` contains the key.
 
-    If the data set was moved, paths in cached problems are rewritten from the old folder to `place`.
+    If the data set was moved, paths in cached problems are rewritten from the old folder to `path`.
     """
-    folder = storage.canonical_path(place)
+    folder = storage.canonical_path(path)
 
     def build_with_key() -> EpisodeTable:
         table = build()

@@ -110,11 +110,11 @@ def training_loader(
     Raises:
         InputError: There are no training clips, or a clip cannot be read, also in a worker.
     """
-    both = dataset if isinstance(dataset, MixedDataset) else MixedDataset(dataset)
-    dataset, replayed = both.dataset, both.replayed
+    mixed = dataset if isinstance(dataset, MixedDataset) else MixedDataset(dataset)
+    dataset, replayed = mixed.dataset, mixed.replayed
     clips = _training_clips(dataset, seed)
     if replayed is not None:
-        clips = replace(clips, replayed=_training_clips(replayed, seed), share=Fraction(str(both.share)))
+        clips = replace(clips, replayed=_training_clips(replayed, seed), share=Fraction(str(mixed.share)))
     firsts = first_positions(share, batch_size, start=start_position)
     rows = (list(range(first, first + batch_size)) for first in firsts)
     micro_batches = map_in_workers(clips, rows, dataset.config.workers, pinned=pinned)
@@ -175,7 +175,7 @@ def read_batches(
     count, empty = len(windows), not allow_empty
     rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
     workers = dataset.config.workers if count >= MIN_CLIPS_FOR_WORKERS else 0
-    clips = _MicroBatches(dataset, partial(_chosen_clip, dataset, windows))
+    clips = _MicroBatches(dataset, partial(_window_request, dataset, windows))
     for batch in Batches(map_in_workers(clips, iter(rows), workers), dataset.broken):
         if batch.starts:
             empty = False
@@ -186,7 +186,7 @@ def read_batches(
         raise InputError(where=f"data.path: {dataset.config.path}", found=found, fix=fix)
 
 
-def _chosen_clip(dataset: Dataset, windows: Sequence[tuple[int, int]], position: int) -> ClipRequest:
+def _window_request(dataset: Dataset, windows: Sequence[tuple[int, int]], position: int) -> ClipRequest:
     return dataset.clip_request(windows[position])
 
 

@@ -109,11 +109,11 @@ def require_selection(
     Raises:
         InputError: Names the config key to change.
     """
-    place = f"{episode}: {section}" if episode else section
-    source, where = " + ".join(columns), f"{place}.state"
+    section_path = f"{episode}: {section}" if episode else section
+    source, where = " + ".join(columns), f"{section_path}.state"
     count = width = sum(columns.values())
     if fields.select is not None:
-        where, count = f"{place}.select", len(fields.select)
+        where, count = f"{section_path}.select", len(fields.select)
         if beyond := [number for number in fields.select if number >= width]:
             found = f"index {beyond[0]}, but {source} has {counted(width, 'number')}"
             raise InputError(where=where, found=found, needed=f"indices from 0 to {width - 1}")
@@ -175,16 +175,19 @@ def measure_rotation_speeds(
     Returns:
         Speeds by format. Formats in radians are absent if a number is too large for radians.
     """
-    numbers = [_without_repetitions(one) for one in episodes]
-    numbers = [one for one in numbers if len(one) > 1]
-    largest = max((float(abs(one).max()) for one in numbers), default=0.0)
-    jumps = [_jumps_in(one) for one in numbers]
+    numbers = [_without_repetitions(episode) for episode in episodes]
+    numbers = [episode for episode in numbers if len(episode) > 1]
+    largest = max((float(abs(episode).max()) for episode in numbers), default=0.0)
+    jumps = [_find_jumps(episode) for episode in numbers]
     speeds: dict[RotationFormat, RotationSpeeds] = {}
     for written_as in FORMATS:
         if written_as != "euler_xyz_degrees" and largest > ANGLE_RAD:
             continue
-        angles = [_step_angles(one, written_as) for one in numbers]
-        ratios = [_relative_to_neighbours(one, at) for one, at in zip(angles, jumps, strict=True)]
+        angles = [_step_angles(episode, written_as) for episode in numbers]
+        ratios = [
+            _relative_to_neighbours(episode_angles, is_jump)
+            for episode_angles, is_jump in zip(angles, jumps, strict=True)
+        ]
         median = float(np.median(np.concatenate(angles))) * control_rate_hz if angles else 0.0
         speeds[written_as] = RotationSpeeds(median, np.concatenate([np.zeros(0), *ratios]))
     return speeds
@@ -210,7 +213,7 @@ def find_smoother_format(
     configured = speeds.get(written_as)
     if configured is None or configured.median_rad_s > max_rad_s:
         return "euler_xyz_degrees" if written_as != "euler_xyz_degrees" else None
-    gains = {other: one.num_smoother_than(configured) for other, one in speeds.items()}
+    gains = {other: other_speeds.num_smoother_than(configured) for other, other_speeds in speeds.items()}
     clear = [
         other
         for other, gain in gains.items()
@@ -224,7 +227,7 @@ def _without_repetitions(numbers: Float[np.ndarray, "steps 3"]) -> Float[np.ndar
     return numbers[np.append(np.diff(numbers, axis=0).any(axis=1), True)] if len(numbers) else numbers
 
 
-def _jumps_in(numbers: Float[np.ndarray, "steps 3"]) -> Bool[np.ndarray, " changes"]:
+def _find_jumps(numbers: Float[np.ndarray, "steps 3"]) -> Bool[np.ndarray, " changes"]:
     change = np.linalg.norm(np.diff(numbers, axis=0), axis=1)
     return np.asarray(change > max(_JUMP, _JUMP_RATIO * float(np.median(change))))
 

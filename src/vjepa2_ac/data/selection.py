@@ -25,7 +25,7 @@ SPLIT_LABEL = "split"  # label of an episode: the name of its split in the data 
 
 _HELD_OUT: tuple[Split, ...] = ("validation", "test")
 _ROLES: dict[str, Split] = {"val": "validation", "valid": "validation", "validation": "validation", "test": "test"}
-_FEWEST_GROUPS = 3  # one per split
+_MIN_GROUPS = 3  # one per split
 
 Members = Bool[np.ndarray, " episodes"]
 
@@ -156,7 +156,7 @@ class BrokenEpisodes:
         Raises:
             InputError: Too many episodes are broken in total.
         """
-        self._add({name: why for name, why in reasons.items() if name not in self._config.exclude})
+        self._add({name: reason for name, reason in reasons.items() if name not in self._config.exclude})
 
     def add_fix(self, error: InputError, names: Sequence[str]) -> InputError:
         """Return an error about broken episodes whose fix names the config keys that would leave them out.
@@ -176,7 +176,7 @@ class BrokenEpisodes:
         return add_exclusion_fix(error, names, is_skippable=is_few and self._config.broken_episodes == "error")
 
     def _add(self, reasons: Mapping[str, str]) -> None:
-        new = {name: why for name, why in reasons.items() if name not in self.reasons}
+        new = {name: reason for name, reason in reasons.items() if name not in self.reasons}
         self.reasons = {**self.reasons, **new}  # a new dict, because a checkpoint may be writing the old one
         if len(self) <= (allowed := max_broken(self._episodes)):
             return
@@ -271,9 +271,9 @@ def select_split(
     held_out = held_out_splits(table, config)
     if split in held_out:
         return np.asarray(among & held_out[split])
-    shares = {f"{own}_share": 0.0 for own in held_out}
-    left = among & ~np.any([*held_out.values()], axis=0) if held_out else among
-    return draw_split(split_hash, config.model_copy(update=shares), split, left)
+    shares = {f"{split_name}_share": 0.0 for split_name in held_out}
+    remaining = among & ~np.any([*held_out.values()], axis=0) if held_out else among
+    return draw_split(split_hash, config.model_copy(update=shares), split, remaining)
 
 
 def draw_split(
@@ -307,14 +307,14 @@ def _bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[f
     `groups` holds the numbers of all groups, sorted.
     """
     test, held_out = config.test_share, config.test_share + config.validation_share
-    if len(groups) < _FEWEST_GROUPS:
+    if len(groups) < _MIN_GROUPS:
         return test, held_out
     if config.test_share > 0 and not (groups < test).any():
         test = float(np.nextafter(groups[0], 2.0))
     held_out = max(test, held_out)
-    left = groups[groups >= test]
-    if config.validation_share > 0 and len(left) > 1 and not (left < held_out).any():
-        held_out = float(np.nextafter(left[0], 2.0))
+    remaining = groups[groups >= test]
+    if config.validation_share > 0 and len(remaining) > 1 and not (remaining < held_out).any():
+        held_out = float(np.nextafter(remaining[0], 2.0))
     return test, held_out
 
 

@@ -155,19 +155,21 @@ class ClipTransforms:
         for number, (name, transform) in enumerate(self.transforms):
             before, generator = clip, np.random.default_rng([_STREAM, number, self.seed, position])
             clip = transform(before, generator)
-            _require_same_form(clip, before, name)
+            _require_same_shapes(clip, before, name)
         return clip
 
 
-def _require_same_form(result: object, before: Clip, name: str) -> None:
+def _require_same_shapes(result: object, before: Clip, name: str) -> None:
     """Refuse the result of a transform if shapes or types differ from its input; the size of frames may differ."""
-    found, needed = ([_form(clip, part) for part in ("frames", "states", "actions")] for clip in (result, before))
-    for form, required_form in zip(found, needed, strict=True):
-        if form != required_form:
-            raise InputError(where=f"data.transforms: {name}", found=form, needed=required_form)
+    found, needed = (
+        [_describe_array(clip, part) for part in ("frames", "states", "actions")] for clip in (result, before)
+    )
+    for described, required in zip(found, needed, strict=True):
+        if described != required:
+            raise InputError(where=f"data.transforms: {name}", found=described, needed=required)
 
 
-def _form(clip: object, part: str) -> str:
+def _describe_array(clip: object, part: str) -> str:
     array = np.asarray(getattr(clip, part, None))
     shape = [str(size) for size in array.shape]
     if part == "frames":

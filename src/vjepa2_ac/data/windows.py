@@ -70,17 +70,19 @@ class Windows:
         return np.unique(self.episode)
 
 
-def find_clip_windows(table: EpisodeTable, kept: StepSelection, config: DataConfig) -> Windows:
+def find_clip_windows(table: EpisodeTable, kept_steps: StepSelection, config: DataConfig) -> Windows:
     """Return the windows of all clips that fit into the kept ranges.
 
     With `data.start_every` = n, clips start at every n-th step, counted from the first kept step of their episode.
     """
-    span = kept.end - kept.start - (config.clip_steps - 1)
+    span = kept_steps.end - kept_steps.start - (config.clip_steps - 1)
     phase = np.zeros(len(table), np.int32)
-    phase[kept.episode[::-1]] = kept.start[::-1]  # reversed, so that the first range of an episode is written last
-    skipped = (phase[kept.episode] - kept.start) % config.start_every
+    phase[kept_steps.episode[::-1]] = kept_steps.start[
+        ::-1
+    ]  # reversed, so that the first range of an episode is written last
+    skipped = (phase[kept_steps.episode] - kept_steps.start) % config.start_every
     count = -((skipped - span) // config.start_every)  # rounded up; 0 or less if no clip fits
-    runs = Windows(kept.episode, kept.start + skipped, count, config.start_every).select(count > 0)
+    runs = Windows(kept_steps.episode, kept_steps.start + skipped, count, config.start_every).select(count > 0)
     return runs.select(np.lexsort((runs.first, table.id_rank[runs.episode])))
 
 

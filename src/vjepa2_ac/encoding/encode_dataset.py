@@ -32,8 +32,8 @@ from vjepa2_ac.storage import free_bytes
 
 Engine = Callable[[Config, LatentCache, Sequence[FramesToEncode], Reporter], None]  # encodes the missing frames
 
-_LOOKS_EVERY_S = 1.0  # interval between checks for the files of other processes
-_LONGEST_UNSEEN_S = 60.0  # a new file in a network folder becomes visible to other machines within this time
+_POLL_S = 1.0  # interval between checks for the files of other processes
+_VISIBILITY_TIMEOUT_S = 60.0  # a new file in a network folder becomes visible to other machines within this time
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ def encode_config(
     require_encodable(config)
     device = select_device(config.training) if engine is None else torch.device("cpu")
     cache, model = open_cache(config, out, reporter)
-    left = cache.missing(retry=True)
-    if left and engine is not None:
-        engine(config, cache, left, reporter)
-    elif left:
+    missing = cache.missing(retry=True)
+    if missing and engine is not None:
+        engine(config, cache, missing, reporter)
+    elif missing:
         share = ProcessShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
-        encode_share(cache, left, EncoderOnDevice.from_model(config, model, device), share, reporter)
+        encode_share(cache, missing, EncoderOnDevice.from_model(config, model, device), share, reporter)
     else:
         cache.begin()
         reporter.note(
@@ -127,7 +127,7 @@ def require_encodable(config: Config) -> None:
         )
 
 
-def begin_encoding(cache: LatentCache, left: Sequence[FramesToEncode], reporter: Reporter) -> None:
+def begin_encoding(cache: LatentCache, missing: Sequence[FramesToEncode], reporter: Reporter) -> None:
     """Report the work, check the disk space or the URL, and create the files that describe the cache.
 
     Raises:
@@ -135,20 +135,20 @@ def begin_encoding(cache: LatentCache, left: Sequence[FramesToEncode], reporter:
         UnreachableError: The URL cannot be written.
     """
     config = cache.dataset.config
-    reporter.note(f"Encoding {config.path} as {config.cache_dtype}: {cache.summary(left)}")
+    reporter.note(f"Encoding {config.path} as {config.cache_dtype}: {cache.summary(missing)}")
     if isinstance(cache.folder, Path):
         free = f" ({free_bytes(cache.folder) / 1e9:.4g} GB free)"
     else:
         free = ""
         storage.check_writable(cache.folder)
     reporter.note(f"Writing the latents to {cache.folder}{free}")
-    cache.require_space(left)
+    cache.require_space(missing)
     cache.begin()
 
 
 def encode_share(
     cache: LatentCache,
-    left: Sequence[FramesToEncode],
+    missing: Sequence[FramesToEncode],
     encoder: EncoderOnDevice,
     share: ProcessShare,
     reporter: Reporter,
@@ -159,8 +159,8 @@ def encode_share(
         InputError: As `begin_encoding` and `encode_files`; or the processes together found too many broken episodes.
     """
     dataset = cache.dataset
-    begin_encoding(cache, left, reporter)
-    requests = [request for request in left if request.episode % share.processes == share.rank]
+    begin_encoding(cache, missing, reporter)
+    requests = [request for request in missing if request.episode % share.processes == share.rank]
     encode_files(dataset, requests, encoder, cache.files, reporter.task("encoding frames", "frames"))
     for number, reason in cache.broken.items():
         dataset.broken.record(dataset.table.identity(number), reason)
@@ -197,12 +197,12 @@ def use_latent_cache(
             _encode_together(
                 cache, partial(EncoderOnDevice.from_model, config, model, accelerator.device), accelerator, reporter
             )
-        elif left := cache.missing():
+        elif missing := cache.missing():
             cache.require_same_key()
-            cache.require_space(left)
-            frames = counted(count_frames(left), "frame")
+            cache.require_space(missing)
+            frames = counted(count_frames(missing), "frame")
             reporter.note(
-                f"Training will first encode {frames} into {cache.folder}. Complete cache: {cache.summary(left)}"
+                f"Training will first encode {frames} into {cache.folder}. Complete cache: {cache.summary(missing)}"
             )
             return dataset
     cached_dataset = cache.open_dataset()
@@ -238,8 +238,8 @@ def _encode_together(
         run_on_all(accelerator, lambda: require_shared(cache, lambda: cache.is_begun))
 
     def encode() -> None:
-        if left := cache.missing():
-            encode_share(cache, left, make_encoder(), share, reporter)
+        if missing := cache.missing():
+            encode_share(cache, missing, make_encoder(), share, reporter)
 
     run_on_all(accelerator, encode)
     if share.processes > 1:
@@ -256,10 +256,10 @@ def require_shared(cache: LatentCache, is_visible: Callable[[], bool]) -> None:
     Raises:
         InputError: The files are not visible after 60 s, which is longer than a network folder takes.
     """
-    end = time.monotonic() + _LONGEST_UNSEEN_S
+    end = time.monotonic() + _VISIBILITY_TIMEOUT_S
     while not is_visible():
         if time.monotonic() > end:
             found = "files of one process of the run are not visible to another process"
             fix = "Choose a folder that all machines of the run share, or run `vjepa2-ac encode` once on every machine"
             raise InputError(where=f"data.cache_dir: {cache.folder}", found=found, fix=fix)
-        time.sleep(_LOOKS_EVERY_S)
+        time.sleep(_POLL_S)

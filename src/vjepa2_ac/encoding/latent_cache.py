@@ -51,7 +51,7 @@ from vjepa2_ac.storage import free_bytes
 _GIGABYTE = 10**9
 FRAMES_AT_ONCE = 64  # decoded together: consecutive frames of a video, at most 180 MB at 720p
 _PREFETCHED_PARTS = 2  # per thread: one in progress and one ready
-_WRITES_UNDER_WAY = 2  # files at most, which limits the memory
+_MAX_PENDING_WRITES = 2  # files at most, which limits the memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,11 +152,11 @@ class LatentCache:
         latents = bytes_per_frame(encoding.tokens, encoding.dim, self.dataset.config.cache_dtype)
         return latents + image_bytes(encoding.image_size)
 
-    def summary(self, left: Sequence[FramesToEncode]) -> str:
-        """Return the number of frames and the size of the cache as text, and how many frames are left to encode."""
-        frames, num_left = count_frames(self.requests), count_frames(left)
+    def summary(self, missing: Sequence[FramesToEncode]) -> str:
+        """Return the number of frames and the size of the cache as text, and the number of frames to encode."""
+        frames, num_missing = count_frames(self.requests), count_frames(missing)
         size = f"{counted(frames, 'frame')} ({frames * self.bytes_per_frame / _GIGABYTE:.3g} GB)"
-        return size if num_left == frames else f"{size}; {frames - num_left:,} cached, {num_left:,} to encode"
+        return size if num_missing == frames else f"{size}; {frames - num_missing:,} cached, {num_missing:,} to encode"
 
     def require_same_key(self) -> None:
         """Refuse a folder that holds another cache or other files.
@@ -185,7 +185,7 @@ class LatentCache:
         for name, data in {**content, EPISODES_FILE: table.to_bytes()}.items():
             storage.write(storage.join(self.folder, name), data)
 
-    def require_space(self, left: Sequence[FramesToEncode]) -> None:
+    def require_space(self, missing: Sequence[FramesToEncode]) -> None:
         """Refuse to start if the local disk has too little space for the missing frames; URLs are not checked.
 
         Raises:
@@ -197,7 +197,7 @@ class LatentCache:
             f"Set data.cache_dtype: int8 or data.start_every: {self.dataset.config.model_stride}, use fewer episodes"
             " (data.outcome, data.idle, data.exclude), or set data.cache_dir to a folder on a larger disk"
         )
-        require_space(self.folder, count_frames(left), self.bytes_per_frame, fix=fix)
+        require_space(self.folder, count_frames(missing), self.bytes_per_frame, fix=fix)
 
     def open_dataset(self) -> Dataset:
         """Return the same data set, with the same clips in the same order, read as latents from this cache.
@@ -207,13 +207,15 @@ class LatentCache:
         """
         if self.is_begun:
             return open_cached_latents(self.dataset, self.folder)
-        parent, others = str(self.folder).rpartition("/")[0], []
+        parent, other_caches = str(self.folder).rpartition("/")[0], []
         for name in storage.list_names(parent):
             if storage.exists(storage.join(other := storage.join(parent, name), CACHE_FILE)):
                 differing = read_cache_key(other).list_differences(self.key.parts)
-                others.append((len(differing), f"{name}, which differs: {'; '.join(differing)}"))
+                other_caches.append((len(differing), f"{name}, which differs: {'; '.join(differing)}"))
         nearest = (
-            f". Number of other caches in its folder: {len(others)}. Most similar: {min(others)[1]}" if others else ""
+            f". Number of other caches in its folder: {len(other_caches)}. Most similar: {min(other_caches)[1]}"
+            if other_caches
+            else ""
         )
         where = f"data.cache: {self.dataset.config.cache}: {self.folder}"
         found = f"no latent cache for this model and these settings{nearest}"
@@ -221,9 +223,9 @@ class LatentCache:
         raise InputError(where=where, found=found, fix=fix)
 
 
-def count_frames(wanted: Sequence[FramesToEncode]) -> int:
+def count_frames(requests: Sequence[FramesToEncode]) -> int:
     """Return the total number of frames of some requests."""
-    return sum(len(request.steps) for request in wanted)
+    return sum(len(request.steps) for request in requests)
 
 
 def image_bytes(image_size: int) -> int:
@@ -281,7 +283,7 @@ _Parts = Iterator[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]  # con
 
 def encode_files(
     dataset: Dataset,
-    wanted: Sequence[FramesToEncode],
+    requests: Sequence[FramesToEncode],
     encoder: EncoderOnDevice,
     files: LatentFiles,
     progress: Progress = no_progress,
@@ -295,7 +297,7 @@ def encode_files(
 
     Args:
         dataset: Source of the frames.
-        wanted: The requests.
+        requests: The requests.
         encoder: Computes the latents.
         files: The files of the cache.
         progress: Called with (done, total) in frames.
@@ -307,11 +309,11 @@ def encode_files(
         UnreachableError: A failure of the connection, not of the episode.
     """
     threads, writes = max(1, dataset.config.workers), deque[Future[None]]()
-    done, total = 0, count_frames(wanted)
+    done, total = 0, count_frames(requests)
     progress(done, total)
-    writers = _WRITES_UNDER_WAY if storage.is_url(files.folder) else 1
+    writers = _MAX_PENDING_WRITES if storage.is_url(files.folder) else 1
     with ThreadPoolExecutor(threads, "decode") as decoders, ThreadPoolExecutor(writers, "write") as writer:
-        parts_ahead = _parts(decoders, dataset, wanted, encoder, threads * _PREFETCHED_PARTS)
+        parts_ahead = _parts(decoders, dataset, requests, encoder, threads * _PREFETCHED_PARTS)
         try:
             for request, parts in groupby(parts_ahead, itemgetter(0)):
                 try:
@@ -323,7 +325,7 @@ def encode_files(
                     writes.append(
                         writer.submit(_write, files, request.episode, encoded, lossless_images=lossless_images)
                     )
-                while len(writes) > _WRITES_UNDER_WAY:
+                while len(writes) > _MAX_PENDING_WRITES:
                     writes.popleft().result()
                 done += len(request.steps)
                 progress(done, total)
@@ -336,27 +338,29 @@ def encode_files(
 def _parts(
     pool: ThreadPoolExecutor,
     dataset: Dataset,
-    wanted: Sequence[FramesToEncode],
+    requests: Sequence[FramesToEncode],
     encoder: EncoderOnDevice,
     ahead: int,
 ) -> _Parts:
     """Yield parts in the order of the requests, while threads read the next parts; each episode is opened once."""
     frames = encoder.chunk * max(1, FRAMES_AT_ONCE // encoder.chunk)  # whole chunks, except at the end of an episode
-    waiting = deque[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]()
-    for request in wanted:
+    queue = deque[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]()
+    for request in requests:
         recording = pool.submit(dataset.read, request.episode, request.camera)
         for first in range(0, len(request.steps), frames):
             steps = request.steps[first : first + frames].tolist()
             pinned = encoder.device.type == "cuda"
-            waiting.append((request, pool.submit(_read, dataset, recording, steps, pinned=pinned)))
-            if len(waiting) > ahead:
-                yield waiting.popleft()
-    while waiting:
-        yield waiting.popleft()
+            queue.append((request, pool.submit(_read, dataset, recording, steps, pinned=pinned)))
+            if len(queue) > ahead:
+                yield queue.popleft()
+    while queue:
+        yield queue.popleft()
 
 
-def _read(dataset: Dataset, opened: Future[Episode], steps: Sequence[int], *, pinned: bool) -> tuple[Episode, _Frames]:
-    recording = opened.result()
+def _read(
+    dataset: Dataset, episode_future: Future[Episode], steps: Sequence[int], *, pinned: bool
+) -> tuple[Episode, _Frames]:
+    recording = episode_future.result()
     frames = torch.from_numpy(crop_frames(recording.read_frames(steps), dataset.config.crop))
     return recording, frames.pin_memory() if pinned else frames
 
@@ -373,7 +377,7 @@ def _encode(
         latents.append(pack_latents(encoder.latents(inputs), kind).mapped(_to_host))
         pictures.append(_to_host(input_to_pixels(inputs)))
 
-    def fetched() -> EncodedEpisode:
+    def finish() -> EncodedEpisode:
         if encoder.device.type == "cuda":
             torch.cuda.synchronize(encoder.device)
         images = np.ascontiguousarray(rearrange(torch.cat(pictures), "n c h w -> n h w c").numpy())
@@ -381,7 +385,7 @@ def _encode(
             recording, request.camera, request.steps.tolist(), join_latents(latents, torch.cat), images
         )
 
-    return fetched
+    return finish
 
 
 def _to_host(tensor: Tensor) -> Tensor:

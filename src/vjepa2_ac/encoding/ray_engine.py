@@ -21,11 +21,11 @@ from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, Lat
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
 from vjepa2_ac.reporter import Reporter
 
-_MOST_AT_ONCE = 16  # requests per task at most; within a task decoding and encoding overlap
-_FEWEST_TASKS = 64  # with enough requests, so that all actors finish at about the same time
-_MOST_DEATHS = 10  # consecutive actors that die during start-up, as on nodes without this package
-_LONGEST_END_S = 30.0  # wait for a thread of Ray Data at shutdown
-_AGAIN = "Run the same command again to encode the missing frames"
+_MAX_TASK_REQUESTS = 16  # requests per task at most; within a task decoding and encoding overlap
+_MIN_TASKS = 64  # with enough requests, so that all actors finish at about the same time
+_MAX_ACTOR_DEATHS = 10  # consecutive actors that die during start-up, as on nodes without this package
+_SHUTDOWN_TIMEOUT_S = 30.0  # wait for a thread of Ray Data at shutdown
+_RESUME_HINT = "Run the same command again to encode the missing frames"
 
 
 @contextlib.contextmanager
@@ -55,15 +55,17 @@ def ray_engine(address: str) -> Iterator[Engine]:
     try:
         yield partial(_encode, where)
     except (ray.exceptions.RayError, ray.data.exceptions.ExecutionTimeoutError) as error:
-        raise UnreachableError(where=where, found=f"Ray failed ({error})", fix=_AGAIN) from error
+        raise UnreachableError(where=where, found=f"Ray failed ({error})", fix=_RESUME_HINT) from error
     finally:
         for thread in threading.enumerate():
             if thread.name == "iter_threaded":  # this thread of Ray Data would kill the process if Ray shut down first
-                thread.join(_LONGEST_END_S)
+                thread.join(_SHUTDOWN_TIMEOUT_S)
         ray.shutdown()
 
 
-def _encode(where: str, config: Config, cache: LatentCache, left: Sequence[FramesToEncode], reporter: Reporter) -> None:
+def _encode(
+    where: str, config: Config, cache: LatentCache, missing: Sequence[FramesToEncode], reporter: Reporter
+) -> None:
     """Encode the missing frames with one actor per GPU, or per CPU core on a cluster without GPUs.
 
     Actors may join later, and the episodes of an actor that dies are encoded by another one.
@@ -78,13 +80,13 @@ def _encode(where: str, config: Config, cache: LatentCache, left: Sequence[Frame
     kind = "GPU" if config.training.device != "cpu" and devices.get("GPU") else "CPU"
     if kind == "CPU" and config.training.device == "cuda":
         raise InputError(where=f"training.device: cuda, {where}", found="the cluster has no GPU")
-    begin_encoding(cache, left, reporter)
-    context, size = ray.data.DataContext.get_current(), max(1, min(_MOST_AT_ONCE, len(left) // _FEWEST_TASKS))
+    begin_encoding(cache, missing, reporter)
+    context, size = ray.data.DataContext.get_current(), max(1, min(_MAX_TASK_REQUESTS, len(missing) // _MIN_TASKS))
     context.enable_progress_bars = context.print_on_execution_start = False
-    context.max_consecutive_actor_init_deaths = _MOST_DEATHS
+    context.max_consecutive_actor_init_deaths = _MAX_ACTOR_DEATHS
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     folder = cache.folder.absolute() if isinstance(cache.folder, Path) else cache.folder
-    tasks = [{"wanted": _Task(left[first : first + size])} for first in range(0, len(left), size)]
+    tasks = [{"task": _Task(missing[first : first + size])} for first in range(0, len(missing), size)]
     results = ray.data.from_items(tasks, override_num_blocks=len(tasks)).map(
         _Actor,
         fn_constructor_args=(config_as_dict(config), folder, Path.cwd()),
@@ -92,10 +94,10 @@ def _encode(where: str, config: Config, cache: LatentCache, left: Sequence[Frame
         num_cpus=int(kind == "CPU"),
         num_gpus=int(kind == "GPU"),
     )
-    progress, done, total = reporter.task("encoding frames", "frames"), 0, count_frames(left)
+    progress, done, total = reporter.task("encoding frames", "frames"), 0, count_frames(missing)
     progress(done, total)
     for row in results.iter_rows():
-        result: _Result = row["found"]
+        result: _Result = row["result"]
         if result.error is not None:
             raise result.error
         for name, reason in result.broken.items():
@@ -107,7 +109,7 @@ def _encode(where: str, config: Config, cache: LatentCache, left: Sequence[Frame
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    wanted: Sequence[FramesToEncode]
+    requests: Sequence[FramesToEncode]
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,13 +135,13 @@ class _Actor:
         return cache, EncoderOnDevice.from_model(config, model, select_device(config.training))
 
     def __call__(self, row: Mapping[str, Any]) -> dict[str, _Result]:
-        requests = row["wanted"].wanted
+        requests = row["task"].requests
         try:
             cache, encoder = self._opened
             # An actor that died may have written some of the files.
-            left = [request for request in requests if not cache.files.has_file(request.episode, request.camera)]
-            encode_files(cache.dataset, left, encoder, cache.files)
+            missing = [request for request in requests if not cache.files.has_file(request.episode, request.camera)]
+            encode_files(cache.dataset, missing, encoder, cache.files)
         except Exception as error:
             error.add_note(traceback.format_exc())
-            return {"found": _Result(0, {}, error)}
-        return {"found": _Result(count_frames(requests), cache.dataset.broken.reasons)}
+            return {"result": _Result(0, {}, error)}
+        return {"result": _Result(count_frames(requests), cache.dataset.broken.reasons)}

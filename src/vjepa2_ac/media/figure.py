@@ -119,7 +119,7 @@ FRAME_KINDS: dict[FrameKind, tuple[str, str]] = {
 }
 """The colour and the legend text of each kind of frame."""
 
-_DOTS = 100  # pixels per inch
+_DPI = 100  # pixels per inch
 _LABEL, _SEQUENCE, _HEAD, _GAP, _LINE, _LEGEND = 160, 90, 90, 14, 17, 270  # pixels
 _MAX_COLUMNS = 6  # more are too small to read on a page that is 800 pixels wide
 _PREVIEW_S, _START_S, _END_S, _LOOP_S = 1.2, 0.8, 0.8, 6.0  # durations of parts of a loop, and its maximal duration
@@ -237,7 +237,7 @@ def schedule_loop(strip: RolloutStrip) -> list[tuple[int, float]]:
 def _figure(strip: RolloutStrip, size: tuple[int, int]) -> Iterator[Any]:
     """Yield a figure of (width, height) in pixels with the title of the rollouts."""
     with figure_style({"font.size": 9}):
-        figure = new_figure(*(pixels / _DOTS for pixels in size), dpi=_DOTS, layout="compressed", facecolor="white")
+        figure = new_figure(*(pixels / _DPI for pixels in size), dpi=_DPI, layout="compressed", facecolor="white")
         figure.suptitle(strip.title, fontsize=11, weight="bold", x=0.01, ha="left")
         yield figure
 
@@ -301,6 +301,6 @@ def stack_vertically(images: Sequence[Pixels]) -> Pixels:
 @lru_cache(maxsize=512)
 def _text_image(text: str, width: int, *, points: float = 9.0) -> UInt8[np.ndarray, "_ width 3"]:
     """Return an image of one line of text on white; callers must not modify it, because it is cached."""
-    figure = new_figure(width / _DOTS, _CAPTION / _DOTS, dpi=_DOTS, facecolor="white")
+    figure = new_figure(width / _DPI, _CAPTION / _DPI, dpi=_DPI, facecolor="white")
     figure.text(8 / width, 0.5, text, fontsize=points, va="center", ha="left", parse_math=False)
     return figure_to_pixels(figure)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
     from av.video.stream import VideoStream
 
-_STRICT = {
+_DECODER_OPTIONS = {
     "err_detect": "crccheck+bitstream+buffer+explode",  # raises an error instead of concealing damage
     "max_pixels": str(MAX_PIXELS),
 }
@@ -37,8 +37,8 @@ _START = -(1 << 40)  # a time before all frames
 _SAME_RATE = 0.98  # least ratio of the video's rate to the steps' rate; times in ms round 30 Hz to 30.3 Hz
 _FIX = "Copy the file again, or exclude the episode"
 _CRF = 20  # x264's constant rate factor: text stays sharp
-_COLOURS = 255  # colours of a GIF
-_SAMPLED = 4  # every n-th pixel along both axes is used to compute the palette
+_PALETTE_SIZE = 255  # colours of a GIF
+_PALETTE_STRIDE = 4  # every n-th pixel along both axes is used to compute the palette
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
@@ -186,7 +186,7 @@ def _stream_of(container: Any, where: str) -> VideoStream:
         found = f"frames of {stream.pix_fmt}: one channel of more than 8 bits, as in depth videos"
         raise InputError(where=where, found=found, needed="a colour video", fix="Choose another camera")
     stream.codec_context.thread_count = 1
-    stream.codec_context.options = _STRICT
+    stream.codec_context.options = _DECODER_OPTIONS
     return cast("VideoStream", stream)
 
 
@@ -415,8 +415,8 @@ def write_gif(path: str | Path, frames: Sequence[Frame], *, seconds: Sequence[fl
     """
     from PIL import Image
 
-    sample = np.concatenate([frame[::_SAMPLED, ::_SAMPLED].reshape(-1, 3) for frame in frames])
-    palette = Image.fromarray(sample[None]).quantize(_COLOURS)
+    sample = np.concatenate([frame[::_PALETTE_STRIDE, ::_PALETTE_STRIDE].reshape(-1, 3) for frame in frames])
+    palette = Image.fromarray(sample[None]).quantize(_PALETTE_SIZE)
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     milliseconds = [max(20, round(100 * duration_s) * 10) for duration_s in seconds]
     with atomic_writer(path) as file:

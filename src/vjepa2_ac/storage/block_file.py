@@ -28,7 +28,7 @@ BLOCK_BYTES = 128 << 10
 _READ_AHEAD_BLOCKS = 32  # upper limit for sequential reads
 _CACHED_BLOCKS = 128
 
-_KEPT_SHARE = 0.8  # an eviction reduces the folder to this share of the limit, so that folder scans are rare
+_EVICTION_TARGET = 0.8  # an eviction reduces the folder to this share of the limit, so that folder scans are rare
 _CRC_BYTES = 4  # appended to the data of an entry
 _TOTAL_BYTES = 8  # length of the total size stored in the file `lock`
 _PART = struct.Struct(">QQI")  # start, size and CRC of a part of an entry
@@ -141,7 +141,7 @@ class DiskCache:
     def write(self, key: str, data: bytes) -> None:
         """Store bytes under a key, replacing an old entry; a warning is logged if that is not possible."""
         path, content = self._path(key), data + _crc(data)
-        if path in self._refused or (self._limit is not None and len(content) > self._limit * _KEPT_SHARE):
+        if path in self._refused or (self._limit is not None and len(content) > self._limit * _EVICTION_TARGET):
             return
         partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
         try:
@@ -220,7 +220,7 @@ class DiskCache:
         if total + size <= limit:
             return total
         for _, entry_size, path in entries:
-            if total + size <= limit * _KEPT_SHARE:
+            if total + size <= limit * _EVICTION_TARGET:
                 break
             Path(path).unlink(missing_ok=True)
             total -= entry_size

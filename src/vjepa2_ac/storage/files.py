@@ -32,12 +32,16 @@ from vjepa2_ac.storage.block_file import RangedFile, open_remote
 from vjepa2_ac.storage.paths import is_url
 from vjepa2_ac.storage.remote import FileInfo, ShortReadError
 
-_ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG})
-_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-_UNWRITABLE = _FULL | _ABSENT | {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.EINVAL, errno.ELOOP}
+_MISSING_ERRNOS = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG})
+_DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT})
+_WRITE_ERRNOS = (
+    _DISK_FULL_ERRNOS
+    | _MISSING_ERRNOS
+    | {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.EINVAL, errno.ELOOP}
+)
 _PARTIAL = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
 _NAME_BYTES = 200  # leaves space for the suffix of a temporary name: file systems allow 255
-_OLD_S = 86_400.0
+_ABANDONED_AFTER_S = 86_400.0
 _POINTER_BYTES = 1024  # git-lfs pointers are smaller
 
 
@@ -172,7 +176,7 @@ def read_error(where: str, error: OSError, *, needed: str = "", fix: str = "") -
         absent = os.strerror(errno.ENOENT)
         return MissingFileError(where=where, found=f"cannot be read: {absent}", needed=needed, fix=fix)
     found = f"cannot be read: {error.strerror or error}"
-    if isinstance(error, ShortReadError | IsADirectoryError) or error.errno in _ABSENT:
+    if isinstance(error, ShortReadError | IsADirectoryError) or error.errno in _MISSING_ERRNOS:
         return InputError(where=where, found=found, needed=needed, fix=fix)
     refusal, fix = describe_refusal(error)
     kind = RefusedError if isinstance(error, PermissionError) else UnreachableError
@@ -321,7 +325,7 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
         temporary = _new_partial(target if is_folder else target.parent, target.name)
         temporary.mkdir()
     try:
-        with translate_write_errors(folder, errors=_FULL):  # any other error of the block is the caller's
+        with translate_write_errors(folder, errors=_DISK_FULL_ERRNOS):  # any other error of the block is the caller's
             yield temporary
         with translate_write_errors(folder):
             if is_folder:
@@ -353,7 +357,7 @@ def sync(path: str | Path) -> None:
 
 
 @contextmanager
-def translate_write_errors(path: str | Path, errors: frozenset[int] = _UNWRITABLE) -> Iterator[None]:
+def translate_write_errors(path: str | Path, errors: frozenset[int] = _WRITE_ERRNOS) -> Iterator[None]:
     """Raise an error for the user if a local path cannot be written, or the disk is full.
 
     Raises:
@@ -364,7 +368,7 @@ def translate_write_errors(path: str | Path, errors: frozenset[int] = _UNWRITABL
     except OSError as error:
         if error.errno not in errors:
             raise
-        full = error.errno in _FULL
+        full = error.errno in _DISK_FULL_ERRNOS
         fix = "Free some space, or choose a path on another disk" if full else "Choose a path that can be written"
         raise InputError(where=str(path), found=f"cannot be written: {error.strerror}", fix=fix) from None
 
@@ -423,5 +427,5 @@ def remove_abandoned(folder: Path) -> None:
     with suppress(OSError):
         for path in [path for path in folder.iterdir() if _PARTIAL.fullmatch(path.name) and not path.is_symlink()]:
             with suppress(OSError):
-                if time.time() - max(entry.lstat().st_mtime for entry in (path, *path.rglob("*"))) > _OLD_S:
+                if time.time() - max(entry.lstat().st_mtime for entry in (path, *path.rglob("*"))) > _ABANDONED_AFTER_S:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()

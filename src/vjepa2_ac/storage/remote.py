@@ -22,18 +22,18 @@ _T = TypeVar("_T")
 
 _THREADS = 64  # concurrent reads of `read_ranges` in a process
 _PIECE_BYTES = 16 << 20  # longer reads are split, so that each piece has the full time-out
-_SLOWEST_BYTES_PER_S = 1 << 20  # a write may take this long per byte in addition to the usual time-out
+_MIN_BYTES_PER_S = 1 << 20  # a write may take this long per byte in addition to the usual time-out
 _VERSION_KEYS = ("generation", "etag", "ETag", "blob_id", "mtime", "last_modified", "LastModified", "created")
 
-_LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
+_LOGIN_COMMANDS = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
 _EXTRAS = {"gs": "gcs", "hf": ""}  # extra of this package per protocol; empty: always installed
-_KNOWN = "a local folder, or a gs://, hf:// or s3:// URL"
+_SUPPORTED_LOCATIONS = "a local folder, or a gs://, hf:// or s3:// URL"
 _CHAINED_PROTOCOLS = frozenset({  # chained fsspec protocols, which wrap other file systems; some execute templates
     "async_wrapper", "asyncwrapper", "blockcache", "cached", "dask", "data", "dir", "filecache", "generic",
     "libarchive", "reference", "simplecache", "tar", "zip",
 })  # fmt: skip
 _EMULATOR = "STORAGE_EMULATOR_HOST"
-_MACHINE = Path("/sys/class/dmi/id/product_name")
+_PRODUCT_NAME_FILE = Path("/sys/class/dmi/id/product_name")
 
 
 _POINTER = b"version https://git-lfs.github.com/spec/v1"  # first bytes of the pointer that git-lfs commits for a file
@@ -138,7 +138,7 @@ def upload(source: Path, url: str) -> None:
     names = (str(source), filesystem._strip_protocol(url))
     # Small pieces, because fsspec's event loop is blocked while a piece is read from the disk.
     pieces = {"chunksize": _PIECE_BYTES} if _protocol(url) == "gs" else {}
-    allowed_s = retries.DEFAULT.timeout_s + source.stat().st_size / _SLOWEST_BYTES_PER_S
+    allowed_s = retries.DEFAULT.timeout_s + source.stat().st_size / _MIN_BYTES_PER_S
     _retry(
         url,
         lambda timeout_s: _call_filesystem(filesystem, "put_file", timeout_s, *names, **pieces),
@@ -260,7 +260,9 @@ def _retry(url: str, action: Callable[[float], _T], operation: str = "read", tim
     try:
         return retries.call_with_retries(url, action, policy=policy, access=login_hint(url), operation=operation)
     except NotImplementedError:
-        raise RefusedError(where=url, found=f"{_protocol(url)}:// URLs cannot be {operation}", needed=_KNOWN) from None
+        raise RefusedError(
+            where=url, found=f"{_protocol(url)}:// URLs cannot be {operation}", needed=_SUPPORTED_LOCATIONS
+        ) from None
 
 
 # ---- fsspec's file systems, and their credentials ----
@@ -283,10 +285,14 @@ def _call_filesystem(filesystem: Any, method: str, timeout_s: float, *arguments:
 def login_hint(url: str) -> str:
     """Return the fix for missing permission, as a sentence."""
     protocol = _protocol(url)
-    log_in = f"Log in with `{_LOG_IN[protocol]}`, or check the name" if protocol in _LOG_IN else "Check your login"
+    fix = (
+        f"Log in with `{_LOGIN_COMMANDS[protocol]}`, or check the name"
+        if protocol in _LOGIN_COMMANDS
+        else "Check your login"
+    )
     if protocol == "hf":
-        log_in += ". Or set HF_TOKEN. For a gated data set, first request access on its page"
-    return f"You are not logged in. {log_in}" if protocol == "gs" and google_token() == "anon" else log_in
+        fix += ". Or set HF_TOKEN. For a gated data set, first request access on its page"
+    return f"You are not logged in. {fix}" if protocol == "gs" and google_token() == "anon" else fix
 
 
 def google_token() -> str:
@@ -300,7 +306,7 @@ def google_token() -> str:
     if os.environ.get("GOOGLE_APPLICATION_CREDENTIALS") or (folder / "application_default_credentials.json").is_file():
         return "google_default"
     try:  # read from the firmware: a network request would take seconds on machines outside Google Cloud
-        return "cloud" if _MACHINE.read_text().startswith("Google") else "anon"
+        return "cloud" if _PRODUCT_NAME_FILE.read_text().startswith("Google") else "anon"
     except OSError:
         return "anon"
 
@@ -329,7 +335,9 @@ def _filesystem(url: str, *, writing: bool = False) -> Any:
                 opened = _google(kind, options) if protocol == "gs" else kind(**options, skip_instance_cache=True)
             except TypeError as error:  # this file system needs more arguments than a URL holds
                 raise InputError(
-                    where=url, found=f"{protocol}:// needs options that a URL cannot hold ({error})", needed=_KNOWN
+                    where=url,
+                    found=f"{protocol}:// needs options that a URL cannot hold ({error})",
+                    needed=_SUPPORTED_LOCATIONS,
                 ) from None
             _filesystems[key] = opened
         return _filesystems[key]
@@ -348,7 +356,9 @@ def _kind(url: str, protocol: str) -> Any:
 
     if protocol in _CHAINED_PROTOCOLS:
         raise InputError(
-            where=url, found=f"{protocol}:// only wraps another protocol and is not supported", needed=_KNOWN
+            where=url,
+            found=f"{protocol}:// only wraps another protocol and is not supported",
+            needed=_SUPPORTED_LOCATIONS,
         )
     try:
         return fsspec.get_filesystem_class(protocol)
@@ -356,7 +366,7 @@ def _kind(url: str, protocol: str) -> Any:
         fix = f"Install it: {pip_install(_EXTRAS[protocol])}" if protocol in _EXTRAS else str(error)
         raise InputError(where=url, found=f"the library for {protocol}:// is not installed", fix=fix) from None
     except ValueError:
-        raise InputError(where=url, found=f"unknown protocol {protocol}://", needed=_KNOWN) from None
+        raise InputError(where=url, found=f"unknown protocol {protocol}://", needed=_SUPPORTED_LOCATIONS) from None
 
 
 def _google(kind: Any, options: dict[str, Any]) -> Any:

@@ -19,10 +19,10 @@ logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 # 499 is Google's answer to cancelling an upload after a failed piece; gcsfs raises it instead of that failure.
-_PASSING_STATUS = frozenset({408, 425, 429, 499, *range(500, 600)})
+_TEMPORARY_STATUS = frozenset({408, 425, 429, 499, *range(500, 600)})
 _NO_ACCESS = frozenset({401, 403, 407})
-_ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
-_LONGEST_SUMMARY = 300
+_MISSING_ERRORS = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
+_MAX_SUMMARY_LENGTH = 300
 _FAILURES_BEFORE_WARNING = 3
 _WARNING_INTERVAL_S = 30.0
 
@@ -81,7 +81,7 @@ def call_with_retries(
     while True:
         try:
             return action(policy.timeout_s)
-        except (*_ABSENT, UserError):
+        except (*_MISSING_ERRORS, UserError):
             raise
         except Exception as error:
             if type(error).__module__ == "builtins" and not isinstance(error, OSError | ValueError | EOFError):
@@ -142,7 +142,7 @@ def http_status(error: BaseException) -> int | None:
 def _is_temporary(error: Exception) -> bool:
     status = http_status(error)
     if status is not None:
-        return status in _PASSING_STATUS
+        return status in _TEMPORARY_STATUS
     if _is_login_error(error):
         return type(error).__name__ == "TransportError" or bool(getattr(error, "retryable", False))
     # A JSON error comes from a truncated listing. FileExistsError means that a precondition of the server failed.
@@ -157,6 +157,6 @@ def _summary(error: Exception) -> str:
     """Return the message of a library's error on one line."""
     status = http_status(error)
     text = " ".join(str(getattr(error, "message", "") or error).split())
-    text = text if len(text) <= _LONGEST_SUMMARY else f"{text[:_LONGEST_SUMMARY]}…"
+    text = text if len(text) <= _MAX_SUMMARY_LENGTH else f"{text[:_MAX_SUMMARY_LENGTH]}…"
     name = "time-out" if isinstance(error, TimeoutError) else type(error).__name__
     return ": ".join(part for part in (f"HTTP {status}" if status else name, text) if part)

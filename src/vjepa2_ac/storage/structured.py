@@ -26,8 +26,8 @@ from vjepa2_ac.storage import read_small_file, translate_read_errors
 T = TypeVar("T")
 
 MAX_BYTES = 16 << 20
-_MOST_SHOWN = 120  # characters of a value in messages
-_MOST_PROBLEMS = 5  # problems of one file in a message
+_MAX_REPR_LENGTH = 120  # characters of a value in messages
+_MAX_PROBLEMS = 5  # problems of one file in a message
 _PLAIN_LIST = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null|true|false),?\s+)+)\]")
 _PYDANTIC_TERMS = {  # pydantic uses the terms of JSON; the file may be YAML
     "Value error, ": "",
@@ -139,8 +139,8 @@ def parse_record(kind: type[T], values: Any, *, where: str, needed: str = "", fi
             for item in error.errors()
         ]
     if problems:
-        more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
-        raise InputError(where=where, found="; ".join(problems[:_MOST_PROBLEMS]) + more, needed=needed, fix=fix)
+        more = f"; and {len(problems) - _MAX_PROBLEMS} more" if len(problems) > _MAX_PROBLEMS else ""
+        raise InputError(where=where, found="; ".join(problems[:_MAX_PROBLEMS]) + more, needed=needed, fix=fix)
     return record
 
 
@@ -161,7 +161,7 @@ def describe_validation_error(detail: Any) -> str:
 def short_repr(value: object) -> str:
     """Return the `repr` of a value, truncated if it is long."""
     text = repr(value)
-    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}…"
+    return text if len(text) <= _MAX_REPR_LENGTH else f"{text[:_MAX_REPR_LENGTH]}…"
 
 
 # ---- YAML ----
@@ -179,9 +179,9 @@ def parse_yaml(text: str, *, where: str) -> Any:
         return yaml.load(text, _Loader)  # noqa: S506 - a SafeLoader
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
-        place = f"{where}: line {mark.line + 1}, column {mark.column + 1}" if mark else where
+        problem_where = f"{where}: line {mark.line + 1}, column {mark.column + 1}" if mark else where
         problem = getattr(error, "problem", None) or str(error)
-        raise InputError(where=place, found=f"invalid YAML: {problem}") from None
+        raise InputError(where=problem_where, found=f"invalid YAML: {problem}") from None
 
 
 class _Loader(yaml.SafeLoader):

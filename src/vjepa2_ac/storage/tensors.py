@@ -31,8 +31,8 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
     path.touch()
     mode = stat.S_IMODE(path.stat().st_mode)
     try:
-        whole = {name: value.detach().to("cpu").contiguous() for name, value in tensors.items()}
-        save_file(whole, path, metadata={"format": "pt"})
+        contiguous = {name: value.detach().to("cpu").contiguous() for name, value in tensors.items()}
+        save_file(contiguous, path, metadata={"format": "pt"})
         path.chmod(mode)  # safetensors 0.8 creates files with mode 0600
     except SafetensorError as error:  # the errno is only in the text of the error
         number = re.search(r"os error (\d+)", str(error))
@@ -74,8 +74,8 @@ def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
             that is read within the block is invalid.
         UnreachableError: The file cannot be read.
     """
-    again = "Copy or write the folder again"
-    with storage.translate_read_errors(path, needed=needed, fix=again):
+    fix = "Copy or write the folder again"
+    with storage.translate_read_errors(path, needed=needed, fix=fix):
         path.open("rb").close()  # safetensors reports a file without read permission as missing
         try:
             with safe_open(path, framework="pt") as file:
@@ -84,7 +84,7 @@ def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
             if storage.is_os_read_error(error):
                 raise
             found = f"not a complete safetensors file ({error})"
-            raise InputError(where=str(path), found=found, needed=needed, fix=again) from None
+            raise InputError(where=str(path), found=found, needed=needed, fix=fix) from None
 
 
 def check_tensors(

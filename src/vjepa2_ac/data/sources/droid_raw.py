@@ -122,7 +122,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             "pose_frame": config.pose_frame,
             "folders": listed,
         }
-        key = index_key(parts, root, named=get_identity(root, folders[0]))
+        key = index_key(parts, root, identity=get_identity(root, folders[0]))
         identities = {folder: get_identity(root, folder) for folder in folders}
         build = partial(self._scan_all, self._scan, identities, progress)
         return get_or_build_index(config.disk_cache, key, root, build), None
