@@ -96,7 +96,7 @@ def files(written: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_a_file_without_permission_is_named_with_its_mode_and_owner(files: Path, name: str) -> None:
+def test_permission_error_names_mode_and_owner(files: Path, name: str) -> None:
     before = (files / name).read_bytes()
     with without_permission(files / name), pytest.raises(RefusedError) as caught:
         READERS[name](files)
@@ -107,7 +107,7 @@ def test_a_file_without_permission_is_named_with_its_mode_and_owner(files: Path,
 
 @pytest.mark.parametrize("name", sorted(READERS.keys() - {CACHED}))
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
-def test_something_else_in_place_of_a_file_is_refused_at_once(files: Path, name: str, kind: str) -> None:
+def test_pipe_device_or_folder_in_place_of_a_file_raises_at_once(files: Path, name: str, kind: str) -> None:
     (files / name).unlink()
     if kind == "pipe":
         os.mkfifo(files / name)
@@ -122,7 +122,7 @@ def test_something_else_in_place_of_a_file_is_refused_at_once(files: Path, name:
 
 @pytest.mark.parametrize("name", sorted(one for one in READERS if one.endswith(".safetensors")))
 @pytest.mark.parametrize("dtype", [torch.float8_e4m3fn, torch.int64, torch.bool, torch.complex64])
-def test_weights_of_another_type_are_refused_by_name(files: Path, name: str, dtype: torch.dtype) -> None:
+def test_weights_of_unsupported_type_raise(files: Path, name: str, dtype: torch.dtype) -> None:
     weights = load_file(files / name)
     tensor = sorted(weights)[0]
     save_file({**weights, tensor: weights[tensor].to(dtype)}, files / name, metadata={"format": "pt"})
@@ -134,7 +134,7 @@ def test_weights_of_another_type_are_refused_by_name(files: Path, name: str, dty
 
 @pytest.mark.parametrize("dtype", [torch.int32, torch.complex64, "sparse"])
 @pytest.mark.parametrize("part", ["target_encoder", "predictor"])  # an encoder that is not loaded is not read
-def test_a_checkpoint_with_weights_of_another_type_is_refused_by_name(tmp_path: Path, part: str, dtype: object) -> None:
+def test_checkpoint_weights_of_unsupported_type_raise(tmp_path: Path, part: str, dtype: object) -> None:
     parts = to_official(model())
     name = next(name for name, value in parts[part].items() if value.dim() == 2)
     value = parts[part][name]
@@ -145,7 +145,7 @@ def test_a_checkpoint_with_weights_of_another_type_is_refused_by_name(tmp_path: 
         load_official(tmp_path / "odd.pt", SIZES)
 
 
-def test_an_encoder_of_whole_numbers_is_refused_by_name(files: Path) -> None:
+def test_integer_encoder_weights_raise(files: Path) -> None:
     path = files / "model/encoder.safetensors"
     weights = load_file(path)
     name = sorted(weights)[0]
@@ -168,7 +168,7 @@ def test_latents_without_permission_are_not_encoded_again(tmp_path: Path) -> Non
     assert not files.is_done(1, "left")
 
 
-def test_an_error_of_the_system_at_the_command_line_names_mode_and_owner(tmp_path: Path) -> None:
+def test_permission_error_at_the_command_line_names_mode_and_owner(tmp_path: Path) -> None:
     (tmp_path / "closed").mkdir()
     with without_permission(tmp_path / "closed"), pytest.raises(PermissionError) as caught:
         list((tmp_path / "closed").iterdir())
@@ -176,7 +176,7 @@ def test_an_error_of_the_system_at_the_command_line_names_mode_and_owner(tmp_pat
         assert re.search(r"/closed: Permission denied \(mode 0000, owner uid \d+; this", describe_error(caught.value))
 
 
-def test_a_finished_run_whose_checkpoints_cannot_be_read_is_not_started_again(
+def test_finished_run_with_unreadable_checkpoints_is_not_restarted(
     whole_run: Path, make_config: MakeConfig, tmp_path: Path
 ) -> None:
     run = shutil.copytree(whole_run, tmp_path / "run")
@@ -205,7 +205,7 @@ def other_modes(root: Path, umask: int) -> dict[str, str]:
     return {str(path.relative_to(root)): oct(mode) for path, mode in modes.items() if mode != 0o666 & ~umask}
 
 
-def test_the_mode_of_every_file_of_a_run_its_exports_and_its_latents_follows_the_umask(
+def test_file_modes_of_run_exports_and_latents_follow_the_umask(
     tmp_path: Path, make_config: MakeConfig, umask: int
 ) -> None:
     config = make_config(

@@ -25,7 +25,7 @@ Use = Callable[..., Dataset]  # opens a data set with some config values, and re
     ("episodes", "allowed"),
     [(0, 0), (1, 0), (2, 1), (3, 1), (4, 2), (5, 2), (6, 3), (20, 3), (100, 3), (399, 3), (400, 4), (95_658, 956)],
 )
-def test_three_episodes_or_one_percent_may_be_broken_but_never_most_of_a_small_set(episodes: int, allowed: int) -> None:
+def test_broken_episode_limit_is_three_or_one_percent_and_half_of_small_sets(episodes: int, allowed: int) -> None:
     assert max_broken(episodes) == allowed
 
 
@@ -105,7 +105,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("make", "episodes", "broken"), CASES)
-def test_every_fix_that_an_error_of_broken_episodes_names_works(
+def test_each_fix_in_a_broken_episode_error_works(
     make: Callable[..., Use], episodes: int, broken: int, tmp_path: Path
 ) -> None:
     use = make(episodes, broken, tmp_path)

@@ -41,7 +41,7 @@ def frames(dataset: Dataset, count: int, seed: int = 1, **keys: Any) -> torch.Te
 OFFSET = {"name": "offset"}
 
 
-def test_training_clips_are_changed_by_seed_and_position_and_others_never() -> None:
+def test_transforms_depend_on_seed_and_position_and_apply_to_training_clips_only() -> None:
     dataset = opened(OFFSET, validation_share=0.5)
     plain = opened(validation_share=0.5)
     offsets = (frames(dataset, 20) - frames(plain, 20))[:, 0, 0, 0]
@@ -58,7 +58,7 @@ def test_training_clips_are_changed_by_seed_and_position_and_others_never() -> N
     np.testing.assert_array_equal(dataset.clips()[3].frames, plain.clips()[3].frames)
 
 
-def test_a_resumed_run_and_workers_see_the_same_changes(droid: Path) -> None:
+def test_transforms_are_identical_after_resume_and_in_workers(droid: Path) -> None:
     data = {"path": droid, "frames": 3, "stride": 2, "transforms": [OFFSET, {"name": "halve"}]}
 
     def read(count: int, start: int = 0, workers: int = 0) -> torch.Tensor:
@@ -71,14 +71,14 @@ def test_a_resumed_run_and_workers_see_the_same_changes(droid: Path) -> None:
     assert torch.equal(read(4, 16, workers=1), whole[16:])
 
 
-def test_transforms_are_applied_in_their_order_each_with_numbers_of_its_own() -> None:
+def test_transforms_run_in_config_order_with_independent_random_numbers() -> None:
     plain, offset = frames(opened(), 8), frames(opened(OFFSET), 8)
     assert torch.equal(frames(opened(OFFSET, {"name": "halve"}), 8), offset // 2)
     assert not torch.equal(frames(opened({"name": "halve"}, OFFSET), 8), offset // 2)
     assert not torch.equal(frames(opened(OFFSET, OFFSET), 8) - offset, offset - plain)
 
 
-def test_options_reach_a_class_and_are_checked() -> None:
+def test_transform_options_are_passed_to_the_class_and_validated() -> None:
     least = opened({"name": "offset", "options": {"most": 2}})
     assert torch.equal(frames(least, 4), frames(opened(), 4) + 1)
     for transform, words in (
@@ -110,7 +110,7 @@ def test_options_reach_a_class_and_are_checked() -> None:
     ],
 )
 @pytest.mark.parametrize("policy", ["error", "skip"])
-def test_a_result_that_training_cannot_use_stops_the_run_and_no_episode_is_blamed(
+def test_invalid_transform_result_raises_without_marking_an_episode_broken(
     registered: dict[str, Any], change: Callable[[Clip], Any], words: str, policy: str
 ) -> None:
     registered["wrong"] = lambda clip, _: change(clip)
@@ -126,7 +126,7 @@ def values(**data: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("data", [{"cache": "auto"}, {"cache": "require"}, {"source": "latents"}])
-def test_cached_latents_cannot_be_transformed(data: dict[str, str]) -> None:
+def test_transforms_on_cached_latents_raise(data: dict[str, str]) -> None:
     with pytest.raises(InputError, match="transforms change frames, latents in a cache stay"):
         parse_config(values(transforms=[{"name": "halve"}], **data), where="")
     parse_config(values(transforms=[], **data), where="")

@@ -29,7 +29,7 @@ def names(clips: list[Clip]) -> list[tuple[str, int]]:
     return [(clip.episode_id, clip.start) for clip in clips]
 
 
-def test_clip_i_is_the_ith_window_sorted_by_identity_and_start(droid: Path) -> None:
+def test_clips_are_sorted_by_identity_and_start(droid: Path) -> None:
     dataset = opened(droid)
     clips, windows = dataset.clips("train"), dataset.windows("train")
     assert isinstance(clips, TorchDataset)
@@ -45,7 +45,7 @@ def test_clip_i_is_the_ith_window_sorted_by_identity_and_start(droid: Path) -> N
     assert all(one < other for one, other in pairwise(every))
 
 
-def test_indices_count_from_the_end_and_iteration_ends() -> None:
+def test_negative_indices_and_iteration_follow_the_sequence_protocol() -> None:
     clips = open_in_memory(MemorySource([9, 9])).clips()
     assert len(list(clips)) == len(clips) == 10
     assert names([clips[-1], clips[-10]]) == names([clips[9], clips[0]])
@@ -57,7 +57,7 @@ def test_indices_count_from_the_end_and_iteration_ends() -> None:
         clips[1.0]
 
 
-def test_default_collation_gives_a_batch() -> None:
+def test_default_collate_returns_a_batch() -> None:
     clips = open_in_memory(MemorySource([9, 9])).clips()
     batches = list(DataLoader(clips, batch_size=4))
     assert [type(batch) for batch in batches] == [Batch] * 3
@@ -72,7 +72,7 @@ def test_default_collation_gives_a_batch() -> None:
 
 
 @pytest.mark.parametrize("policy", ["error", "skip"])
-def test_a_broken_episode_is_named_with_a_fix_that_works(
+def test_broken_episode_error_names_the_episode_and_a_working_fix(
     spoiled: Callable[[Callable[[Any], None]], Path], policy: str
 ) -> None:
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:

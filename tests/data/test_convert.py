@@ -47,7 +47,7 @@ def files_in(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
-def test_poses_read_back_with_the_same_values(droid: Path, tmp_path: Path) -> None:
+def test_converted_poses_equal_the_originals(droid: Path, tmp_path: Path) -> None:
     config = config_of(droid, camera=list(CAMERAS))
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (6, 87)
     before, after = open_dataset(config), read_back(tmp_path / "out", *CAMERAS)
@@ -70,7 +70,7 @@ def test_poses_read_back_with_the_same_values(droid: Path, tmp_path: Path) -> No
     np.testing.assert_allclose(actions[: ends[0]], actions_from_states(before.source.read(0).states), atol=1e-6)
 
 
-def test_each_step_has_its_own_frame(tmp_path: Path) -> None:
+def test_converted_video_has_one_frame_per_step(tmp_path: Path) -> None:
     def recording(number: int, steps: int) -> Recorded:
         states = synthetic_states(steps, seed=number).astype(np.float32)
         drawn = [numbered(draw_frame(state, size=(48, 64)), number, step) for step, state in enumerate(states)]
@@ -85,7 +85,7 @@ def test_each_step_has_its_own_frame(tmp_path: Path) -> None:
         assert [numbers_of(frame, 2) for frame in frames] == [(index, step) for step in range(70)]
 
 
-def test_the_form_is_that_of_lerobot(droid: Path, tmp_path: Path) -> None:
+def test_converted_files_have_the_lerobot_layout(droid: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     convert_to_lerobot(config_of(droid), out, SILENT)
     key = "observation.images.exterior_1_left"
@@ -148,7 +148,7 @@ def test_the_form_is_that_of_lerobot(droid: Path, tmp_path: Path) -> None:
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
 
 
-def test_statistics_are_those_of_the_numbers_and_pixels(droid: Path, tmp_path: Path) -> None:
+def test_converted_statistics_match_numbers_and_pixels(droid: Path, tmp_path: Path) -> None:
     convert_to_lerobot(config_of(droid), tmp_path / "out", SILENT)
     dataset = open_dataset(config_of(droid))
     states = [dataset.source.read(index).states.astype(np.float32) for index in range(6)]
@@ -170,9 +170,7 @@ def test_statistics_are_those_of_the_numbers_and_pixels(droid: Path, tmp_path: P
     assert (np.shape(of_pixels["mean"]), of_pixels["count"]) == ((3, 1, 1), [87])
 
 
-def test_episodes_are_whole_whatever_is_idle_or_held_out_and_excluded_ones_are_left_out(
-    droid: Path, tmp_path: Path
-) -> None:
+def test_conversion_writes_whole_episodes_and_omits_excluded_ones(droid: Path, tmp_path: Path) -> None:
     idle = {"rule": "motion", "shortest_kept_steps": 2, "cut_last_steps": 6}
     config = config_of(droid, idle=idle, validation_share=0.5, stride="auto")
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (6, 87)
@@ -194,15 +192,13 @@ def damaged(spoiled: Callable[..., Path]) -> Path:
     return spoiled(spoil)
 
 
-def test_a_broken_episode_stops_the_conversion_and_nothing_is_left(
-    spoiled: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_broken_episode_stops_the_conversion_and_leaves_no_folder(spoiled: Callable[..., Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"not a JPEG.*add to data\.exclude"):
         convert_to_lerobot(config_of(damaged(spoiled), camera=list(CAMERAS)), tmp_path / "out", SILENT)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_broken_episode_is_left_out_where_the_policy_says_so(spoiled: Callable[..., Path], tmp_path: Path) -> None:
+def test_broken_episode_is_skipped_by_the_skip_policy(spoiled: Callable[..., Path], tmp_path: Path) -> None:
     config = config_of(damaged(spoiled), camera=list(CAMERAS), broken_episodes="skip")
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (5, 75)
     after = read_back(tmp_path / "out", *CAMERAS)
@@ -218,7 +214,7 @@ def test_a_broken_episode_is_left_out_where_the_policy_says_so(spoiled: Callable
     )
 
 
-def test_latents_and_names_with_a_slash_are_refused(tmp_path: Path) -> None:
+def test_conversion_of_latents_or_camera_names_with_a_slash_raises(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a latent cache, which has no frames.*to write its frames"):
         convert_to_lerobot(config_of("x", source="latents"), tmp_path / "out", SILENT)
     with pytest.raises(InputError, match=r"'a/b'.*without /"):

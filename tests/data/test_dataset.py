@@ -30,7 +30,7 @@ def problems(count: int) -> list[EpisodeProblem]:
     ]
 
 
-def test_every_filter_counts_what_it_took() -> None:
+def test_each_filter_reports_the_episodes_it_removed() -> None:
     source = MemorySource([10, 20, 30, 40, 50], [True, False, None, True, False], problems=problems(2))
     dataset = open_in_memory(source, exclude=("episode 4", "bad 1", "bad 0"), outcome="success")
     assert removed(dataset) == {
@@ -43,14 +43,14 @@ def test_every_filter_counts_what_it_took() -> None:
     assert len(open_in_memory(source, exclude=("bad 1", "bad 0"), outcome="failure").windows("train")) == 16 + 46
 
 
-def test_an_outcome_that_nobody_tells_is_refused() -> None:
+def test_outcome_filter_without_success_labels_raises() -> None:
     with pytest.raises(InputError, match=r"data\.outcome: success: no episode.*Set data\.outcome: all"):
         open_in_memory(MemorySource([10, 10]), outcome="success")
     with pytest.raises(InputError, match=r"none of 2 episodes remains \(removed: outcome 2\)"):
         open_in_memory(MemorySource([10, 10], [False, None]), outcome="success")
 
 
-def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> None:
+def test_broken_episodes_count_across_resume_unless_excluded() -> None:
     def resumed(**knobs: Any) -> BrokenEpisodes:
         ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip", **knobs), 300)
         ledger.restore({name: f"{name} is damaged" for name in "abc"})
@@ -62,7 +62,7 @@ def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> 
     resumed(exclude=("b",)).record("d", "d is damaged")
 
 
-def test_excluding_what_there_is_not_is_refused() -> None:
+def test_excluding_an_unknown_episode_raises() -> None:
     with pytest.raises(InputError, match=r"data\.exclude: unknown episodes: elsewhere\."):
         open_in_memory(MemorySource([10], problems=problems(1)), exclude=("elsewhere", "bad 0"))
 
@@ -90,7 +90,7 @@ def two_ranges_each(table: EpisodeTable) -> StepSelection:
 
 
 @pytest.mark.parametrize("idle", [{}, {"rule": "motion"}])
-def test_a_set_of_droids_size_is_opened_without_a_call_for_each_episode_and_in_fifty_megabytes(
+def test_opening_a_data_set_of_droids_size_takes_no_call_per_episode_and_50_mb(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, idle: dict[str, Any]
 ) -> None:
     kept, ranges = tmp_path / "table", tmp_path / "ranges"

@@ -51,7 +51,7 @@ def groups_split(dataset: Dataset, group: Any) -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize("by", ["day", r"/(\d{4}-\d\d-\d\d)/"])
-def test_episodes_of_a_group_share_the_split_of_its_name(by: str) -> None:
+def test_episodes_of_a_group_are_in_the_same_split(by: str) -> None:
     dataset = opened(split_by=by)
     days = groups_split(dataset, lambda name: name.split("/")[7])
     assert days == {day: {split_of(day, dataset.config)} for day in days}
@@ -63,7 +63,7 @@ def count_of_groups(dataset: Dataset) -> int:
     return len(np.unique(dataset.split_hash))
 
 
-def test_an_identity_without_a_group_is_named_and_refused() -> None:
+def test_identity_without_a_group_raises() -> None:
     names = [*NAMES[:20], "elsewhere/one", "elsewhere/two"]
     with pytest.raises(
         InputError, match=r"split_by: day: .*does not match the identities of 2 of 22 episodes: elsewhere/one, "
@@ -78,7 +78,7 @@ def test_an_identity_without_a_group_is_named_and_refused() -> None:
     ("source", "by", "groups"),
     [("npz", "scene", 3), ("npz", "task", 2), ("lerobot", "task", 2), ("droid_raw", "day", 8), ("rlds", "lab", 2)],
 )
-def test_every_source_offers_what_it_knows(source: str, by: str, groups: int, tmp_path: Path) -> None:
+def test_each_source_provides_its_labels_for_split_by(source: str, by: str, groups: int, tmp_path: Path) -> None:
     folder = tmp_path / "set"
     if source == "npz":
         write_npz(folder, range(8), scene=lambda place: f"room {place % 3}", language=lambda place: f"task {place % 2}")
@@ -88,13 +88,13 @@ def test_every_source_offers_what_it_knows(source: str, by: str, groups: int, tm
     assert count_of_groups(dataset) == groups
 
 
-def test_an_episode_of_which_the_field_is_not_said_is_named(tmp_path: Path) -> None:
+def test_episode_without_a_split_by_value_raises(tmp_path: Path) -> None:
     folder = write_npz(tmp_path / "set", range(4), scene=lambda place: "" if place == 2 else "kitchen")
     with pytest.raises(InputError, match=r"the data set has no value for 1 of 4 episodes: 002"):
         open_dataset(config_of(source="npz", path=str(folder), split_by="scene"))
 
 
-def test_a_latent_cache_knows_the_groups_and_serves_any_grouping(tmp_path: Path) -> None:
+def test_latent_cache_supports_any_split_by(tmp_path: Path) -> None:
     write_npz(tmp_path / "set", range(8), scene=lambda place: f"room {place % 3}")
     plain = config_of(source="npz", path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
     folder = write_cache(open_dataset(plain))

@@ -32,7 +32,7 @@ def resting(steps: int, rests: list[tuple[int, int]], *, seed: int = 0) -> np.nd
     return states
 
 
-def test_commands_keep_what_openpi_keeps() -> None:
+def test_commands_rule_keeps_the_same_ranges_as_openpi() -> None:
     golden = np.load(GOLDEN / "idle_ranges.npz")
     for number in range(3):
         idle = idle_by_commands(golden[f"velocities_{number}"].astype(np.float64), COMMANDS)
@@ -40,14 +40,14 @@ def test_commands_keep_what_openpi_keeps() -> None:
 
 
 @pytest.mark.parametrize("number", range(7))
-def test_motion_of_any_kind_is_motion(number: int) -> None:
+def test_translation_rotation_or_gripper_motion_is_not_idle(number: int) -> None:
     states = np.tile(np.array([0.5, 0.0, 0.3, np.pi, 0.0, 1.0, 0.5]), (30, 1))
     states[:, number] += np.linspace(0, 0.5, 30)
     assert not idle_by_motion(states, MOTION)[1:].any()
     assert idle_by_motion(states[:1].repeat(30, axis=0), MOTION)[1:].all()
 
 
-def test_rest_is_found_in_the_poses_where_roll_wraps() -> None:
+def test_idle_steps_are_detected_where_roll_wraps() -> None:
     states = resting(60, [(20, 40)])
     states[20:40, 3] += np.where(np.arange(20) % 2, 2 * np.pi, 0)  # the same angle, written differently
     idle = idle_by_motion(states, MOTION)
@@ -55,7 +55,7 @@ def test_rest_is_found_in_the_poses_where_roll_wraps() -> None:
     assert moving_ranges(idle, MOTION) == [(0, 10), (40, 50)]
 
 
-def test_short_rests_stay_and_short_moves_go() -> None:
+def test_short_idle_runs_are_kept_and_short_moves_removed() -> None:
     def ranges(rests: list[tuple[int, int]], **knobs: Any) -> list[tuple[int, int]]:
         idle = np.zeros(80, bool)
         for start, end in rests:
@@ -73,7 +73,7 @@ def test_short_rests_stay_and_short_moves_go() -> None:
 
 @settings(max_examples=60)
 @given(idle=st.lists(st.booleans(), max_size=120))
-def test_kept_ranges_lie_apart_and_hold_no_long_rest(idle: list[bool]) -> None:
+def test_kept_ranges_are_disjoint_and_contain_no_long_idle_run(idle: list[bool]) -> None:
     ranges = moving_ranges(np.array(idle, bool), MOTION)
     edges = [edge for pair in ranges for edge in pair]
     assert edges == sorted(set(edges))
@@ -119,7 +119,7 @@ def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
     assert removed.windows == 56 + 36 + 76 - len(starts(dataset))
 
 
-def test_the_episodes_are_indexed_once(open_with: Any) -> None:
+def test_idle_ranges_are_computed_once(open_with: Any) -> None:
     first, second, third = restful(), restful(), restful()
     kept = open_with(first, idle=MOTION).kept_steps
     again = open_with(second, idle=MOTION, exclude=("episode 1",), stride=3).kept_steps
@@ -131,7 +131,7 @@ def test_the_episodes_are_indexed_once(open_with: Any) -> None:
     assert len(third.reads) == 3, "another rule is another pass"
 
 
-def test_an_episode_that_breaks_on_the_way_is_a_broken_episode(open_with: Any, caplog: Any) -> None:
+def test_episode_that_fails_while_ranges_are_computed_is_broken(open_with: Any, caplog: Any) -> None:
     lengths = [60] * 200
     source = restful(lengths, unreadable=frozenset({7, 9}))
     with pytest.raises(InputError, match=r"memory: episode 7: damaged\. 1 more.*\[\"episode 7\", \"episode 9\"\]"):
@@ -143,7 +143,7 @@ def test_an_episode_that_breaks_on_the_way_is_a_broken_episode(open_with: Any, c
     assert len(open_with(source, idle=MOTION, exclude=("episode 7", "episode 9")).broken) == 0
 
 
-def test_settings_at_fault_end_the_pass_early(open_with: Any) -> None:
+def test_wrong_setting_stops_the_pass_after_ten_episodes(open_with: Any) -> None:
     source = MemorySource([40] * 50)
     with pytest.raises(InputError, match="no commanded joint velocities"):
         open_with(source, idle=COMMANDS, broken_episodes="skip")
@@ -159,7 +159,7 @@ def published(tmp_path: Path, content: object) -> dict[str, Any]:
     return {"idle": IdleConfig(rule="published", ranges=str(path))}
 
 
-def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, caplog: Any, gcs: Gcs) -> None:
+def test_published_ranges_are_matched_by_identity(open_with: Any, tmp_path: Path, caplog: Any, gcs: Gcs) -> None:
     ranges = {"episode 1": [[0, 12], [20, 40]], "elsewhere": [[0, 9999]], "episode 2": []}
     source = restful()
     dataset = open_with(source, **published(tmp_path, ranges))
@@ -190,9 +190,7 @@ BAD_LISTS = {
 
 
 @pytest.mark.parametrize(("content", "complaint"), BAD_LISTS.values(), ids=BAD_LISTS.keys())
-def test_a_list_that_does_not_fit_is_one_clear_error(
-    open_with: Any, tmp_path: Path, content: object, complaint: str
-) -> None:
+def test_mismatched_range_list_raises(open_with: Any, tmp_path: Path, content: object, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint) as caught:
         open_with(restful(), **published(tmp_path, content))
     assert "ranges.json" in caught.value.where

@@ -43,7 +43,7 @@ def kept(tmp_path: Path, key: str = KEY, place: str = "/data/set", table: Episod
     )
 
 
-def test_a_table_is_built_once_and_again_when_that_is_asked_for(tmp_path: Path) -> None:
+def test_table_is_built_once_and_rebuilt_after_deletion(tmp_path: Path) -> None:
     for table in (TABLE, None):
         found = kept(tmp_path, table=table)
         assert (ids(found), found.problems, compute_fingerprint(found)) == (ids(TABLE), TABLE.problems, KEY)
@@ -53,7 +53,7 @@ def test_a_table_is_built_once_and_again_when_that_is_asked_for(tmp_path: Path) 
     assert ids(kept(tmp_path, table=EpisodeTable.from_infos([EpisodeInfo("other", 1)]))) == ["other"]
 
 
-def test_an_index_of_a_folder_is_found_wherever_it_is_moved_and_its_problems_are_there(tmp_path: Path) -> None:
+def test_index_of_a_moved_folder_is_reused_with_updated_paths(tmp_path: Path) -> None:
     problem = EpisodeProblem("bad", "/data/set/a.npz: x", "damaged")
     broken = replace(EpisodeTable.from_infos([EpisodeInfo("one", 3)]), problems=(problem,))
     kept(tmp_path, table=broken)
@@ -64,7 +64,7 @@ def test_an_index_of_a_folder_is_found_wherever_it_is_moved_and_its_problems_are
     assert len({KEY, *others}) == 5
 
 
-def test_whatever_is_damaged_the_table_is_right(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_damaged_index_is_rebuilt(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     chance, rebuilt = random.Random(0), 0  # noqa: S311 - no secret
     whole = kept(tmp_path, table=TABLE).to_bytes()
     [path] = (tmp_path / "index").iterdir()
@@ -80,9 +80,7 @@ def test_whatever_is_damaged_the_table_is_right(tmp_path: Path, caplog: pytest.L
     assert rebuilt > 150
 
 
-def test_the_index_of_another_data_set_is_not_used_under_this_name(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_index_of_another_key_is_not_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     kept(tmp_path, table=TABLE)
     [path] = (tmp_path / "index").iterdir()
     other = index_key({"files": 4}, "/data/set")
@@ -92,7 +90,7 @@ def test_the_index_of_another_data_set_is_not_used_under_this_name(
     assert ids(kept(tmp_path, other)) == ["other"]
 
 
-def test_a_folder_that_cannot_be_written_costs_a_warning(
+def test_unwritable_cache_folder_logs_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(*_: object) -> None:

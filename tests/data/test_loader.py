@@ -51,7 +51,7 @@ def assert_same(found: list[Batch], expected: list[Batch]) -> None:
         assert torch.equal(one.actions, other.actions)
 
 
-def test_a_clip_holds_the_strided_steps_of_its_episode(droid: Path) -> None:
+def test_clip_has_the_strided_steps_of_its_episode(droid: Path) -> None:
     config = config_of(droid, frames=4, stride=3)
     dataset = open_dataset(config)
     episode = dataset.source.read(2)
@@ -61,13 +61,13 @@ def test_a_clip_holds_the_strided_steps_of_its_episode(droid: Path) -> None:
     assert np.array_equal(clip.frames, episode.read_frames([4, 7, 10, 13])[:, :, 15:80])
 
 
-def test_loading_does_not_draw_from_the_generator_of_dropout(droid: Path) -> None:
+def test_loading_does_not_use_the_global_random_generator(droid: Path) -> None:
     before = torch.get_rng_state()
     take(2, config_of(droid))
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_validation_clips_are_few_distinct_and_from_all_held_out_episodes(droid: Path) -> None:
+def test_validation_clips_are_distinct_and_cover_all_held_out_episodes(droid: Path) -> None:
     config = config_of(droid, validation_share=0.6)
     batches = list(validation_batches(open_dataset(config), "validation", clips=7, batch_size=3))
     assert [len(batch.starts) for batch in batches] == [3, 3, 1]
@@ -80,7 +80,7 @@ def test_validation_clips_are_few_distinct_and_from_all_held_out_episodes(droid:
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_an_error_in_a_worker_is_the_error_the_user_reads(spoiled: Callable[..., Path], workers: int) -> None:
+def test_worker_error_reaches_the_caller_unchanged(spoiled: Callable[..., Path], workers: int) -> None:
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
 
@@ -108,7 +108,7 @@ if __name__ == "__main__":
 """
 
 
-def test_workers_end_with_a_run_that_is_killed(droid: Path, tmp_path: Path) -> None:
+def test_workers_exit_when_the_run_is_killed(droid: Path, tmp_path: Path) -> None:
     script = tmp_path / "run.py"
     script.write_text(RUN_THAT_DIES)
     with subprocess.Popen(
@@ -126,7 +126,7 @@ def test_workers_end_with_a_run_that_is_killed(droid: Path, tmp_path: Path) -> N
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("workers", [0, 1])
-def test_batches_for_a_cuda_device_are_pinned_and_as_they_are(droid: Path, workers: int) -> None:
+def test_pinned_batches_equal_unpinned_batches(droid: Path, workers: int) -> None:
     dataset = open_dataset(config_of(droid, workers=workers))
     with closing(training_loader(dataset, seed=1, batch_size=2, pinned=True)) as batches:
         found = [next(batches), next(batches)]
@@ -134,7 +134,7 @@ def test_batches_for_a_cuda_device_are_pinned_and_as_they_are(droid: Path, worke
     assert_same(found, take(2, config_of(droid)))
 
 
-def test_frames_of_two_sizes_do_not_stack(droid: Path) -> None:
+def test_frames_of_different_sizes_raise_in_collate(droid: Path) -> None:
     config = config_of(droid)
     clip = clip_at(open_dataset(config), 0, 0)
     other = replace(clip, frames=clip.frames[:, :20], episode_id="the other")
@@ -153,7 +153,7 @@ def first(dataset: Dataset, count: int, **knobs: Any) -> list[Batch]:
 
 @pytest.mark.parametrize("world_size", [1, 3])
 @pytest.mark.parametrize("batch_size", [1, 4])
-def test_ranks_lose_no_window_and_see_none_twice_in_an_epoch(world_size: int, batch_size: int) -> None:
+def test_ranks_read_each_window_exactly_once_per_epoch(world_size: int, batch_size: int) -> None:
     dataset = open_in_memory(MemorySource([9, 12, 7, 10]))
     everything = {(f"episode {e}", s) for e, length in enumerate((9, 12, 7, 10)) for s in range(length - 4)}
     steps = -(-2 * len(everything) // (world_size * batch_size))
@@ -167,7 +167,7 @@ def test_ranks_lose_no_window_and_see_none_twice_in_an_epoch(world_size: int, ba
         assert set(epoch) == everything
 
 
-def test_resuming_reads_nothing_that_came_before() -> None:
+def test_resume_reads_no_earlier_clips() -> None:
     lengths = [30] * 40
     whole = names(first(open_in_memory(MemorySource(lengths)), 60))
     source = MemorySource(lengths)
@@ -180,7 +180,7 @@ def test_resuming_reads_nothing_that_came_before() -> None:
 CAMERAS = ("exterior_1_left", "exterior_2_left", "wrist_left")
 
 
-def test_the_camera_is_drawn_per_clip_by_the_position_alone() -> None:
+def test_camera_of_a_clip_depends_on_seed_and_position_only() -> None:
     def cameras(start: int, count: int) -> list[str | None]:
         source = MemorySource([30] * 10)
         first(open_in_memory(source, camera=CAMERAS[:2]), count, batch_size=1, start_position=start)
@@ -195,7 +195,7 @@ def test_the_camera_is_drawn_per_clip_by_the_position_alone() -> None:
 # Poses of the camera.
 
 
-def test_poses_in_the_cameras_frame_lead_to_actions_in_it() -> None:
+def test_camera_frame_poses_give_camera_frame_actions() -> None:
     cameras = np.tile([0.3, -0.2, 0.5, 0.4, -0.3, 1.2], (30, 1))
     source = MemorySource([30], extrinsics=lambda _: cameras)
     in_base = clip_at(open_in_memory(source), 0, 3)
@@ -217,7 +217,7 @@ def broken_set(broken: set[int], **knobs: Any) -> Dataset:
     return open_in_memory(source, **({"broken_episodes": "skip"} | knobs))
 
 
-def test_a_clip_that_cannot_be_read_is_missing_and_no_other_takes_its_place(caplog: pytest.LogCaptureFixture) -> None:
+def test_unreadable_clip_is_dropped_without_replacement(caplog: pytest.LogCaptureFixture) -> None:
     whole = [names([batch]) for batch in first(broken_set(set()), 80, batch_size=4)]
     broken = {f"episode {number}" for number in (3, 17)}
     dataset = broken_set({3, 17})
@@ -229,7 +229,7 @@ def test_a_clip_that_cannot_be_read_is_missing_and_no_other_takes_its_place(capl
     assert "memory: pictures of episode 17: damaged." in caplog.text
 
 
-def test_a_batch_may_lose_all_its_clips() -> None:
+def test_batch_of_unreadable_clips_is_empty() -> None:
     found = first(broken_set({3, 17}), 300, batch_size=1)
     empty = [batch for batch in found if not batch.starts]
     assert empty
@@ -237,19 +237,19 @@ def test_a_batch_may_lose_all_its_clips() -> None:
     assert empty[0].actions.shape == (0, 2, 7)
 
 
-def test_the_default_is_to_stop_at_a_clip_that_cannot_be_read() -> None:
+def test_unreadable_clip_raises_by_default() -> None:
     with pytest.raises(InputError, match=r"pictures of episode \d+: damaged\..*broken_episodes: skip, or add to"):
         first(broken_set(set(range(300)), broken_episodes="error"), 1)
 
 
-def test_a_validation_of_nothing_but_broken_clips_is_refused() -> None:
+def test_validation_with_only_broken_clips_raises() -> None:
     windows = broken_set({0}, validation_share=0.5).windows("validation")
     nothing = broken_set(set(windows.episodes.tolist()), validation_share=0.5)
     with pytest.raises(InputError, match=r"none of the clips can be read; broken episodes: episode \d+"):
         list(validation_batches(nothing, "validation", clips=1, batch_size=1))
 
 
-def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(spoiled: Callable[..., Path]) -> None:
+def test_workers_and_resume_are_bit_exact_with_all_options(spoiled: Callable[..., Path]) -> None:
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][3] = b"GIF89a"
 
@@ -267,7 +267,7 @@ def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(spoiled: C
         assert_same(found, alone[start : start + len(found)])
 
 
-def test_clips_of_a_set_that_lies_elsewhere_are_read_several_at_once() -> None:
+def test_remote_clips_are_read_concurrently() -> None:
     meeting = threading.Barrier(4, timeout=120)
 
     class Slow(MemorySource):

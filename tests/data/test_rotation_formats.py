@@ -70,7 +70,7 @@ def rounded(numbers: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("written_as", FORMATS)
 @pytest.mark.parametrize("base", BASES)
-def test_right_format_is_never_doubted(base: str, written_as: RotationFormat) -> None:
+def test_correct_rotation_format_is_never_rejected(base: str, written_as: RotationFormat) -> None:
     for seed in range(8):
         episodes, rate_hz = smooth_motion(base, seed)
         numbers = [numbers_of(one, written_as) for one in episodes]
@@ -82,7 +82,7 @@ def test_right_format_is_never_doubted(base: str, written_as: RotationFormat) ->
 
 @pytest.mark.parametrize("written_as", FORMATS)
 @pytest.mark.parametrize("change", [as_written, repeated, with_dropouts, padded, rounded])
-def test_wrong_format_is_named_for_a_hand_that_points_down(
+def test_wrong_rotation_format_is_detected_for_a_hand_pointing_down(
     written_as: RotationFormat, change: Callable[[np.ndarray], np.ndarray]
 ) -> None:
     for seed in range(8):
@@ -92,14 +92,14 @@ def test_wrong_format_is_named_for_a_hand_that_points_down(
         assert [named[configured] for configured in wrong] == [written_as] * 2, seed
 
 
-def test_numbers_without_jumps_do_not_tell_the_format() -> None:
+def test_numbers_without_jumps_do_not_identify_the_format() -> None:
     numbers = [numbers_of(one, "rotation_vector") for one in smooth_motion("near zero", 0)[0]]
     speeds = measure_rotation_speeds(numbers, 15.0)
     assert {one.num_jumps for one in speeds.values()} == {0}
     assert set(formats_named(numbers, 15.0).values()) == {None}
 
 
-def test_speeds_are_those_of_the_rotation_in_each_format() -> None:
+def test_rotation_speeds_match_the_rotation_in_each_format() -> None:
     angles = np.linspace(3.0, 3.5, 11)[:, None] * [1.0, 0, 0]
     wrapped = np.where(angles > np.pi, angles - 2 * np.pi, angles) + np.array([0.0, 0.3, 0.0])
     speeds = measure_rotation_speeds([wrapped], 10.0)

@@ -79,7 +79,7 @@ def numbers_in(dataset: Dataset, split: Split) -> set[int]:
 
 
 @pytest.mark.parametrize("val", ["val", "valid", "validation", "Val"])
-def test_splits_of_rlds_are_read_as_the_set_has_them(val: str, opened: Opened, tmp_path: Path) -> None:
+def test_rlds_splits_are_used(val: str, opened: Opened, tmp_path: Path) -> None:
     dataset = opened(write_rlds_splits(tmp_path / "set", "test", "train", val))
     assert [numbers_in(dataset, split) for split in ("test", "train", "validation")] == [
         set(range(start, 3 * EPISODES, 3)) for start in range(3)
@@ -94,7 +94,7 @@ def test_splits_of_rlds_are_read_as_the_set_has_them(val: str, opened: Opened, t
     assert "drawn" not in text
 
 
-def test_a_missing_split_is_drawn_from_train_alone(opened: Opened, tmp_path: Path) -> None:
+def test_missing_split_is_drawn_from_train_only(opened: Opened, tmp_path: Path) -> None:
     dataset = opened(write_rlds_splits(tmp_path / "set", "train", "train_2", "val"), test_share=0.4)
     assert numbers_in(dataset, "validation") == set(range(2, 3 * EPISODES, 3))
     by_hash = dataset.config.model_copy(update={"validation_share": 0.0})
@@ -116,7 +116,7 @@ def test_a_missing_split_is_drawn_from_train_alone(opened: Opened, tmp_path: Pat
         (("val", "test"), {}, "they do not include both train and a held-out split"),
     ],
 )
-def test_other_splits_are_pooled_and_drawn_by_hash_as_is_said(
+def test_unusable_splits_are_pooled_and_drawn_by_hash(
     names: tuple[str, ...], changes: dict[str, str], why: str, opened: Opened, tmp_path: Path
 ) -> None:
     dataset = opened(write_rlds_splits(tmp_path / "set", *names), **changes)
@@ -126,7 +126,7 @@ def test_other_splits_are_pooled_and_drawn_by_hash_as_is_said(
     assert all(f"{name} (4 episodes)" in text for name in names)
 
 
-def test_a_set_with_one_split_is_drawn_by_hash_and_keeps_its_index(opened: Opened, tmp_path: Path) -> None:
+def test_single_split_is_drawn_by_hash_with_the_same_index(opened: Opened, tmp_path: Path) -> None:
     folder = write_rlds(tmp_path / "set", range(8))
     one, pooled = opened(folder), opened(folder, splits="hash")
     assert one.table.to_bytes() == pooled.table.to_bytes()
@@ -135,7 +135,7 @@ def test_a_set_with_one_split_is_drawn_by_hash_and_keeps_its_index(opened: Opene
     assert describe_splits(one.table, one.config) == ""
 
 
-def test_splits_of_lerobot_are_ranges_of_episode_numbers(opened: Opened, tmp_path: Path) -> None:
+def test_lerobot_splits_are_ranges_of_episode_numbers(opened: Opened, tmp_path: Path) -> None:
     folder = write_lerobot_splits(tmp_path / "set", 6, {"train": "0:3", "val": "3:5", "test": "5:6"})
     found = members(opened(folder, source="lerobot"))
     assert [found[f"episode_{number:06d}"] for number in range(6)] == [
@@ -143,14 +143,14 @@ def test_splits_of_lerobot_are_ranges_of_episode_numbers(opened: Opened, tmp_pat
     ]  # fmt: skip
 
 
-def test_a_split_of_the_set_that_is_left_out_is_an_error_with_the_key(opened: Opened, tmp_path: Path) -> None:
+def test_excluding_a_whole_own_split_raises_with_the_config_key(opened: Opened, tmp_path: Path) -> None:
     folder = write_rlds_splits(tmp_path / "set", "train", "val")
     held_out = [name for name, split in members(opened(folder)).items() if split == "validation"]
     with pytest.raises(InputError, match=r"no validation episodes among 4 .*Set data\.splits: hash"):
         opened(folder, exclude=tuple(held_out)).windows("validation")
 
 
-def test_check_says_which_splits_are_used(opened: Opened, tmp_path: Path) -> None:
+def test_check_reports_the_used_splits(opened: Opened, tmp_path: Path) -> None:
     config = opened(write_rlds_splits(tmp_path / "set", "train", "test")).config
     findings = list(check_data(config, clips=2))
     assert [one.text for one in findings if one.about == "splits"] == [

@@ -21,7 +21,7 @@ from vjepa2_ac.errors import InputError
 FLOAT16_ROUNDING = 2.0**-10  # half a step between 2 and 4
 
 
-def test_crops_equal_all_that_the_official_code_took() -> None:
+def test_crops_equal_those_of_the_official_code() -> None:
     rows = json.loads((GOLDEN / "crops.json").read_text())
     assert len(rows) == 6
     for row in rows:
@@ -29,14 +29,14 @@ def test_crops_equal_all_that_the_official_code_took() -> None:
         assert [CropBox(*seen) for seen in row["train_crops_seen"]] == [found]
 
 
-def test_the_square_is_what_the_official_code_evaluates_on() -> None:
+def test_square_crop_equals_the_official_evaluation_crop() -> None:
     rows = json.loads((GOLDEN / "crops.json").read_text())
     for row in rows:
         assert crop_box(row["height"], row["width"], "square") == CropBox(*row["eval_crop"])
 
 
 @pytest.mark.parametrize(("height", "width"), [(18, 32), (32, 18), (17, 32), (20, 20)])
-def test_a_letterbox_shows_every_pixel_between_black_bars(height: int, width: int) -> None:
+def test_letterbox_keeps_all_pixels_between_black_bars(height: int, width: int) -> None:
     frames = np.random.default_rng(0).integers(1, 256, (2, height, width, 3), dtype=np.uint8)
     seen = crop_frames(frames, "letterbox")
     side = max(height, width)
@@ -48,24 +48,26 @@ def test_a_letterbox_shows_every_pixel_between_black_bars(height: int, width: in
 
 
 @pytest.mark.parametrize("size", [(16, 20_000), (20_000, 16)])
-def test_a_letterbox_that_would_take_gigabytes_is_refused(size: tuple[int, int]) -> None:
+def test_letterbox_of_gigabytes_raises(size: tuple[int, int]) -> None:
     with pytest.raises(InputError, match=r"data\.crop: letterbox: 1 images of 20000 x 20000 pixels"):
         crop_frames(np.zeros((1, *size, 3), np.uint8), "letterbox")
 
 
 @pytest.mark.parametrize(("height", "width", "expected"), [(200, 100, (33, 0, 133, 100)), (180, 243, (0, 0, 180, 243))])
-def test_tall_frames_are_cut_too_and_cropped_ones_are_left(height: int, width: int, expected: tuple[int, ...]) -> None:
+def test_tall_frames_are_cropped_and_cropped_frames_unchanged(
+    height: int, width: int, expected: tuple[int, ...]
+) -> None:
     assert crop_box(height, width) == CropBox(*expected)
 
 
-def test_the_transform_equals_the_official_one_on_a_frame() -> None:
+def test_encoder_input_equals_the_official_transform() -> None:
     with np.load(GOLDEN / "transform_frame.npz") as golden:
         frame, expected = golden["frame"], golden["clip"].astype(np.float32)
     found = pixels_to_input(torch.from_numpy(crop_frames(frame[None]))[None], 256)[0, 0]
     assert abs(found.numpy()[:, ::8, ::8] - expected).max() <= FLOAT16_ROUNDING
 
 
-def test_what_inference_has_kept_can_be_trained_with() -> None:
+def test_constants_cached_in_inference_mode_work_in_training() -> None:
     channel_constants.cache_clear()
     with torch.inference_mode():
         pixels_to_input(torch.zeros(1, 1, 8, 8, 3, dtype=torch.uint8), 8)
@@ -74,6 +76,6 @@ def test_what_inference_has_kept_can_be_trained_with() -> None:
     )
 
 
-def test_input_goes_back_to_the_image_that_it_is() -> None:
+def test_encoder_input_converts_back_to_the_image() -> None:
     frames = torch.randint(0, 256, (2, 3, 8, 8, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     assert torch.equal(input_to_pixels(pixels_to_input(frames, 8)).permute(0, 1, 3, 4, 2), frames)

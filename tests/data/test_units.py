@@ -23,7 +23,7 @@ def write_lerobot(folder: Path) -> Path:
     return write_v30(folder, [Recorded({**episode.columns, STATE[0]: pose}, episode.frames)])
 
 
-def test_lerobot_names_the_keys_and_reads_with_them(tmp_path: Path) -> None:
+def test_lerobot_unit_errors_name_the_keys_that_fix_them(tmp_path: Path) -> None:
     def opened(**fields: Any) -> LeRobotSource:
         return LeRobotSource(LeRobotData(path=str(folder), lerobot=fields, disk_cache={"dir": str(tmp_path / "cache")}))
 
@@ -40,7 +40,7 @@ def test_lerobot_names_the_keys_and_reads_with_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(opened(**IN_OTHER_UNITS).read(0).states, synthetic_states(12, seed=0), atol=1e-5)
 
 
-def test_a_unit_that_the_config_names_is_not_doubted() -> None:
+def test_configured_unit_is_not_rejected() -> None:
     numbers = synthetic_states(12, seed=0) * ([1e6] * 3 + [180 / np.pi] * 3 + [1])
     fields = LeRobotFields(position_unit="mm", rotation="rotation_vector")
     with pytest.raises(InputError, match="within 5 m") as raised:

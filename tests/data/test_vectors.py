@@ -40,7 +40,7 @@ def recorded_by(how: str | None, **changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("width", [1, 7, 14])
-def test_states_are_the_numbers_of_the_file_and_actions_their_differences(tmp_path: Path, width: int) -> None:
+def test_vector_states_are_the_stored_numbers_and_actions_their_differences(tmp_path: Path, width: int) -> None:
     dataset = open_dataset(knobs(write_vectors(tmp_path, width=width)))
     assert dataset.widths == Widths(width, width)
     clip = clip_at(dataset, 0, 3)
@@ -50,7 +50,7 @@ def test_states_are_the_numbers_of_the_file_and_actions_their_differences(tmp_pa
 
 
 @pytest.mark.parametrize(("how", "join"), [("sum", np.sum), ("mean", np.mean), ("last", lambda x, **_: x[:, -1])])
-def test_commands_of_a_model_step_are_those_of_its_control_steps_joined(
+def test_commands_of_a_model_step_are_joined_control_steps(
     tmp_path: Path, how: str, join: Callable[..., np.ndarray]
 ) -> None:
     dataset = open_dataset(knobs(write_vectors(tmp_path, width=14, action_width=5), **recorded_by(how)))
@@ -60,7 +60,7 @@ def test_commands_of_a_model_step_are_those_of_its_control_steps_joined(
     np.testing.assert_array_equal(clip.actions, join(written[4:8].reshape(2, 2, 5), axis=1).astype(np.float32))
 
 
-def test_rlds_gives_the_features_that_are_named(droid: Path) -> None:
+def test_rlds_reads_the_configured_features(droid: Path) -> None:
     fields = {"state": JOINTS, "action": VELOCITIES}
     config = knobs(droid, source="rlds", fields=fields, **recorded_by("mean"))
     dataset = open_dataset(config)
@@ -75,7 +75,7 @@ def test_rlds_gives_the_features_that_are_named(droid: Path) -> None:
         open_dataset(without)
 
 
-def test_rlds_without_a_flag_for_each_step_cannot_say_how_wide_a_vector_is(
+def test_rlds_vector_width_is_unknown_without_a_flag_per_step(
     spoiled: Callable[[Callable[[Any], None]], Path],
 ) -> None:
     folder = spoiled(lambda features: features.pop("steps/is_first"))
@@ -92,7 +92,7 @@ def bimanual(number: int, steps: int) -> Recorded:
 
 
 @pytest.mark.parametrize("write", [write_v30, write_v21], ids=["v3.0", "v2.1"])
-def test_lerobot_gives_the_columns_that_are_named(tmp_path: Path, write: Callable[..., Path]) -> None:
+def test_lerobot_reads_the_configured_columns(tmp_path: Path, write: Callable[..., Path]) -> None:
     folder = write(tmp_path / "set", [bimanual(number, 12) for number in range(4)])
     lerobot = {"state": ["observation.state"], "success": None}
     dataset = open_dataset(knobs(folder, source="lerobot", lerobot=lerobot, **recorded_by("last")))
@@ -107,14 +107,14 @@ def test_lerobot_gives_the_columns_that_are_named(tmp_path: Path, write: Callabl
         open_dataset(wrong)
 
 
-def test_a_robot_of_another_width_is_a_broken_episode(tmp_path: Path) -> None:
+def test_episode_of_another_width_is_broken(tmp_path: Path) -> None:
     write_vectors(tmp_path, width=14)
     write_vectors(tmp_path / "other", width=8, episodes=1)
     with pytest.raises(InputError, match=r"other.*8 numbers a state.*14 numbers a state, as in most"):
         open_dataset(knobs(tmp_path))
 
 
-def test_commands_that_are_asked_for_must_be_there_for_every_step(tmp_path: Path) -> None:
+def test_missing_or_short_recorded_commands_raise(tmp_path: Path) -> None:
     write_vectors(tmp_path / "none", width=8)
     with pytest.raises(InputError, match=r"actions: no such array"):
         open_dataset(knobs(tmp_path / "none", **recorded_by("sum")))
@@ -139,9 +139,7 @@ def test_commands_that_are_asked_for_must_be_there_for_every_step(tmp_path: Path
         ({"fields": {"gripper_open": 0.5}}, "data.fields: a section of source rlds, and this is source npz"),
     ],
 )
-def test_what_needs_poses_or_says_too_little_is_refused_with_the_config(
-    changes: dict[str, Any], complaint: str
-) -> None:
+def test_vector_config_that_needs_poses_or_is_incomplete_raises(changes: dict[str, Any], complaint: str) -> None:
     values = {"path": "d", "source": "npz", "states": "vector"} | changes
     with pytest.raises(InputError, match=complaint):
         parse_config({"run_dir": "r", "model": {"base": "b"}, "data": values}, where="here")
@@ -166,14 +164,14 @@ def batch(states: np.ndarray, actions: np.ndarray | None = None) -> Batch:
         (vectors(9, 5, seed=0) * 0, "actions", "error", "nothing to learn from"),
     ],
 )
-def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: str, level: str, words: str) -> None:
+def test_check_reports_constant_states_and_zero_actions(states: np.ndarray, about: str, level: str, words: str) -> None:
     found = {one.about: one for one in batch_findings([batch(states)], FIVE)}
     assert found[about].level == level
     assert words in found[about].text
 
 
 @pytest.mark.usefixtures("drawn")
-def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
+def test_inspection_of_vector_states(tmp_path: Path) -> None:
     dataset = open_dataset(knobs(write_vectors(tmp_path / "set", width=14)))
     found = inspect_dataset(dataset)
     figures = json.loads(json.dumps(found.values))

@@ -51,7 +51,7 @@ ALL_TRAIN = {"validation_share": 0.0, "test_share": 0.0}
 
 @settings(max_examples=60)
 @given(size=st.integers(1, 300), seed=st.integers(0, 2**31), epoch=st.integers(0, 1000))
-def test_a_permutation_hits_every_index_once(size: int, seed: int, epoch: int) -> None:
+def test_permutation_returns_each_index_once(size: int, seed: int, epoch: int) -> None:
     assert sorted(permute_index(index, size=size, seed=seed, epoch=epoch) for index in range(size)) == list(range(size))
 
 
@@ -78,7 +78,7 @@ def test_order_and_split_do_not_depend_on_the_order_of_the_episodes() -> None:
         assert named[0] == named[1]
 
 
-def test_the_demo_sees_the_clips_it_always_saw() -> None:
+def test_demo_clips_are_unchanged() -> None:
     golden = json.loads((GOLDEN / "demo_clip_order.json").read_text())
     infos = [EpisodeInfo(f"{folder}/recordings/MP4--{folder}/trajectory.h5", 41) for folder in golden["folders"]]
     config = load_config(ROOT / "configs/demo.yaml", []).data
@@ -92,7 +92,7 @@ def test_the_demo_sees_the_clips_it_always_saw() -> None:
             assert [list(windows[index]) for index in interleave_halves(spread_indices(count, 40))] == golden[split]
 
 
-def test_short_episodes_are_left_out_counted_and_named(caplog: pytest.LogCaptureFixture) -> None:
+def test_short_episodes_are_skipped_and_reported(caplog: pytest.LogCaptureFixture) -> None:
     windows = select_split_windows(episodes(9, 10, 3), settings_of(**ALL_TRAIN), "train")
     assert windows.short == (0, 2)
     assert windows.episodes.tolist() == [1]
@@ -102,7 +102,7 @@ def test_short_episodes_are_left_out_counted_and_named(caplog: pytest.LogCapture
 
 @settings(max_examples=50)
 @given(size=st.integers(1, 500), count=st.integers(1, 100))
-def test_what_is_spread_is_distinct_and_even(size: int, count: int) -> None:
+def test_spread_indices_are_distinct_and_even(size: int, count: int) -> None:
     chosen = spread_indices(size, count)
     assert len(chosen) == len(set(chosen)) == min(size, count)
     gaps = np.diff([-size / len(chosen) / 2, *chosen])
@@ -120,7 +120,7 @@ def counts(hashes: list[int], **shares: float) -> dict[str, int]:
 
 
 @given(numbers=HASHES, validation=st.floats(0, 0.4), test=st.floats(0, 0.4))
-def test_each_episode_is_in_one_split_and_none_that_has_a_share_is_empty(
+def test_each_episode_is_in_one_split_and_no_split_with_a_share_is_empty(
     numbers: list[int], validation: float, test: float
 ) -> None:
     found = counts([number * 2**54 for number in numbers], validation_share=validation, test_share=test)
@@ -130,7 +130,7 @@ def test_each_episode_is_in_one_split_and_none_that_has_a_share_is_empty(
         assert found["test"] > 0 or test == 0
 
 
-def test_growing_a_share_moves_episodes_out_of_training_only() -> None:
+def test_larger_held_out_share_only_takes_episodes_from_train() -> None:
     hashes = [number * 2**54 for number in range(1024)]
     before, after = (
         {split: draw_split(np.array(hashes, np.uint64), settings_of(validation_share=share, test_share=0.05), split)
@@ -154,7 +154,7 @@ def splits_of(source: MemorySource, **knobs: object) -> dict[str, Split]:
 
 @pytest.mark.parametrize("split_by", [None, r"episode (\d)"])
 @pytest.mark.parametrize("left_out", [0, 2, 6, 7])
-def test_leaving_an_episode_out_moves_no_other(left_out: int, split_by: str | None) -> None:
+def test_excluding_an_episode_moves_no_other_between_splits(left_out: int, split_by: str | None) -> None:
     """Neither `data.exclude` nor an episode that breaks: what a run has trained on stays out of its validation."""
     knobs = {"split_by": split_by, "idle": {"rule": "motion"}, "broken_episodes": "skip"}
     before = splits_of(MemorySource([60] * 8), **knobs)
@@ -165,7 +165,7 @@ def test_leaving_an_episode_out_moves_no_other(left_out: int, split_by: str | No
     assert splits_of(MemorySource([61 + left_out] * 8, unreadable=frozenset({left_out})), **knobs) == without
 
 
-def test_of_the_outcomes_only_the_chosen_one_is_split() -> None:
+def test_splits_contain_the_selected_outcome_only() -> None:
     source = MemorySource([60] * 12, [number % 2 == 0 for number in range(12)])
     found = splits_of(source, outcome="success")
     assert sorted(found.values()).count("train") == 4

@@ -43,7 +43,7 @@ def data(workers: int) -> DataConfig:
 
 
 @pytest.mark.parametrize(("workers", "processes"), [(4, 1), (2, 2)])
-def test_shared_memory_must_hold_the_batches_of_all_workers(shared_memory: Any, workers: int, processes: int) -> None:
+def test_shared_memory_smaller_than_all_batches_raises(shared_memory: Any, workers: int, processes: int) -> None:
     needed = 1000 * workers * loader.PREFETCH * processes
     shared_memory(needed)
     require_shared_memory(data(workers), 1000, processes)
@@ -58,7 +58,7 @@ def test_a_system_without_shared_memory_is_not_checked(monkeypatch: pytest.Monke
     require_shared_memory(data(4), 10**18)
 
 
-def test_a_run_is_refused_before_its_first_step(make_config: Any, shared_memory: Any) -> None:
+def test_too_little_shared_memory_raises_before_the_first_step(make_config: Any, shared_memory: Any) -> None:
     frames = 2 * 4 * 36 * 49 * 3  # a batch of two clips of 4 frames, and 49 numbers of states and actions each
     shared_memory(2 * loader.PREFETCH * (frames + 2 * 4 * (4 * 7 + 3 * 7)) - 1)
     with pytest.raises(UnreachableError, match=r"2 workers x 2 prefetched batches of 0\.0427 MB"):
@@ -66,7 +66,7 @@ def test_a_run_is_refused_before_its_first_step(make_config: Any, shared_memory:
     set_up(make_config(data__workers=0))
 
 
-def test_a_batch_without_room_in_shared_memory_is_an_error_of_the_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_shared_memory_raises_from_the_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_: torch.Tensor) -> torch.Tensor:
         raise RuntimeError("unable to allocate shared memory(shm)")
 
@@ -83,7 +83,7 @@ def take_all(failure: str) -> list[list[int]]:
     return list(map_in_workers(Rows(failure), ([number] for number in range(4)), 1))
 
 
-def test_a_worker_that_dies_or_cannot_send_ends_the_run() -> None:
+def test_dead_or_blocked_worker_raises() -> None:
     assert take_all("") == [[0], [1], [2], [3]]
     for failure, status in (("dies", 9), ("cannot be sent", 1)):
         with pytest.raises(UnreachableError, match=rf"worker has ended unexpectedly \(exit code {status}\)"):
@@ -102,7 +102,7 @@ class Slow(Iterator[int]):
         return 7
 
 
-def test_a_slow_batch_is_waited_for_unless_a_signal_has_come(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_batch_is_awaited_unless_a_stop_signal_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
     assert loader._next_row(Slow(), ()) == 7
     with pytest.raises(RuntimeError, match="another"):
         loader._next_row(Slow("another"), ())

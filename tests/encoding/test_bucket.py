@@ -84,7 +84,7 @@ def equal(one: list[torch.Tensor], other: list[torch.Tensor]) -> bool:
 # ---- written, found and read -------------------------------------------------------------------------------------
 
 
-def test_another_machine_goes_on_with_what_is_there_and_then_finds_it_finished(
+def test_second_machine_completes_a_cache_in_a_bucket(
     bucket: Gcs, far: Callable[..., Config], encoded_frames: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
@@ -105,7 +105,7 @@ def test_another_machine_goes_on_with_what_is_there_and_then_finds_it_finished(
 
 
 @pytest.mark.usefixtures("bucket")
-def test_a_run_on_latents_in_a_bucket_is_the_run_on_those_of_a_folder_bit_for_bit(
+def test_run_on_a_bucket_cache_equals_run_on_a_local_cache_bit_for_bit(
     far: Callable[..., Config], tmp_path: Path, encoded_frames: list[int]
 ) -> None:
     runs = []
@@ -117,7 +117,7 @@ def test_a_run_on_latents_in_a_bucket_is_the_run_on_those_of_a_folder_bit_for_bi
     assert sum(encoded_frames) == 2 * EPISODES * 24
 
 
-def test_a_cache_is_opened_by_one_listing_and_read_in_ranges_once(bucket: Gcs, far: Callable[..., Config]) -> None:
+def test_bucket_cache_takes_one_listing_and_reads_each_range_once(bucket: Gcs, far: Callable[..., Config]) -> None:
     knobs = {"data__start_every": 2, "data__frames": 8}
     folder = encode_config(far(**knobs)).folder
     far = partial(far, **knobs)
@@ -146,7 +146,7 @@ def test_a_cache_is_opened_by_one_listing_and_read_in_ranges_once(bucket: Gcs, f
         (URL, 403, r"no permission.*gcloud auth application-default login"),
     ],
 )
-def test_a_place_that_cannot_be_written_is_one_error_before_a_frame_is_encoded(
+def test_unwritable_cache_url_raises_before_encoding(
     bucket: Gcs, far: Callable[..., Config], url: str, status: int | None, words: str, encoded_frames: list[int]
 ) -> None:
     if status:
@@ -158,7 +158,7 @@ def test_a_place_that_cannot_be_written_is_one_error_before_a_frame_is_encoded(
     assert bucket.names("bucket") == ["other"]
 
 
-def test_a_damaged_file_is_named_and_encoded_again(
+def test_damaged_bucket_file_is_reported_and_encoded_again(
     bucket: Gcs, far: Callable[..., Config], encoded_frames: list[int]
 ) -> None:
     folder = encode_config(far()).folder
@@ -189,7 +189,7 @@ def start(nursery: Nursery, config: Config, folder: Path, name: str, **environme
     return nursery.start_script(*words, environment=dict(os.environ) | environment, out=files[0], err=files[1])
 
 
-def test_a_killed_upload_leaves_nothing_that_looks_finished(
+def test_killed_upload_leaves_no_finished_file(
     bucket: Gcs, far: Callable[..., Config], nursery: Nursery, tmp_path: Path, encoded_frames: list[int]
 ) -> None:
     expected = batches(alone(far(), encode_config(far(data__cache_dir=str(tmp_path / "whole"))).folder))

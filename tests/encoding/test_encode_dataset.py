@@ -37,7 +37,7 @@ def needed(config: Config) -> int:
     return sum(len(one.steps) for one in needed_frames(open_dataset(config.data)))
 
 
-def test_every_needed_frame_is_encoded_once(
+def test_each_needed_frame_is_encoded_once(
     make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int], reporter: SilentReporter
 ) -> None:
     config = make_config(data__start_every=2)
@@ -59,7 +59,7 @@ def test_every_needed_frame_is_encoded_once(
 # ---- whatever happens --------------------------------------------------------------------------------------------
 
 
-def test_a_kill_costs_one_episode_at_most(
+def test_kill_loses_at_most_one_episode(
     nursery: Nursery, make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
 ) -> None:
     config = make_config(data__start_every=2)
@@ -80,7 +80,7 @@ def test_a_kill_costs_one_episode_at_most(
     assert contents(out) == expected
 
 
-def test_processes_share_the_episodes_without_waiting_for_one_another(
+def test_processes_split_the_episodes_without_waiting(
     make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoded_frames: list[int]
 ) -> None:
     config = make_config(data__start_every=2)
@@ -94,7 +94,7 @@ def test_processes_share_the_episodes_without_waiting_for_one_another(
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
-def test_a_disk_that_fills_up_is_named_and_nothing_half_written_counts(
+def test_full_disk_raises_and_leaves_no_partial_file(
     make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config, out, whole = make_config(), tmp_path / "out", writing.atomic_writer
@@ -114,9 +114,7 @@ def test_a_disk_that_fills_up_is_named_and_nothing_half_written_counts(
     assert encode(config, out).is_finished
 
 
-def test_a_folder_that_cannot_be_written_or_holds_other_things_is_refused(
-    make_config: MakeConfig, tmp_path: Path
-) -> None:
+def test_unwritable_or_foreign_cache_folder_raises(make_config: MakeConfig, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").touch()
     for folder, words in ((tmp_path / "config.yaml" / "out", "cannot be written"), (tmp_path, r"config\.yaml")):
         with pytest.raises(InputError, match=words):
@@ -131,14 +129,14 @@ def test_a_folder_that_cannot_be_written_or_holds_other_things_is_refused(
         ({"data__source": "latents"}, "already encoded"),
     ],
 )
-def test_what_cannot_be_encoded_is_refused_before_the_data_is_opened(
+def test_config_that_cannot_be_encoded_raises_before_opening_the_data(
     make_config: MakeConfig, tmp_path: Path, changes: dict, words: str
 ) -> None:
     with pytest.raises(InputError, match=words):
         encode(make_config(data__path=str(tmp_path / "nowhere"), **changes), tmp_path / "out")
 
 
-def test_what_is_damaged_deleted_or_takes_part_from_now_on_is_encoded_by_the_next_start_and_only_that(
+def test_next_encoding_writes_only_damaged_deleted_and_new_files(
     make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
 ) -> None:
     out = tmp_path / "out"
@@ -188,7 +186,7 @@ def mend(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     return mended
 
 
-def test_a_broken_episode_stops_the_work_or_is_left_out_named_and_tried_again(
+def test_broken_episode_stops_the_encoding_or_is_skipped_and_retried(
     make_config: MakeConfig, tmp_path: Path, mend: Callable[[], None]
 ) -> None:
     skip, out = make_config(data__broken_episodes="skip"), tmp_path / "out"
@@ -204,7 +202,7 @@ def test_a_broken_episode_stops_the_work_or_is_left_out_named_and_tried_again(
 
 
 @pytest.mark.usefixtures("mend")
-def test_too_many_broken_episodes_of_all_processes_together_stop_the_last_one(
+def test_too_many_broken_episodes_over_all_processes_raise(
     make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, config = tmp_path / "out", make_config(data__broken_episodes="skip")
@@ -226,7 +224,7 @@ def cache(tmp_path: Path) -> Path:
     return tmp_path / "cache"
 
 
-def test_a_run_that_encodes_first_is_the_run_on_frames_bit_for_bit(
+def test_run_with_cached_latents_equals_run_on_frames_bit_for_bit(
     make_config: MakeConfig, tmp_path: Path, whole_run: Path, cache: Path, encoded_frames: list[int]
 ) -> None:
     reporter = SilentReporter()
@@ -241,7 +239,7 @@ def test_a_run_that_encodes_first_is_the_run_on_frames_bit_for_bit(
     assert any("Reading latents from" in note for note in reporter.notes)
 
 
-def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
+def test_two_processes_share_the_encoding_before_the_first_step(
     make_config: MakeConfig, tmp_path: Path, cache: Path
 ) -> None:
     config = make_config(data__cache="auto", data__cache_dir=str(cache), training__steps=1, training__accumulation=1)

@@ -81,9 +81,7 @@ def read_all(files: LatentFiles) -> tuple[StoredLatents, np.ndarray]:
 
 
 @pytest.mark.parametrize(("kind", "largest_error"), [("fp32", 0.0), ("bf16", 2**-8), ("int8", 0.5)])
-def test_latents_come_back_in_the_precision_that_they_are_kept_in(
-    tmp_path: Path, kind: CacheType, largest_error: float
-) -> None:
+def test_cached_latents_have_the_precision_of_the_cache(tmp_path: Path, kind: CacheType, largest_error: float) -> None:
     found = written(tmp_path, kind).open(0, "left").read_latents([3, 0])
     true = drawn_latents()[[3, 0]]
     unit = {"fp32": 1.0, "bf16": true.abs(), "int8": true.abs().amax(-1, keepdim=True) / 127}[kind]
@@ -93,7 +91,7 @@ def test_latents_come_back_in_the_precision_that_they_are_kept_in(
 
 
 @pytest.mark.parametrize("exact", [False, True])
-def test_everything_else_of_an_episode_comes_back_bit_for_bit(tmp_path: Path, exact: bool) -> None:
+def test_other_cached_values_are_bit_exact(tmp_path: Path, exact: bool) -> None:
     file, true = written(tmp_path, exact=exact).open(0, "left"), episode()
     for name in ("states", *OPTIONAL):
         assert file.read_array(name).dtype == getattr(true, name).dtype
@@ -125,9 +123,7 @@ def changed(path: Path, change: Callable[[dict[str, torch.Tensor], dict[str, str
         lambda _, about: about.update(metadata="["),
     ],
 )
-def test_a_strangers_file_that_is_not_what_it_should_be_is_an_error_for_the_user(
-    tmp_path: Path, change: Callable[..., object]
-) -> None:
+def test_invalid_third_party_cache_file_raises(tmp_path: Path, change: Callable[..., object]) -> None:
     files = written(tmp_path)
     read_all(files)
     changed(Path(files.path(0, "left")), change)
@@ -149,9 +145,7 @@ def with_nan(tensors: dict[str, torch.Tensor], _: object) -> None:
         (lambda tensors, _: tensors.pop("states"), r"not a whole file of latents"),
     ],
 )
-def test_states_of_a_third_partys_cache_are_checked_as_those_of_any_source(
-    tmp_path: Path, change: Callable[..., object], message: str
-) -> None:
+def test_states_of_a_third_party_cache_are_checked(tmp_path: Path, change: Callable[..., object], message: str) -> None:
     through = open_dataset(cached_config(tmp_path))
     files = sorted((Path(through.config.path) / "episodes/000").glob("*.safetensors"))
     through.source.read(1)
@@ -168,7 +162,7 @@ def cached_config(tmp_path: Path) -> DataConfig:
     return config.with_source("latents", path=str(write_cache(open_dataset(config))), camera=config.cameras)
 
 
-def test_only_the_frames_that_are_asked_for_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_requested_latents_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files, count, frame = LatentFiles(tmp_path, "key"), 200, 64 * 1024 * 4
     latents = StoredLatents(torch.zeros(1, 64, 1024).expand(count, -1, -1))
     pictures = np.zeros((count, 8, 8, 3), np.uint8)
@@ -253,7 +247,7 @@ def assert_same_clips(original: list[Batch], cached: list[Batch]) -> None:
 
 
 @pytest.mark.parametrize("knobs", EVERYTHING.values(), ids=EVERYTHING)
-def test_a_cache_has_the_clips_of_its_data_set_in_their_order(
+def test_cached_clips_equal_those_of_the_data_set(
     droid_with_rests: Path, tmp_path: Path, knobs: dict[str, Any]
 ) -> None:
     original, through = cached(droid_with_rests, tmp_path, **knobs)
@@ -287,7 +281,7 @@ def with_a_broken_one(tmp_path: Path) -> Dataset:
     return Dataset(config, source, table, StepSelection.all_steps(table, is_selected), BrokenEpisodes(config, 100))
 
 
-def test_an_episode_that_could_not_be_encoded_is_left_out_as_it_was_without_a_cache(with_a_broken_one: Dataset) -> None:
+def test_broken_episode_is_skipped_with_and_without_a_cache(with_a_broken_one: Dataset) -> None:
     original = with_a_broken_one
     write_cache(original)
     through = replace(
@@ -302,7 +296,7 @@ def test_an_episode_that_could_not_be_encoded_is_left_out_as_it_was_without_a_ca
     )
 
 
-def test_damage_to_a_cache_is_handled_as_damage_to_the_data(with_a_broken_one: Dataset) -> None:
+def test_damaged_cache_file_follows_the_broken_episode_policy(with_a_broken_one: Dataset) -> None:
     def opened(policy: str) -> Dataset:
         config = with_a_broken_one.config.model_copy(update={"broken_episodes": policy})
         source, broken = MemorySource([6] * 100), BrokenEpisodes(config, 100)
@@ -347,7 +341,7 @@ def a_cache(droid_with_rests: Path, tmp_path_factory: pytest.TempPathFactory) ->
     ],
     ids=lambda value: str(value)[:20],
 )
-def test_a_cache_of_other_clips_is_refused_and_the_difference_named(
+def test_cache_of_other_clips_raises_with_the_difference(
     a_cache: tuple[Dataset, Dataset, Path], knobs: dict[str, Any], reported: str
 ) -> None:
     original, through, _ = a_cache
@@ -366,7 +360,7 @@ def test_a_cache_of_other_clips_is_refused_and_the_difference_named(
     ],
     ids=str,
 )
-def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
+def test_cache_of_another_encoder_raises_with_the_difference(
     a_cache: tuple[Dataset, Dataset, Path], change: dict[str, Any], reported: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original, through, _ = a_cache
@@ -382,7 +376,7 @@ def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
     batch.require_same_encoder(encoding, original, None)  # type: ignore[arg-type]  # no cache
 
 
-def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_path: Path) -> None:
+def test_unfinished_or_damaged_cache_raises(droid_with_rests: Path, tmp_path: Path) -> None:
     original, through = cached(droid_with_rests, tmp_path, idle=IDLE)
     folder = Path(through.config.path)
     for name in (EPISODES_FILE, STEPS_FILE, CACHE_FILE):
@@ -403,7 +397,7 @@ def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_p
         alone(through, path=str(tmp_path))
 
 
-def test_key_of_an_older_version_has_removed_config_keys_with_the_values_of_today(tmp_path: Path) -> None:
+def test_key_of_an_older_version_accepts_removed_keys_at_their_default(tmp_path: Path) -> None:
     key = CacheKey({"decoder": {"size": "small"}})
     for noise, is_accepted in ((0.0, True), (0.5, False)):
         (tmp_path / "key.json").write_text(json.dumps({"key": {"decoder": {"size": "small", "noise": noise}}}))

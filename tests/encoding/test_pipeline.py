@@ -43,7 +43,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     return encode
 
 
-def test_each_episode_gets_its_own_frames_which_are_read_once(run: Run) -> None:
+def test_pipeline_reads_each_frame_of_each_episode_once(run: Run) -> None:
     source = MemorySource(LENGTHS)
     files = run(source)
     assert sorted(source.decoded) == [(number, step) for number, steps in enumerate(LENGTHS) for step in range(steps)]
@@ -57,7 +57,7 @@ def test_each_episode_gets_its_own_frames_which_are_read_once(run: Run) -> None:
         np.testing.assert_allclose(found[:, :2], expected, atol=0.6)
 
 
-def test_a_network_that_is_gone_is_no_fault_of_an_episode(run: Run, tmp_path: Path) -> None:
+def test_network_failure_does_not_mark_an_episode_broken(run: Run, tmp_path: Path) -> None:
     unreachable = MemorySource(
         [2], unreadable=frozenset({0}), fault=lambda where: UnreachableError(where=where, found="gone")
     )

@@ -87,7 +87,7 @@ def assert_finished(job: "subprocess.Popen[str]", folder: Path, config: MakeConf
 
 @needs_ray
 @pytest.mark.usefixtures("default_signals")
-def test_an_interrupted_command_leaves_nothing_behind_and_a_killed_actor_loses_nothing(
+def test_interrupted_ray_command_cleans_up_and_killed_actor_loses_no_file(
     start: Callable, make_config: MakeConfig, tmp_path: Path
 ) -> None:
     job = start("ray")
@@ -107,7 +107,7 @@ def test_an_interrupted_command_leaves_nothing_behind_and_a_killed_actor_loses_n
 
 
 @needs_ray
-def test_an_error_of_an_actor_is_the_error_that_one_process_would_end_with(start: Callable, tmp_path: Path) -> None:
+def test_actor_error_equals_the_single_process_error(start: Callable, tmp_path: Path) -> None:
     for word in ("go", "fail"):
         (tmp_path / word).touch()
     job = start("ray")
@@ -118,24 +118,24 @@ def test_an_error_of_an_actor_is_the_error_that_one_process_would_end_with(start
     assert "Traceback" not in errors
 
 
-def test_an_actor_that_does_not_see_the_folder_or_sees_another_cache_there_says_so(
+def test_actor_without_the_cache_folder_raises(
     make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(encode_dataset, "_VISIBILITY_TIMEOUT_S", 0.0)
     config = make_config()
-    wanted = _Task(list(needed_frames(open_dataset(config.data))))
+    task = _Task(list(needed_frames(open_dataset(config.data))))
     encode_config(make_config(data__crop="square"), out=tmp_path / "other")
     for folder, words in (("none", "are not visible to another process"), ("other", "data.crop: square, not")):
-        found = _Actor(config_as_dict(config), tmp_path / folder, Path.cwd())({"wanted": wanted})["found"]
-        assert isinstance(found.error, InputError)
-        assert words in str(found.error)
+        result = _Actor(config_as_dict(config), tmp_path / folder, Path.cwd())({"task": task})["result"]
+        assert isinstance(result.error, InputError)
+        assert words in str(result.error)
 
 
 @pytest.mark.parametrize(
     ("engine", "words"),
     [("dask", "neither ray nor ray=ADDRESS"), ("ray=", "neither ray nor"), ("ray", r"Ray.*is not installed.*cluster")],
 )
-def test_an_engine_that_is_not_there_is_one_plain_error(
+def test_missing_ray_or_unknown_engine_raises_one_error(
     engine: str, words: str, make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip

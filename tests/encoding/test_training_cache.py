@@ -25,7 +25,7 @@ def of_cache(folder: Path, **changes: Any) -> dict[str, Any]:
     return {"data__source": "latents", "data__path": str(folder)} | changes
 
 
-def test_training_on_an_exact_cache_is_training_on_the_fly_bit_for_bit(make_config, reporter, tmp_path) -> None:
+def test_training_on_a_lossless_cache_equals_on_the_fly_encoding_bit_for_bit(make_config, reporter, tmp_path) -> None:
     changes = {"data__camera": ("exterior_1_left", "wrist_left"), "data__start_every": 2, "training__steps": 3}
     changes |= {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches")}
     on_the_fly = make_config(run_dir=str(tmp_path / "fly"), **changes)
@@ -37,7 +37,7 @@ def test_training_on_an_exact_cache_is_training_on_the_fly_bit_for_bit(make_conf
     assert_same_run(tmp_path / "fly", tmp_path / "through")
 
 
-def test_a_run_on_frames_is_resumed_on_a_cache(make_config, reporter, tmp_path, whole_run) -> None:
+def test_run_on_frames_resumes_on_a_cache(make_config, reporter, tmp_path, whole_run) -> None:
     changes = {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches")}
     encoded(make_config(**changes))
     with pytest.raises(KilledError):

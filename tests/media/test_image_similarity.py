@@ -47,7 +47,7 @@ def test_values_equal_torchmetrics(
         assert float(ms_ssim(predicted, true, scales)) == pytest.approx(expected, abs=1e-5)
 
 
-def test_every_image_of_a_batch_has_its_own_value() -> None:
+def test_metrics_return_one_value_per_image() -> None:
     pairs = [pair(case, (97, 64)) for case in range(4)]
     predicted, true = (torch.stack(images).reshape(2, 2, 3, 97, 64) for images in zip(*pairs, strict=True))
     for measure in (psnr, ssim, ms_ssim_of_3):
@@ -82,7 +82,7 @@ def test_autocast_changes_nothing() -> None:
     assert all(value.dtype == torch.float32 for value in inside)
 
 
-def test_within_a_region_only_its_pixels_count() -> None:
+def test_masked_metrics_use_only_the_region() -> None:
     predicted, true = pair(1, (97, 64))
     where = torch.zeros(97, 64, dtype=torch.bool)
     where[30:60, 20:40] = True
@@ -95,7 +95,7 @@ def test_within_a_region_only_its_pixels_count() -> None:
     assert torch.isnan(psnr(predicted, true, torch.zeros_like(where)))
 
 
-def test_moving_region_is_what_moved_and_eight_pixels_around() -> None:
+def test_moving_region_is_dilated_by_eight_pixels() -> None:
     true = torch.full((3, 3, 40, 40), 100 / 255)
     true[1, 1, 20, 12] += 9 / 255  # one channel suffices
     true[1, 2, 20, 30] -= 8 / 255  # exactly 8 levels do not

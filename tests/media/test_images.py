@@ -29,7 +29,7 @@ def png(image: Image.Image, form: str = "PNG") -> bytes:
     return file.getvalue()
 
 
-def test_images_are_their_pixels_in_rgb(tmp_path: Path) -> None:
+def test_images_decode_to_their_rgb_pixels(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(png(Image.fromarray(PIXELS)))
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), PIXELS)
     seen_through = Image.fromarray(np.dstack([PIXELS, PIXELS[..., :1]]))
@@ -53,7 +53,7 @@ def test_images_are_their_pixels_in_rgb(tmp_path: Path) -> None:
         (png(Image.fromarray(PIXELS[..., 0].astype(np.uint16)), "TIFF"), "not an image, .*depth images, such as TIFF"),
     ],
 )
-def test_what_is_no_image_is_refused(data: bytes, complaint: str, tmp_path: Path) -> None:
+def test_invalid_image_raises(data: bytes, complaint: str, tmp_path: Path) -> None:
     (tmp_path / "goal.png").write_bytes(data)
     with pytest.raises(InputError, match=rf"goal\.png.*{complaint}"):
         read_image(tmp_path / "goal.png")
@@ -74,9 +74,7 @@ def claimed_jpeg(height: int, width: int) -> bytes:
 
 
 @pytest.mark.parametrize("size", [(65_500, 65_500), (10_001, 10_000)])
-def test_an_image_that_claims_to_be_huge_is_refused_before_anything_is_made(
-    size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_huge_image_raises_before_decoding(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simplejpeg, "decode_jpeg", None)
     monkeypatch.setattr(Image.Image, "convert", None)
     huge: list[Callable[[], object]] = [
@@ -93,9 +91,7 @@ FORMS = ("rlds", "lerobot videos", "lerobot images", "npz")
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_every_form_of_data_refuses_images_beyond_the_bound(
-    tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_formats_reject_images_above_the_limit(tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "set"
     if form == "rlds":
         write_synthetic_droid(path, steps=[3], size=(32, 64), shards=1)
@@ -139,7 +135,7 @@ STORED_AS = {  # by EXIF orientation: how a camera stores what a viewer shows
 
 @pytest.mark.parametrize("form", ["JPEG", "PNG"])
 @pytest.mark.parametrize("orientation", STORED_AS)
-def test_a_photo_is_turned_as_its_exif_orientation_says(orientation: int, form: str, tmp_path: Path) -> None:
+def test_exif_orientation_is_applied(orientation: int, form: str, tmp_path: Path) -> None:
     shown = np.zeros((24, 40, 3), np.uint8)
     shown[:8, :8], shown[:8, 32:], shown[16:, :8] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
     stored = np.ascontiguousarray(STORED_AS[orientation](shown))
@@ -149,9 +145,7 @@ def test_a_photo_is_turned_as_its_exif_orientation_says(orientation: int, form: 
     assert abs(found.astype(int) - shown).max() < (40 if form == "JPEG" else 1)
 
 
-def test_an_image_that_may_never_end_or_is_too_large_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pipe_or_too_large_image_file_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     os.mkfifo(tmp_path / "goal.png")
     for path in (tmp_path / "goal.png", "/dev/zero"):
         with pytest.raises(InputError, match="a pipe or a device"):

@@ -67,7 +67,7 @@ def test_reading_and_seeking_equal_those_of_a_file_in_memory(size: int, steps: l
             assert ours.tell() == theirs.tell()
 
 
-def test_a_jump_costs_a_block_and_what_is_at_hand_nothing() -> None:
+def test_seek_fetches_one_block_and_cached_blocks_none() -> None:
     served = Served(bytes(100 * MB))
     served.file.read(32)
     served.file.seek(-50_000, os.SEEK_END)
@@ -81,7 +81,7 @@ def test_a_jump_costs_a_block_and_what_is_at_hand_nothing() -> None:
     assert len(served.fetches) == before
 
 
-def test_reading_on_takes_fewer_and_fewer_fetches_and_a_long_read_one() -> None:
+def test_sequential_reads_double_the_fetch_size() -> None:
     served = Served(bytes(64 * MB))
     while served.file.read(32 * 1024):
         pass
@@ -94,7 +94,7 @@ def test_reading_on_takes_fewer_and_fewer_fetches_and_a_long_read_one() -> None:
     assert served.bytes <= 7 * MB + 2 * 128 * 1024
 
 
-def test_a_block_is_fetched_once_per_machine_and_not_used_for_another_version(gcs: Gcs, tmp_path: Path) -> None:
+def test_block_is_fetched_once_per_machine_and_version(gcs: Gcs, tmp_path: Path) -> None:
     data = os.urandom(5 * BLOCK_BYTES + 77)
     url, cache = gcs.put("bucket/file", data), DiskCache(tmp_path, 10 * MB)
 
@@ -129,7 +129,7 @@ def size_of(folder: Path) -> int:
     return sum(path.stat().st_size for path in entries(folder))
 
 
-def test_what_is_written_is_read_by_every_cache_on_the_folder(tmp_path: Path) -> None:
+def test_entry_is_readable_by_each_cache_of_the_folder(tmp_path: Path) -> None:
     cache = DiskCache(tmp_path / "new", 1000)
     assert cache.read("gs://a/b 0-10") is None
     cache.write("gs://a/b 0-10", b"first")
@@ -144,7 +144,7 @@ def test_what_is_written_is_read_by_every_cache_on_the_folder(tmp_path: Path) ->
         assert cache.read("gs://a/b 0-10") is None, "as after a power cut"
 
 
-def test_parts_of_an_entry_are_read_by_number_and_a_damaged_entry_is_absent(tmp_path: Path) -> None:
+def test_parts_are_read_by_number_and_damaged_entries_are_absent(tmp_path: Path) -> None:
     cache, parts = DiskCache(tmp_path, 10_000), [b"first", b"second", b"third" * 100, b"last"]
     assert cache.read_parts("a", 4, [0]) is None
     cache.write_parts("a", parts)
@@ -163,7 +163,7 @@ def test_parts_of_an_entry_are_read_by_number_and_a_damaged_entry_is_absent(tmp_
     assert cache.read_parts("a", 4, [0]) is None
 
 
-def test_the_entry_used_longest_ago_goes_first(tmp_path: Path) -> None:
+def test_least_recently_used_entry_is_evicted_first(tmp_path: Path) -> None:
     cache = DiskCache(tmp_path, 410)
     for second, key in enumerate("abcd"):
         before = set(entries(tmp_path))
@@ -179,7 +179,7 @@ def test_the_entry_used_longest_ago_goes_first(tmp_path: Path) -> None:
 @example(writes=[(0, 1), (0, 172), (0, 796), (0, 16)], is_shared=True)
 @example(writes=[(0, 10 + size) for size in range(80)], is_shared=False)
 @given(writes=st.lists(st.tuples(st.integers(0, 9), st.integers(1, 1000)), max_size=30), is_shared=st.booleans())
-def test_the_limit_holds_and_the_newest_entry_is_present_whoever_writes_it(
+def test_size_limit_holds_and_newest_entry_is_present(
     tmp_path_factory: pytest.TempPathFactory, writes: list[tuple[int, int]], *, is_shared: bool
 ) -> None:
     folder = tmp_path_factory.mktemp("cache")
@@ -194,7 +194,7 @@ def test_the_limit_holds_and_the_newest_entry_is_present_whoever_writes_it(
 
 
 @pytest.mark.parametrize("fault", ["full", "no folder"])
-def test_a_disk_that_cannot_be_written_costs_one_warning_and_not_the_run(
+def test_unwritable_disk_logs_one_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, fault: str
 ) -> None:
     (tmp_path / "file").touch()
@@ -223,7 +223,7 @@ def fill(folder: Path, entries: int) -> None:
 
 
 @pytest.mark.parametrize("is_unknown", [False, True], ids=["known total", "total of an earlier version"])
-def test_a_folder_over_the_limit_is_reduced_by_the_first_write(tmp_path: Path, *, is_unknown: bool) -> None:
+def test_first_write_reduces_a_folder_over_the_limit(tmp_path: Path, *, is_unknown: bool) -> None:
     fill(tmp_path, 20)
     if is_unknown:
         (tmp_path / "lock").write_bytes(b"")
@@ -236,7 +236,7 @@ def test_a_folder_over_the_limit_is_reduced_by_the_first_write(tmp_path: Path, *
     assert cache.read("18") is not None
 
 
-def test_a_limit_of_zero_and_no_limit_evict_nothing(tmp_path: Path) -> None:
+def test_zero_limit_and_no_limit_evict_nothing(tmp_path: Path) -> None:
     fill(tmp_path, 20)
     for limit in (0, None):
         cache = DiskCache(tmp_path, limit)
@@ -265,7 +265,7 @@ with ThreadPoolExecutor(2) as pool:
 """
 
 
-def test_the_limit_holds_while_several_processes_and_threads_write(popen: Popen, tmp_path: Path) -> None:
+def test_size_limit_holds_with_concurrent_writers(popen: Popen, tmp_path: Path) -> None:
     limit, most_in_progress = 20_000, 4 * 2 * 255  # of 33,000 bytes
     writers = [
         popen([sys.executable, "-c", WRITE_MANY, str(tmp_path), str(limit), str(60 * first)]) for first in range(4)
@@ -276,7 +276,7 @@ def test_the_limit_holds_while_several_processes_and_threads_write(popen: Popen,
     assert not list(tmp_path.rglob("*.partial"))
 
 
-def test_an_entry_without_permission_is_fetched_again_and_not_replaced(
+def test_entry_without_permission_is_fetched_again_and_not_replaced(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     cache = DiskCache(tmp_path, None)

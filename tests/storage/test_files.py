@@ -49,7 +49,7 @@ def age(path: Path, days: float) -> None:
 # ---- one file ----
 
 
-def test_a_file_has_its_name_when_it_is_whole_and_one_that_fails_leaves_the_old_one(tmp_path: Path) -> None:
+def test_file_appears_when_complete_and_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
     target = tmp_path / "inner" / "file"
     with storage.atomic_writer(target) as file:
         file.write("Grüße".encode())
@@ -68,7 +68,7 @@ def test_a_file_has_its_name_when_it_is_whole_and_one_that_fails_leaves_the_old_
     storage.write_atomically(tmp_path / ("ü" * 127), "a long name")
 
 
-def test_a_full_disk_is_called_one_and_says_of_which_file(tmp_path: Path) -> None:
+def test_full_disk_error_names_the_file(tmp_path: Path) -> None:
     full = OSError(errno.ENOSPC, "No space left on device")
     with (
         pytest.raises(OSError, match=r"No space left on device: '.*a\.json'"),
@@ -93,7 +93,7 @@ def fill(folder: Path, *names: str) -> None:
             storage.write_atomically(partial / name, name)
 
 
-def test_a_folder_is_filled_whole_and_nothing_is_left_where_that_fails(tmp_path: Path) -> None:
+def test_new_folder_appears_complete_or_not_at_all(tmp_path: Path) -> None:
     def fail() -> None:
         with storage.folder_writer(tmp_path / "new", "manifest") as partial:
             (partial / "a").touch()
@@ -106,9 +106,7 @@ def test_a_folder_is_filled_whole_and_nothing_is_left_where_that_fails(tmp_path:
     assert names(tmp_path / "deep" / "new") == ["a", "inner", "manifest"]
 
 
-def test_a_folder_that_is_there_stays_itself_and_keeps_its_other_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_existing_folder_is_kept_with_its_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine").write_text("precious")
     (tmp_path / "manifest").write_text("old")
     before = tmp_path.stat().st_ino
@@ -119,7 +117,7 @@ def test_a_folder_that_is_there_stays_itself_and_keeps_its_other_files(
     assert (tmp_path / "manifest").read_text() == "manifest"
 
 
-def test_a_folder_in_which_moving_fails_has_no_manifest(tmp_path: Path) -> None:
+def test_failed_move_leaves_no_manifest(tmp_path: Path) -> None:
     (tmp_path / "manifest").write_text("old")
     (tmp_path / "a").mkdir()  # where a file is to go
     (tmp_path / "a" / "mine").write_text("precious")
@@ -129,7 +127,7 @@ def test_a_folder_in_which_moving_fails_has_no_manifest(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["file", "file/inner", "/proc/inner"])
-def test_a_place_that_cannot_be_a_folder_is_named(tmp_path: Path, place: str) -> None:
+def test_path_that_cannot_be_a_folder_raises(tmp_path: Path, place: str) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=rf"{place}: cannot be written: .*Choose a path") as caught:
         fill(tmp_path / place, "manifest")
@@ -142,7 +140,7 @@ def test_a_place_that_cannot_be_a_folder_is_named(tmp_path: Path, place: str) ->
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("kind", ["file", "folder"])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_what_was_not_whole_never_has_its_name(tmp_path: Path, popen: Popen, kind: str, number: int) -> None:
+def test_incomplete_file_never_has_its_final_name(tmp_path: Path, popen: Popen, kind: str, number: int) -> None:
     process = popen([sys.executable, "-c", WRITING, str(tmp_path / "target"), kind], stdout=subprocess.PIPE)
     assert process.stdout.readline() == b"writing\n"
     process.send_signal(number)
@@ -158,7 +156,7 @@ def test_what_was_not_whole_never_has_its_name(tmp_path: Path, popen: Popen, kin
     assert names(tmp_path) == []
 
 
-def test_a_folder_that_changed_today_names_of_others_and_links_are_left_alone(tmp_path: Path) -> None:
+def test_recent_folders_foreign_names_and_links_are_not_removed(tmp_path: Path) -> None:
     precious = tmp_path / ".f.0123abcd.partial"
     (precious / "inner").mkdir(parents=True)
     for name in (".a.partial", "a.0123abcd.partial", ".a.0123abcd.part", ".a.xyz.partial", "partial"):
@@ -175,7 +173,7 @@ def test_a_folder_that_changed_today_names_of_others_and_links_are_left_alone(tm
 
 
 @pytest.mark.parametrize("jump_s", [-86_400.0, 0.9 * 86_400.0])
-def test_what_another_machine_is_writing_stays_though_our_clock_has_jumped(
+def test_partial_file_of_another_machine_survives_a_clock_jump(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jump_s: float
 ) -> None:
     path = tmp_path / ".file.abcdef01.partial"
@@ -200,7 +198,7 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     return place
 
 
-def test_a_url_is_read_like_a_local_folder(folder: str) -> None:
+def test_url_is_read_like_a_local_folder(folder: str) -> None:
     assert storage.list_names(folder) == ["a", "b"]
     file = storage.join(folder, "b")
     assert storage.exists(file)
@@ -221,7 +219,7 @@ def test_a_url_is_read_like_a_local_folder(folder: str) -> None:
     assert storage.list_names(storage.join(folder, "none")) == []
 
 
-def test_a_file_that_changes_has_another_version(folder: str) -> None:
+def test_version_changes_with_the_file(folder: str) -> None:
     before = storage.list_files(folder)
     assert storage.list_files(folder) == before
     filesystem, file = fsspec.core.url_to_fs(storage.join(folder, "a"))
@@ -229,7 +227,7 @@ def test_a_file_that_changes_has_another_version(folder: str) -> None:
     assert [old.name for old, new in zip(before, storage.list_files(folder), strict=True) if old != new] == ["a"]
 
 
-def test_a_file_that_may_never_end_is_not_waited_for(tmp_path: Path) -> None:
+def test_pipe_or_device_raises_without_blocking(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="a pipe"):
         storage.read_small_file(tmp_path / "pipe", 10)

@@ -40,7 +40,7 @@ def read(key: str, value: str) -> str:
     return config_as_flat_dict(parse_config(config_with(key, value), where="test"))[key]
 
 
-def test_no_path_knob_is_missing_here() -> None:
+def test_all_path_keys_are_covered() -> None:
     keys = {key for key in all_keys() if not key.startswith("replay.data.")}  # the same ones as of data
     found = {key for key in keys if key.split(".")[-1].endswith(LOOK_LIKE_PATHS)}
     found.remove("training.allow_weak_base")
@@ -48,7 +48,7 @@ def test_no_path_knob_is_missing_here() -> None:
 
 
 @pytest.mark.parametrize("key", [*ON_THIS_MACHINE, *ANYWHERE])
-def test_every_path_knob_knows_the_users_home(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_path_keys_expand_the_home_folder(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/of/mine")
     assert read(key, "~/x/") == "/home/of/mine/x"
     assert read(key, "./~/x") == "./~/x", "a folder may be called so"
@@ -59,17 +59,17 @@ def test_every_path_knob_knows_the_users_home(key: str, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("key", ON_THIS_MACHINE)
 @pytest.mark.parametrize("url", ["gs://bucket/run", "file:///x", "S3://x"])
-def test_a_url_is_refused_where_only_this_machine_will_do(key: str, url: str) -> None:
+def test_url_for_a_local_path_key_raises(key: str, url: str) -> None:
     with pytest.raises(InputError, match=rf"  {key}: is a URL .*{url}"):
         read(key, url)
 
 
 @pytest.mark.parametrize("key", ANYWHERE)
-def test_a_url_stays_one_elsewhere(key: str) -> None:
+def test_url_is_kept_for_other_path_keys(key: str) -> None:
     assert read(key, "gs://bucket/~x/") == "gs://bucket/~x"
 
 
-def test_the_cache_of_the_environment_is_a_path_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_environment_variable_is_resolved_like_a_path_key(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/of/mine")
     monkeypatch.setenv("VJEPA2_AC_CACHE", "~/cache")
     assert cache_folder(DiskCacheConfig()) == Path("/home/of/mine/cache")
@@ -78,7 +78,7 @@ def test_the_cache_of_the_environment_is_a_path_like_any_other(monkeypatch: pyte
         cache_folder(DiskCacheConfig())
 
 
-def test_every_path_on_the_command_line_is_read_alike() -> None:
+def test_all_path_options_are_resolved_the_same() -> None:
     words = {"CONFIG", "FOLDER", "DIR", "PATH", "PNG", "IMAGE", "RUN", "MODEL", "RUN_OR_MODEL"}
     found = 0
     for command, action in ((words, one) for words, parser in _leaves(_parser(), ()) for one in parser._actions):
@@ -90,7 +90,7 @@ def test_every_path_on_the_command_line_is_read_alike() -> None:
     assert found > 20
 
 
-def test_an_option_knows_the_users_home_and_refuses_urls(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_path_option_expands_home_and_rejects_urls(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setenv("HOME", "/home/of/mine")
     options = _parser().parse_args(["data", "inspect", "~/c.yaml", "--out=~/x"])
     assert (options.config, options.out) == ("/home/of/mine/c.yaml", Path("/home/of/mine/x"))

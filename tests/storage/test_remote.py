@@ -42,7 +42,7 @@ def file(gcs: Gcs) -> str:
     ids=["file_size", "exists", "list_names", "list_files", "read_bytes", "read_ranges", "open_for_reading"],
 )
 @pytest.mark.usefixtures("file")
-def test_everything_survives_what_passes(
+def test_all_reads_survive_temporary_failures(
     gcs: Gcs, action: Callable[[], object], expected: object, failure: Failure
 ) -> None:
     gcs.fail_next(failure, times=2)
@@ -50,7 +50,7 @@ def test_everything_survives_what_passes(
     assert gcs.faults_left == 0
 
 
-def test_a_server_that_does_not_answer_is_asked_again(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unresponsive_server_is_retried(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
     # A busy machine is slow as well: it has further attempts.
     monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=100, first_wait_s=0.0, timeout_s=0.3))
     gcs.fail_next("hang", match="/download/")
@@ -64,9 +64,7 @@ def test_a_server_that_does_not_answer_is_asked_again(gcs: Gcs, file: str, monke
 @pytest.mark.parametrize(
     ("failure", "words"), [(503, "HTTP 503: made to fail"), (429, "HTTP 429"), ("reset", "Disconnected")]
 )
-def test_attempts_are_counted_and_the_error_says_where_and_why(
-    gcs: Gcs, file: str, failure: Failure, words: str
-) -> None:
+def test_failed_retries_raise_with_attempts_url_and_reason(gcs: Gcs, file: str, failure: Failure, words: str) -> None:
     gcs.fail_next(failure, times=100, match="/download/")
     with pytest.raises(UnreachableError, match=rf"^{file}: 5 attempts in .* failed.*{words}.*Check the net"):
         storage.read_range(file, 0, 5)
@@ -75,14 +73,14 @@ def test_attempts_are_counted_and_the_error_says_where_and_why(
 
 
 @pytest.mark.parametrize("status", [401, 403])
-def test_missing_permission_is_said_at_once_with_the_way_to_log_in(gcs: Gcs, file: str, status: int) -> None:
+def test_missing_permission_raises_at_once_with_the_login_command(gcs: Gcs, file: str, status: int) -> None:
     gcs.fail_next(status, times=100)
     with pytest.raises(UnreachableError, match=rf"no permission \(HTTP {status}.*gcloud auth application-def"):
         storage.read_range(file, 0, 5)
     assert len(gcs.requests) == 1
 
 
-def test_an_absent_file_is_absent_and_not_asked_for_again(gcs: Gcs, file: str) -> None:
+def test_missing_file_raises_without_retry(gcs: Gcs, file: str) -> None:
     with pytest.raises(FileNotFoundError):
         storage.read_range(f"{file}.none", 0, 5)
     assert len(gcs.reads()) == 1
@@ -94,7 +92,7 @@ def test_an_absent_file_is_absent_and_not_asked_for_again(gcs: Gcs, file: str) -
         storage.open_for_reading(f"{file}.none")
 
 
-def test_a_read_past_the_end_gives_what_there_is(gcs: Gcs, file: str) -> None:
+def test_read_past_the_end_returns_the_rest(gcs: Gcs, file: str) -> None:
     size = len(DATA)
     assert storage.read_range(file, size - 3, 10) == DATA[-3:]
     assert storage.read_range(file, size + 3, 10) == b""
@@ -105,7 +103,7 @@ def test_a_read_past_the_end_gives_what_there_is(gcs: Gcs, file: str) -> None:
         storage.read_ranges(file, [(0, 4), (size - 3, 10)])
 
 
-def test_ranges_are_read_at_the_same_time_and_come_in_order(gcs: Gcs, file: str) -> None:
+def test_ranges_are_read_concurrently_and_returned_in_order(gcs: Gcs, file: str) -> None:
     ranges = [(start, 3) for start in range(0, 9600, 100)]
     gcs.hold(33, match="/download/")
     assert storage.read_ranges(file, ranges) == [DATA[start : start + 3] for start, _ in ranges]
@@ -113,14 +111,14 @@ def test_ranges_are_read_at_the_same_time_and_come_in_order(gcs: Gcs, file: str)
     assert len(gcs.reads()) == len(ranges)
 
 
-def test_a_long_read_comes_in_pieces(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_read_is_split_into_pieces(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vjepa2_ac.storage.remote._PIECE_BYTES", 1000)
     assert storage.read_bytes(file) == DATA
     assert len(gcs.reads()) == -(-len(DATA) // 1000)
     assert storage.read_ranges(file, [(5, 2500), (7, 3)]) == [DATA[5:2505], DATA[7:10]]
 
 
-def test_a_folder_is_listed_at_once_with_sizes_and_versions(gcs: Gcs) -> None:
+def test_folder_listing_has_sizes_and_versions(gcs: Gcs) -> None:
     for number in range(100):
         gcs.put(f"bucket/set/{number:03d}", bytes(number))
     gcs.put("bucket/set/inner/file", b"1")
@@ -133,7 +131,7 @@ def test_a_folder_is_listed_at_once_with_sizes_and_versions(gcs: Gcs) -> None:
     assert changed == ["007"]
 
 
-def test_a_worker_process_reads_on_its_own(file: str) -> None:
+def test_forked_process_opens_its_own_file_system(file: str) -> None:
     code = (
         "import multiprocessing, sys; from vjepa2_ac import storage\n"
         "def read(start): return storage.read_range(sys.argv[1], start, 3)\n"
@@ -147,15 +145,13 @@ def test_a_worker_process_reads_on_its_own(file: str) -> None:
     subprocess.run([sys.executable, "-W", "ignore", "-c", code, file], check=True, timeout=120)
 
 
-def test_a_url_that_nothing_reads_is_named() -> None:
+def test_unknown_protocol_raises() -> None:
     with pytest.raises(InputError, match=r"unknown protocol ftpx://.*gs://, hf:// or s3://"):
         storage.exists("ftpx://host/file")
 
 
 @pytest.mark.parametrize(("url", "extra"), [("gs://bucket/set", "gcs"), ("hf://datasets/one/set", "")])
-def test_a_missing_library_is_named_with_the_extra_that_brings_it(
-    url: str, extra: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_protocol_library_raises_with_the_extra(url: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.import_module("fsspec.registry"), "registry", {})
     monkeypatch.setattr(remote, "_filesystems", {})
     monkeypatch.setitem(sys.modules, "gcsfs", None)
@@ -177,7 +173,7 @@ def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_google_is_asked_as_the_user_as_the_machine_or_as_nobody(nobody: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_google_token_is_user_machine_or_anonymous(nobody: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert remote.google_token() == "anon"
     assert remote.login_hint("gs://a/b").startswith("You are not logged in. Log in with `gcloud auth application-de")
     (nobody / "product_name").write_text("Some other machine\n")
@@ -194,7 +190,7 @@ def test_google_is_asked_as_the_user_as_the_machine_or_as_nobody(nobody: Path, m
     assert remote.google_token() == "anon", "an emulator is shown no login"
 
 
-def test_the_way_in_is_that_of_the_place() -> None:
+def test_login_hint_matches_the_protocol() -> None:
     assert "hf auth login" in remote.login_hint("hf://datasets/owner/name")
     assert remote.login_hint("https://host/file") == "Check your login"
 
@@ -203,7 +199,7 @@ AT_ONCE = RetryPolicy(attempts=3, first_wait_s=0.0, longest_wait_s=0.0)
 
 
 @pytest.mark.parametrize("error", [TypeError("ours"), KeyError("ours"), AssertionError("ours")])
-def test_a_mistake_of_ours_is_neither_tried_again_nor_blamed_on_the_network(error: Exception) -> None:
+def test_programming_error_is_not_retried(error: Exception) -> None:
     calls = []
 
     def action(timeout_s: float) -> None:
@@ -242,7 +238,7 @@ class NoCredentialsError(Exception):
         (ValueError("Bad Request"), 1, "cannot be read.*Bad Request.*Check the URL"),
     ],
 )
-def test_errors_of_any_library_are_told_apart(error: Exception, attempts: int, words: str) -> None:
+def test_library_errors_are_classified(error: Exception, attempts: int, words: str) -> None:
     calls = []
 
     def action(timeout_s: float) -> None:
@@ -256,7 +252,7 @@ def test_errors_of_any_library_are_told_apart(error: Exception, attempts: int, w
     assert "\n" not in str(caught.value)
 
 
-def test_a_network_that_stays_away_is_spoken_of_once(
+def test_lasting_network_failure_logs_one_warning(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def action(_timeout_s: float) -> None:

@@ -23,13 +23,13 @@ from vjepa2_ac.storage.structured import format_json, parse_json_object, parse_r
 @pytest.mark.parametrize(
     "text", ["[" * 200_000, '{"a": 1} {}', "", "[1]", "null", b"\xff\xfe\x00", '{"a": ' + "9" * 5000 + "}"]
 )
-def test_what_is_no_json_object_is_refused_with_its_file(text: str | bytes) -> None:
+def test_invalid_json_object_raises_with_the_file(text: str | bytes) -> None:
     with pytest.raises(InputError, match=r"^x\.json: .*JSON.*needed: a card\. Copy it again\.") as caught:
         parse_json_object(text, where="x.json", needed="a card", fix="Copy it again")
     assert len(str(caught.value)) < 400
 
 
-def test_no_more_of_a_file_is_read_than_its_reader_wants_and_a_missing_one_is_named(tmp_path: Path, gcs: Gcs) -> None:
+def test_reads_are_bounded_and_missing_json_file_raises(tmp_path: Path, gcs: Gcs) -> None:
     (tmp_path / "a.json").write_text('{"a": "' + "x" * 100 + '"}')
     assert read_json_object(tmp_path / "a.json", max_bytes=200)
     with pytest.raises(InputError, match=r"too large.*at most 50 bytes"):
@@ -41,7 +41,7 @@ def test_no_more_of_a_file_is_read_than_its_reader_wants_and_a_missing_one_is_na
         read_json_object(tmp_path)
 
 
-def test_lists_of_numbers_are_written_on_one_line_and_read_back() -> None:
+def test_lists_of_numbers_are_written_on_one_line() -> None:
     value = {"a": [1, 2.5, None], "b": [[1e-5, -2], ["text, 1"]]}
     assert format_json({"a": [1, 2.5, None]}) == '{\n "a": [1, 2.5, null]\n}\n'
     assert json.loads(format_json(value)) == value
@@ -61,7 +61,7 @@ class Sample:
     names: tuple[str, ...] = ()
 
 
-def test_a_record_is_made_of_plain_values() -> None:
+def test_record_is_parsed_from_plain_values() -> None:
     values = {"step": 3, "error": 1, "reasons": {"a": "b"}, "names": ["x"]}
     assert parse_record(Sample, values, where="") == Sample(3, "", 1.0, {"a": "b"}, ("x",))
 
@@ -78,7 +78,7 @@ def test_a_record_is_made_of_plain_values() -> None:
         ({f"k{n}": 1 for n in range(1000)}, "; and 996 more"),
     ],
 )
-def test_values_of_other_types_are_refused_by_name(values: dict[str, object], complaint: str) -> None:
+def test_values_of_wrong_types_raise_with_their_names(values: dict[str, object], complaint: str) -> None:
     with pytest.raises(InputError) as caught:
         parse_record(Sample, values, where="state.json")
     assert complaint in str(caught.value)
@@ -100,12 +100,12 @@ def test_values_of_other_types_are_refused_by_name(values: dict[str, object], co
         ("", None),
     ],
 )
-def test_what_people_mean_is_read(text: str, value: Any) -> None:
+def test_yaml_numbers_and_dates_are_read_as_intended(text: str, value: Any) -> None:
     assert parse_yaml(text, where="") == value
     assert repr(parse_yaml(text, where="")) == repr(value)  # True is not 1
 
 
-def test_what_is_written_and_every_config_is_read_as_pyyaml_reads_it() -> None:
+def test_configs_are_read_as_pyyaml_reads_them() -> None:
     values = {"a": [1, -2.5, 1e-05, True, None, "text", "off", "010", "1:30", "~", "", "a: b", "=", "<<"], "b": {}}
     assert parse_yaml(yaml.safe_dump(values), where="") == values
     for path in (ROOT / "configs").glob("*.yaml"):
@@ -128,7 +128,7 @@ def test_what_is_written_and_every_config_is_read_as_pyyaml_reads_it() -> None:
         ("a: " + "9" * 5000, "", "digits"),
     ],
 )
-def test_what_is_no_config_is_refused_where_it_stands(text: str, place: str, complaint: str) -> None:
+def test_invalid_yaml_raises_with_line_and_column(text: str, place: str, complaint: str) -> None:
     with pytest.raises(InputError) as caught:
         parse_yaml(text, where="my.yaml")
     assert str(caught.value).startswith(f"my.yaml{place}: invalid YAML")

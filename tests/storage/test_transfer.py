@@ -32,7 +32,7 @@ def source_of(folder: Path, size: int) -> Path:
 
 @pytest.mark.usefixtures("bucket")
 @pytest.mark.parametrize("size", [0, SMALL, LARGE])
-def test_what_is_uploaded_is_read_again(tmp_path: Path, size: int) -> None:
+def test_uploaded_file_is_read_back(tmp_path: Path, size: int) -> None:
     source = source_of(tmp_path, size)
     storage.upload(source, PLACE)
     assert storage.read_bytes(PLACE) == source.read_bytes()
@@ -43,7 +43,7 @@ def test_what_is_uploaded_is_read_again(tmp_path: Path, size: int) -> None:
 
 @pytest.mark.parametrize("size", [SMALL, LARGE])
 @pytest.mark.parametrize("failure", [408, 429, 500, 503, "reset", "cut"])
-def test_an_upload_survives_what_passes(bucket: Gcs, tmp_path: Path, size: int, failure: Failure) -> None:
+def test_upload_survives_temporary_failures(bucket: Gcs, tmp_path: Path, size: int, failure: Failure) -> None:
     source = source_of(tmp_path, size)
     bucket.fail_next(failure, times=2, match="POST /upload/")
     storage.upload(source, PLACE)
@@ -52,7 +52,7 @@ def test_an_upload_survives_what_passes(bucket: Gcs, tmp_path: Path, size: int, 
 
 
 @pytest.mark.usefixtures("bucket")
-def test_a_failure_between_two_pieces_leaves_nothing_and_is_sent_again(
+def test_failure_between_pieces_leaves_nothing_and_restarts_the_upload(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(remote, "_PIECE_BYTES", 2 << 20)
@@ -73,9 +73,7 @@ def test_a_failure_between_two_pieces_leaves_nothing_and_is_sent_again(
     assert len(begun) == 2 + 3, "two of the first attempt, three of the second"
 
 
-def test_an_upload_that_stalls_is_cut_off_and_begun_again(
-    bucket: Gcs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stalled_upload_times_out_and_is_retried(bucket: Gcs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # A busy machine is slow as well: it has further attempts.
     monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=100, first_wait_s=0.0, timeout_s=0.3))
     source = source_of(tmp_path, SMALL)
@@ -92,7 +90,7 @@ def test_an_upload_that_stalls_is_cut_off_and_begun_again(
     ("failure", "words"),
     [(403, r"no permission .*You are not logged in\. Log in with `gcloud"), (412, "cannot be written")],
 )
-def test_a_refusal_is_not_tried_again(bucket: Gcs, tmp_path: Path, failure: int, words: str) -> None:
+def test_refused_upload_is_not_retried(bucket: Gcs, tmp_path: Path, failure: int, words: str) -> None:
     bucket.fail_next(failure, times=9)
     with pytest.raises(RefusedError, match=words):
         storage.upload(source_of(tmp_path, SMALL), PLACE)
@@ -100,7 +98,7 @@ def test_a_refusal_is_not_tried_again(bucket: Gcs, tmp_path: Path, failure: int,
 
 
 @pytest.mark.usefixtures("bucket")
-def test_a_bucket_that_does_not_exist_is_named(tmp_path: Path) -> None:
+def test_missing_bucket_raises_with_its_name(tmp_path: Path) -> None:
     for action in (
         lambda: storage.upload(source_of(tmp_path, SMALL), "gs://other/run/file"),
         lambda: storage.file_sizes("gs://other/run"),
@@ -119,7 +117,7 @@ def place(request: pytest.FixtureRequest, bucket: Gcs, tmp_path: Path) -> str:
     ]
 
 
-def test_every_kind_of_place_is_written_listed_and_removed_from(place: str, tmp_path: Path) -> None:
+def test_each_kind_of_folder_is_written_listed_and_removed(place: str, tmp_path: Path) -> None:
     source = source_of(tmp_path, SMALL)
     assert storage.file_sizes(place) == {}
     for name in ("a", "inner/b", "inner/deep/c"):
@@ -135,14 +133,14 @@ def test_every_kind_of_place_is_written_listed_and_removed_from(place: str, tmp_
     assert storage.file_sizes(place) == {}
 
 
-def test_trying_a_place_leaves_nothing(place: str, bucket: Gcs, tmp_path: Path) -> None:
+def test_check_writable_leaves_no_file(place: str, bucket: Gcs, tmp_path: Path) -> None:
     storage.check_writable(place)
     assert storage.file_sizes(place) == {}
     assert not (tmp_path / "at").exists()
     assert bucket.names("bucket") == ["before"]
 
 
-def test_a_folder_of_this_machine_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+def test_unwritable_local_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for action in (
         lambda: storage.upload(source_of(tmp_path, SMALL), str(tmp_path / "file/inner/a")),
@@ -152,7 +150,7 @@ def test_a_folder_of_this_machine_that_cannot_be_written_is_refused(tmp_path: Pa
             action()
 
 
-def test_a_place_has_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_canonical_path_is_unique(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert (
         storage.canonical_path("runs/one/")
@@ -163,7 +161,7 @@ def test_a_place_has_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.usefixtures("bucket")
-def test_reading_asks_for_no_right_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readers_request_read_only_access(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote, "_filesystems", {})
     storage.file_sizes("gs://bucket/run")
     assert [system.credentials.access for system in remote._filesystems.values()] == ["read_only"]
@@ -171,9 +169,7 @@ def test_reading_asks_for_no_right_to_write(tmp_path: Path, monkeypatch: pytest.
     assert [system.credentials.access for system in remote._filesystems.values()] == ["read_only", "read_write"]
 
 
-def test_a_file_that_vanishes_while_a_folder_is_listed_is_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_file_removed_during_listing_is_omitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("kept", "temporary"):
         (tmp_path / name).write_bytes(b"1")
     is_file = Path.is_file
