@@ -1,7 +1,7 @@
-"""Fine-tune V-JEPA 2-AC, the action-conditioned video world model, and know whether it helped.
+"""Fine-tune, evaluate and plan with V-JEPA 2-AC, Meta's action-conditioned video world model.
 
-The public names are described in docs/python.md. Each is imported when it is first used: `import vjepa2_ac` takes no
-time and imports no PyTorch.
+The public names are described in docs/python.md. They are imported lazily: `import vjepa2_ac` is fast and does not
+import PyTorch.
 """
 
 from importlib import import_module
@@ -22,7 +22,7 @@ __all__ = [
 
 __version__ = version("vjepa2-ac")
 
-_NAMES = {  # the same as above, for the time of use
+_NAMES = {  # module -> public names that are imported from it on first use
     "vjepa2_ac.api": ("encode", "evaluate", "load_model", "load_run", "open_dataset", "read_clips", "train"),
     "vjepa2_ac.config.loading": ("load_config",),
     "vjepa2_ac.errors": ("UserError",),
@@ -35,12 +35,12 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-if not TYPE_CHECKING:  # else a type checker would accept any name
+if not TYPE_CHECKING:  # with __getattr__ a type checker would accept any name
 
     def __getattr__(name: str) -> Any:
         """Import a public name."""
         for module, names in _NAMES.items():
             if name in names:
-                globals()[name] = found = getattr(import_module(module), name)
-                return found
+                globals()[name] = value = getattr(import_module(module), name)
+                return value
         raise AttributeError(f"vjepa2_ac has no {name!r}; its public names are {', '.join(__all__)}")

@@ -107,7 +107,7 @@ def test_slow_batch_is_awaited_unless_a_stop_signal_arrived(monkeypatch: pytest.
     with pytest.raises(RuntimeError, match="another"):
         loader._next_row(Slow("another"), ())
     stop = StopRequest()
-    stop.take(signal.SIGTERM, None)
+    stop.record(signal.SIGTERM, None)
     stop._came_at -= 100.0
     monkeypatch.setattr(loader, "stop_request", lambda: stop)
     assert loader._next_row(Slow(), ()) == 7, "only a wait after the signal counts"
