@@ -20,7 +20,7 @@ from vjepa2_ac.reports.metrics_json import read_metrics
         (InputError(where="a.yaml", found="nothing"), "a.yaml: nothing."),
         (
             InputError(where="a.yaml", found="3", needed="4", fix="Set it to 4"),
-            "a.yaml: 3. needed: 4. Set it to 4.",
+            "a.yaml: 3. Expected 4. Set it to 4.",
         ),
         (InputError(where="a", found="2 are wrong\n  x\n", fix="See b"), "a: 2 are wrong\n  x\nSee b."),
         (InputError(where="a", found="is it?", fix="Yes."), "a: is it? Yes."),

@@ -127,7 +127,7 @@ def test_weights_of_unsupported_type_raise(files: Path, name: str, dtype: torch.
     tensor = sorted(weights)[0]
     save_file({**weights, tensor: weights[tensor].to(dtype)}, files / name, metadata={"format": "pt"})
     with pytest.raises(
-        InputError, match=rf"{re.escape(tensor)} has type {dtype} and .*needed: dense weights in float16"
+        InputError, match=rf"{re.escape(tensor)} has type {dtype} and .*Expected dense weights in float16"
     ):
         READERS[name](files)
 
@@ -141,7 +141,7 @@ def test_checkpoint_weights_of_unsupported_type_raise(tmp_path: Path, part: str,
     parts[part][name] = value.to_sparse() if dtype == "sparse" else value.to(dtype)
     torch.save(parts, tmp_path / "odd.pt")
     found = rf"odd\.pt: {part}: {re.escape(name.removeprefix('module.'))} has type torch\."
-    with pytest.raises(InputError, match=rf"{found}.*needed: dense weights"):
+    with pytest.raises(InputError, match=rf"{found}.*Expected dense weights"):
         load_official(tmp_path / "odd.pt", SIZES)
 
 

@@ -116,7 +116,7 @@ def test_an_invalid_number_is_refused_at_any_position(place: int, sign: int) -> 
     with pytest.raises(InputError, match=complaint):
         POSE.require_state(changed(place, sign * wrong), "state")
     for never in (math.nan, sign * math.inf):
-        with pytest.raises(InputError, match=rf"{never}\b.* needed: finite numbers") as caught:
+        with pytest.raises(InputError, match=rf"{never}\b.* Expected finite numbers") as caught:
             POSE.require_state(changed(place, never), "state")
         assert "degrees" not in str(caught.value)
     if place < 6:
@@ -135,8 +135,8 @@ def test_a_pose_has_its_numbers_and_a_vector_any_that_are_finite() -> None:
     for numbers, space, complaint in (
         (np.zeros(5), EXTRINSICS, "5 numbers"),
         (np.zeros(7), EXTRINSICS, "7 numbers"),
-        (np.zeros(3), vector_states(2), r"3 numbers .* needed: 2: state 0, state 1"),
-        (np.array([0.0, math.nan]), vector_states(2), "needed: finite numbers"),
+        (np.zeros(3), vector_states(2), r"3 numbers .* Expected 2: state 0, state 1"),
+        (np.array([0.0, math.nan]), vector_states(2), "Expected finite numbers"),
     ):
         with pytest.raises(InputError, match=complaint):
             space.require_state(numbers, "state")

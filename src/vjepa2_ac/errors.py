@@ -52,7 +52,7 @@ class UserError(Exception):
 
     def __init__(self, *, where: str, found: str, needed: str = "", fix: str = "") -> None:
         self.where, self.found, self.needed, self.fix = where, found, needed, fix
-        sentences = [_short(found), f"needed: {_short(needed)}" if needed else "", _short(fix)]
+        sentences = [_short(found), f"Expected {_short(needed)}" if needed else "", _short(fix)]
         text = f"{_short(where)}: " + "".join(_sentence(text) for text in sentences if text).rstrip()
         super().__init__(printable(text))
 

@@ -140,7 +140,7 @@ class StoppedError(Exception):
 
     def __init__(self, folder: Path, step: int, reason: str) -> None:
         self.folder, self.step, self.reason = folder, step, reason
-        super().__init__(f"{reason}: stopped after step {step:,}; the same command goes on from there")
+        super().__init__(f"{reason}: stopped after step {step:,}. Run the same command again to resume")
 
 
 class SignalExit(BaseException):

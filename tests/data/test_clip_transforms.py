@@ -104,7 +104,7 @@ def test_transform_options_are_passed_to_the_class_and_validated() -> None:
         (lambda clip: replace(clip, frames=clip.frames[..., :1]), r"width x 1\."),
         (
             lambda clip: replace(clip, states=clip.states[:, :6]),
-            "states of float32, 3 x 6. needed: states of float32, 3 x 7",
+            "states of float32, 3 x 6. Expected states of float32, 3 x 7",
         ),
         (lambda clip: replace(clip, actions=clip.actions.astype(float)), "actions of float64"),
     ],

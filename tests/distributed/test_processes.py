@@ -95,7 +95,7 @@ def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
 
 def test_more_processes_than_micro_batches_are_refused(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
-    with pytest.raises(InputError, match=r"5 processes.*needed: 4 at most, for the 8 clips"):
+    with pytest.raises(InputError, match=r"5 processes.*Expected 4 at most, for the 8 clips"):
         count_micro_batches(config, RunState(step=3, clips_per_step=8, clips_per_process=8), 5, reporter)
 
 

@@ -139,7 +139,7 @@ def with_nan(tensors: dict[str, torch.Tensor], _: object) -> None:
     ("change", "message"),
     [
         (with_nan, r"states: step 2: the numbers .*finite numbers"),
-        (lambda tensors, _: tensors.update(states=tensors["states"][:3]), r"states: shape \(3, 7\).*needed: 40 x 7"),
+        (lambda tensors, _: tensors.update(states=tensors["states"][:3]), r"states: shape \(3, 7\).*Expected 40 x 7"),
         (lambda tensors, _: tensors.update(states=tensors["states"] * 1000), r"states: step 0: .*like millimetres"),
         (lambda tensors, _: tensors.update(extrinsics=torch.zeros(3, 6)), r"extrinsics: shape \(3, 6\)"),
         (lambda tensors, _: tensors.pop("states"), r"not a whole file of latents"),

@@ -127,7 +127,7 @@ def test_a_file_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> No
     ]
     for file in [*outside, "a\0.png", "a\n.png", "\x1b[2J.png"]:
         edit(folder, lambda goals, file=file: goals[1].update(file=file))
-        with pytest.raises(InputError, match=r"goals\.json: goal 2: the file .*needed: a printable path") as caught:
+        with pytest.raises(InputError, match=r"goals\.json: goal 2: the file .*Expected a printable path") as caught:
             read_goal_folder(folder)
         assert str(caught.value).isprintable()
     for file, complaint in (("pipe.png", "a pipe or a device"), ("loop.png", "symbolic links"), (".", "directory")):

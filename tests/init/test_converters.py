@@ -54,7 +54,7 @@ def test_data_converter_prints_the_script_and_lists_all_scripts(name: str, capsy
     assert main(["data", "converter"]) == 0
     assert name in capsys.readouterr().out
     assert main(["data", "converter", f"../{name}"]) == 2
-    assert "needed: one of lance_to_files, mp4_and_csv, ros2_bag" in capsys.readouterr().err
+    assert "Expected one of lance_to_files, mp4_and_csv, ros2_bag" in capsys.readouterr().err
 
 
 # Videos and tables.

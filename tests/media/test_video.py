@@ -115,7 +115,7 @@ def test_frame_half_a_step_away_is_rejected(tmp_path: Path) -> None:
 def test_video_slower_than_its_clock_raises_with_both_rates(tmp_path: Path) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, rate=10)
     message = (
-        r"a: no frame at 0\.033 s: the video has 10 frames per second, but meta/info\.json states 30\. needed: a frame"
+        r"a: no frame at 0\.033 s: the video has 10 frames per second, but meta/info\.json states 30\. Expected a frame"
     )
     with pytest.raises(InputError, match=message):
         read_frames(path, [0, 1], where="a", clock=Clock(0.0, 30.0, "meta/info.json"))
@@ -257,7 +257,7 @@ def test_damaged_video_raises_and_libav_prints_nothing(
 @pytest.mark.parametrize("clock", [None, Clock(0.0, 15.0)])
 def test_frame_past_the_end_raises(tmp_path: Path, clock: Clock | None) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES)
-    with pytest.raises(InputError, match=r"40 frames. needed: at least 43|no frame at 2.800 s"):
+    with pytest.raises(InputError, match=r"40 frames. Expected at least 43|no frame at 2.800 s"):
         read_frames(path, [3, 42], where="a", clock=clock)
 
 

@@ -142,5 +142,5 @@ def test_a_model_without_states_plans_vectors_and_takes_states_of_any_width_for_
 
 
 def test_a_model_whose_states_are_no_poses_is_refused() -> None:
-    with pytest.raises(InputError, match=r"states of 8 and actions of 8 numbers\. needed: 7 and 7"):
+    with pytest.raises(InputError, match=r"states of 8 and actions of 8 numbers\. Expected 7 and 7"):
         controller(vector_model(8))

@@ -56,7 +56,7 @@ def test_actions_are_read_from_arrays_and_tables(tmp_path: Path) -> None:
     for name in ("a.npy", "a.csv", "named.csv"):
         np.testing.assert_allclose(read_actions(tmp_path / name), ROWS, atol=1e-8)
     np.testing.assert_array_equal(read_actions(tmp_path / "a.csv", steps=1), ROWS[:1])
-    with pytest.raises(InputError, match=r"a\.csv: 2 actions\. needed: 3"):
+    with pytest.raises(InputError, match=r"a\.csv: 2 actions\. Expected 3"):
         read_actions(tmp_path / "a.csv", steps=3)
 
 

@@ -117,7 +117,7 @@ def test_a_run_of_vectors_plans_within_what_it_was_taught(make_config, reporter)
     limited = Controller.of_subject(load_to_plan(str(folder), overrides=["planning.limits.axes=[0.01]"]))
     limited.reset(image(0))
     assert np.abs(limited.act(image(1), states[0][0])).max() <= 0.01
-    with pytest.raises(InputError, match=r"state: 7 numbers .* needed: 8: state 0, state 1"):
+    with pytest.raises(InputError, match=r"state: 7 numbers .* Expected 8: state 0, state 1"):
         limited.act(image(1), np.zeros(7))
     for spoiled, complaint in (('{"changes": [1.0, "far"]}', "a number of 0 or more"), ('{"changes": 3}', "found|3")):
         (folder / "changes.json").write_text(spoiled)
@@ -242,9 +242,9 @@ def test_whoever_loads_a_run_is_warned_of_limits_that_leave_what_it_was_taught(
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        (3, "needed: a number of 0 or more"),
-        ([*TAUGHT[:6], "far"], "needed: a number of 0 or more"),
-        (TAUGHT[:6], "needed: 7 numbers: dx, dy"),
+        (3, "Expected a number of 0 or more"),
+        ([*TAUGHT[:6], "far"], "Expected a number of 0 or more"),
+        (TAUGHT[:6], "Expected 7 numbers: dx, dy"),
         ([30.0, *TAUGHT[1:]], "positions in metres"),
     ],
 )

@@ -74,7 +74,7 @@ def test_goals_are_made_of_both_cameras_and_a_film_shows_both(tmp_path: Path) ->
     one, both = (np.stack([made.first, made.goals[0].image]) for made in found)
     np.testing.assert_array_equal(both[:, :, : both.shape[2] // 2], one)
     assert (both[:, :, both.shape[2] // 2 :] != one).any()
-    with pytest.raises(InputError, match=r"data.camera: exterior_1_left. needed: 2 cameras"):
+    with pytest.raises(InputError, match=r"data.camera: exterior_1_left. Expected 2 cameras"):
         make_goals(RldsData(path=str(data), camera="exterior_1_left"), "0", KeyFrameOptions(views=2))
 
     quick = ["planning.views=2", "planning.samples=8", "planning.iterations=1", "planning.planner.options.elites=2"]

@@ -124,7 +124,7 @@ def test_views_are_read_side_by_side_as_the_planner_sees_them(tmp_path: Path) ->
     score_policies(run, both, [one])
     expected = [both.source.read(1, camera).read_frames([3])[0] for camera in ("frames", "right")]
     np.testing.assert_array_equal(run.frames[0], np.hstack(expected))
-    with pytest.raises(InputError, match=r"data\.camera: frames\. needed: 2 cameras"):
+    with pytest.raises(InputError, match=r"data\.camera: frames\. Expected 2 cameras"):
         score_policies(run, open_dataset(tmp_path, camera="frames", **how), [one])
 
 

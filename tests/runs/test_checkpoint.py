@@ -377,7 +377,9 @@ def test_the_newest_the_best_and_that_of_a_step_are_found(run: Path, by: str, wo
 
 @pytest.mark.parametrize(("by", "found"), [("15", "no checkpoint of step 15"), ("bset", "--checkpoint bset")])
 def test_one_that_is_not_there_is_an_error_that_names_those_that_are(run: Path, by: str, found: str) -> None:
-    with pytest.raises(InputError, match=rf"{found}.*\. needed: selected, newest, best or one of the steps 10, 20, 30"):
+    with pytest.raises(
+        InputError, match=rf"{found}.*\. Expected selected, newest, best or one of the steps 10, 20, 30"
+    ):
         select_checkpoint(run, by)
 
 

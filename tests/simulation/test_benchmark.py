@@ -115,7 +115,7 @@ def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
 @pytest.mark.parametrize(
     ("words", "wrong"),
     [
-        (["{model}", "--domain", "random"], "needed: A or B"),
+        (["{model}", "--domain", "random"], "Expected A or B"),
         (["{model}", "--workers", "2"], "--workers"),
         (["{model}", "--out", "{model}/config.json"], "config.json"),
         (["{model}", "training.steps=3"], "training.steps=3"),

@@ -101,7 +101,7 @@ def test_other_data_are_refused(recorded, droid: Path) -> None:
     ours = episode_of(recorded("A"))
     for episode, step, camera, message in (
         (episode_of(droid), 0, "exterior_1_left", "not the episode"),
-        (ours, STEPS, "exterior_1_left", "needed: 0 to 12"),
+        (ours, STEPS, "exterior_1_left", "Expected 0 to 12"),
         (ours, 0, "front", "one of exterior_1_left"),
     ):
         with pytest.raises(InputError, match=message):

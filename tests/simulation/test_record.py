@@ -142,7 +142,7 @@ def test_the_spec_that_is_read_is_the_one_that_was_recorded(tmp_path: Path, spec
 
 def test_a_folder_without_the_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"simulation\.json: no such file: .*needed: .*simulate record.*Record it again"
+        InputError, match=r"simulation\.json: no such file: .*Expected .*simulate record.*Record it again"
     ):
         read_simulation(tmp_path)
 

@@ -24,7 +24,7 @@ from vjepa2_ac.storage.structured import format_json, parse_json_object, parse_r
     "text", ["[" * 200_000, '{"a": 1} {}', "", "[1]", "null", b"\xff\xfe\x00", '{"a": ' + "9" * 5000 + "}"]
 )
 def test_invalid_json_object_raises_with_the_file(text: str | bytes) -> None:
-    with pytest.raises(InputError, match=r"^x\.json: .*JSON.*needed: a card\. Copy it again\.") as caught:
+    with pytest.raises(InputError, match=r"^x\.json: .*JSON.*Expected a card\. Copy it again\.") as caught:
         parse_json_object(text, where="x.json", needed="a card", fix="Copy it again")
     assert len(str(caught.value)) < 400
 

@@ -356,7 +356,7 @@ def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[
         try:
             fitting[stride] = len(np.unique(dataset.windows(split).episodes))
         except InputError as error:
-            reasons[stride] = f"{error.found}; needed: {error.needed}" if error.needed else error.found
+            reasons[stride] = f"{error.found}. Expected {error.needed}" if error.needed else error.found
             if len(reasons) == len(views):
                 raise
     needed = min(_EPISODES_NEEDED, max(fitting.values()))

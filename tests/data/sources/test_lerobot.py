@@ -213,7 +213,7 @@ def test_the_gripper_is_closedness_whatever_its_range_and_sign(opened: float, cl
     np.testing.assert_allclose(source.read(0).states, states, atol=1e-12)
     if abs(closed - opened) > 1.1:
         with pytest.raises(
-            InputError, match=r"needed: a gripper between 0 and 1: 0 for open, 1 for closed\. Check data\.lerobot"
+            InputError, match=r"Expected a gripper between 0 and 1: 0 for open, 1 for closed\. Check data\.lerobot"
         ):
             source_of(root, lerobot=OWN).infos()
 
@@ -347,12 +347,12 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "no column": (spoiled(lambda _: None), f"no column {STATE[0]}.*It has: episode_index, frame_index, timestamp"),
     "no commands": (lambda root: change_table(first_rows(root), **{"action.joint_velocity": None}), "no column action"),
     "not a number": (spoiled(with_value(3, np.nan)), "episode_000000: step 3: the numbers"),
-    "out of reach": (spoiled(with_value(5, 50.0)), "needed: a position within 5 m"),
-    "five numbers": (spoiled(lambda rows: np.float32(rows)[:, :5]), r"5 numbers a row\. needed: 6, says"),
+    "out of reach": (spoiled(with_value(5, 50.0)), "Expected a position within 5 m"),
+    "five numbers": (spoiled(lambda rows: np.float32(rows)[:, :5]), r"5 numbers a row\. Expected 6, says"),
     "uneven": (spoiled(lambda rows: pa.array([rows[0][:5], *rows[1:]], LIST)), "5 numbers in one row and 6 in another"),
     "gaps": (spoiled(lambda rows: pa.array([None, *rows[1:]], LIST)), "1 rows without a value"),
     "words": (spoiled(lambda rows: pa.array(["a"] * len(rows))), "values of type string"),
-    "lost rows": (taken(*range(10)), r"10 rows\. needed: 12"),
+    "lost rows": (taken(*range(10)), r"10 rows\. Expected 12"),
     "mixed rows": (taken(1, 0, *range(2, 12)), "frame_index that is not 0 to 11 in order"),
 }  # fmt: skip
 
@@ -362,7 +362,7 @@ def only_problem(root: Path) -> str:
     assert len(table) + len(table.problems) == 5
     first = table.problems[0]
     assert first.name == "episode_000000"
-    return f"{first.where}: {first.found}. needed: {first.needed}. {first.fix}"
+    return f"{first.where}: {first.found}. Expected {first.needed}. {first.fix}"
 
 
 @pytest.mark.parametrize("damage", BROKEN)
@@ -376,7 +376,7 @@ def test_a_wrong_rate_is_found_out_by_the_timestamps(v21: Path, tmp_path: Path) 
     root = Path(shutil.copytree(v21, tmp_path / "set"))
     change_info(root, fps=10)
     with pytest.raises(
-        InputError, match=r"step 2: the timestamp 0\.1333 s\. needed: 0\.2 s, at the 10 rows per second"
+        InputError, match=r"step 2: the timestamp 0\.1333 s\. Expected 0\.2 s, at the 10 rows per second"
     ):
         source_of(root).infos()
 
@@ -445,7 +445,7 @@ def test_a_video_that_is_shorter_than_its_rows_is_found_while_a_local_set_is_ind
     root = Path(shutil.copytree(v21, tmp_path / "v21"))
     shorten(first_video(root), 11)
     message = (
-        r"episode_000000\.mp4: episode_000000: 11 frames at 15 a second, up to 0\.667 s\. needed: one for each of 12 "
+        r"episode_000000\.mp4: episode_000000: 11 frames at 15 a second, up to 0\.667 s\. Expected one for each of 12 "
     )
     assert re.search(message + r"rows at 15 a second, up to 0\.733 s\. Copy the data set again", only_problem(root))
     assert not source_of(root, camera="wrist_left").infos().problems

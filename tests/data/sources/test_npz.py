@@ -79,7 +79,7 @@ def test_a_file_that_changed_after_indexing_is_named(tmp_path: Path) -> None:
     plain = source(tmp_path)
     plain.infos()
     write(path, states=STATES[:9], frames=FRAMES[:9])
-    with pytest.raises(InputError, match=r"one.npz: 9 steps. needed: the 20"):
+    with pytest.raises(InputError, match=r"one.npz: 9 steps. Expected the 20"):
         plain.read(0)
 
 
@@ -98,14 +98,14 @@ NAN = np.where(np.arange(STEPS)[:, None] == 3, np.nan, STATES)
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "no states": (lambda path: write(path, without="states"), "states: no such array"),
     "no rate worth the name": (lambda path: write(path, fps_hz=0.0), "fps_hz: 0"),
-    "another rate": (lambda path: write(path, fps_hz=30.0), "30 steps a second.*needed: 15 steps a second"),
+    "another rate": (lambda path: write(path, fps_hz=30.0), "30 steps a second.*Expected 15 steps a second"),
     "no such camera": (lambda path: write(path, without="frames", wrist=WRIST), "frames: no such array"),
     "too few frames": (lambda path: write(path, frames=FRAMES[:-1]), r"frames: shape \(19, 36, 64, 3\)"),
     "float frames": (lambda path: write(path, frames=FRAMES / 255), "frames: shape .* float64"),
     "pickled frames": (lambda path: write(path, frames=np.array([{}, []], object)), "frames: .*objects"),
     "turned frames": (
         lambda path: write(path, frames=np.asfortranarray(FRAMES)),
-        r"frames: frames in Fortran order.*needed: C order.*ascontiguousarray",
+        r"frames: frames in Fortran order.*Expected C order.*ascontiguousarray",
     ),
     "states of another width": (lambda path: write(path, states=STATES[:, :6]), r"states: shape \(20, 6\)"),
     "no steps": (lambda path: write(path, states=STATES[:0], frames=FRAMES[:0]), "no steps"),

@@ -47,11 +47,11 @@ LONG = 5_000_000  # steps: nine days
 BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
     "states without end": (
         lambda path: add(without(path, "states"), "states", described((LONG, 7), "|u1"), 7 * LONG),
-        r"states: 35,000,000 numbers\. needed: at most 33,554,432",
+        r"states: 35,000,000 numbers\. Expected at most 33,554,432",
     ),
     "a text without end": (
         lambda path: add(without(path, ""), "language", described((), f"<U{4 * _MB}"), 16 * _MB),
-        r"language: a text of 16,777,216 bytes\. needed: at most 262,144",
+        r"language: a text of 16,777,216 bytes\. Expected at most 262,144",
     ),
     "a head without end": (
         lambda path: add(without(path, "states"), "states", described((STEPS, 7), "<f8", claimed=32 * _MB), 32 * _MB),

@@ -71,7 +71,7 @@ def test_lists_without_end_are_refused_by_what_the_footer_says(tmp_path: Path, m
     path = write(tmp_path / "rows.parquet", 10, width=70)
     assert rows_of(path).read_rows(str(path), 0)[STATE].shape == (10, 70)
     monkeypatch.setattr(parquet, "MAX_NUMBERS", 600)
-    with pytest.raises(InputError, match=r"observation\.state.*: 700 numbers in a row group\. needed: at most 600"):
+    with pytest.raises(InputError, match=r"observation\.state.*: 700 numbers in a row group\. Expected at most 600"):
         rows_of(path).read_rows(str(path), 0)
 
 

@@ -74,7 +74,7 @@ def test_what_no_adapter_of_ours_can_be_is_refused_by_name(
     rewrite(folder, changes)
     for model in (fresh(), on):
         if model is on and complaint == "matches no layer of the predictor":
-            complaint = "needed: ('fc1', 'q'), as the model has"
+            complaint = "Expected ('fc1', 'q'), as the model has"
         with pytest.raises(InputError) as caught:
             load_trained(model, folder)
         assert complaint in str(caught.value)

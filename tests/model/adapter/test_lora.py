@@ -304,8 +304,8 @@ def test_a_folder_that_is_not_a_whole_adapter_is_named(
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (LORA.model_copy(update={"rank": 2}), r"an adapter with rank 4\. needed: 2, as the model has"),
-        (LORA.model_copy(update={"targets": ("q",)}), r"with targets \('fc1', .*needed: \('q',\)"),
+        (LORA.model_copy(update={"rank": 2}), r"an adapter with rank 4\. Expected 2, as the model has"),
+        (LORA.model_copy(update={"targets": ("q",)}), r"with targets \('fc1', .*Expected \('q',\)"),
         (EVERYTHING, r"an adapter of kind lora, and the model has one of kind none"),
     ],
 )

@@ -173,9 +173,9 @@ def drop_head(whole: Whole) -> None:
             r"encoder: 2 tensors do not match \(missing: blocks.1.norm1.weight; unexpected: blocks.1.norm1.scale\)",
         ),
         (drop_head, r"predictor: 1 tensors do not match \(missing: state_encoder.weight\)"),
-        (lambda _: [1, 2], "changed.pt: a list. needed: a checkpoint of V-JEPA"),
-        (lambda whole: {"encoder": whole["encoder"]}, r"no predictor \(keys: encoder\)\. needed: both parts"),
-        (lambda whole: whole["predictor"], r"no encoder \(keys: module\.\w+\..*needed: both parts.*torch\.save\("),
+        (lambda _: [1, 2], "changed.pt: a list. Expected a checkpoint of V-JEPA"),
+        (lambda whole: {"encoder": whole["encoder"]}, r"no predictor \(keys: encoder\)\. Expected both parts"),
+        (lambda whole: whole["predictor"], r"no encoder \(keys: module\.\w+\..*Expected both parts.*torch\.save\("),
         (
             lambda whole: whole | {"predictor": renamed(whole["predictor"], "model.")},
             r"no tensor 'action_encoder.weight' in predictor \(its tensors: model\.\w+\.",

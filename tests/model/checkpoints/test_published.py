@@ -132,7 +132,7 @@ def test_a_refusal_is_final_and_no_network_is_said(serve, tmp_path: Path) -> Non
 
 
 def test_a_file_whose_size_is_not_said_is_refused(serve, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"needed: its size \(Content-Length\)"):
+    with pytest.raises(InputError, match=r"Expected its size \(Content-Length\)"):
         download(serve(Behaviour(says_size=False)), tmp_path / "model.pt")
     assert list(tmp_path.iterdir()) == []
 
@@ -141,7 +141,7 @@ def test_less_than_the_published_file_is_not_taken_for_it(serve, tmp_path: Path)
     part = tmp_path / PART
     part.write_bytes(CONTENT[:1000])
     url = serve(Behaviour(content=b"please wait", resumes=False))
-    with pytest.raises(InputError, match=r"a file of 11 bytes\. needed: made-up, of 102,400 to 102,400 bytes.*proxy"):
+    with pytest.raises(InputError, match=r"a file of 11 bytes\. Expected made-up, of 102,400 to 102,400 bytes.*proxy"):
         download(url, tmp_path / "made-up.pt", known=MADE_UP)
     assert part.read_bytes() == CONTENT[:1000]  # hours of a good line are not thrown away
     assert download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP).read_bytes() == CONTENT
@@ -153,7 +153,7 @@ def test_a_file_that_is_here_and_cannot_be_the_published_one_is_named(serve, tmp
     path.write_bytes(b"<html>")
     with pytest.raises(InputError, match=r"made-up\.pt: a file of 6 bytes.*or name another with --to"):
         download(url, path, known=MADE_UP)
-    with pytest.raises(InputError, match=r"a folder\. needed: the name of a file"):
+    with pytest.raises(InputError, match=r"a folder\. Expected the name of a file"):
         download(url, tmp_path, known=MADE_UP)
     assert behaviour.seen == []
 
@@ -164,7 +164,7 @@ def test_disk_space_for_the_rest_is_checked_before_the_first_byte(
     monkeypatch.setattr(storage, "free_bytes", lambda _: 101_399)  # one byte less than the rest of the file
     part = tmp_path / PART
     part.write_bytes(CONTENT[:1000])
-    with pytest.raises(InputError, match=r"GB free on its disk\. needed: 0\.0001024 GB.*--to"):
+    with pytest.raises(InputError, match=r"GB free on its disk\. Expected 0\.0001024 GB.*--to"):
         download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP)
     assert part.read_bytes() == CONTENT[:1000]
 

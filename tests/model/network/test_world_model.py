@@ -50,7 +50,7 @@ def break_sizes(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (shutil.rmtree, "config.json: cannot be read: No such file or directory. needed: a folder written by"),
+        (shutil.rmtree, "config.json: cannot be read: No such file or directory. Expected a folder written by"),
         (
             lambda folder: (folder / "config.json").write_text('{"model_type": "vjepa2"}'),
             "config.json: not the config of a world model",
