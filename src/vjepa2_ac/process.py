@@ -115,7 +115,7 @@ def seconds_since_output() -> float:
 def safe_imports() -> Iterator[None]:
     """Keep the working directory off `sys.path` of Python processes started within the context.
 
-    Python puts the directory first for `-c` and `-m`, which multiprocessing uses: a user's `random.py` would be imported.
+    Python puts the directory first for `-c` and `-m`, as multiprocessing does, and would import a user's `random.py`.
     """
     before = os.environ.get(_SAFE_PATH)
     os.environ[_SAFE_PATH] = "1"
