@@ -291,7 +291,7 @@ class Explorer:
         return np.asarray(shown(self.decoder.decoder, latents[None])[0])
 
 
-def relative_spread(latents: Float[Tensor, "tokens dim"], like: Float[Tensor, "tokens dim"]) -> float:
+def compute_relative_spread(latents: Float[Tensor, "tokens dim"], like: Float[Tensor, "tokens dim"]) -> float:
     """Return the variance of latents over the patches of a frame, relative to that of another frame."""
     return float(latents.var(dim=0).sum() / like.var(dim=0).sum())
 
@@ -405,7 +405,7 @@ class Search:
             SearchCancelledError: It was cancelled.
         """
         around = torch.tensor([list(action)], dtype=torch.float32)
-        with self._cost(model_index, position, goal) as cost:
+        with self._open_cost(model_index, position, goal) as cost:
             checked_progress = until_cancelled(cancelled, progress)
             return energy_slices(
                 cost, around, self.make_search_space(), self.axes, nodes=_GRID_POINTS, progress=checked_progress
@@ -427,7 +427,7 @@ class Search:
             SearchCancelledError: The search was cancelled.
         """
         planner = Planner(self._with_horizon(steps), self.make_search_space(steps), progress=progress)
-        with self._cost(model_index, position, goal) as cost, torch.no_grad():
+        with self._open_cost(model_index, position, goal) as cost, torch.no_grad():
             plan = planner.plan(cost, torch.Generator().manual_seed(0), cancelled=cancelled)
             elites = torch.stack(
                 [iteration.elites[0] for iteration in plan.iterations if len(iteration.elites)][-8:] or [plan.actions]
@@ -437,7 +437,7 @@ class Search:
         return PlanResult(plan, energy_now, tuple(best[:, -1].float()))
 
     @contextmanager
-    def _cost(self, model_index: int, position: RolloutPosition, goal: Tensor) -> Iterator[WorldModelCost]:
+    def _open_cost(self, model_index: int, position: RolloutPosition, goal: Tensor) -> Iterator[WorldModelCost]:
         """Yield the cost function of a search from a position, whose predicted frame is used like an observed one."""
         explorer = self._explorer
         state = torch.from_numpy(np.array(explorer.integrate_states(position)[-1], dtype=np.float32))

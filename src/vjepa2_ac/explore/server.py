@@ -114,7 +114,7 @@ class ExploreServer:
             )
         if path not in _FILES:
             return connection.respond(status.NOT_FOUND, "not found\n")
-        return _file(connection, *_FILES[path])
+        return _make_file_response(connection, *_FILES[path])
 
     async def _serve_client(self, connection: Any) -> None:
         if self._pages >= _MAX_PAGES:
@@ -127,7 +127,7 @@ class ExploreServer:
         try:
             with contextlib.suppress(closed.exceptions.ConnectionClosed):
                 async for message in connection:
-                    if error_message := self._take(client, message):
+                    if error_message := self._set_request(client, message):
                         await connection.send(error_message)
         finally:
             self._pages -= 1
@@ -137,7 +137,7 @@ class ExploreServer:
                 if isinstance(error, Exception) and not isinstance(error, closed.exceptions.ConnectionClosed):
                     logger.error("the connection to a page was closed after an error", exc_info=error)
 
-    def _take(self, client: _Client, message: str | bytes) -> bytes | None:
+    def _set_request(self, client: _Client, message: str | bytes) -> bytes | None:
         """Set the pending request of a page, which cancels the running one; return an error if it is invalid."""
         try:
             client.waiting = read_request(message)
@@ -162,12 +162,12 @@ class ExploreServer:
                 asyncio.run_coroutine_threadsafe(connection.send(message), loop)
 
             answer = await loop.run_in_executor(
-                self._computing, self._answer, request, progress, client.replaced.is_set
+                self._computing, self._answer_request, request, progress, client.replaced.is_set
             )
             if answer is not None:
                 await connection.send(answer)
 
-    def _answer(
+    def _answer_request(
         self, request: PageRequest, progress: Callable[[int, int], None], cancelled: Callable[[], bool]
     ) -> bytes | None:
         try:
@@ -181,7 +181,7 @@ class ExploreServer:
             return encode_message("error", request.seq, {"text": "Internal error. The terminal shows the details."})
 
 
-def _file(connection: Any, name: str, kind: str) -> Any:
+def _make_file_response(connection: Any, name: str, kind: str) -> Any:
     """Return the response that contains a file of the page."""
     response = connection.respond(http.HTTPStatus.OK, "")
     response.body = files("vjepa2_ac").joinpath("explore/page", name).read_bytes()

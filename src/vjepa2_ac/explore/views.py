@@ -27,7 +27,7 @@ from vjepa2_ac.explore.explorer import (
     Pixels,
     RolloutPosition,
     Search,
-    relative_spread,
+    compute_relative_spread,
 )
 from vjepa2_ac.media.figure import colour_errors
 from vjepa2_ac.media.images import encode_jpeg
@@ -215,11 +215,11 @@ class Views:
             images.append(Image(f"predicted-{name}", explorer.decode(latents), f"frame predicted by {name}"))
             errors = None if outcome is None or not position.actions else mean_difference(latents, outcome.latents)
             if errors is not None:
-                images.append(Image(f"error-{name}", self._error_map(errors), f"error map of {name}"))
+                images.append(Image(f"error-{name}", self._draw_error_map(errors), f"error map of {name}"))
             model_results.append({
                 "id": name,
                 "error": None if errors is None else float(errors.mean()),
-                "spread": relative_spread(latents, start.latents if outcome is None else outcome.latents),
+                "spread": compute_relative_spread(latents, start.latents if outcome is None else outcome.latents),
                 "energy": None if goal is None else self.search.compute_energy(latents, goal.latents),
             })  # fmt: skip
         position_axes = explorer.spaces.state.position
@@ -257,7 +257,7 @@ class Views:
             raise InputError(where="goal", found=found, needed="a frame of one of the listed episodes")
         return explorer.get_observation(goal.episode, goal.step)
 
-    def _error_map(self, errors: Float[Tensor, " tokens"]) -> Pixels:
+    def _draw_error_map(self, errors: Float[Tensor, " tokens"]) -> Pixels:
         size = self.explorer.world_model.image_size
         grid = size // self.explorer.world_model.sizes.patch_size
         return colour_errors(errors.float().reshape(grid, grid).cpu().numpy(), (size, size)).astype(np.uint8)

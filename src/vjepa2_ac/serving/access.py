@@ -69,7 +69,7 @@ class Access:
             return False
         name = parts[1] or parts[2] or parts[3]
         known_names = {"localhost", self.host.lower(), *(known.lower() for known in self.names)}
-        return name in known_names or _address(name) is not None
+        return name in known_names or _parse_address(name) is not None
 
     def _has_key(self, authorization: str | None) -> bool:
         scheme, _, key = (authorization or "").partition(" ")
@@ -109,11 +109,11 @@ def read_key(path: Path) -> str:
 
 def is_loopback(host: str) -> bool:
     """Return whether only this machine can reach an address. `localhost` is the only name that is accepted."""
-    address = _address(host)
+    address = _parse_address(host)
     return host == "localhost" or (address is not None and address.is_loopback)
 
 
-def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+def _parse_address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
         return ipaddress.ip_address(name)
     except ValueError:

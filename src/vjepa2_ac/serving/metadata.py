@@ -19,7 +19,7 @@ from vjepa2_ac.serving.session import Session
 
 PROTOCOL = 2  # incremented at changes that require changes of clients
 _MAX_NAMES = 60  # names of goals in the metadata
-_SIZE = 180, 320  # height and width of each view in the first decision
+_IMAGE_SIZE = 180, 320  # height and width of each view in the first decision
 _REACHABLE_POSE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])  # for the first decision
 
 
@@ -47,11 +47,11 @@ def make_metadata(loaded: Subject, session: Session) -> dict[str, Any]:
         "image_keys": list(options.image_keys),
         "goals": sorted(session.goals)[:_MAX_NAMES],
         "warnings": list(loaded.warnings),
-        "action_space": action_space(session),
+        "action_space": get_action_space(session),
     }
 
 
-def action_space(session: Session) -> str:
+def get_action_space(session: Session) -> str:
     """Return the name of the action space, as RoboArena calls it."""
     space = session.controller.spaces
     if session.options.actions == "pose":
@@ -80,7 +80,7 @@ def warm_up(controller: Controller) -> float:
         InputError: The model returns no finite energy.
     """
     start_time, rng = time.perf_counter(), np.random.default_rng(0)
-    height, width = _SIZE
+    height, width = _IMAGE_SIZE
     goal, frame = rng.integers(0, 256, (2, height, width * controller.config.views, 3), dtype=np.uint8)
     space, box = controller.spaces.state, controller.config.limits.workspace
     state = _REACHABLE_POSE.copy() if space.is_pose else np.zeros(len(space))

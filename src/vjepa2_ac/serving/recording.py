@@ -63,10 +63,15 @@ class Recorder:
         if not self._is_active:
             return
         try:
-            line = {"time": utc_now(), "episode": self._episode, "frame": self._image(frame), "state": to_plain(state)}
-            line |= {"goals": [self._image(image) for image in self._goals], "answer": to_plain(answer)}
+            line = {
+                "time": utc_now(),
+                "episode": self._episode,
+                "frame": self._write_image(frame),
+                "state": to_plain(state),
+            }
+            line |= {"goals": [self._write_image(image) for image in self._goals], "answer": to_plain(answer)}
             text = json.dumps(line, allow_nan=False) + "\n"
-            self._count(len(text.encode()))
+            self._reserve_bytes(len(text.encode()))
             with (self.folder / DECISIONS_FILE).open("a") as file:
                 file.write(text)
         except OSError as error:
@@ -75,17 +80,17 @@ class Recorder:
                 "recording to %s has stopped, the server continues: %s", self.folder, error.strerror or error
             )
 
-    def _image(self, pixels: np.ndarray) -> str:
+    def _write_image(self, pixels: np.ndarray) -> str:
         """Write an image unless the folder contains it already; return its name in the folder."""
         digest = hashlib.sha256(repr(pixels.shape).encode() + np.ascontiguousarray(pixels).tobytes()).hexdigest()[:24]
         name = f"{IMAGES_FOLDER}/{digest}.png"
         if not (self.folder / name).exists():
             data = encode_png(pixels)
-            self._count(len(data))
+            self._reserve_bytes(len(data))
             write_atomically(self.folder / name, data)
         return name
 
-    def _count(self, size: int) -> None:
+    def _reserve_bytes(self, size: int) -> None:
         if size > self._bytes_left:
             raise OSError("the size limit is reached")
         self._bytes_left -= size

@@ -94,7 +94,7 @@ def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_K
         raise _make_error("reset", reset, "True or False")
     if episode is not None and not isinstance(episode, str):
         raise _make_error("session_id", episode, "a string that differs between episodes")
-    goal = _goal(message)
+    goal = _parse_goal(message)
     if endpoint == "reset":
         return Request(episode, is_new_episode=True, goal=goal)
     key = next((key for key in image_keys if key in message), None)
@@ -106,7 +106,7 @@ def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_K
     if (chunks is not None or endpoint == "score") and not _is_chunks(chunks):
         needed = f"a float array [chunks up to {MAX_CHUNKS}, control steps up to {MAX_CHUNK_STEPS}, numbers of a state]"
         raise _make_error(_CHUNKS, chunks, needed)
-    frame, state = _image(message[key], key), _state(message)
+    frame, state = _parse_image(message[key], key), _parse_state(message)
     chunks = None if chunks is None else chunks.astype(np.float64)
     return Request(episode, reset, goal, frame, state, chunks, cast("ChunkForm", form), endpoint == "score")
 
@@ -116,20 +116,20 @@ def _is_chunks(value: Any) -> bool:
     return is_array and len(value) <= MAX_CHUNKS and value.shape[1] <= MAX_CHUNK_STEPS
 
 
-def _image(value: Any, where: str) -> np.ndarray:
+def _parse_image(value: Any, where: str) -> np.ndarray:
     if not isinstance(value, np.ndarray) or value.ndim != 3 or value.shape[2] != 3 or value.dtype != np.uint8:
         raise _make_error(where, value, "an RGB image [height, width, 3] of type uint8")
     return value
 
 
-def _state(message: Mapping[str, Any]) -> np.ndarray:
+def _parse_state(message: Mapping[str, Any]) -> np.ndarray:
     if _STATE in message:
-        return _numbers(message[_STATE], _STATE)
+        return _parse_numbers(message[_STATE], _STATE)
     if _POSE not in message or _GRIPPER not in message:
         raise _make_missing_key_error(
             message, f"the measured state under the key {_STATE}, or under {_POSE} and {_GRIPPER}"
         )
-    pose, gripper = _numbers(message[_POSE], _POSE), _numbers(message[_GRIPPER], _GRIPPER)
+    pose, gripper = _parse_numbers(message[_POSE], _POSE), _parse_numbers(message[_GRIPPER], _GRIPPER)
     if pose.shape != (6,) or gripper.shape != (1,):
         found = f"{pose.size} and {gripper.size} numbers"
         needed = "6 numbers (x, y, z in metres; roll, pitch, yaw in radians, extrinsic xyz) and 1 (0 open, 1 closed)"
@@ -137,7 +137,7 @@ def _state(message: Mapping[str, Any]) -> np.ndarray:
     return np.concatenate([pose, gripper])
 
 
-def _numbers(value: Any, where: str) -> np.ndarray:
+def _parse_numbers(value: Any, where: str) -> np.ndarray:
     """Return a one-dimensional float64 array from an array, a list or a single number."""
     numbers = value if isinstance(value, list) else [value]
     if isinstance(value, np.ndarray):
@@ -148,7 +148,7 @@ def _numbers(value: Any, where: str) -> np.ndarray:
     raise _make_error(where, value, "a one-dimensional array of numbers")
 
 
-def _goal(message: Mapping[str, Any]) -> GoalRequest | None:
+def _parse_goal(message: Mapping[str, Any]) -> GoalRequest | None:
     """Return the goal of a request; without goal keys the prompt is the name of the goal."""
     goal_keys = sorted(key for key in message if key.startswith(_GOAL_PREFIX))
     for key in goal_keys:
@@ -161,7 +161,8 @@ def _goal(message: Mapping[str, Any]) -> GoalRequest | None:
         )
     if main_keys and main_keys != ["goal/name"]:
         return GoalRequest(
-            _make_sub_goals(_images(message, main_keys[0]), message.get("goal/rules")), _mask(message.get("goal/mask"))
+            _make_sub_goals(_parse_images(message, main_keys[0]), message.get("goal/rules")),
+            _parse_mask(message.get("goal/mask")),
         )
     if len(goal_keys) > 1:
         found = ", ".join(goal_keys)
@@ -177,14 +178,14 @@ def _goal(message: Mapping[str, Any]) -> GoalRequest | None:
     return GoalRequest(name=name)
 
 
-def _images(message: Mapping[str, Any], key: str) -> tuple[np.ndarray, ...]:
+def _parse_images(message: Mapping[str, Any], key: str) -> tuple[np.ndarray, ...]:
     value = message[key]
     if key == "goal/image":
-        return (_image(value, key),)
+        return (_parse_image(value, key),)
     images = list(value) if isinstance(value, np.ndarray) and value.ndim == 4 else value
     if not isinstance(images, list) or not 1 <= len(images) <= MAX_GOALS:
         raise _make_error(key, value, f"1 to {MAX_GOALS} images of the same size, in order")
-    return tuple(_image(image, f"{key}[{index}]") for index, image in enumerate(images))
+    return tuple(_parse_image(image, f"{key}[{index}]") for index, image in enumerate(images))
 
 
 def _make_sub_goals(images: Sequence[np.ndarray], rules: Any) -> tuple[SubGoal, ...]:
@@ -206,7 +207,7 @@ def _is_rule(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(field, str | int | float | None) for field in value.values())
 
 
-def _mask(value: Any) -> np.ndarray | None:
+def _parse_mask(value: Any) -> np.ndarray | None:
     if value is not None and (not isinstance(value, np.ndarray) or value.ndim != 2 or value.dtype.kind not in "bu"):
         needed = (
             "a bool or integer array [height, width] of the goal's size, with 0 where the goal image does not count"

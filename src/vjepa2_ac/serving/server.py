@@ -105,14 +105,14 @@ class PlanningServer:
             return connection.respond(status.OK, "OK\n")
         rejection = self._access.find_rejection(host, authorization)
         if rejection is None and path == "/metrics":
-            return connection.respond(status.OK, self._metrics())
+            return connection.respond(status.OK, self._format_metrics())
         if rejection is None and path != "/":
             return connection.respond(status.NOT_FOUND, "not found\n")
         if rejection is None and request.headers.get_all("Upgrade"):
             if request.headers.get_all("Origin"):
                 rejection = status.FORBIDDEN.value, "connections from web pages are not accepted"
             elif self._robot is not None:
-                rejection = status.SERVICE_UNAVAILABLE.value, _busy(self._robot)
+                rejection = status.SERVICE_UNAVAILABLE.value, _format_busy_message(self._robot)
         if rejection is None:
             return None
         self._rejected[str(rejection[0])] += 1
@@ -121,9 +121,9 @@ class PlanningServer:
     async def _serve_robot(self, connection: Any) -> None:
         """Serve a robot until it disconnects."""
         if self._robot is not None:  # two robots have connected at the same time
-            await connection.close(1013, _busy(self._robot)[:100])
+            await connection.close(1013, _format_busy_message(self._robot)[:100])
             return
-        self._robot = _name(connection)
+        self._robot = _format_address(connection)
         disconnected = asyncio.ensure_future(connection.wait_closed())
         closed = require_library("websockets.exceptions", where="serve", called="websockets", extra="serve")
         self._print_status(f"robot connected: {self._robot}")
@@ -157,7 +157,7 @@ class PlanningServer:
         except ClientDisconnectedError:
             return None
 
-    def _metrics(self) -> str:
+    def _format_metrics(self) -> str:
         """Return the counters in Prometheus' text format."""
         counts = self._session.counts
         values = {
@@ -188,10 +188,10 @@ async def _first_of(*futures: asyncio.Future[Any]) -> None:
     await asyncio.wait(futures, return_when=asyncio.FIRST_COMPLETED)
 
 
-def _busy(robot: str) -> str:
+def _format_busy_message(robot: str) -> str:
     return f"busy: the robot at {robot} is connected, and a server accepts one robot at a time"
 
 
-def _name(connection: Any) -> str:
+def _format_address(connection: Any) -> str:
     address = connection.remote_address
     return f"{address[0]}:{address[1]}" if isinstance(address, tuple) else "an unknown address"

@@ -169,9 +169,13 @@ class Session:
         if request.frame is None or request.state is None:
             return {"status": "reset"}
         if self._goal is None:
-            needed = f"goal/image, goal/images or goal/name{self._known_names()}"
+            needed = f"goal/image, goal/images or goal/name{self._format_known_goals()}"
             raise InputError(where="request", found="no goal was set in this episode", needed=needed)
-        changes, planning_start, observation = self._changes(request), self._clock(), (request.frame, request.state)
+        changes, planning_start, observation = (
+            self._convert_chunks(request),
+            self._clock(),
+            (request.frame, request.state),
+        )
         if request.is_score and changes is not None:  # the robot does not move, and no decision is counted
             scores = self.controller.score(*observation, changes, cancelled=cancelled)
             return {**scores.as_dict(is_blind=self.options.is_blind), "goal": scores.goal}
@@ -181,7 +185,7 @@ class Session:
         self._count_surprise(decision)
         return self._make_reply(*observation, (decision, why), (start_time, planning_start))
 
-    def _changes(self, request: Request) -> Float[np.ndarray, "chunks model_steps dim"] | None:
+    def _convert_chunks(self, request: Request) -> Float[np.ndarray, "chunks model_steps dim"] | None:
         """Convert the action chunks of a request into changes per model step; None if there are none."""
         if request.chunks is None or request.state is None:
             return None
@@ -251,9 +255,11 @@ class Session:
             if plan is not None and not self.options.dry_run:
                 changes = plan.actions.double().numpy()
         reply |= {"dry_run": True, "planned": planned} if self.options.dry_run else {"target": planned}
-        return {"actions": self._actions(state, changes), **to_plain(reply)}
+        return {"actions": self._format_actions(state, changes), **to_plain(reply)}
 
-    def _actions(self, state: np.ndarray, changes: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "rows dim"]:
+    def _format_actions(
+        self, state: np.ndarray, changes: Float[np.ndarray, "steps dim"]
+    ) -> Float[np.ndarray, "rows dim"]:
         """Convert the changes of the plan into the format of the reply.
 
         With `actions="pose"` these are waypoints to the first target. Otherwise they are one row per model step: target
@@ -267,7 +273,7 @@ class Session:
 
     def _set_goal(self, goal: GoalRequest, cancelled: Cancelled) -> None:
         if goal.name is not None and goal.name not in self.goals:
-            needed = f"the name of a goal{self._known_names()}"
+            needed = f"the name of a goal{self._format_known_goals()}"
             raise InputError(where="goal", found=f"unknown goal {goal.name!r}", needed=needed)
         goals = goal.goals if goal.name is None else self.goals[goal.name]
         self.controller.follow(goals, mask=goal.mask, cancelled=cancelled)
@@ -275,7 +281,7 @@ class Session:
         if self.recorder is not None:
             self.recorder.set_goals(goals, goal.mask)
 
-    def _known_names(self) -> str:
+    def _format_known_goals(self) -> str:
         names = list(self.goals)
         more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
         return f" (this server has {', '.join(names[:_MAX_NAMES])}{more})" if names else ""

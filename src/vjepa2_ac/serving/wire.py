@@ -94,9 +94,9 @@ class _Parts:
             raise WireError("a map contains a key twice")
         entries = dict(pairs)
         if _ARRAY in entries:
-            return _array(entries)
+            return _decode_array(entries)
         if _SCALAR in entries:
-            return _scalar(entries)
+            return _decode_scalar(entries)
         if not all(isinstance(key, str) for key in keys):
             raise WireError("a map has keys that are not strings")
         return entries
@@ -111,10 +111,10 @@ class _Parts:
             raise WireError(f"the message contains more than {MAX_PARTS} maps, lists and arrays")
 
 
-def _array(entries: dict[Any, Any]) -> np.ndarray:
+def _decode_array(entries: dict[Any, Any]) -> np.ndarray:
     if entries.keys() != {_ARRAY, _DATA, _DTYPE, _SHAPE} or entries[_ARRAY] is not True:
         raise WireError("an array must have exactly the entries `data`, `dtype` and `shape`")
-    dtype, shape, data = _type(entries[_DTYPE]), entries[_SHAPE], entries[_DATA]
+    dtype, shape, data = _check_dtype(entries[_DTYPE]), entries[_SHAPE], entries[_DATA]
     is_shape = isinstance(shape, list) and len(shape) <= MAX_AXES
     if not is_shape or not all(type(side) is int and 0 <= side <= MAX_MESSAGE_BYTES for side in shape):
         raise WireError(f"the shape of an array must be a list of up to {MAX_AXES} non-negative integers")
@@ -125,17 +125,17 @@ def _array(entries: dict[Any, Any]) -> np.ndarray:
     return np.frombuffer(data, dtype=dtype).reshape(shape).copy()  # frombuffer returns a read-only array
 
 
-def _scalar(entries: dict[Any, Any]) -> bool | int | float:
+def _decode_scalar(entries: dict[Any, Any]) -> bool | int | float:
     if entries.keys() != {_SCALAR, _DATA, _DTYPE} or entries[_SCALAR] is not True:
         raise WireError("a NumPy scalar must have exactly the entries `data` and `dtype`")
-    _type(entries[_DTYPE])
+    _check_dtype(entries[_DTYPE])
     value = entries[_DATA]
     if not isinstance(value, bool | int | float):
         raise WireError(f"a NumPy scalar contains a {type(value).__name__}. Expected a number")
     return value
 
 
-def _type(dtype: Any) -> str:
+def _check_dtype(dtype: Any) -> str:
     if not isinstance(dtype, str) or dtype not in _TYPES:
         raise WireError(f"an array has an unsupported type. Expected one of {', '.join(sorted(_TYPES))}")
     return dtype
