@@ -35,7 +35,7 @@ from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.search_space import GRIPPER, pose_space
+from vjepa2_ac.planning.search_space import GRIPPER, make_pose_search_space
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.spaces import states_along
@@ -95,7 +95,7 @@ def main(words: Sequence[str] | None = None) -> None:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     model.to(device).eval()
     settings = PROTOCOL.model_copy(update={"samples": options.samples})
-    space = pose_space(settings)
+    space = make_pose_search_space(settings)
     space.std[:, GRIPPER] = GRIPPER_START_STD
     planner = Planner(settings, space)
     ids, errors = [], []

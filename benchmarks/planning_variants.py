@@ -143,7 +143,7 @@ class Bench:
         """Return the model FLOPs of a decision: PyTorch counts those of one sequence."""
         cost = WorldModelCost(self.model, self._scene, self._goal(horizon), EnergyConfig())
         with torch.no_grad(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
-            cost.imagine(torch.tensor(WANTED).expand(1, horizon, -1))
+            cost.rollout(torch.tensor(WANTED).expand(1, horizon, -1))
         return self.sequences * int(counter.get_total_flops())
 
     @torch.no_grad()
@@ -153,7 +153,7 @@ class Bench:
         Seen from a goal that has nothing to do with a random model's predictions, all of them would be equally far.
         """
         cost = WorldModelCost(self.model, self._scene, Goal(self._scene.latents[None]), EnergyConfig())
-        return cost.imagine(torch.tensor(WANTED).expand(1, max(self.options.horizon), -1))[0][0]
+        return cost.rollout(torch.tensor(WANTED).expand(1, max(self.options.horizon), -1))[0][0]
 
     def _goal(self, horizon: int) -> Goal:
         return Goal(self._goals[horizon - 1 : horizon])

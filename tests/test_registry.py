@@ -14,7 +14,7 @@ from vjepa2_ac import registry as doors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.settings import planning_settings
+from vjepa2_ac.planning.settings import load_planning_config
 from vjepa2_ac.registry import LOSSES, import_plugins
 
 Write = Callable[..., str]
@@ -161,8 +161,8 @@ def test_the_config_of_a_run_never_imports_from_the_working_directory(write: Wri
     Path("run/run_id").write_text("a")
     read = (
         load_config,
-        lambda path: planning_settings(str(path.parent)),
-        lambda path: planning_settings("builtin:sim-tiny", config=path),
+        lambda path: load_planning_config(str(path.parent)),
+        lambda path: load_planning_config("builtin:sim-tiny", config=path),
     )
     for one in read:
         with pytest.raises(InputError, match=r"plugin 'p_evil': no such module.*--plugin p_evil"):
@@ -195,7 +195,7 @@ def test_an_installed_module_that_is_no_plugin_is_not_imported_for_a_run(write: 
     assert "antigravity" not in sys.modules
 
 
-@pytest.mark.parametrize("door", [load_config, lambda path: planning_settings("builtin:sim-tiny", config=path)])
+@pytest.mark.parametrize("door", [load_config, lambda path: load_planning_config("builtin:sim-tiny", config=path)])
 def test_the_users_own_config_imports_from_the_working_directory(write: Write, door: Callable[[Path], object]) -> None:
     config = Path("mine.yaml")
     write("p_mine")

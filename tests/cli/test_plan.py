@@ -81,7 +81,7 @@ def test_a_plan_that_is_predicted_to_be_worse_is_said_first_and_ends_with_status
 ) -> None:
     def decided(*given: Any, **how: Any) -> Any:
         found = decide(*given, **how)
-        return replace(found, doing_nothing=still, decision=replace(found.decision, energy_now=1e9))
+        return replace(found, zero_action_energy=still, decision=replace(found.decision, current_energy=1e9))
 
     monkeypatch.setattr("vjepa2_ac.planning.decision.decide", decided)
     status, file = plan(workshop, *QUICK)
@@ -133,12 +133,12 @@ def test_a_broken_model_leads_to_no_motion_and_to_status_1(workshop: Path) -> No
 WRONG = {
     "goal of another size": (["--goal", "{here}/other.png"], "48 x 60 pixels (width x height)"),
     "an image that is not there": (["--goal", "{here}/nowhere.png"], "nowhere.png: cannot be read: No such file"),
-    "a black mask": (["--mask", "{here}/black.png"], "nothing of what the model sees counts"),
+    "a black mask": (["--mask", "{here}/black.png"], "no pixel inside the cropped image"),
     "degrees": (["--state", "0.4,0,0.3,180,0,5,0"], "multiply them by pi / 180"),
     "too few numbers": (["--state", "0.4,0,0.3"], "3 numbers in the shape (3,)"),
     "limits below zero": (["planning.limits.xyz=[-0.05,0.05,0.05]"], "planning.limits.xyz.0"),
     "a knob of training": (["training.steps=2"], "a setting that planning does not use"),
-    "a camera that is not used": (["--extrinsics", "0,0,0,0,0,0"], "a camera pose exactly where the model uses it"),
+    "a camera that is not used": (["--extrinsics", "0,0,0,0,0,0"], "a camera pose if and only if the model uses it"),
     "a checkpoint of a model": (["--checkpoint", "best"], "not the folder of a run"),
     "a file in the way": (["--out", "{here}/notes.png"], "notes.png"),
 }  # fmt: skip
@@ -181,7 +181,11 @@ def test_a_decoder_shows_what_was_imagined_and_only_its_name_goes_into_the_file(
 def test_a_decoder_that_will_not_do_is_told_before_the_plan(
     workshop: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    where = "vjepa2_ac.planning.model_setup.load_to_plan" if kind == "missing" else "vjepa2_ac.planning.decision.decide"
+    where = (
+        "vjepa2_ac.planning.model_setup.load_for_planning"
+        if kind == "missing"
+        else "vjepa2_ac.planning.decision.decide"
+    )
     monkeypatch.setattr(where, lambda *_, **__: pytest.fail("too late"))
     if kind != "missing":
         write_decoder(tmp_path / "decoder", tiny_model(), encoder="other")

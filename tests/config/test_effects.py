@@ -24,7 +24,7 @@ from vjepa2_ac.data.sources.latents import build_cache_key
 from vjepa2_ac.encoding.batch import get_encoding
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.settings import USED, planning_settings
+from vjepa2_ac.planning.settings import USED_KEYS, load_planning_config
 from vjepa2_ac.runs.folder import check_run_folder, open_run_folder
 
 # What cannot be guessed from a knob's type, or must exist in the data set.
@@ -269,11 +269,13 @@ def test_a_run_goes_on_only_where_no_knob_that_decides_it_has_changed(tmp_path: 
 
 def test_planning_takes_the_values_that_affect_a_decision_and_names_them() -> None:
     for key, mark in collect_effects(Config).items():
-        named = key in USED or key.startswith(tuple(one.removesuffix("…") for one in USED if one.endswith("…")))
+        named = key in USED_KEYS or key.startswith(
+            tuple(one.removesuffix("…") for one in USED_KEYS if one.endswith("…"))
+        )
         assert (Affects.PLAN in mark) == named, key
         if Affects.PLAN not in mark:
             with pytest.raises(InputError, match=r"planning does not use.*model\.sizes\.…, model\.dtype"):
-                planning_settings("model.pt", overrides=[f"{key}=1"])
+                load_planning_config("model.pt", overrides=[f"{key}=1"])
 
 
 def test_a_mark_of_a_section_holds_for_its_knobs_and_a_value_has_that_of_its_knob() -> None:

@@ -206,5 +206,5 @@ def test_under_vector_states_only_recorded_actions_can_be_imagined(make_config: 
     options = ImagineOptions(decoder="", actions=("true",))
     assert list(imagined._actions_of(options, batch, dataset, limits=None)) == [AS_RECORDED]
     options = ImagineOptions(decoder="", actions=("true", "up"))
-    with pytest.raises(InputError, match="--actions up: states that are no poses"):
+    with pytest.raises(InputError, match="--actions up: states that are not poses"):
         imagined._actions_of(options, batch, dataset, limits=None)

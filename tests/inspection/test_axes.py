@@ -24,7 +24,7 @@ class Turned(Oracle):
         self.back, self.gain, self.side = Axes(-np.deg2rad(degrees)), gain, -1.0 if mirrored else 1.0
 
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        back = self.back.actions(actions) / torch.tensor([self.gain, self.side * self.gain, 1, 1, 1, 1, 1])
+        back = self.back.rotate_actions(actions) / torch.tensor([self.gain, self.side * self.gain, 1, 1, 1, 1, 1])
         return super().predict(latents, back, states, extrinsics)
 
 
@@ -89,7 +89,7 @@ class Placed(Turned):
 def test_the_place_that_is_turned_about_is_found(about: str) -> None:
     """A mounting is turned about the base; a camera leaves what it looks at where it is."""
     there = torch.tensor([0.4, 0.1, 0.3, 0.0, 0.0, 0.0, 0.0])
-    expected = there if about == "middle" else Axes(np.deg2rad(45.0)).poses(there)
+    expected = there if about == "middle" else Axes(np.deg2rad(45.0)).rotate_poses(there)
     begun = [replace(start, state=there) for start in starts()]
     found = infer_axes(Placed(45.0, expected[:3]), begun, at_once=64)
     assert found.yaw_degrees.value == pytest.approx(45.0, abs=0.5)

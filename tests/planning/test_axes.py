@@ -20,7 +20,7 @@ from vjepa2_ac.inspection.axes import TRIED_DEGREES, fit_axes
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import Axes, WorldModelCost
-from vjepa2_ac.planning.model_setup import load_to_plan
+from vjepa2_ac.planning.model_setup import load_for_planning
 from vjepa2_ac.planning.settings import read_axes
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.spaces import apply_actions
@@ -50,16 +50,17 @@ def test_turned_states_follow_from_turned_actions() -> None:
     """What the model sees is a world like the robot's, only turned: acting and turning can be done in either order."""
     states, tried = some(50, 7), some(50, 7, seed=1) - 0.4
     torch.testing.assert_close(
-        apply_actions(TURN.poses(states), TURN.actions(tried)), TURN.poses(apply_actions(states, tried)),
+        apply_actions(TURN.rotate_poses(states), TURN.rotate_actions(tried)),
+        TURN.rotate_poses(apply_actions(states, tried)),
         atol=1e-5, rtol=0,
     )  # fmt: skip
 
 
 def test_a_turn_is_counterclockwise_from_above_and_keeps_height_and_gripper() -> None:
     quarter = Axes(math.pi / 2)
-    turned = quarter.actions(torch.tensor([0.03, 0.0, 0.02, 0.0, 0.0, 0.1, 0.5]))
+    turned = quarter.rotate_actions(torch.tensor([0.03, 0.0, 0.02, 0.0, 0.0, 0.1, 0.5]))
     torch.testing.assert_close(turned, torch.tensor([0.0, 0.03, 0.02, 0.0, 0.0, 0.1, 0.5]), atol=1e-6, rtol=0)
-    posed = quarter.poses(torch.tensor([0.4, 0.1, 0.3, 0.0, 0.0, 0.1, 0.5]))
+    posed = quarter.rotate_poses(torch.tensor([0.4, 0.1, 0.3, 0.0, 0.0, 0.1, 0.5]))
     expected = torch.tensor([-0.1, 0.4, 0.3, 0.0, 0.0, 0.1 + math.pi / 2, 0.5])
     torch.testing.assert_close(posed, expected, atol=1e-6, rtol=0)
 
@@ -69,12 +70,12 @@ def test_the_energy_in_turned_axes_is_that_of_turned_actions_from_turned_states(
     model, start, tried = tiny_model(extrinsics=extrinsics), scene(extrinsics=extrinsics), actions(6, 2)
     plain = replace(
         start,
-        state=TURN.poses(start.state),
-        extrinsics=None if start.extrinsics is None else TURN.poses(start.extrinsics),
+        state=TURN.rotate_poses(start.state),
+        extrinsics=None if start.extrinsics is None else TURN.rotate_poses(start.extrinsics),
     )
     with torch.no_grad():
         turned = WorldModelCost(model, replace(start, axes=TURN), goal(), EnergyConfig())(tried)
-        expected = WorldModelCost(model, plain, goal(), EnergyConfig())(TURN.actions(tried))
+        expected = WorldModelCost(model, plain, goal(), EnergyConfig())(TURN.rotate_actions(tried))
         untouched = WorldModelCost(model, start, goal(), EnergyConfig())(tried)
     torch.testing.assert_close(turned, expected, atol=1e-5, rtol=0)
     assert not torch.allclose(turned, untouched, atol=1e-4)
@@ -125,11 +126,11 @@ def test_a_run_plans_by_axes_of_its_own_trained_weights_merged_or_not(make_confi
     loaded = load_subject(run)
     path = write(tmp_path / "axes.json", loaded.world_model)
     for_base = write(tmp_path / "base.json", WorldModel.from_pretrained(str(config.model.base)))
-    session = load_to_plan(str(run), overrides=[f"planning.axes={path}"])
+    session = load_for_planning(str(run), overrides=[f"planning.axes={path}"])
     Controller.of_subject(session)
     Controller.of_run(loaded, config.planning.model_copy(update={"axes": path}))
     with pytest.raises(InputError, match="fitted for another model"):
-        Controller.of_subject(load_to_plan(str(run), overrides=[f"planning.axes={for_base}"]))
+        Controller.of_subject(load_for_planning(str(run), overrides=[f"planning.axes={for_base}"]))
 
 
 def test_what_a_fit_writes_can_be_read(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import has_moved, is_uniform
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.goals import timed
+from vjepa2_ac.planning.goals import make_timed_goals
 from vjepa2_ac.simulation.arm import SimulatedArm
 from vjepa2_ac.simulation.domains import DOMAIN_A
 from vjepa2_ac.spaces import POSE, apply_action
@@ -115,16 +115,16 @@ def test_only_what_the_model_receives_of_an_image_counts(crop: Crop) -> None:
 
 def test_goals_make_no_progress_on_an_unusable_frame() -> None:
     run = controller()
-    goals = [dataclasses.replace(goal, share=0.5) for goal in timed([image(100), image(101)], [3])]
+    goals = [dataclasses.replace(goal, share=0.5) for goal in make_timed_goals([image(100), image(101)], [3])]
     goals[0] = dataclasses.replace(goals[0], at_least=1)
     run.follow(goals)
     assert why(run, BLACK) == "uniform frame"
-    assert (run.decision.goals, math.isnan(run.decision.energy_now)) == ((0, 0), True)
+    assert (run.decision.goals, math.isnan(run.decision.current_energy)) == ((0, 0), True)
     run.act(image(1), STATE)
-    began = run.decision.progress.began
-    assert began == pytest.approx(float((run.encoded(image(1)) - run._goal_latents[0]).abs().mean()), rel=1e-5)
+    began = run.decision.progress.initial_energy
+    assert began == pytest.approx(float((run.encode(image(1)) - run._goal_latents[0]).abs().mean()), rel=1e-5)
     for _ in range(4):
         assert why(run, BLACK) == "uniform frame"
-        assert (run.decision.progress.place, run.decision.progress.changed) == (0, "")
+        assert (run.decision.progress.goal_index, run.decision.progress.changed) == (0, "")
     run.act(image(2), STATE)
-    assert run.decision.progress.place == 1, "its steps are over"
+    assert run.decision.progress.goal_index == 1, "its steps are over"

@@ -80,10 +80,10 @@ def test_the_present_energy_is_that_of_an_image_that_stays(steps: str) -> None:
     run = controller(energy=EnergyConfig(steps=steps))
     run.reset(image(100), image(101), durations=(1,))
     run.act(image(1), STATE)
-    seen = run.encoded(image(1))
+    seen = run.encode(image(1))
     first, second = (float((seen - wanted).abs().mean()) for wanted in run._goal_latents)
     expected = {"last": second, "sum": first + second}[steps]
-    assert run.decision.energy_now == pytest.approx(expected, rel=1e-5)
+    assert run.decision.current_energy == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_decision_that_failed_can_be_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,7 +32,7 @@ def test_an_answer_is_what_the_controller_decides() -> None:
     controller = Controller(tiny_model(), QUICK, seed=5)
     controller.reset(image(100))
     np.testing.assert_array_equal(controller.act(image(0), STATE), found.actions[0])
-    assert found.doing_nothing == pytest.approx(float(found.decision.cost(torch.zeros(1, 2, 7))[0]))
+    assert found.zero_action_energy == pytest.approx(float(found.decision.cost(torch.zeros(1, 2, 7))[0]))
     assert found.states.shape == (3, 7)
     assert len(found.slices) == 3
     assert asked(nodes=0).slices == asked(nodes=2).slices == ()
@@ -49,8 +49,8 @@ def test_the_file_holds_the_decision(tmp_path: Path) -> None:
     np.testing.assert_allclose(file["states"], found.states)
     np.testing.assert_allclose(file["state"], STATE)
     assert file["energy"] == {
-        "now": found.decision.energy_now, "began": found.decision.progress.began, "doing_nothing": found.doing_nothing,
-        "plan": plan.energy,
+        "now": found.decision.current_energy, "began": found.decision.progress.initial_energy,
+        "doing_nothing": found.zero_action_energy, "plan": plan.energy,
     }  # fmt: skip
     assert [one["lowest"] for one in file["iterations"]] == [one.lowest for one in plan.iterations]
     np.testing.assert_allclose(file["iterations"][2]["std"], plan.iterations[2].std)
@@ -68,8 +68,8 @@ def test_the_file_holds_the_decision(tmp_path: Path) -> None:
 def test_a_plan_is_called_worse_than_exactly_the_lower_energies(tmp_path: Path, still: float, now: float) -> None:
     found = asked(nodes=0)
     energy = found.decision.plan.energy
-    decision = replace(found.decision, energy_now=now * energy)
-    found = replace(found, doing_nothing=still * energy, decision=decision)
+    decision = replace(found.decision, current_energy=now * energy)
+    found = replace(found, zero_action_energy=still * energy, decision=decision)
     worse = [name for name, share in (("zero action", still), ("current frame", now)) if share < 0.999]
     assert read(found, tmp_path)["worse_than"] == worse
     said = {

@@ -14,9 +14,9 @@ from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_mode
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, energy_slices
+from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, compute_energy_slices, distance
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.search_space import pose_space
+from vjepa2_ac.planning.search_space import make_pose_search_space
 from vjepa2_ac.registry import ENERGIES
 from vjepa2_ac.spaces import Spaces, apply_action
 
@@ -47,7 +47,7 @@ def test_predictions_are_those_of_the_plain_computation(adapted: bool, extrinsic
         actions(3, 3),
     )
     with torch.no_grad():
-        found, states = WorldModelCost(model, start, goal(), EnergyConfig()).imagine(tried)
+        found, states = WorldModelCost(model, start, goal(), EnergyConfig()).rollout(tried)
     expected = torch.stack([plain_predictions(model, start, one) for one in tried])
     torch.testing.assert_close(found, expected, rtol=2e-5, atol=2e-5)
     assert states.shape == (3, 4, 7)
@@ -61,7 +61,7 @@ def test_vectors_add_and_a_model_of_targets_is_given_the_states_that_changes_lea
     model.base_predictor.action_encoder.weight.mul_(40)
     start, tried = Scene(draw(TOKENS, DIM), draw(3)), actions(2, 4)[..., :3]
     spaces = Spaces.of_vectors(Widths(3, 3), joined)
-    found, states = WorldModelCost(model, start, goal(), EnergyConfig(), spaces=spaces).imagine(tried)
+    found, states = WorldModelCost(model, start, goal(), EnergyConfig(), spaces=spaces).rollout(tried)
     after = start.state + torch.cat([torch.zeros(2, 1, 3), tried.cumsum(dim=1)], dim=1)
     torch.testing.assert_close(states, after)
     given = after[:, 1:] if joined == "last" else tried
@@ -109,7 +109,7 @@ def test_the_goals_weights_are_used() -> None:
     model, tried = tiny_model(), actions(3, 1)
     weights = torch.arange(float(TOKENS))
     measure = WorldModelCost(model, scene(), goal(weights=weights), EnergyConfig())
-    predicted, _ = measure.imagine(tried)
+    predicted, _ = measure.rollout(tried)
     torch.testing.assert_close(measure(tried), distance(predicted[:, 0], goal().latents[0], EnergyConfig(), weights))
 
 
@@ -182,7 +182,9 @@ def weighted(actions: Tensor) -> Tensor:
 
 
 def test_a_slice_changes_two_numbers_of_the_first_action_and_no_others() -> None:
-    slices = energy_slices(weighted, CHOSEN, pose_space(PlanningConfig(horizon=4, limits=LIMITS)), nodes=5)
+    slices = compute_energy_slices(
+        weighted, CHOSEN, make_pose_search_space(PlanningConfig(horizon=4, limits=LIMITS)), nodes=5
+    )
     assert tuple(one.axes for one in slices) == ((0, 1), (0, 2), (1, 2))
     for one in slices:
         for row, up in enumerate(one.up):
@@ -193,12 +195,16 @@ def test_a_slice_changes_two_numbers_of_the_first_action_and_no_others() -> None
 
 
 def test_a_slice_reaches_beyond_the_limits_also_along_an_axis_that_is_held() -> None:
-    slices = energy_slices(weighted, CHOSEN, pose_space(PlanningConfig(horizon=4, limits=LIMITS)), nodes=3)
+    slices = compute_energy_slices(
+        weighted, CHOSEN, make_pose_search_space(PlanningConfig(horizon=4, limits=LIMITS)), nodes=3
+    )
     np.testing.assert_allclose(slices[0].across, [-0.05, 0, 0.05], rtol=1e-5)
     np.testing.assert_allclose(slices[0].up, [-0.1, 0, 0.1], rtol=1e-5)
     np.testing.assert_allclose(slices[2].up, [-0.1, 0, 0.1], rtol=1e-5)  # dz is held: as wide as the widest
-    held = pose_space(PlanningConfig(horizon=4, limits=LimitsConfig(xyz=(0, 0, 0), rotation=0.1)))
-    np.testing.assert_allclose(energy_slices(weighted, CHOSEN, held, nodes=3)[0].up, [-0.0625, 0, 0.0625], rtol=1e-5)
+    held = make_pose_search_space(PlanningConfig(horizon=4, limits=LimitsConfig(xyz=(0, 0, 0), rotation=0.1)))
+    np.testing.assert_allclose(
+        compute_energy_slices(weighted, CHOSEN, held, nodes=3)[0].up, [-0.0625, 0, 0.0625], rtol=1e-5
+    )
 
 
 # Waiting

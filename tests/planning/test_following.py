@@ -33,10 +33,10 @@ def decided(run: Controller, seen: np.ndarray) -> tuple[int, int, bool, bool]:
     """Return which goal applies, since when, whether it changed, and whether all is done."""
     run.act(seen, STATE)
     return (
-        run.decision.progress.place,
-        run.decision.progress.since,
+        run.decision.progress.goal_index,
+        run.decision.progress.start_step,
         bool(run.decision.progress.changed),
-        run.decision.done,
+        run.decision.is_done,
     )
 
 
@@ -48,11 +48,11 @@ def test_the_next_goal_follows_once_an_image_is_near_the_present_one() -> None:
     assert decided(run, image(1)) == (0, 0, False, False)
     assert decided(run, noisy(100)) == (1, 3, True, False)
     assert decided(run, image(2)) == (1, 3, False, False)
-    assert run.decision.progress.began == pytest.approx(begun(run, noisy(100), 101), rel=1e-5)
+    assert run.decision.progress.initial_energy == pytest.approx(begun(run, noisy(100), 101), rel=1e-5)
 
 
 def begun(run: Controller, seen: np.ndarray, goal: int) -> float:
-    return float((run.encoded(seen) - run.encoded(image(goal))).abs().mean())
+    return float((run.encode(seen) - run.encode(image(goal))).abs().mean())
 
 
 def test_a_noisy_image_of_the_goal_ends_it_and_what_is_done_stays_done() -> None:
@@ -60,7 +60,7 @@ def test_a_noisy_image_of_the_goal_ends_it_and_what_is_done_stays_done() -> None
     run.follow(goals)
     assert decided(run, image(0)) == (0, 0, False, False)
     assert not run.act(noisy(100), STATE).any()
-    assert (run.decision.why, run.decision.done, run.decision.plan) == ("at the goal", True, None)
+    assert (run.decision.why, run.decision.is_done, run.decision.plan) == ("at the goal", True, None)
     assert "below 50%" in run.decision.progress.changed
     assert not run.act(image(1), STATE).any(), "only a reset begins again"
     run.follow(goals)
@@ -94,8 +94,8 @@ def test_a_plan_looks_ahead_to_what_follows_at_the_latest() -> None:
 @pytest.mark.parametrize(
     ("goals", "wrong"),
     [
-        ([SubGoal(image(100)), SubGoal(image(101))], r"goal 0: a goal that would never end"),
-        ([SubGoal(image(100), at_most=3)], r"goal 0: at_most 3 of the last goal"),
+        ([SubGoal(image(100)), SubGoal(image(101))], r"goal 0: a goal without an end"),
+        ([SubGoal(image(100), at_most=3)], r"goal 0: at_most 3 for the last goal"),
         ([SubGoal(image(100), share=0.5), SubGoal(image(101)[:30])], r"goal 1: 48 x 30 pixels"),
         ([SubGoal(image(100).astype(float))], r"goal 0: .*float64"),
     ],
@@ -130,7 +130,7 @@ def test_a_gripper_mode_needs_a_gripper_and_something_to_plan() -> None:
     with pytest.raises(InputError, match=r"'held' of a goal: .*vectors"):
         run.follow([SubGoal(image(100), gripper="held")])
     held = controller(limits=LimitsConfig(xyz=(0.0, 0.0, 0.0)))
-    with pytest.raises(InputError, match="'held' of a goal: nothing that is left to plan"):
+    with pytest.raises(InputError, match="'held' of a goal: no free component"):
         held.follow([SubGoal(image(100), gripper="held")])
 
 
@@ -143,7 +143,7 @@ def progress_over(rules: Sequence[SubGoal], energies: Sequence[Sequence[float]])
     """Return the progress at each decision, from the energy of each image to each goal."""
     found = [GoalProgress(0, 0, energies[0][0])]
     for step, row in enumerate(energies[1:], start=1):
-        found.append(found[-1].after(rules, step, row.__getitem__))
+        found.append(found[-1].advance(rules, step, row.__getitem__))
     return found
 
 
@@ -166,14 +166,14 @@ def courses(draw: st.DrawFn) -> tuple[list[SubGoal], list[list[float]]]:
 def test_goals_never_go_back_and_each_applies_within_its_bounds(course: tuple) -> None:
     rules, energies = course
     found = progress_over(rules, energies)
-    places = [one.place for one in found]
+    places = [one.goal_index for one in found]
     assert all(0 <= after - before <= 1 for before, after in pairwise(places))
     for place, goal in enumerate(rules[:-1]):
         assert goal.at_least <= places.count(place) <= goal.at_most
     assert places[-1] == len(rules) - 1, "bounded goals are over after all their steps"
     for before, after in pairwise(found):
-        assert bool(after.changed) == (after.place != before.place or after.done != before.done)
-        assert after.since == before.since or after.place == before.place + 1
+        assert bool(after.changed) == (after.goal_index != before.goal_index or after.is_done != before.is_done)
+        assert after.start_step == before.start_step or after.goal_index == before.goal_index + 1
 
 
 @given(courses())
@@ -181,23 +181,23 @@ def test_a_goal_that_gave_way_early_was_below_its_share(course: tuple) -> None:
     rules, energies = course
     found = progress_over(rules, energies)
     for step, (before, after) in enumerate(pairwise(found), start=1):
-        goal, now = rules[before.place], energies[step][before.place]
-        if after.place > before.place:
-            share = goal.share is not None and (now < goal.share * before.began or now <= 1e-6)
-            assert share or step - before.since == goal.at_most
-            assert after.began == pytest.approx(energies[step][after.place], nan_ok=True)
-        elif not before.done and step - before.since >= goal.at_least and goal.share is not None:
-            reached = now < goal.share * before.began or now <= 1e-6
-            assert after.done == reached
+        goal, now = rules[before.goal_index], energies[step][before.goal_index]
+        if after.goal_index > before.goal_index:
+            share = goal.share is not None and (now < goal.share * before.initial_energy or now <= 1e-6)
+            assert share or step - before.start_step == goal.at_most
+            assert after.initial_energy == pytest.approx(energies[step][after.goal_index], nan_ok=True)
+        elif not before.is_done and step - before.start_step >= goal.at_least and goal.share is not None:
+            reached = now < goal.share * before.initial_energy or now <= 1e-6
+            assert after.is_done == reached
 
 
 def test_the_next_goal_begins_with_its_own_first_energy() -> None:
     rules = [rule("grasp", 1, 9, 0.5), rule(share=0.5)]
     found = progress_over(rules, [[1.0, 5.0], [0.6, 4.0], [0.4, 3.0], [9.0, 2.0], [9.0, 1.4], [9.0, 9.0]])
-    assert [one.place for one in found] == [0, 0, 1, 1, 1, 1]
-    assert [one.since for one in found] == [0, 0, 2, 2, 2, 2]
-    assert [one.began for one in found] == [1.0, 1.0, 3.0, 3.0, 3.0, 3.0]
-    assert [one.done for one in found] == [False] * 4 + [True] * 2, "what is reached stays so"
+    assert [one.goal_index for one in found] == [0, 0, 1, 1, 1, 1]
+    assert [one.start_step for one in found] == [0, 0, 2, 2, 2, 2]
+    assert [one.initial_energy for one in found] == [1.0, 1.0, 3.0, 3.0, 3.0, 3.0]
+    assert [one.is_done for one in found] == [False] * 4 + [True] * 2, "what is reached stays so"
     assert found[2].changed == "Goal 1 (grasp), after 2 steps: energy 0.4 is below 50% of 1."
     assert found[4].changed == "Goal 2, after 2 steps: energy 1.4 is below 50% of 3."
     assert not found[5].changed
@@ -207,5 +207,5 @@ def test_an_energy_that_is_no_number_moves_nothing_on_before_its_time() -> None:
     nan = float("nan")
     rules = [rule("", 1, 3, 0.5), rule(share=0.5)]
     found = progress_over(rules, [[nan, nan]] * 6)
-    assert [one.place for one in found] == [0, 0, 0, 1, 1, 1]
-    assert not found[-1].done
+    assert [one.goal_index for one in found] == [0, 0, 0, 1, 1, 1]
+    assert not found[-1].is_done

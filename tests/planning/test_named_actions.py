@@ -7,7 +7,7 @@ import pytest
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.counterfactual import named_actions, read_actions
+from vjepa2_ac.planning.counterfactual import make_named_actions, read_actions
 from vjepa2_ac.spaces import counterfactual_states
 
 START = np.array([0.4, 0.1, 0.3, np.pi - 0.01, 0.02, -0.7, 0.4])
@@ -16,7 +16,7 @@ ROWS = np.array([[0.05, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0], [0.0, -0.02, 0.01, 0.0, 0
 
 @pytest.mark.parametrize(("one", "other"), [("up", "down"), ("left", "right"), ("forward", "back"), ("close", "open")])
 def test_opposites_sum_to_zero_and_lead_apart_along_one_axis(one: str, other: str) -> None:
-    there, back = named_actions(one, 3), named_actions(other, 3)
+    there, back = make_named_actions(one, 3), make_named_actions(other, 3)
     assert there.any()
     assert not (there + back).any()
     ends = [counterfactual_states(START, actions)[-1] for actions in (there, back)]
@@ -28,24 +28,24 @@ def test_opposites_sum_to_zero_and_lead_apart_along_one_axis(one: str, other: st
 
 def test_steps_are_as_long_as_asked_and_never_beyond_the_limits() -> None:
     taught = LimitsConfig(xyz=(0.03, 0.02, 0.0), gripper=0.5)
-    assert named_actions("forward", 1)[0, 0] == 0.05
-    assert named_actions("forward", 1, limits=taught)[0, 0] == 0.03
-    assert named_actions("right", 1, limits=taught, size_m=0.01)[0, 1] == -0.01
-    assert named_actions("open", 1, limits=taught)[0, 6] == -0.5
+    assert make_named_actions("forward", 1)[0, 0] == 0.05
+    assert make_named_actions("forward", 1, limits=taught)[0, 0] == 0.03
+    assert make_named_actions("right", 1, limits=taught, size_m=0.01)[0, 1] == -0.01
+    assert make_named_actions("open", 1, limits=taught)[0, 6] == -0.5
     with pytest.raises(InputError, match=r"planning\.limits\.xyz: 0, so that nothing can move up"):
-        named_actions("up", 1, limits=taught)
+        make_named_actions("up", 1, limits=taught)
     with pytest.raises(InputError, match=r"planning\.limits\.gripper: 0"):
-        named_actions("close", 1, limits=LimitsConfig(gripper=0.0))
+        make_named_actions("close", 1, limits=LimitsConfig(gripper=0.0))
     for name in ("close", "open"):
         with pytest.raises(InputError, match=rf"planning\.limits\.gripper_mode: held, so that nothing can move {name}"):
-            named_actions(name, 1, limits=LimitsConfig(gripper_mode="held"))
+            make_named_actions(name, 1, limits=LimitsConfig(gripper_mode="held"))
     for size in (0.0, -0.01, float("nan"), float("inf")):
-        with pytest.raises(InputError, match=r"--size: .* cm a step"):
-            named_actions("up", 1, size_m=size)
+        with pytest.raises(InputError, match=r"--size: .* cm per step"):
+            make_named_actions("up", 1, size_m=size)
     with pytest.raises(InputError, match=r"true \(of a recorded clip\), none, up, down"):
-        named_actions("sideways", 1)
+        make_named_actions("sideways", 1)
     with pytest.raises(ValueError, match="0 steps"):
-        named_actions("up", 0)
+        make_named_actions("up", 0)
 
 
 def test_actions_are_read_from_arrays_and_tables(tmp_path: Path) -> None:

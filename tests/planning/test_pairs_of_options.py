@@ -22,7 +22,7 @@ from vjepa2_ac.model import compilation
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, decide
-from vjepa2_ac.planning.goals import timed
+from vjepa2_ac.planning.goals import make_timed_goals
 from vjepa2_ac.policies.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
 from vjepa2_ac.policies.monitor import Monitor
 from vjepa2_ac.runs.subject import Subject
@@ -149,7 +149,7 @@ def tried(scene: Scene, *names: str) -> None:
     config = scene.config(*names)
     planning, controller = config.planning, Controller.of_subject(Subject("tiny", config, scene.model))
     images = [image(seed, SIDE, SIDE * planning.views) for seed in range(4)]
-    goals, chunks = timed(images[2:], (1,)), None
+    goals, chunks = make_timed_goals(images[2:], (1,)), None
     mask = np.arange(SIDE * SIDE * planning.views).reshape(SIDE, -1) % 3 > 0 if "mask" in names else None
     if "samples of a policy" in names:
         chunks = np.random.default_rng(0).normal(0, 0.01, (3, planning.horizon, 7))

@@ -20,8 +20,8 @@ from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.world_model import WorldModel, fingerprint
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.model_setup import load_to_plan
-from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
+from vjepa2_ac.planning.model_setup import load_for_planning
+from vjepa2_ac.planning.settings import load_planning_config, warn_if_limits_exceed_data
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.spaces import actions_from_states
@@ -45,7 +45,7 @@ def prediction(world_model: WorldModel) -> torch.Tensor:
 
 
 def test_a_run_is_planned_with_as_its_own_config_says(run: Path) -> None:
-    steering = load_to_plan(str(run))
+    steering = load_for_planning(str(run))
     assert steering.chosen == "step-00000010 (the best by error)"
     assert steering.config.planning.horizon == 2
     controller = Controller.of_subject(steering)
@@ -60,20 +60,20 @@ def test_a_run_is_planned_with_as_its_own_config_says(run: Path) -> None:
 
 def test_the_checkpoint_that_is_named_is_the_one_that_plans(run: Path, base_folder: Path) -> None:
     newest, best, base = (
-        prediction(load_to_plan(*given[:1], checkpoint=given[1]).world_model)
+        prediction(load_for_planning(*given[:1], checkpoint=given[1]).world_model)
         for given in ((str(run), "newest"), (str(run), "selected"), (str(base_folder), "selected"))
     )
-    torch.testing.assert_close(prediction(load_to_plan(str(run), checkpoint="10").world_model), best)
+    torch.testing.assert_close(prediction(load_for_planning(str(run), checkpoint="10").world_model), best)
     assert not torch.allclose(newest, best, atol=1e-4)
     assert not torch.allclose(base, best, atol=1e-4)
 
 
 def test_a_model_needs_no_config_and_takes_one(make_config, base_folder: Path, tmp_path: Path) -> None:
-    alone = load_to_plan(str(base_folder), overrides=["planning.samples=20", "seed=4"])
+    alone = load_for_planning(str(base_folder), overrides=["planning.samples=20", "seed=4"])
     assert (alone.config.planning.samples, alone.config.seed, alone.config.planning.horizon) == (20, 4, 1)
     path = tmp_path / "its.yaml"
     path.write_text(config_as_yaml(make_config(planning=PLANNING, model__dtype="bfloat16", training__precision="bf16")))
-    reported = load_to_plan(str(base_folder), config=path, overrides=["planning.planner.options.elites=3"])
+    reported = load_for_planning(str(base_folder), config=path, overrides=["planning.planner.options.elites=3"])
     assert (reported.config.planning.horizon, reported.config.planning.planner.options) == (2, {"elites": 3})
     assert next(reported.world_model.parameters()).dtype == torch.bfloat16
 
@@ -89,7 +89,7 @@ def test_a_model_needs_no_config_and_takes_one(make_config, base_folder: Path, t
 )
 def test_what_a_model_cannot_be_asked_for_is_refused(base_folder: Path, given: dict, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
-        load_to_plan(str(base_folder), **given)
+        load_for_planning(str(base_folder), **given)
 
 
 VECTORS = {
@@ -107,25 +107,27 @@ def test_a_run_of_vectors_plans_within_what_it_was_taught(make_config, reporter)
     states = [episode.states for episode in episodes_of(folder)]
     expected = np.percentile(np.abs(np.concatenate([one[2:] - one[:-2] for one in states])), 99, axis=0)
     np.testing.assert_allclose(taught, expected, rtol=1e-6)
-    controller = Controller.of_subject(load_to_plan(str(folder)))
+    controller = Controller.of_subject(load_for_planning(str(folder)))
     controller.reset(image(0))
     action = controller.act(image(1), states[0][0])
     assert action.shape == (8,)
     assert np.any(action)
     assert (np.abs(action) <= taught).all()
     np.testing.assert_allclose(controller.decision.states[1], states[0][0] + action, atol=1e-6)
-    limited = Controller.of_subject(load_to_plan(str(folder), overrides=["planning.limits.axes=[0.01]"]))
+    limited = Controller.of_subject(load_for_planning(str(folder), overrides=["planning.limits.axes=[0.01]"]))
     limited.reset(image(0))
     assert np.abs(limited.act(image(1), states[0][0])).max() <= 0.01
     with pytest.raises(InputError, match=r"state: 7 numbers .* Expected 8: state 0, state 1"):
         limited.act(image(1), np.zeros(7))
-    for spoiled, complaint in (('{"changes": [1.0, "far"]}', "a number of 0 or more"), ('{"changes": 3}', "found|3")):
+    for spoiled, complaint in (('{"changes": [1.0, "far"]}', "one number of 0 or more"), ('{"changes": 3}', "found|3")):
         (folder / "changes.json").write_text(spoiled)
         with pytest.raises(InputError, match=complaint):
-            load_to_plan(str(folder))
+            load_for_planning(str(folder))
     (folder / "changes.json").unlink()
-    with pytest.raises(InputError, match=r"planning\.limits\.axes: data, for a model without.*of the 8 numbers"):
-        Controller.of_subject(load_to_plan(str(folder)))
+    with pytest.raises(
+        InputError, match=r"planning\.limits\.axes: data, but the model has no record.*of the 8 numbers"
+    ):
+        Controller.of_subject(load_for_planning(str(folder)))
 
 
 def episodes_of(folder: Path) -> list[Episode]:
@@ -146,7 +148,7 @@ def test_a_run_is_merged_in_its_bases_type_and_its_fingerprints_are_those_of_wha
 ) -> None:
     config = make_config(adapter=adapter, model__dtype="bfloat16", training__precision="bf16")
     run = write_adapted_run(config)
-    steering, trained = load_to_plan(str(run), checkpoint="newest"), load_subject(run, "newest").world_model
+    steering, trained = load_for_planning(str(run), checkpoint="newest"), load_subject(run, "newest").world_model
     assert type(steering.world_model.predictor) is ActionConditionedPredictor
     assert steering.world_model.adaptation is None
     assert {value.dtype for value in steering.world_model.parameters()} == {torch.bfloat16}
@@ -174,7 +176,7 @@ def note(folder: Path, **changes: object) -> None:
 
 
 def read_warnings(folder: Path, *overrides: str) -> tuple[str, ...]:
-    return warn_beyond_taught(planning_settings(str(folder), overrides=list(overrides)), folder)
+    return warn_if_limits_exceed_data(load_planning_config(str(folder), overrides=list(overrides)), folder)
 
 
 def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config, reporter) -> None:
@@ -186,7 +188,9 @@ def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config
     expected = np.percentile(np.abs(np.concatenate([actions_from_states(one) for one in pieces])), 99, axis=0)
     np.testing.assert_allclose(noted["changes"], expected, atol=1e-9)
     assert noted["percentile"] == 99
-    session = load_to_plan(str(folder), overrides=["planning.limits.xyz=data", "planning.limits.gripper_mode=held"])
+    session = load_for_planning(
+        str(folder), overrides=["planning.limits.xyz=data", "planning.limits.gripper_mode=held"]
+    )
     limits = session.config.planning.limits.xyz
     assert (np.array(noted["changes"][:3]) - limits < 1e-4).all()
     assert not any("planning.limits" in warning for warning in session.warnings)
@@ -205,11 +209,11 @@ def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config
 
 def test_a_run_without_it_plans_as_before_and_its_limits_cannot_be_those_of_the_data(make_config, base_folder) -> None:
     folder = write_adapted_run(make_config(planning=PLANNING))
-    assert load_to_plan(str(folder)).warnings == ()
+    assert load_for_planning(str(folder)).warnings == ()
     error = r"planning\.limits\.xyz: data, for a model or an older run.*such as planning\.limits\.xyz=\[0\.05.*inspect"
     for subject in (folder, base_folder):
         with pytest.raises(InputError, match=error):
-            planning_settings(str(subject), overrides=["planning.limits.xyz=data"])
+            load_planning_config(str(subject), overrides=["planning.limits.xyz=data"])
     taught = PlanningConfig.model_validate({"limits": {"xyz": "data"}})
     with pytest.raises(InputError, match=error):
         Controller(load_subject(folder).world_model, taught)
@@ -218,21 +222,21 @@ def test_a_run_without_it_plans_as_before_and_its_limits_cannot_be_those_of_the_
 def test_whoever_loads_a_run_is_warned_of_limits_that_leave_what_it_was_taught(
     taught_run: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    session = load_to_plan(str(taught_run), overrides=["planning.limits.xyz=[0.05,0.02,0.012]"])
+    session = load_for_planning(str(taught_run), overrides=["planning.limits.xyz=[0.05,0.02,0.012]"])
     assert len(session.warnings) == 1
     assert "planning.limits.xyz exceeds the motions in the training data of" in session.warnings[0]
     assert "dx 5 (3) cm, dz 1.2 (1) cm (99th percentile" in session.warnings[0]
-    assert "planning.limits.xyz=data stays within" in session.warnings[0]
+    assert "Set planning.limits.xyz=data" in session.warnings[0]
     assert session.as_dict()["warnings"] == list(session.warnings)
     assert [(one.levelno, one.getMessage()) for one in caplog.records] == [(logging.WARNING, session.warnings[0])]
     caplog.clear()
     Controller.of_run(load_subject(taught_run))
     assert "dx 5 (3) cm, dy 5 (2) cm, dz 5 (1) cm" in caplog.text
     caplog.clear()
-    assert load_to_plan(str(taught_run), overrides=["planning.limits.xyz=data"]).warnings == ()
+    assert load_for_planning(str(taught_run), overrides=["planning.limits.xyz=data"]).warnings == ()
     assert not caplog.records
     note(taught_run, changes=[0.03, 1e-9, 0.00009, *TAUGHT[3:]])
-    assert load_to_plan(str(taught_run), overrides=["planning.limits.xyz=data"]).config.planning.limits.xyz == (
+    assert load_for_planning(str(taught_run), overrides=["planning.limits.xyz=data"]).config.planning.limits.xyz == (
         0.03,
         0,
         0,
@@ -242,8 +246,8 @@ def test_whoever_loads_a_run_is_warned_of_limits_that_leave_what_it_was_taught(
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        (3, "Expected a number of 0 or more"),
-        ([*TAUGHT[:6], "far"], "Expected a number of 0 or more"),
+        (3, "Expected one number of 0 or more"),
+        ([*TAUGHT[:6], "far"], "Expected one number of 0 or more"),
         (TAUGHT[:6], "Expected 7 numbers: dx, dy"),
         ([30.0, *TAUGHT[1:]], "positions in metres"),
     ],
@@ -251,7 +255,7 @@ def test_whoever_loads_a_run_is_warned_of_limits_that_leave_what_it_was_taught(
 def test_a_note_that_says_no_limits_is_an_error(taught_run: Path, changes: object, complaint: str) -> None:
     note(taught_run, changes=changes)
     with pytest.raises(InputError, match=rf"changes\.json: .*{complaint}"):
-        load_to_plan(str(taught_run))
+        load_for_planning(str(taught_run))
 
 
 def test_vectors_are_compared_number_by_number(make_config) -> None:
@@ -263,8 +267,10 @@ def test_vectors_are_compared_number_by_number(make_config) -> None:
     def found(axes: tuple[float, ...]) -> tuple[str, ...]:
         limits = config.planning.limits.model_copy(update={"axes": axes})
         planning = config.planning.model_copy(update={"limits": limits})
-        return warn_beyond_taught(config.model_copy(update={"planning": planning}), folder)
+        return warn_if_limits_exceed_data(config.model_copy(update={"planning": planning}), folder)
 
-    assert found((0.1, 0.02)) == (f"{folder} learned from narrow data: 1 of 2 numbers hardly move, 0 only one way",)
+    assert found((0.1, 0.02)) == (
+        f"{folder} was trained on low-diversity data: 1 of 2 numbers hardly move, 0 only one way",
+    )
     assert "planning.limits.axes exceeds" in found((0.1,))[1]
     assert "state 1 0.1 (0.02) (99th percentile" in found((0.1,))[1]

@@ -13,12 +13,12 @@ from torch import Tensor
 from paths import GOLDEN
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.planning.planner import Plan, Planner
-from vjepa2_ac.planning.search_space import GRIPPER, SearchSpace, pose_space
+from vjepa2_ac.planning.search_space import GRIPPER, SearchSpace, make_pose_search_space
 from vjepa2_ac.planning.solvers import (
     EvaluatedPlans,
     MppiSolver,
     PlanStart,
-    coloured_noise,
+    draw_coloured_noise,
 )
 
 PLANNERS = ("cem", "icem", "mppi", "gradient")
@@ -89,7 +89,7 @@ def test_cem_gives_upstreams_plan_for_upstreams_seed(case: dict) -> None:
         limits=LimitsConfig(xyz=(given.get("maxnorm", 0.05),) * 3),
         planner={"name": "cem", "options": cem},
     )
-    where = pose_space(settings)
+    where = make_pose_search_space(settings)
     if closing is not None:
         where.lower[closing:, GRIPPER] = where.upper[closing:, GRIPPER] = 1.0
     plan = Planner(settings, where).plan(upstream_cost, torch.Generator().manual_seed(case["seed"]))
@@ -116,7 +116,7 @@ def test_cem_with_settings_of_jepa_wms_gives_its_plan(case: dict) -> None:
         iterations=15,
         limits=LimitsConfig(xyz=(0.1, 0.1, 0.1), rotation=0.1, gripper=0.75, gripper_mode="free"),
     )
-    where = pose_space(settings)
+    where = make_pose_search_space(settings)
     where.std[:, GRIPPER] = 0.1
     plan = Planner(settings, where).plan(jepa_wms_cost, torch.Generator().manual_seed(case["seed"]))
     torch.testing.assert_close([one.lowest for one in plan.iterations], case["losses"], rtol=1e-3, atol=1e-7)
@@ -200,7 +200,7 @@ def test_a_warm_start_begins_where_the_last_plan_led(planner: str) -> None:
     target = torch.tensor([[0.2, 0.1], [0.8, -0.9], [-0.7, 0.6]])
     before = solve(planner, parabola(target), space(3), iterations=40)
     following = torch.cat([target[1:], target[-1:]])
-    start = before.start_after()
+    start = before.make_next_start()
     torch.testing.assert_close(start.mean[:2], before.mean[1:])
 
     def first(start: PlanStart | None) -> float:
@@ -213,7 +213,7 @@ def test_a_warm_start_begins_where_the_last_plan_led(planner: str) -> None:
 
 def test_icems_elites_take_part_again() -> None:
     before = solve("icem", rosenbrock, space(2), iterations=3)
-    start = before.start_after()
+    start = before.make_next_start()
     shown: list[Tensor] = []
 
     def cost(actions: Tensor) -> Tensor:
@@ -243,6 +243,6 @@ def test_mppi_tries_its_mean_and_weighs_by_energy() -> None:
 @pytest.mark.parametrize("decisions", [1, 2, 7, 8])
 @pytest.mark.parametrize("exponent", [0.0, 2.0])
 def test_coloured_noise_has_variance_one_everywhere(decisions: int, exponent: float) -> None:
-    noise = coloured_noise(40_000, decisions, 1, exponent, torch.Generator().manual_seed(0))
+    noise = draw_coloured_noise(40_000, decisions, 1, exponent, torch.Generator().manual_seed(0))
     torch.testing.assert_close(noise.var(dim=0), torch.ones(decisions, 1), atol=0.05, rtol=0)
     assert noise.mean(dim=0).abs().max() < 0.03

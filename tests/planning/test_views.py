@@ -16,7 +16,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.imagined import ImageObservation, ImagineOptions, imagine_image
 from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.model_setup import load_to_plan
+from vjepa2_ac.planning.model_setup import load_for_planning
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions, run_benchmark
 from vjepa2_ac.simulation.camera import FRAME_SIZE
@@ -41,10 +41,10 @@ def test_the_energy_of_two_views_is_the_mean_of_theirs() -> None:
     both = decided(np.hstack(goals), np.hstack(frames), 2)
     alone = [energies(decided(goal, frame, 1), actions) for goal, frame in zip(goals, frames, strict=True)]
     torch.testing.assert_close(energies(both, actions), torch.stack(alone).mean(dim=0))
-    predicted, states = both.decision.cost.imagine(actions)
+    predicted, states = both.decision.cost.rollout(actions)
     tokens = tiny_model().num_tokens
     for number, (goal, frame) in enumerate(zip(goals, frames, strict=True)):
-        of_one, the_same = decided(goal, frame, 1).decision.cost.imagine(actions)
+        of_one, the_same = decided(goal, frame, 1).decision.cost.rollout(actions)
         torch.testing.assert_close(predicted[:, :, number * tokens : (number + 1) * tokens], of_one)
         torch.testing.assert_close(states, the_same)
 
@@ -79,7 +79,7 @@ def test_goals_are_made_of_both_cameras_and_a_film_shows_both(tmp_path: Path) ->
 
     quick = ["planning.views=2", "planning.samples=8", "planning.iterations=1", "planning.planner.options.elites=2"]
     options = BenchmarkOptions(episodes=1, steps=2, films=1, sub_goals="demonstration")
-    benchmark = run_benchmark(load_to_plan("builtin:sim-tiny", overrides=quick), options)
+    benchmark = run_benchmark(load_for_planning("builtin:sim-tiny", overrides=quick), options)
     assert benchmark.results[0].episodes[0].frames.shape[2] == 2 * FRAME_SIZE[1]
 
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from decisions import controller, image
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, pose_space
+from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_within_limits, make_pose_search_space
 from vjepa2_ac.spaces import CAMERA_POSE, POSE, vector_states
 
 CORNERS = ((0.3, -0.2, 0.1), (0.6, 0.2, 0.5))
@@ -25,7 +25,7 @@ def limits_of(l1: float | None = None) -> LimitsConfig:
 
 
 def box() -> Workspace:
-    return Workspace.of(limits_of(), POSE)
+    return Workspace.from_limits(limits_of(), POSE)
 
 
 def position(*numbers: float) -> np.ndarray:
@@ -39,22 +39,22 @@ NEAR = st.tuples(st.floats(0.27, 0.63), st.floats(-0.23, 0.23), st.floats(0.08, 
 @example((0.27, 0.0, 0.3), np.array([[-1.0, 1, 0, 0, 0, 0, 0]] * 3), 0.05)  # outside, and moving along the wall
 def test_every_target_is_inside_and_every_action_allowed(where, wild, l1) -> None:
     limits, state = limits_of(l1), position(*where)
-    space = pose_space(PlanningConfig(limits=limits, horizon=3))
-    actions = space.allowed(torch.from_numpy(wild).float()).double().numpy()
-    if not is_allowed(box().way_back(state[:3]), limits):
+    space = make_pose_search_space(PlanningConfig(limits=limits, horizon=3))
+    actions = space.clip(torch.from_numpy(wild).float()).double().numpy()
+    if not is_within_limits(box().get_return_motion(state[:3]), limits):
         return
-    kept = box().kept(state, actions, limits)
+    kept = box().clip_actions(state, actions, limits)
     targets = state[:3] + np.cumsum(kept[:, :3], axis=0)
     assert (targets >= np.array(CORNERS[0]) - SLACK).all()
     assert (targets <= np.array(CORNERS[1]) + SLACK).all()
-    assert is_allowed(kept[:, :3], limits, SLACK)
+    assert is_within_limits(kept[:, :3], limits, SLACK)
     np.testing.assert_array_equal(kept[:, 3:], actions[:, 3:])
 
 
 @given(NEAR)
 def test_the_search_does_not_leave_the_box_with_its_first_decision(where) -> None:
     config, state = PlanningConfig(limits=limits_of(), horizon=4, action_repeat=2), position(*where)
-    wide, narrow = pose_space(config), box().narrowed(pose_space(config), state)
+    wide, narrow = make_pose_search_space(config), box().narrow(make_pose_search_space(config), state)
     for bound, outwards in ((narrow.upper, 1), (narrow.lower, -1)):
         ahead = state[:3] + 2 * bound[0, :3].double().numpy()
         edge = np.array(CORNERS[1] if outwards > 0 else CORNERS[0])
@@ -78,8 +78,8 @@ def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -
 @pytest.mark.parametrize("space", [CAMERA_POSE, vector_states(8)])
 def test_a_box_is_of_poses_in_the_base_frame(space) -> None:
     with pytest.raises(InputError, match="workspace: a model whose states are not poses"):
-        Workspace.of(limits_of(), space)
-    assert Workspace.of(LimitsConfig(), space) is None
+        Workspace.from_limits(limits_of(), space)
+    assert Workspace.from_limits(LimitsConfig(), space) is None
 
 
 @pytest.mark.parametrize("corners", [((0, 0, 0), (1, 1, 0)), ((0, 0, 0), (1, 1, math.nan)), ((0, 0, 0), (1, 1, 600))])
@@ -93,7 +93,9 @@ WIDEST = (0.05, 0.03, 0.07, 0.2, 0.2, 0.2, 0.75)
 
 def pose(horizon: int = 1, action_repeat: int = 1, **limits: object) -> SearchSpace:
     given = {"xyz": WIDEST[:3], "rotation": 0.2} | limits
-    return pose_space(PlanningConfig(horizon=horizon, action_repeat=action_repeat, limits=LimitsConfig(**given)))
+    return make_pose_search_space(
+        PlanningConfig(horizon=horizon, action_repeat=action_repeat, limits=LimitsConfig(**given))
+    )
 
 
 @settings(max_examples=50)
@@ -102,7 +104,7 @@ def pose(horizon: int = 1, action_repeat: int = 1, **limits: object) -> SearchSp
     l1=st.none() | st.floats(1e-3, 0.1),
 )
 def test_allowed_actions_are_within_all_limits(values: list[float], l1: float | None) -> None:
-    allowed = pose(l1=l1).allowed(torch.tensor([values]))[0].double()
+    allowed = pose(l1=l1).clip(torch.tensor([values]))[0].double()
     assert torch.isfinite(allowed).all()
     assert (allowed.abs() <= torch.tensor(WIDEST, dtype=torch.float64)).all()
     assert l1 is None or allowed[:3].abs().sum() <= l1
@@ -110,14 +112,14 @@ def test_allowed_actions_are_within_all_limits(values: list[float], l1: float | 
 
 def test_actions_within_the_limits_are_unchanged_and_longer_ones_keep_their_direction() -> None:
     inside = torch.tensor([[0.01, -0.02, 0.0, 0.1, -0.1, 0.19, -0.7]])
-    assert torch.equal(pose(l1=0.031).allowed(inside), inside)
-    torch.testing.assert_close(pose(l1=0.015).allowed(inside)[0, :3], torch.tensor([0.005, -0.01, 0.0]))
+    assert torch.equal(pose(l1=0.031).clip(inside), inside)
+    torch.testing.assert_close(pose(l1=0.015).clip(inside)[0, :3], torch.tensor([0.005, -0.01, 0.0]))
 
 
 @pytest.mark.parametrize("l1", [1e-50, 0.075])
 def test_no_motion_is_allowed_under_any_limit_of_the_norm_and_has_a_finite_gradient(l1: float) -> None:
     motion = torch.zeros(2, 3, 7, requires_grad=True)
-    allowed = pose(horizon=3, l1=l1).allowed(motion)
+    allowed = pose(horizon=3, l1=l1).clip(motion)
     allowed.sum().backward()
     assert torch.equal(allowed, torch.zeros(2, 3, 7))
     assert torch.isfinite(motion.grad).all()
@@ -133,7 +135,7 @@ def test_no_motion_is_allowed_under_any_limit_of_the_norm_and_has_a_finite_gradi
 def test_each_gripper_mode_does_what_it_says(mode: str, given: float, expected: float) -> None:
     decisions = torch.zeros(1, 7)
     decisions[0, 6] = given
-    assert float(pose(gripper_mode=mode).finished(decisions)[0, 6]) == pytest.approx(expected)
+    assert float(pose(gripper_mode=mode).finalize(decisions)[0, 6]) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

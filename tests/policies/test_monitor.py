@@ -143,8 +143,8 @@ def test_what_is_not_a_number_is_an_alarm(tmp_path: Path) -> None:
 def test_what_the_last_decision_predicted_is_compared_with_what_is_seen(tmp_path: Path) -> None:
     first, second, *_ = acting(written(tmp_path, 1e6))
     assert first.surprise is None
-    predicted, _ = first.cost.imagine(first.plan.actions[None, :1])
-    expected = (predicted[0, 0] - second.cost.now[0]).abs().mean(dim=-1)
+    predicted, _ = first.cost.rollout(first.plan.actions[None, :1])
+    expected = (predicted[0, 0] - second.cost.current[0]).abs().mean(dim=-1)
     np.testing.assert_allclose(second.surprise.errors, expected, rtol=1e-5)
     assert not second.surprise.is_alarm
     assert acting(written(tmp_path, 1e-6))[1].surprise.is_alarm

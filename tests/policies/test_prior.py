@@ -85,13 +85,13 @@ def test_a_plan_of_several_steps_follows_what_the_model_predicts(tmp_path: Path)
         horizon=3,
         limits=LimitsConfig(xyz=(1.0,) * 3, rotation=3.0, gripper=1.0),
     )
-    cost, wanted = run.decision.cost, run.encoded(image(100))
-    seen, state = cost.now
+    cost, wanted = run.decision.cost, run.encode(image(100))
+    seen, state = cost.current
     for step, action in enumerate(run.decision.plan.actions):
         left = torch.tensor([max(1, 3 - step)])
         mean, _ = prior(seen[None], wanted[None], left, state[None])
-        np.testing.assert_allclose(action, run.space.allowed(mean.expand(3, -1))[0], atol=1e-5)
-        predicted, states = cost.imagine(run.decision.plan.actions[None, : step + 1])
+        np.testing.assert_allclose(action, run.space.clip(mean.expand(3, -1))[0], atol=1e-5)
+        predicted, states = cost.rollout(run.decision.plan.actions[None, : step + 1])
         seen, state = predicted[0, -1], states[0, -1]
 
 
@@ -134,5 +134,5 @@ def test_the_command_writes_it_beside_the_run_and_says_how_to_plan(
 
 def test_a_command_without_a_prior_refuses_the_planner_of_that_name() -> None:
     config = PlanningConfig(planner="prior", prior="nowhere")
-    with pytest.raises(InputError, match=r"planning\.planner: prior, in a command that loads none"):
+    with pytest.raises(InputError, match=r"planning\.planner: prior, but no action prior is loaded"):
         Planner(config).plan(lambda actions: actions.sum(dim=(1, 2)), torch.Generator())

@@ -68,7 +68,7 @@ def test_many_goals_and_a_mask_are_shown(tmp_path: Path) -> None:
     plain = pixels_of(found, tmp_path)
     mask = np.zeros(image(0).shape[:2], bool)
     mask[:30] = True
-    object.__setattr__(found.question, "mask", mask)
+    object.__setattr__(found.request, "mask", mask)
     masked = pixels_of(found, tmp_path)
     assert masked.shape == plain.shape
     assert not np.array_equal(masked, plain)

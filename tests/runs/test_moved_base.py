@@ -21,7 +21,7 @@ from vjepa2_ac.evaluation.evaluate_run import evaluate_subject, load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, resolve_config
 from vjepa2_ac.export import CARD, export_run
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.model_setup import load_to_plan
+from vjepa2_ac.planning.model_setup import load_for_planning
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import read_metrics
 from vjepa2_ac.reports.write import write_evaluation
@@ -67,7 +67,7 @@ def evaluated(run: str, overrides: list[str]) -> WorldModel:
     "load",
     [
         lambda run, overrides: load_run(run, overrides=overrides).world_model,
-        lambda run, overrides: load_to_plan(run, overrides=overrides).world_model,
+        lambda run, overrides: load_for_planning(run, overrides=overrides).world_model,
         exported,
         evaluated,
     ],
@@ -89,7 +89,7 @@ def test_nothing_else_is_changed_on_the_way(run: str, base_folder: Path) -> None
     with pytest.raises(InputError, match=r"adapter\.rank=8: a setting that loading does not use"):
         load_run(run, overrides=["adapter.rank=8"])
     with pytest.raises(InputError, match="not the folder of a run"):
-        load_to_plan(str(base_folder), overrides=["model.base=elsewhere"])
+        load_for_planning(str(base_folder), overrides=["model.base=elsewhere"])
     asked = EvaluationOptions(overrides=(f"model.base={base_folder}", "planning.samples=30"))
     config = resolve_config(run, asked)
     assert (config.model.base, config.planning.samples) == (str(base_folder), 30)

@@ -57,7 +57,7 @@ def test_reply_equals_the_controllers_decision_bit_for_bit(changes: dict) -> Non
         assert reply["actions"].dtype == np.float64
         np.testing.assert_array_equal(reply["actions"], own.decision.plan.actions.double().numpy())
         np.testing.assert_array_equal(reply["target"], own.decision.states[1:])
-        assert reply["energy"] == {"now": own.decision.energy_now, "plan": own.decision.plan.energy}
+        assert reply["energy"] == {"now": own.decision.current_energy, "plan": own.decision.plan.energy}
         assert reply["why"] == "planned"
         assert reply["server_timing"].keys() == {"infer_ms"} | ({"prev_total_ms"} if step else set())
 
@@ -77,7 +77,7 @@ def test_named_goal_or_prompt_selects_a_goal_of_the_server() -> None:
     assert (first["goal"]["name"], first["goal"]["since"]) == ("a", 0)
     second = ask(served, **request(2, prompt="two"))
     assert (second["goal"]["name"], second["goal"]["index"], second["goal"]["since"]) == ("b", 1, 1)
-    assert "it ends after 1 step" in second["goal"]["changed"]
+    assert "the limit of 1 step is reached" in second["goal"]["changed"]
     assert "the name of a goal (this server has cup, two)" in get_error(served, **request(prompt="cap"))
     assert "no goal was set in this episode" in get_error(served, **request(3)), (
         "an invalid goal does not leave the previous goal active"

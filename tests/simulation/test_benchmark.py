@@ -11,7 +11,7 @@ import yaml
 from tiny_models import tiny_model, vector_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.media.video import read_header
-from vjepa2_ac.planning.model_setup import load_to_plan
+from vjepa2_ac.planning.model_setup import load_for_planning
 from vjepa2_ac.simulation.benchmark import JOINT_FIELDS, VIDEO_FILE, BenchmarkOptions, run_benchmark, video_frames
 from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 
@@ -54,7 +54,7 @@ def test_a_robot_of_joints_is_steered_by_its_joints(
 
 def test_the_film_shows_images_and_goal(model: str) -> None:
     options = BenchmarkOptions(episodes=2, steps=2, films=1)
-    result = run_benchmark(load_to_plan(model, overrides=SMALL), options).results[0]
+    result = run_benchmark(load_for_planning(model, overrides=SMALL), options).results[0]
     filmed, other = result.episodes
     assert other.frames is None
     frames = list(video_frames(result))

@@ -21,7 +21,7 @@ from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
 from vjepa2_ac.evaluation.request import EvaluationOptions
-from vjepa2_ac.planning.counterfactual import named_actions
+from vjepa2_ac.planning.counterfactual import make_named_actions
 from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, Resimulation, resimulate, simulated_outcome
 from vjepa2_ac.simulation.domains import DomainRanges
 from vjepa2_ac.simulation.record import SIMULATION_FILE, RecordingSpec, record_dataset
@@ -71,7 +71,7 @@ def test_what_is_simulated_again_is_what_was_recorded_in_states_and_images(name:
 
 def test_the_hand_goes_where_the_name_says_in_states_and_in_images(start: Resimulation) -> None:
     names = ("none", "up", "down", "left", "right")
-    none, up, down, left, right = (start.simulate(named_actions(name, 2), STRIDE) for name in names)
+    none, up, down, left, right = (start.simulate(make_named_actions(name, 2), STRIDE) for name in names)
     assert down.states[-1, 2] < none.states[-1, 2] - 0.001  # in `push` it is at the table already
     assert up.states[-1, 2] - none.states[-1, 2] > 0.08
     assert left.states[-1, 1] - right.states[-1, 1] > 0.15
@@ -89,9 +89,9 @@ def test_the_hand_goes_where_the_name_says_in_states_and_in_images(start: Resimu
 
 
 def test_the_start_is_the_recorded_one_and_no_outcome_depends_on_another(start: Resimulation) -> None:
-    first = start.simulate(named_actions("forward", 1), STRIDE)
-    start.simulate(named_actions("down", 2), STRIDE)
-    again = start.simulate(named_actions("forward", 1), STRIDE)
+    first = start.simulate(make_named_actions("forward", 1), STRIDE)
+    start.simulate(make_named_actions("down", 2), STRIDE)
+    again = start.simulate(make_named_actions("forward", 1), STRIDE)
     assert first.frames.shape == (2, 180, 320, 3)
     np.testing.assert_array_equal(first.frames, again.frames)
     np.testing.assert_array_equal(first.states, again.states)

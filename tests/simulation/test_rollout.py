@@ -269,4 +269,4 @@ def test_a_planner_is_given_the_goals_of_the_trial() -> None:
     closes = [goal.gripper for goal in goals].index("close")
     assert not episode.actions[:closes, 6].any()
     assert planner.decision is not None
-    assert planner.decision.progress.place > 0
+    assert planner.decision.progress.goal_index > 0

@@ -20,7 +20,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.model_setup import load_to_plan
+from vjepa2_ac.planning.model_setup import load_for_planning
 from vjepa2_ac.simulation import worlds
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.policies import ZeroActions
@@ -106,7 +106,7 @@ def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) 
     ],
 )
 def test_what_a_world_does_wrong_is_said(model: str, world: str, said: str) -> None:
-    subject = load_to_plan(model, overrides=SMALL)
+    subject = load_for_planning(model, overrides=SMALL)
     with pytest.raises(InputError, match=said), ExternalEnvironment(world) as opened:
         run_world_benchmark(subject, opened, BenchmarkOptions(episodes=2, films=0))
 

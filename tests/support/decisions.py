@@ -9,7 +9,7 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, PlanResult, decide
-from vjepa2_ac.planning.goals import equal_durations, timed
+from vjepa2_ac.planning.goals import make_timed_goals, split_horizon
 from vjepa2_ac.spaces import Spaces
 
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
@@ -39,5 +39,5 @@ def asked(*goals: int, nodes: int | None = 3, broken: bool = False, start: int =
             model.base_predictor.predictor_proj.weight.fill_(float("nan"))
     config = QUICK.model_copy(update=changes)
     images = [image(goal) for goal in goals or (100,)]
-    question = PlanRequest(image(start), STATE, timed(images, equal_durations(config.horizon, len(images))))
+    question = PlanRequest(image(start), STATE, make_timed_goals(images, split_horizon(config.horizon, len(images))))
     return decide(Controller(model, config, seed=5), question, nodes=nodes)

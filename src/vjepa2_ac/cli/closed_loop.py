@@ -110,7 +110,7 @@ def _loaded(options: argparse.Namespace, goals: NamedGoals | None) -> tuple[Sess
     """Load the model and make a first decision; return the session and the metadata for clients."""
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.planning.controller import Controller
-    from vjepa2_ac.planning.goals import require_ends
+    from vjepa2_ac.planning.goals import require_goal_ends
     from vjepa2_ac.policies.score import is_blind, ranking_of_run
     from vjepa2_ac.serving.metadata import describe_server, make_metadata, warm_up
     from vjepa2_ac.serving.recording import Recorder
@@ -129,7 +129,7 @@ def _loaded(options: argparse.Namespace, goals: NamedGoals | None) -> tuple[Sess
     )
     controller = Controller.of_subject(loaded, extrinsics=options.extrinsics)
     for sequence in (goals or {}).values():
-        require_ends(sequence, first=1)
+        require_goal_ends(sequence, first=1)
     session = Session(controller, goals or {}, how)
     about = make_metadata(loaded, session)
     Work.begin("the first decision")

@@ -199,9 +199,9 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
         raise InputError(where="--model", found="--axes beside it", needed="one of them: --model is of strides")
     cli.require_subject(options.axes)
 
-    from vjepa2_ac.planning.settings import AXES_FILE, require_axes_in
+    from vjepa2_ac.planning.settings import AXES_FILE, require_calibratable
 
-    require_axes_in(config.data)
+    require_calibratable(config.data)
     cli.make_folder(options.out)
 
     from vjepa2_ac.inspection.axes import calibrate_axes

@@ -136,7 +136,7 @@ def _next(measured: WrittenEvaluation, options: argparse.Namespace) -> list[str]
 def _simulation(about: About, options: argparse.Namespace) -> list[str]:
     """Return the arguments of the command that tests a run in closed loop; empty unless its data were simulated."""
     from vjepa2_ac.distributed import is_on_cpu
-    from vjepa2_ac.planning.settings import planning_settings
+    from vjepa2_ac.planning.settings import load_planning_config
     from vjepa2_ac.simulation.domains import Domain
     from vjepa2_ac.simulation.record import read_simulation
 
@@ -145,7 +145,7 @@ def _simulation(about: About, options: argparse.Namespace) -> list[str]:
     except (OSError, UserError):
         return []
     task, domain = recorded.task or "reach", recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
-    config = planning_settings(about.subject, overrides=options.overrides)
+    config = load_planning_config(about.subject, overrides=options.overrides)
     quick = cli.quick_words(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
     words = ["simulate", about.subject, "--task", task, "--domain", domain, *cli.option_words(options, "checkpoint")]
     return [*words, *options.overrides, *quick]

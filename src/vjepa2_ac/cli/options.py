@@ -281,20 +281,20 @@ def require_to_plan(options: argparse.Namespace) -> Config:
     Raises:
         InputError: An override or option is invalid, or the run or model does not exist.
     """
-    from vjepa2_ac.planning.settings import planning_settings
+    from vjepa2_ac.planning.settings import load_planning_config
 
-    config = planning_settings(options.subject, config=options.config, overrides=options.overrides)
+    config = load_planning_config(options.subject, config=options.config, overrides=options.overrides)
     require_subject(options.subject, config, options.words)
     return config
 
 
 def load_planning_session(options: argparse.Namespace) -> Subject:
     """Load the run or model that plans, with the options that `require_to_plan` has checked."""
-    from vjepa2_ac.planning.model_setup import load_to_plan
+    from vjepa2_ac.planning.model_setup import load_for_planning
 
     say_places_elsewhere(options.subject)
     how = {"checkpoint": options.checkpoint or "selected", "config": options.config, "overrides": options.overrides}
-    return load_to_plan(options.subject, **how)
+    return load_for_planning(options.subject, **how)
 
 
 def open_data(config: Config, reporter: ConsoleReporter) -> Dataset:
@@ -454,9 +454,9 @@ def quick_words(words: Sequence[str], planning: PlanningConfig, *, on_cpu: bool)
         planning: The planning config.
         on_cpu: Whether the model runs on a CPU; otherwise the result is empty.
     """
-    from vjepa2_ac.planning.planner import samples_of_iterations
+    from vjepa2_ac.planning.planner import count_samples_per_iteration
 
     is_chosen = any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)
     is_sampled, elites = planning.planner.name != "gradient", planning.planner.options.get("elites", ELITES)
-    is_long = is_sampled and planning.budget_s is None and sum(samples_of_iterations(planning)) > _QUICK_SEQUENCES
+    is_long = is_sampled and planning.budget_s is None and sum(count_samples_per_iteration(planning)) > _QUICK_SEQUENCES
     return [*QUICK_WORDS] if on_cpu and is_long and not is_chosen and elites <= QUICK["samples"] else []

@@ -66,14 +66,14 @@ def _plan(options: argparse.Namespace) -> int:
     this.
     """
     from vjepa2_ac.data.sources.indexed_source import get_state_space
-    from vjepa2_ac.planning.goals import require_ends
+    from vjepa2_ac.planning.goals import require_goal_ends
 
     state = options.state
     config = cli.require_to_plan(options)
     get_state_space(config.data, len(state)).require_state(state, "--state")  # the model checks the width later
     cli.make_folder(options.out)
     goals = _goals_of(options, config)
-    require_ends(goals, first=1)
+    require_goal_ends(goals, first=1)
     start, mask = _images(options, goals[0].image)
 
     from vjepa2_ac.cli.tables import plan_table
@@ -107,9 +107,12 @@ def _plan(options: argparse.Namespace) -> int:
 
 def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     """Return a line with the size of the search, and on a CPU the overrides of a faster search."""
-    from vjepa2_ac.planning.planner import samples_of_iterations
+    from vjepa2_ac.planning.planner import count_samples_per_iteration
 
-    sequences, steps = counted(sum(samples_of_iterations(config)), "action sequence"), counted(config.horizon, "step")
+    sequences, steps = (
+        counted(sum(count_samples_per_iteration(config)), "action sequence"),
+        counted(config.horizon, "step"),
+    )
     text = f"Planning: {sequences} of {steps} in {counted(config.iterations, 'iteration')}"
     text += "" if config.budget_s is None else f", for {config.budget_s:g} s at most"
     quick = cli.quick_words([], config, on_cpu=on_cpu)
@@ -131,18 +134,18 @@ def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, 
 def _goals_of(options: argparse.Namespace, config: Config) -> tuple[SubGoal, ...]:
     """Return the goals: from a folder, from an episode, or from images that divide the horizon equally."""
     from vjepa2_ac.media.images import read_image, require_image
-    from vjepa2_ac.planning.goals import equal_durations, read_goal_folder, timed
+    from vjepa2_ac.planning.goals import make_timed_goals, read_goal_folder, split_horizon
 
     if options.goals is not None:
         return read_goal_folder(options.goals)
     if options.goal_from is not None:
         from vjepa2_ac.goals.make_goals import frame_of_episode
 
-        return timed([frame_of_episode(config.data, options.goal_from)], [])
+        return make_timed_goals([frame_of_episode(config.data, options.goal_from)], [])
     images = [read_image(path) for path in options.goal]
     for path, image in zip(options.goal, images, strict=True):
         require_image(image, where=f"--goal {path}", like=images[0])
-    return timed(images, equal_durations(config.planning.horizon, len(images)))
+    return make_timed_goals(images, split_horizon(config.planning.horizon, len(images)))
 
 
 def _goals(options: argparse.Namespace) -> None:

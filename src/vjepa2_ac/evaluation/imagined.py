@@ -25,7 +25,7 @@ from vjepa2_ac.errors import InputError, UserError, counted
 from vjepa2_ac.evaluation.evaluate_run import load_models
 from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, resolve_config
 from vjepa2_ac.planning.controller import Decision
-from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, named_actions, read_actions
+from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, make_named_actions, read_actions
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.subject import Subject
@@ -126,7 +126,7 @@ def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None
 def _actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig) -> Float[np.ndarray, "steps 7"]:
     if word.lower().endswith((".npy", ".csv")):
         return read_actions(word, steps=steps)
-    return named_actions(word, steps, size_m=size_m, limits=limits)
+    return make_named_actions(word, steps, size_m=size_m, limits=limits)
 
 
 def imagine_clip(
@@ -265,9 +265,9 @@ def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
         answer: The decision.
         decoder: A decoder for the model's encoder; it is moved to the model's device.
     """
-    controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]].image
+    controller, goal = answer.controller, answer.request.goals[answer.decision.goals[-1]].image
     decoder.to(controller.device)
-    latents = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
+    latents = torch.stack([controller.encode(image) for image in (answer.request.start, goal)])
     start, decoded_goal = shown(decoder.decoder, latents, controller.config.views)
     frames = _rollout(answer.decision, decoder)
     shown_steps = spread_indices_with_ends(len(frames), _MOST_PLAN_STEPS)
@@ -283,5 +283,5 @@ def _rollout(decision: Decision, decoder: TrainedDecoder) -> Frames:
     no_frames = np.zeros((0, side, side, 3), np.uint8)
     if decision.plan is None or decision.cost is None:
         return no_frames
-    latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.imagine(decision.plan.actions[None])[0][0]
+    latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.rollout(decision.plan.actions[None])[0][0]
     return shown(decoder.decoder, latents, decision.cost.views) if bool(torch.isfinite(latents).all()) else no_frames

@@ -12,7 +12,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.planning.settings import with_taught_limits
+from vjepa2_ac.planning.settings import resolve_data_limits
 from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.folder import is_run, read_run_config, sets_movable_path
 
@@ -61,7 +61,7 @@ def resolve_config(subject: str, options: EvaluationOptions) -> Config:
             needed = "keys of planning, such as planning.samples=200; or, for a run, model.base=PATH"
             raise InputError(where="override", found=override, needed=needed)
     config = parse_config(config_as_dict(config), options.overrides, where="overrides")
-    return with_taught_limits(config, Path(subject)) if is_run(subject) else config
+    return resolve_data_limits(config, Path(subject)) if is_run(subject) else config
 
 
 def require_one_process(environment: Mapping[str, str] = os.environ) -> None:

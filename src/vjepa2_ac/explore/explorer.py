@@ -29,9 +29,9 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import LoadedModels
 from vjepa2_ac.model.predictor import KeyValueCache
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.energy import EnergySlice, Goal, Scene, WorldModelCost, distance, energy_slices
-from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, until_cancelled
-from vjepa2_ac.planning.search_space import SearchSpace, search_space
+from vjepa2_ac.planning.energy import EnergySlice, Goal, Scene, WorldModelCost, compute_energy_slices, distance
+from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, raise_if_cancelled
+from vjepa2_ac.planning.search_space import SearchSpace, make_search_space
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces, counterfactual_states, feasible_actions
 
@@ -432,7 +432,7 @@ class Search:
             elites = torch.stack(
                 [iteration.elites[0] for iteration in plan.iterations if len(iteration.elites)][-8:] or [plan.actions]
             )
-            best, _ = cost.imagine(elites)
+            best, _ = cost.rollout(elites)
         energy_now = self.compute_energy(self._explorer.predict_latents(model_index, position), goal)
         return PlanResult(plan, energy_now, tuple(best[:, -1].float()))
 

@@ -110,7 +110,7 @@ def frame_of_episode(config: DataConfig, place: str) -> UInt8[np.ndarray, "heigh
         InputError: There is no such episode or step, or the episode cannot be read.
     """
     name, _, step = place.rpartition(":") if re.fullmatch(r".+:\d+", place) else (place, "", "")
-    require_frames(config, to="take a goal from")
+    require_frames(config, to="read a goal image")
     dataset = open_dataset(config)
     episode = dataset.source.read(find_episode(dataset, name))
     count = len(episode.states)

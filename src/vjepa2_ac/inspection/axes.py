@@ -32,7 +32,7 @@ from vjepa2_ac.intervals import Estimate, bootstrapped, ratio
 from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.planning.energy import Axes
-from vjepa2_ac.planning.settings import AXES_FORMAT, require_axes_in
+from vjepa2_ac.planning.settings import AXES_FORMAT, require_calibratable
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.storage.structured import utc_now
 
@@ -164,11 +164,11 @@ def _errors_by_angle(
 ) -> Float[np.ndarray, " angles"]:
     """Return the mean squared error of the next frame at each angle of `TRIED_DEGREES`, with the executed action."""
     turns = [Axes(math.radians(angle), centre_m) for angle in TRIED_DEGREES]
-    states = torch.stack([turn.poses(start.state) for turn in turns])[:, None]
-    actions = torch.stack([turn.actions(start.action) for turn in turns])[:, None]
+    states = torch.stack([turn.rotate_poses(start.state) for turn in turns])[:, None]
+    actions = torch.stack([turn.rotate_actions(start.action) for turn in turns])[:, None]
     cameras = None
     if start.extrinsics is not None:
-        cameras = torch.stack([turn.poses(start.extrinsics) for turn in turns])[:, None]
+        cameras = torch.stack([turn.rotate_poses(start.extrinsics) for turn in turns])[:, None]
     errors = []
     for first in range(0, len(turns), at_once):
         part = slice(first, first + at_once)
@@ -199,7 +199,7 @@ def calibrate_axes(
     Raises:
         InputError: The data or the model cannot be used; or the states have no axes.
     """
-    require_axes_in(config.data)
+    require_calibratable(config.data)
     accelerator = make_accelerator(config)
     settings = config.data.model_copy(update={"frames": 2})
     dataset = open_dataset(settings, progress=reporter.task(INDEXING))

@@ -25,7 +25,7 @@ from vjepa2_ac.media.images import (
     require_mask,
 )
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.energy import patch_weights
+from vjepa2_ac.planning.energy import compute_patch_weights
 from vjepa2_ac.spaces import StateSpace
 
 Image = UInt8[np.ndarray, "rows columns 3"]
@@ -39,7 +39,7 @@ class Cameras:
     model: WorldModel
     crop: Crop
     views: int = 1
-    newest: tuple[CameraFrame, ...] = field(default=(), init=False)  # of each camera; empty after a reset
+    latest_frames: tuple[CameraFrame, ...] = field(default=(), init=False)  # of each camera; empty after a reset
 
     def require_contrast(self, image: Image, *, where: str) -> None:
         """Refuse an image in which the view of a camera has no contrast; see `images.is_uniform`.
@@ -47,32 +47,32 @@ class Cameras:
         Raises:
             InputError: The view of a camera is uniform.
         """
-        require_contrast(self._received(image), where=where)
+        require_contrast(self._crop_views(image), where=where)
 
-    def checked(
+    def check_frame(
         self,
         frame: Image,
         state: Float[np.ndarray, " numbers"],
         space: StateSpace,
-        largest: Float[np.ndarray, " numbers"],
+        max_change: Float[np.ndarray, " numbers"],
     ) -> tuple[tuple[CameraFrame, ...], Fault | None]:
-        """Return the newest frame of each camera, and the fault for which the robot must not move; None: no fault.
+        """Return the latest frame of each camera, and the fault for which the robot must not move; None: no fault.
 
-        A fault of one camera is enough. This method does not set `newest`; the controller sets it after the decision.
+        A fault of one camera is enough. The controller sets `latest_frames` after the decision, not this method.
 
         Args:
             frame: The current frame, with the views of all cameras side by side.
             state: The measured state.
             space: The meaning of the state's numbers.
-            largest: The largest change of each number in a model step.
+            max_change: The largest change of each number in a model step.
         """
-        newest = newest_frames(split_views(frame[None], self.views), state, self.newest)
-        if any(map(is_uniform, self._received(frame))):
-            return newest, "uniform frame"
-        is_frozen = any(has_moved(before, state, space, largest) for _, before in newest)
-        return newest, "frozen frame" if is_frozen else None
+        latest_frames = newest_frames(split_views(frame[None], self.views), state, self.latest_frames)
+        if any(map(is_uniform, self._crop_views(frame))):
+            return latest_frames, "uniform frame"
+        is_frozen = any(has_moved(before, state, space, max_change) for _, before in latest_frames)
+        return latest_frames, "frozen frame" if is_frozen else None
 
-    def weights(self, mask: np.ndarray | None, like: Image) -> Float[Tensor, " tokens"] | None:
+    def compute_patch_weights(self, mask: np.ndarray | None, like: Image) -> Float[Tensor, " tokens"] | None:
         """Return the weight of each patch for a mask over an image; None: no mask.
 
         Raises:
@@ -85,17 +85,18 @@ class Cameras:
         received = np.ascontiguousarray(crop_frames(split_views(pixels, self.views), self.crop)[..., 0])
         grid = self.model.image_size // self.model.sizes.patch_size
         try:
-            return patch_weights(torch.from_numpy(received) > 0, grid).to(self.model.device)
+            return compute_patch_weights(torch.from_numpy(received) > 0, grid).to(self.model.device)
         except ValueError:
-            raise InputError(where="mask", found="nothing of what the model sees counts") from None
+            needed = "a mask that overlaps the part of the image that the model receives (data.crop)"
+            raise InputError(where="mask", found="no pixel inside the cropped image", needed=needed) from None
 
-    def _received(self, image: Image) -> UInt8[np.ndarray, "views height width 3"]:
+    def _crop_views(self, image: Image) -> UInt8[np.ndarray, "views height width 3"]:
         """Return the part of each camera's image that the model receives, without the bars of a letterbox."""
         views = split_views(image[None], self.views)
         return views if self.crop == "letterbox" else crop_frames(views, self.crop)
 
 
-def require_views(config: DataConfig, views: int, *, to: str = "make goals of") -> None:
+def require_views(config: DataConfig, views: int, *, to: str = "make goals") -> None:
     """Refuse data without frames, or with fewer cameras than the model receives side by side.
 
     Raises:
@@ -103,7 +104,10 @@ def require_views(config: DataConfig, views: int, *, to: str = "make goals of") 
     """
     require_frames(config, to=to)
     if len(config.cameras) < views:
-        found, needed = ", ".join(config.cameras), f"{views} cameras, from left to right, as planning.views says"
+        found, needed = (
+            ", ".join(config.cameras),
+            f"{views} cameras, from left to right, because planning.views is {views}",
+        )
         raise InputError(where="data.camera", found=found, needed=needed)
 
 

@@ -28,11 +28,11 @@ from vjepa2_ac.model.world_model import (
 )
 from vjepa2_ac.planning.cameras import Cameras, Fault
 from vjepa2_ac.planning.energy import Axes, ChunkScores, EnergyFunction, Goal, Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, require_ends, timed
+from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, make_timed_goals, require_goal_ends
 from vjepa2_ac.planning.model_setup import prepare_for_planning
-from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, until_cancelled
-from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
-from vjepa2_ac.planning.settings import read_axes, require_base_frame, warn_beyond_taught, with_taught_limits
+from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, raise_if_cancelled
+from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_within_limits, make_search_space
+from vjepa2_ac.planning.settings import read_axes, require_base_frame, resolve_data_limits, warn_if_limits_exceed_data
 from vjepa2_ac.planning.solvers import PlanStart
 from vjepa2_ac.registry import PLANNING_FILES
 from vjepa2_ac.runs.subject import Subject
@@ -41,7 +41,7 @@ from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces, states_along
 _PRIOR_STEPS = 3  # model steps left for the prior's input if a goal has no `at_most`; fewer give larger motions
 State = Float[np.ndarray, " numbers"]
 Latents = Float[Tensor, "tokens dim"]
-Why = Literal["planned", "out of time", "at the goal", "no finite energy", "outside the workspace", Fault]
+Reason = Literal["planned", "out of time", "at the goal", "no finite energy", "outside the workspace", Fault]
 
 
 @dataclass(frozen=True)
@@ -66,14 +66,14 @@ class Decision:
     action: Float[np.ndarray, " dim"]  # for the next model step; zero for some values of `why`
     # "out of time": the best plan so far. The action is zero for all other values except "planned". "uniform frame":
     # the image of a camera has no contrast. "frozen frame": an image equals the previous one, although the robot moved.
-    why: Why
-    energy_now: float  # energy if the image stayed as it is, to compare with the plan's; NaN for a faulty frame
+    why: Reason
+    current_energy: float  # energy if the image stayed as it is, to compare with the plan's; NaN for a faulty frame
     goals: tuple[int, ...]  # index of the goal that applies in each model step of a plan
     progress: GoalProgress  # the goal that applies, since when, and why it changed
     plan: Plan | None = None  # None if the goal is reached, or the robot is outside the workspace
     states: Float[np.ndarray, "time dim"] | None = None  # states predicted along the plan, the current state first
     cost: WorldModelCost | None = None  # evaluates other actions
-    done: bool = False  # the last goal is reached: no motion
+    is_done: bool = False  # the last goal is reached: no motion
     from_samples: bool = False  # the search started from actions that a policy proposed
     surprise: Surprise | None = None  # None: no monitor, or no prediction for this frame
 
@@ -124,11 +124,13 @@ class Controller:
         self._model = prepare_for_planning(world_model, self.config)
         self.cameras = Cameras(self._model, crop, self.config.views)
         self._camera_pose = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
-        self._energy = EnergyFunction.of(self.config.energy)
+        self._energy = EnergyFunction.from_config(self.config.energy)
         self._load_files(world_model)
-        self.space = search_space(self.config, spaces.state)  # the allowed changes of the state, of the last decision
+        self.space = make_search_space(
+            self.config, spaces.state
+        )  # the allowed changes of the state, of the last decision
         self.planner = Planner(self.config, self.space)
-        self._workspace = Workspace.of(self.config.limits, spaces.state)
+        self._workspace = Workspace.from_limits(self.config.limits, spaces.state)
         self._searched: dict[GripperMode | None, SearchSpace] = {None: self.space}
         self._goals: tuple[SubGoal, ...] = ()
         self._progress: GoalProgress | None = None  # at the last usable frame
@@ -145,7 +147,7 @@ class Controller:
         known = world_model.fingerprints()
         if config.axes:
             require_base_frame(f"planning.axes: {config.axes}", is_base=self.spaces.state.is_base_pose)
-            self._axes = _axes_of(config.axes, known)
+            self._axes = _load_axes(config.axes, known)
         if config.monitor:
             self._compare = PLANNING_FILES.find("monitor")(config.monitor, known, self.cameras)
         if config.prior:
@@ -168,15 +170,15 @@ class Controller:
             InputError: As `Controller`.
         """
         settings = run.config if config is None else run.config.model_copy(update={"planning": config})
-        settings = with_taught_limits(settings, Path(settings.run_dir))
-        warn_beyond_taught(settings, Path(settings.run_dir))
+        settings = resolve_data_limits(settings, Path(settings.run_dir))
+        warn_if_limits_exceed_data(settings, Path(settings.run_dir))
         return cls.of_subject(replace(run, config=settings), seed=seed, extrinsics=extrinsics)
 
     @classmethod
     def of_subject(
         cls, subject: Subject, *, seed: int | None = None, extrinsics: Float[np.ndarray, " 6"] | None = None
     ) -> Controller:
-        """Return the controller of a model that `load_to_plan` loaded, with its settings.
+        """Return the controller of a model that `load_for_planning` loaded, with its settings.
 
         Args:
             subject: The model; its config gives the settings, crop and spaces.
@@ -218,7 +220,7 @@ class Controller:
             InputError: An image is invalid, sizes differ, or the mask is empty.
             ValueError: No goals, or the number of durations is not the number of goals minus one, or one is below 1.
         """
-        self.follow(timed(goals, durations), mask=mask)
+        self.follow(make_timed_goals(goals, durations), mask=mask)
 
     def follow(
         self, goals: Sequence[SubGoal], *, mask: np.ndarray | None = None, cancelled: Cancelled = lambda: False
@@ -246,16 +248,18 @@ class Controller:
         for index, goal in enumerate(goals):
             require_image(goal.image, where=f"goal {index}", like=goals[0].image if index else None)
             self.cameras.require_contrast(goal.image, where=f"goal {index}")
-        require_ends(goals)
-        searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
-        report, latents = until_cancelled(cancelled), []
+        require_goal_ends(goals)
+        searched = {goal.gripper: self._make_search_space(goal.gripper) for goal in goals} | {
+            None: self._searched[None]
+        }
+        report, latents = raise_if_cancelled(cancelled), []
         for index, goal in enumerate(goals):
             report(index, len(goals))
-            latents.append(self.encoded(goal.image))
-        weights = self.cameras.weights(mask, goals[0].image)
+            latents.append(self.encode(goal.image))
+        weights = self.cameras.compute_patch_weights(mask, goals[0].image)
         self._goals, self._goal_latents, self._patch_weights = tuple(goals), torch.stack(latents), weights
         self._searched, self.space = searched, searched[None]
-        self.cameras.newest, self._progress, self._done, self.decision = (), None, 0, None
+        self.cameras.latest_frames, self._progress, self._done, self.decision = (), None, 0, None
 
     def act(
         self,
@@ -283,16 +287,16 @@ class Controller:
             SearchCancelledError: `cancelled` returned true. After any error the controller is unchanged.
             ValueError: No goal was set.
         """
-        state = self._checked(frame, state)
+        state = self._check_input(frame, state)
         largest = self.space.upper[0].double().numpy()
-        newest, fault = self.cameras.checked(frame, state, self.spaces.state, largest)
+        newest, fault = self.cameras.check_frame(frame, state, self.spaces.state, largest)
         if fault is None:
-            decision = self._decided(self.encoded(frame), state, samples, cancelled)
+            decision = self._decide(self.encode(frame), state, samples, cancelled)
             self._progress = decision.progress
         else:
-            decision = self._faulty(state, fault)
+            decision = self._decide_without_motion(state, fault)
         # Set after all calls that can raise, so that an error leaves the controller unchanged.
-        self.cameras.newest, self._done, self.decision = newest, self._done + 1, decision
+        self.cameras.latest_frames, self._done, self.decision = newest, self._done + 1, decision
         return decision.action
 
     @torch.no_grad()
@@ -320,20 +324,20 @@ class Controller:
             SearchCancelledError: `cancelled` returned true.
             ValueError: No goal was set.
         """
-        state = self._checked(frame, state)
+        state = self._check_input(frame, state)
         self.cameras.require_contrast(frame, where="frame")
-        latents = self.encoded(frame)
+        latents = self.encode(frame)
         if chunks.ndim != 3 or 0 in chunks.shape or chunks.shape[2] != self.space.dim:
             needed = f"chunks x model steps x {self.space.dim}"
             raise InputError(where="chunks", found=f"an array of the shape {chunks.shape}", needed=needed)
-        progress = self._progressed(latents)
-        still, _ = self._still(latents, progress, chunks.shape[1])
-        cost = self._cost(latents, state, progress)
-        cost.progress = until_cancelled(cancelled)
+        progress = self._update_progress(latents)
+        still, _ = self._compute_current_energies(latents, progress, chunks.shape[1])
+        cost = self._make_cost(latents, state, progress)
+        cost.progress = raise_if_cancelled(cancelled)
         energies = cost(torch.from_numpy(np.concatenate([np.zeros_like(chunks[:1]), chunks])).float()).double()
-        return ChunkScores(energies[1:].numpy(), float(energies[0]), self._over_steps(still), progress.place)
+        return ChunkScores(energies[1:].numpy(), float(energies[0]), self._combine_steps(still), progress.goal_index)
 
-    def _checked(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " dim"]:
+    def _check_input(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " dim"]:
         """Return the measured state; refuse a frame or a state that cannot be used, and a controller without a goal."""
         if not self._goals:
             raise ValueError("no goal: call reset first")
@@ -345,13 +349,13 @@ class Controller:
         space.require_state(state, "state")
         return state
 
-    def _faulty(self, state: np.ndarray, why: Fault) -> Decision:
+    def _decide_without_motion(self, state: np.ndarray, why: Fault) -> Decision:
         """Return a zero action for a faulty frame; the goal stays, since the frame does not show if it is reached."""
         progress = self._progress or GoalProgress(0, 0, math.nan)
-        goals, command = (progress.place,) * self.space.steps, self._command(state, np.zeros(len(state)))
-        return Decision(command, why, math.nan, goals, replace(progress, changed=""), done=progress.done)
+        goals, command = (progress.goal_index,) * self.space.steps, self._get_command(state, np.zeros(len(state)))
+        return Decision(command, why, math.nan, goals, replace(progress, changed=""), is_done=progress.is_done)
 
-    def encoded(self, image: UInt8[np.ndarray, "height width 3"]) -> Latents:
+    def encode(self, image: UInt8[np.ndarray, "height width 3"]) -> Latents:
         """Return the latents of an image on the model's device; the latents of several views are concatenated.
 
         Raises:
@@ -359,7 +363,7 @@ class Controller:
         """
         return encode_frames(self._model, image[None], self.crop, views=self.config.views)[0]
 
-    def _progressed(self, latents: Latents) -> GoalProgress:
+    def _update_progress(self, latents: Latents) -> GoalProgress:
         """Return the progress through the goals at the current image."""
 
         def energy(index: int) -> float:
@@ -367,9 +371,9 @@ class Controller:
 
         if self._progress is None:
             return GoalProgress(0, 0, energy(0))
-        return self._progress.after(self._goals, self._done, energy)
+        return self._progress.advance(self._goals, self._done, energy)
 
-    def _goal_from(self, index: int) -> Goal:
+    def _get_goal(self, index: int) -> Goal:
         """Return a goal and the later goals that a long plan can reach, with `at_most` as the durations."""
         durations: list[int] = []
         for goal in self._goals[index:-1]:
@@ -378,46 +382,48 @@ class Controller:
             durations.append(goal.at_most)
         return Goal(self._goal_latents[index : index + len(durations) + 1], tuple(durations), self._patch_weights)
 
-    def _still(
+    def _compute_current_energies(
         self, latents: Latents, progress: GoalProgress, steps: int
     ) -> tuple[Float[Tensor, " steps"], tuple[int, ...]]:
         """Return the distance of the current image from the goal of each of the next steps, and the goals' indices."""
-        goal, done = self._goal_from(progress.place), self._done - progress.since
-        goal_latents = goal.ahead(done, steps)
+        goal, done = self._get_goal(progress.goal_index), self._done - progress.start_step
+        goal_latents = goal.get_latents(done, steps)
         still = distance(latents.expand_as(goal_latents), goal_latents, self._energy, goal.weights)
-        return still, tuple(progress.place + goal.place(done + step) for step in range(steps))
+        return still, tuple(progress.goal_index + goal.get_index(done + step) for step in range(steps))
 
-    def _cost(self, latents: Latents, state: State, progress: GoalProgress) -> WorldModelCost:
-        goal, done = self._goal_from(progress.place), self._done - progress.since
+    def _make_cost(self, latents: Latents, state: State, progress: GoalProgress) -> WorldModelCost:
+        goal, done = self._get_goal(progress.goal_index), self._done - progress.start_step
         scene = Scene(latents, torch.from_numpy(state).float(), self._camera_pose, self._axes, self.config.views)
         return WorldModelCost(self._model, scene, goal, self._energy, done=done, spaces=self.spaces)
 
-    def _over_steps(self, distances: Float[Tensor, " steps"]) -> float:
+    def _combine_steps(self, distances: Float[Tensor, " steps"]) -> float:
         return float(distances[-1] if self.config.energy.steps == "last" else distances.sum())
 
-    def _decided(
+    def _decide(
         self,
         latents: Latents,
         state: State,
         samples: np.ndarray | None,
         cancelled: Cancelled,
     ) -> Decision:
-        progress = self._progressed(latents)
-        still, goal_indices = self._still(latents, progress, self.config.horizon)
-        energy = self._over_steps(still)
-        command = self._command(state, np.zeros(len(state)))
+        progress = self._update_progress(latents)
+        still, goal_indices = self._compute_current_energies(latents, progress, self.config.horizon)
+        energy = self._combine_steps(still)
+        command = self._get_command(state, np.zeros(len(state)))
         zero_action = Decision(command, "at the goal", energy, goal_indices, progress, surprise=self._surprise(latents))
-        if progress.done or float(still.max()) <= REACHED:
-            return replace(zero_action, done=progress.place == len(self._goals) - 1)
-        if self._workspace is not None and not is_allowed(self._workspace.way_back(state[:3]), self.config.limits):
+        if progress.is_done or float(still.max()) <= REACHED:
+            return replace(zero_action, is_done=progress.goal_index == len(self._goals) - 1)
+        if self._workspace is not None and not is_within_limits(
+            self._workspace.get_return_motion(state[:3]), self.config.limits
+        ):
             return replace(zero_action, why="outside the workspace")
-        self.space = self._searched[self._goals[progress.place].gripper]
-        cost = self._cost(latents, state, progress)
-        plan = self._planned(state, cost, self._start(cost, progress, samples), cancelled)
-        why: Why = "planned" if plan.stopped == "finished" else plan.stopped
+        self.space = self._searched[self._goals[progress.goal_index].gripper]
+        cost = self._make_cost(latents, state, progress)
+        plan = self._search(state, cost, self._get_start(cost, progress, samples), cancelled)
+        why: Reason = "planned" if plan.stopped == "finished" else plan.stopped
         return replace(
             zero_action,
-            action=self._command(state, plan.actions[0].double().numpy()),
+            action=self._get_command(state, plan.actions[0].double().numpy()),
             why=why,
             plan=plan,
             states=states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0].numpy(),
@@ -431,35 +437,37 @@ class Controller:
         if self._compare is None or before is None or before.cost is None or before.plan is None:
             return None
         with torch.no_grad():
-            predicted, _ = before.cost.imagine(before.plan.actions[None, :1])
+            predicted, _ = before.cost.rollout(before.plan.actions[None, :1])
         return self._compare(predicted[0, 0], latents)
 
-    def _start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
+    def _get_start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
         """Return the start of a search: from a policy's samples, the action prior, or the rest of the last plan."""
         if samples is not None:
-            return PlanStart.of_samples(torch.from_numpy(np.array(samples, dtype=np.float64)), self.space)
+            return PlanStart.from_samples(torch.from_numpy(np.array(samples, dtype=np.float64)), self.space)
         if self._prior_start is not None:
-            bound = self._goals[progress.place].at_most
-            steps_left = _PRIOR_STEPS if bound is None else bound - (self._done - progress.since)
-            return self._prior_start(cost, self._goal_latents[progress.place], steps_left, self.space)
+            bound = self._goals[progress.goal_index].at_most
+            steps_left = _PRIOR_STEPS if bound is None else bound - (self._done - progress.start_step)
+            return self._prior_start(cost, self._goal_latents[progress.goal_index], steps_left, self.space)
         last_plan = None if self.decision is None else self.decision.plan
-        return last_plan.start_after() if last_plan is not None and self.config.warm_start else None
+        return last_plan.make_next_start() if last_plan is not None and self.config.warm_start else None
 
-    def _planned(self, state: np.ndarray, cost: WorldModelCost, start: PlanStart | None, cancelled: Cancelled) -> Plan:
+    def _search(self, state: np.ndarray, cost: WorldModelCost, start: PlanStart | None, cancelled: Cancelled) -> Plan:
         """Return the plan of a search, kept inside the workspace if there is one, with the energy of its actions."""
         generator, box = torch.Generator().manual_seed(self.seed + self._done), self._workspace
-        space = self.space if box is None else box.narrowed(self.space, state)
+        space = self.space if box is None else box.narrow(self.space, state)
         plan = self.planner.plan(cost, generator, start, cancelled, space)
         if box is None or plan.stopped == "no finite energy":
             return plan
-        kept = torch.from_numpy(box.kept(state, plan.actions.double().numpy(), self.config.limits)).to(plan.actions)
+        kept = torch.from_numpy(box.clip_actions(state, plan.actions.double().numpy(), self.config.limits)).to(
+            plan.actions
+        )
         if torch.equal(kept, plan.actions):
             return plan
         with torch.no_grad():
             energy = float(cost(kept[None])[0])
         return replace(plan, actions=kept, energy=energy, evaluations=plan.evaluations + 1)
 
-    def _space_with(self, gripper: GripperMode | None) -> SearchSpace:
+    def _make_search_space(self, gripper: GripperMode | None) -> SearchSpace:
         """Return the search space of a gripper mode.
 
         Raises:
@@ -467,23 +475,23 @@ class Controller:
         """
         if gripper is None:
             return self._searched[None]
-        where, fix = f"gripper mode {gripper!r} of a goal", "Leave the goal's gripper mode out"
+        where, fix = f"gripper mode {gripper!r} of a goal", "Remove the gripper mode of the goal"
         if not self.spaces.state.is_pose:
-            found = "a model whose states are vectors, in which no number is known to be the gripper"
+            found = "a model with vector states, whose gripper is unknown"
             raise InputError(where=where, found=found, fix=fix)
         limits = self.config.limits.model_copy(update={"gripper_mode": gripper})
-        space = search_space(self.config.model_copy(update={"limits": limits}), self.spaces.state)
+        space = make_search_space(self.config.model_copy(update={"limits": limits}), self.spaces.state)
         if not len(space.free):
-            found = "nothing that is left to plan: planning.limits hold position and rotation"
+            found = "no free component: planning.limits fix position and rotation"
             raise InputError(where=where, found=found, fix=fix)
         return space
 
-    def _command(self, state: np.ndarray, change: np.ndarray) -> Float[np.ndarray, " action_dim"]:
+    def _get_command(self, state: np.ndarray, change: np.ndarray) -> Float[np.ndarray, " action_dim"]:
         """Return the action for a change of the state: the change itself, or the resulting state."""
         return state + change if self.spaces.action.follows == "target" else change
 
 
-def _axes_of(path: str, known: Fingerprints) -> Axes:
+def _load_axes(path: str, known: Fingerprints) -> Axes:
     """Read calibrated axes, and check that they were fitted for this model.
 
     Raises:
@@ -491,8 +499,8 @@ def _axes_of(path: str, known: Fingerprints) -> Axes:
     """
     axes = read_axes(path)
     if (axes.encoder, axes.predictor) != (known.encoder, known.predictor):
-        found = f"axes that were fitted for another model, {axes.subject}"
-        fix = "Fit them anew: `vjepa2-ac data calibrate CONFIG --axes MODEL`"
+        found = f"axes that were calibrated for another model, {axes.subject}"
+        fix = "Calibrate them for this model: `vjepa2-ac data calibrate CONFIG --axes MODEL`"
         raise InputError(where=f"planning.axes: {path}", found=found, fix=fix)
     return Axes(math.radians(axes.yaw_degrees), axes.centre_m)
 
@@ -501,10 +509,12 @@ def _require_camera_pose(model: WorldModel, extrinsics: np.ndarray | None, views
     if extrinsics is not None:
         EXTRINSICS.require_state(extrinsics, "extrinsics")
     if (uses := model.sizes.predictor.use_extrinsics) != (extrinsics is not None):
-        found, needed = f"{uses}, camera pose given: {not uses}", "a camera pose exactly where the model uses it"
+        found, needed = f"{uses}, camera pose given: {not uses}", "a camera pose if and only if the model uses it"
         raise InputError(where="model: predictor.use_extrinsics", found=found, needed=needed)
     if uses and views > 1:
-        raise InputError(where="planning.views", found=f"{views}, and a model that takes one camera's pose", needed="1")
+        raise InputError(
+            where="planning.views", found=f"{views} views, with a model that uses the camera pose", needed="1"
+        )
 
 
 def _require_spaces(model: WorldModel, spaces: Spaces) -> None:
@@ -512,6 +522,6 @@ def _require_spaces(model: WorldModel, spaces: Spaces) -> None:
         needed = f"{spaces.widths.state} and {spaces.widths.action}, as the spaces of the data that it was trained on"
         raise InputError(where="model", found=describe_model_widths(model.sizes), needed=needed)
     if spaces.action.follows == "unknown":
-        found = "commands whose effect on the state is not known"
-        fix = "To plan, train with data.actions: difference, or with join_actions: sum or last"
+        found = "recorded actions whose effect on the state is unknown"
+        fix = "To plan, train with data.actions: difference, or with data.join_actions: sum or last"
         raise InputError(where="data.actions: recorded", found=found, fix=fix)

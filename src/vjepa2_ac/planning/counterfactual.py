@@ -28,10 +28,10 @@ _DIRECTIONS: dict[str, tuple[int, float]] = {  # in the robot base frame: x to t
     "open": (6, -1.0), "close": (6, 1.0),
 }  # fmt: skip
 ACTION_NAMES = ("none", *_DIRECTIONS)
-_LARGEST = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, closedness in one step: more are other units
+_MAX_ACTION = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, closedness in one step: more are other units
 
 
-def named_actions(
+def make_named_actions(
     name: str, steps: int, *, size_m: float = STEP_M, limits: LimitsConfig | None = None
 ) -> Float[np.ndarray, "steps 7"]:
     """Return the action of a name, repeated for every model step (conventions: episode.py).
@@ -54,12 +54,12 @@ def named_actions(
     if steps < 1:
         raise ValueError(f"{steps} steps")
     if not 0 < size_m < np.inf:
-        raise InputError(where="--size", found=f"{100 * size_m:g} cm a step", needed="a length above 0 cm")
+        raise InputError(where="--size", found=f"{100 * size_m:g} cm per step", needed="a length above 0 cm")
     actions = np.zeros((steps, ACTION_DIM))
     if name == "none":
         return actions
     if name not in _DIRECTIONS:
-        needed = f"true (of a recorded clip), {', '.join(ACTION_NAMES)}, or a file"
+        needed = f"true (the actions of a recorded clip), {', '.join(ACTION_NAMES)}, or a file"
         raise InputError(where="actions", found=repr(name), needed=needed)
     axis, sign = _DIRECTIONS[name]
     if axis != GRIPPER:
@@ -73,7 +73,7 @@ def named_actions(
         if axis == GRIPPER and limits is not None and limits.gripper_mode == "held":
             key, found, needed = "gripper_mode", "held", "rounded or free"
         where = f"planning.limits.{key}"
-        raise InputError(where=where, found=f"{found}, so that nothing can move {name}", needed=needed)
+        raise InputError(where=where, found=f"{found}, so that no action can move {name}", needed=needed)
     actions[:, axis] = sign * size
     return actions
 
@@ -92,7 +92,7 @@ def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndar
             there are too few rows.
     """
     needed = f"one line of {ACTION_DIM} numbers for each model step: {', '.join(POSE_CHANGE.names)}"
-    fix = "In metres, radians, and closedness from -1 to 1; a .npy of NumPy, or a .csv with commas"
+    fix = "Use metres, radians and closedness changes from -1 to 1, in a NumPy .npy file or a comma-separated .csv file"
     refused = partial(InputError, where=str(path), needed=needed, fix=fix)
     try:
         if str(path).lower().endswith(".npy"):
@@ -106,7 +106,7 @@ def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndar
         raise refused(found=f"cannot be read ({error})") from None
     if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
         raise refused(found=f"an array of shape {actions.shape}")
-    wrong = ~(np.abs(actions) <= _LARGEST).all(axis=1)  # NaN is wrong, too
+    wrong = ~(np.abs(actions) <= _MAX_ACTION).all(axis=1)  # NaN is wrong, too
     if wrong.any():
         step = int(wrong.argmax())
         raise refused(found=f"action {step} is {np.array2string(actions[step], precision=4, max_line_width=200)}")

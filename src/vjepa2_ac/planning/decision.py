@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac.errors import counted
 from vjepa2_ac.planning.controller import Controller, Decision
-from vjepa2_ac.planning.energy import SAME_ENERGY, EnergySlice, energy_slices
+from vjepa2_ac.planning.energy import SAME_ENERGY, EnergySlice, compute_energy_slices
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.reporter import SILENT, Reporter
@@ -45,12 +45,12 @@ class PlanRequest:
 class PlanResult:
     """A decision, with its alternatives."""
 
-    question: PlanRequest
+    request: PlanRequest
     controller: Controller
     decision: Decision
     actions: Float[np.ndarray, "steps dim"]  # changes of the state; zero if there is no plan
     states: Float[np.ndarray, "steps+1 dim"]  # predicted states before and after these actions
-    doing_nothing: float  # predicted energy of the zero action; NaN if it was not computed
+    zero_action_energy: float  # predicted energy of the zero action; NaN if it was not computed
     slices: tuple[EnergySlice, ...]  # empty if there is no plan, or none were requested
     seconds: dict[str, float]  # for encoding the goals, the decision (with encoding the start), and the slices
 
@@ -68,21 +68,21 @@ class PlanResult:
     def worse_than(self) -> dict[str, str]:
         """A sentence for each reference (zero action, current frame) whose energy is below the plan's prediction."""
         energy = math.nan if self.decision.plan is None else self.decision.plan.energy
-        references = {"zero action": self.doing_nothing, "current frame": self.decision.energy_now}
+        references = {"zero action": self.zero_action_energy, "current frame": self.decision.current_energy}
         sentence = "The plan is predicted to be worse than the {}: energy {:.4f} against {:.4f}{}."
         return {
-            name: sentence.format(name, energy, reference, _change(energy, reference))
+            name: sentence.format(name, energy, reference, _relative_change(energy, reference))
             for name, reference in references.items()
             if energy > reference + SAME_ENERGY * abs(reference)
         }
 
 
-def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0, reporter: Reporter = SILENT) -> PlanResult:
+def decide(controller: Controller, request: PlanRequest, *, nodes: int = 0, reporter: Reporter = SILENT) -> PlanResult:
     """Make one decision, and evaluate its alternatives.
 
     Args:
         controller: The controller that plans; its goals are replaced by those of the request.
-        question: The observation and the goal.
+        request: The observation and the goal.
         nodes: Number of points of an energy slice along each axis; below 3: no slices.
         reporter: Shows the progress of the slices. The search reports through the controller's planner.
 
@@ -91,14 +91,14 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0, rep
         ValueError: No goals.
     """
     times = [time.perf_counter()]
-    controller.follow(question.goals, mask=question.mask)
+    controller.follow(request.goals, mask=request.mask)
     times.append(time.perf_counter())
-    controller.act(question.start, question.state)
-    controller.cameras.require_contrast(question.start, where="start")
+    controller.act(request.start, request.state)
+    controller.cameras.require_contrast(request.start, where="start")
     times.append(time.perf_counter())
     decision = controller.decision
     if decision is None:
-        raise ValueError("a controller that acted has decided")
+        raise ValueError("the controller made no decision")
     plan, space, still = decision.plan, controller.space, np.nan
     slices: tuple[EnergySlice, ...] = ()
     if plan is not None and decision.cost is not None:
@@ -107,15 +107,15 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0, rep
         axes = controller.shown_axes
         if decision.why != "no finite energy" and nodes >= 3 and len(axes) >= 2:
             task = reporter.task("energy maps", "action sequences")
-            slices = energy_slices(decision.cost, plan.actions, space, axes, nodes=nodes, progress=task)
+            slices = compute_energy_slices(decision.cost, plan.actions, space, axes, nodes=nodes, progress=task)
     times.append(time.perf_counter())
     return PlanResult(
-        question=question,
+        request=request,
         controller=controller,
         decision=decision,
         actions=np.zeros((space.steps, space.dim)) if plan is None else plan.actions.double().numpy(),
-        states=np.tile(question.state, (space.steps + 1, 1)) if decision.states is None else decision.states,
-        doing_nothing=still,
+        states=np.tile(request.state, (space.steps + 1, 1)) if decision.states is None else decision.states,
+        zero_action_energy=still,
         slices=slices,
         seconds=dict(zip(("goals", "decision", "slices"), np.diff(times).tolist(), strict=True)),
     )
@@ -127,41 +127,45 @@ FORMAT = 1  # incremented when a reader of the file would have to change
 _AT_LIMIT = 0.98  # an action counts as being at its limit from this share of it
 
 
-def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
+def write_plan(result: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
     """Write a decision as JSON; the file is written atomically, and numbers that are not finite are null.
 
     Args:
-        answer: The decision.
+        result: The decision.
         about: The model and the sources of the images, as plain values.
         path: The file.
     """
-    decision, question, controller = answer.decision, answer.question, answer.controller
-    plan, progress, names = decision.plan, decision.progress, answer.state_space.change_names
+    decision, request, controller = result.decision, result.request, result.controller
+    plan, progress, names = decision.plan, decision.progress, result.state_space.change_names
     rules = ("name", "at_least", "at_most", "share", "gripper")
     recorded = ("samples", "finite", "lowest", "mean", "std", "seconds")
-    energy = {"now": decision.energy_now, "began": progress.began, "doing_nothing": answer.doing_nothing}
+    energy = {
+        "now": decision.current_energy,
+        "began": progress.initial_energy,
+        "doing_nothing": result.zero_action_energy,
+    }
     slices = []
-    for part in answer.slices:
+    for part in result.slices:
         across, up = (names[axis] for axis in part.axes)
         slices.append({"across": across, "up": up, across: part.across, up: part.up, "energy": part.energy})
     content = {
         "format": FORMAT,
-        "in_words": summarize(answer),
+        "in_words": summarize(result),
         **about,
-        "state": question.state,
-        "durations": question.durations,
+        "state": request.state,
+        "durations": request.durations,
         "settings": controller.config.model_dump(mode="json"),
         "seed": controller.seed,
         "crop": controller.crop,
         "why": decision.why,
-        "worse_than": list(answer.worse_than),
-        "actions": answer.actions,
-        "states": answer.states,
+        "worse_than": list(result.worse_than),
+        "actions": result.actions,
+        "states": result.states,
         "goal_of_each_step": decision.goals,
-        "sub_goals": [{name: getattr(goal, name) for name in rules} for goal in question.goals],
-        "since": progress.since,
+        "sub_goals": [{name: getattr(goal, name) for name in rules} for goal in request.goals],
+        "since": progress.start_step,
         "changed": progress.changed,
-        "done": decision.done,
+        "done": decision.is_done,
         "energy": energy | {"plan": None if plan is None else plan.energy},
         "evaluations": 0 if plan is None else plan.evaluations,
         "iterations": [
@@ -169,69 +173,71 @@ def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path
             for iteration in (() if plan is None else plan.iterations)
         ],
         "slices": slices,
-        "seconds": {**answer.seconds, "search": 0.0 if plan is None else plan.seconds},
+        "seconds": {**result.seconds, "search": 0.0 if plan is None else plan.seconds},
     }
     write_atomically(path, format_json({name: to_plain(value) for name, value in content.items()}))
     return path
 
 
-def summarize(answer: PlanResult) -> str:
+def summarize(result: PlanResult) -> str:
     """Return the decision as one or more sentences."""
-    plan, why, now = answer.decision.plan, answer.decision.why, answer.decision.energy_now
+    plan, why, now = result.decision.plan, result.decision.why, result.decision.current_energy
     if why == "outside the workspace":
         return (
-            "Zero action: the robot is farther outside planning.limits.workspace than an action leads. Move the robot"
-            " back by hand, or correct the box."
+            "Zero action: the robot is farther outside planning.limits.workspace than one action can correct. Move the"
+            " robot inside by hand, or correct the workspace."
         )
     if why == "at the goal" or plan is None:
-        return "Zero action: the current frame has the latents of the goal image."
+        return "Zero action: the latents of the current frame equal those of the goal image."
     if why == "no finite energy":
         return (
             "Zero action: the model gives no finite energy for any of"
-            f" {plan.evaluations:,} action sequences. The model is broken; try another checkpoint."
+            f" {plan.evaluations:,} action sequences. Use another checkpoint."
         )
     rounds = len(plan.iterations)
     searched = f"{counted(plan.evaluations, 'action sequence')} in {counted(rounds, 'iteration')}"
     sentences = [
-        _motion(answer),
-        f"Energy {now:.4f} now, {plan.energy:.4f} predicted for the plan{_change(plan.energy, now)},",
-        f"{answer.doing_nothing:.4f} predicted for the zero action.",
-        f"Planner {plan.planner}, seed {plan.seed}: {searched}, {answer.seconds['decision']:.2f} s.",
+        _describe_motion(result),
+        f"Energy {now:.4f} now, {plan.energy:.4f} predicted for the plan{_relative_change(plan.energy, now)},",
+        f"{result.zero_action_energy:.4f} predicted for the zero action.",
+        f"Planner {plan.planner}, seed {plan.seed}: {searched}, {result.seconds['decision']:.2f} s.",
     ]
     if plan.stopped == "out of time":
         sentences.append(
-            f"Time was up after {rounds} of {answer.controller.config.iterations} iterations: the best so far."
+            f"The time budget ended the search after {rounds} of {result.controller.config.iterations} iterations."
         )
-    if at_limit := axes_at_limit(answer):
-        key = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
+    if at_limit := find_axes_at_limit(result):
+        key = f"planning.limits.{'xyz' if result.state_space.is_pose else 'axes'}"
         sentences.append(f"The first action is at its limit along {', '.join(at_limit)} ({key}).")
     return " ".join(sentences)
 
 
-def _change(energy: float, reference: float) -> str:
+def _relative_change(energy: float, reference: float) -> str:
     return f" ({100 * (energy - reference) / abs(reference):+.1f} %)" if reference else ""
 
 
-def _motion(answer: PlanResult) -> str:
-    space, change, steps = answer.state_space, answer.states[-1] - answer.states[0], len(answer.actions)
-    shown = change[list(answer.controller.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
-    names = [space.change_names[axis] for axis in answer.controller.shown_axes]
-    lasting = f"in {counted(steps, 'model step')}"
+def _describe_motion(result: PlanResult) -> str:
+    space, change, steps = result.state_space, result.states[-1] - result.states[0], len(result.actions)
+    shown = change[list(result.controller.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
+    names = [space.change_names[axis] for axis in result.controller.shown_axes]
+    duration = f"in {counted(steps, 'model step')}"
     if not space.is_pose:
         parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, shown, strict=True))
-        more = ", ..." if len(answer.space.free) > len(names) else ""
-        return f"Changes {parts}{more} {lasting}."
+        more = ", ..." if len(result.space.free) > len(names) else ""
+        return f"Changes {parts}{more} {duration}."
     parts = ", ".join(f"{name} {value:+.1f}" for name, value in zip(names, shown, strict=True))
     gripper = 0.0 if space.gripper is None else change[space.gripper]
-    grips = f", gripper {gripper:+.2f}" if gripper else ""
-    return f"Goes {np.linalg.norm(shown):.1f} {space.shown_unit} {lasting} ({parts} {space.shown_unit}{grips})."
+    gripper_text = f", gripper {gripper:+.2f}" if gripper else ""
+    return (
+        f"Moves {np.linalg.norm(shown):.1f} {space.shown_unit} {duration} ({parts} {space.shown_unit}{gripper_text})."
+    )
 
 
-def axes_at_limit(answer: PlanResult) -> list[str]:
+def find_axes_at_limit(result: PlanResult) -> list[str]:
     """Return the names of the components of the first action that are at their limits (position or vector)."""
-    upper, space = answer.space.upper[0].numpy(), answer.state_space
-    numbers = answer.controller.shown_axes if space.is_pose else range(len(space))
+    upper, space = result.space.upper[0].numpy(), result.state_space
+    numbers = result.controller.shown_axes if space.is_pose else range(len(space))
     return [
         space.change_names[number] for number in numbers
-        if upper[number] > 0 and abs(answer.actions[0, number]) >= _AT_LIMIT * upper[number]
+        if upper[number] > 0 and abs(result.actions[0, number]) >= _AT_LIMIT * upper[number]
     ]  # fmt: skip

@@ -19,15 +19,15 @@ from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.model.distances import absolute_difference, squared_difference
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.planner import Cost, reporting
+from vjepa2_ac.planning.planner import Cost, report_progress
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.registry import ENERGIES
 from vjepa2_ac.spaces import POSES, Spaces, euler_from_matrices, matrices_from_euler, states_along
 
 Latents = Float[Tensor, "*batch tokens dim"]
 Target = Float[Tensor, "*target tokens dim"]
-OfTokens = Float[Tensor, "*batch tokens"]
-OfEach = Float[Tensor, "*batch"]
+TokenDistances = Float[Tensor, "*batch tokens"]
+Distances = Float[Tensor, "*batch"]
 Weights = Float[Tensor, " tokens"]  # of each patch
 _POSITION, _ROTATION = slice(0, 3), slice(3, 6)  # of a pose
 SAME_ENERGY = 1e-6  # energies with a smaller relative difference are equal up to rounding
@@ -41,7 +41,7 @@ class Goal:
     durations: tuple[int, ...] = ()  # model steps of each goal but the last
     weights: Weights | None = None  # None: equal ones
 
-    def place(self, step: int) -> int:
+    def get_index(self, step: int) -> int:
         """Return the index of the goal that applies after this many model steps since the start."""
         for index, duration in enumerate(self.durations):
             step -= duration
@@ -49,16 +49,16 @@ class Goal:
                 return index
         return len(self.latents) - 1
 
-    def ahead(self, done: int, steps: int) -> Float[Tensor, "steps tokens dim"]:
+    def get_latents(self, done: int, steps: int) -> Float[Tensor, "steps tokens dim"]:
         """Return the latents of the goal that applies in each of the next steps, after `done` steps.
 
         The frame after a goal's last step is still compared with that goal.
         """
-        indices = [self.place(done + step) for step in range(steps)]
+        indices = [self.get_index(done + step) for step in range(steps)]
         return torch.stack([self.latents[index] for index in indices])  # a list as an index would wait for the device
 
 
-def patch_weights(
+def compute_patch_weights(
     mask: Bool[Tensor, "*views height width"] | Float[Tensor, "*views height width"], grid: int
 ) -> Weights:
     """Return the weight of each patch: the mean of a mask over the patch, patches row by row, view after view.
@@ -72,7 +72,7 @@ def patch_weights(
     """
     weights = adaptive_avg_pool2d(mask.float().reshape(-1, *mask.shape[-2:]), grid).flatten()
     if weights.sum() <= 1e-12:
-        raise ValueError("the mask leaves nothing of the image")
+        raise ValueError("the mask is empty")
     return weights
 
 
@@ -89,24 +89,26 @@ class Axes:
     yaw: float  # radians, counterclockwise seen from above
     centre_m: tuple[float, float] = (0.0, 0.0)  # x, y of the rotation axis; default: the robot's base
 
-    def poses(self, poses: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch numbers"]:
+    def rotate_poses(self, poses: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch numbers"]:
         """Return rotated poses: x, y, z and three angles; further numbers, such as the gripper, are unchanged."""
         with torch.autocast(poses.device.type, enabled=False):
-            turn, centre = self._turn(poses), poses.new_tensor([*self.centre_m, 0.0])
-            rotation = euler_from_matrices(turn @ matrices_from_euler(poses[..., _ROTATION]))
-            position = (poses[..., _POSITION] - centre) @ turn.T + centre
+            axes_rotation, centre = self._get_rotation(poses), poses.new_tensor([*self.centre_m, 0.0])
+            rotation = euler_from_matrices(axes_rotation @ matrices_from_euler(poses[..., _ROTATION]))
+            position = (poses[..., _POSITION] - centre) @ axes_rotation.T + centre
             return torch.cat([position, rotation, poses[..., 6:]], dim=-1)
 
-    def actions(self, actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
+    def rotate_actions(self, actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
         """Return rotated actions: the translation and the axis of the rotation are rotated."""
         with torch.autocast(actions.device.type, enabled=False):
-            turn = self._turn(actions)
-            rotation = euler_from_matrices(turn @ matrices_from_euler(actions[..., _ROTATION]) @ turn.T)
-            return torch.cat([actions[..., _POSITION] @ turn.T, rotation, actions[..., 6:]], dim=-1)
+            axes_rotation = self._get_rotation(actions)
+            rotation = euler_from_matrices(
+                axes_rotation @ matrices_from_euler(actions[..., _ROTATION]) @ axes_rotation.T
+            )
+            return torch.cat([actions[..., _POSITION] @ axes_rotation.T, rotation, actions[..., 6:]], dim=-1)
 
-    def _turn(self, like: Tensor) -> Float[Tensor, "3 3"]:
-        turn: Tensor = matrices_from_euler(like.new_tensor([0.0, 0.0, self.yaw]))
-        return turn
+    def _get_rotation(self, like: Tensor) -> Float[Tensor, "3 3"]:
+        axes_rotation: Tensor = matrices_from_euler(like.new_tensor([0.0, 0.0, self.yaw]))
+        return axes_rotation
 
 
 @dataclass(frozen=True)
@@ -119,16 +121,22 @@ class Scene:
     axes: Axes | None = None  # rotation to the model's axes; None: they equal the robot's
     views: int = 1
 
-    def seen(
+    def to_model_axes(
         self, actions: Float[Tensor, "*batch action_dim"], states: Float[Tensor, "*batch state_dim"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch state_dim"]]:
         """Return actions and states as the model receives them: rotated to the calibrated axes, if there are any."""
-        return (actions, states) if self.axes is None else (self.axes.actions(actions), self.axes.poses(states))
+        return (
+            (actions, states)
+            if self.axes is None
+            else (self.axes.rotate_actions(actions), self.axes.rotate_poses(states))
+        )
 
     @property
     def camera(self) -> Float[Tensor, " 6"] | None:
         """Pose of the camera as the model receives it."""
-        return self.extrinsics if self.axes is None or self.extrinsics is None else self.axes.poses(self.extrinsics)
+        return (
+            self.extrinsics if self.axes is None or self.extrinsics is None else self.axes.rotate_poses(self.extrinsics)
+        )
 
 
 @dataclass(frozen=True)
@@ -139,7 +147,7 @@ class EnergyFunction:
     by_token: Callable[[Tensor, Tensor], Tensor]
 
     @classmethod
-    def of(cls, energy: EnergyConfig | EnergyFunction) -> EnergyFunction:
+    def from_config(cls, energy: EnergyConfig | EnergyFunction) -> EnergyFunction:
         """Return the function that a config names; an `EnergyFunction` is returned unchanged."""
         if isinstance(energy, EnergyFunction):
             return energy
@@ -174,14 +182,19 @@ class WorldModelCost:
             ValueError: The model is in training mode.
         """
         if world_model.predictor.training:
-            raise ValueError("a model in training mode: dropout would change energies; call eval() first")
+            raise ValueError("the model is in training mode, so dropout would change the energies; call eval() first")
         device = world_model.device
-        self._model, self._energy, self._spaces, self._done = world_model, EnergyFunction.of(energy), spaces, done
+        self._model, self._energy, self._spaces, self._done = (
+            world_model,
+            EnergyFunction.from_config(energy),
+            spaces,
+            done,
+        )
         weights = None if goal.weights is None else goal.weights.to(device)
         self._goal = Goal(goal.latents.to(device), goal.durations, weights)
         self._frame, self._state = scene.latents.to(device), scene.state.to(device)
         self._camera = None if scene.camera is None else scene.camera.to(device)
-        self._seen, self.views = scene.seen, scene.views
+        self._to_model_axes, self.views = scene.to_model_axes, scene.views
         self.progress: Progress = no_progress  # called after each part, without waiting for the device
 
     def __call__(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
@@ -203,11 +216,11 @@ class WorldModelCost:
         return torch.cat(energies).to(actions.device)
 
     @property
-    def now(self) -> tuple[Float[Tensor, "tokens dim"], Float[Tensor, " state_dim"]]:
+    def current(self) -> tuple[Float[Tensor, "tokens dim"], Float[Tensor, " state_dim"]]:
         """Latents of the current frame, and the state."""
         return self._frame, self._state
 
-    def imagine(
+    def rollout(
         self, actions: Float[Tensor, "samples steps action_dim"]
     ) -> tuple[Float[Tensor, "samples steps tokens dim"], Float[Tensor, "samples steps+1 state_dim"]]:
         """Return the predicted latents after each action, and the states before and after it, in one batch."""
@@ -219,13 +232,15 @@ class WorldModelCost:
         dim = self._frame.shape[-1]
         views = self._frame.reshape(1, self.views, -1, dim)
         frame = views.expand(samples, -1, -1, -1).flatten(0, 1)[:, None]
-        inputs, before = (values.repeat_interleave(self.views, dim=0) for values in self._seen(inputs, states[:, :-1]))
+        inputs, before = (
+            values.repeat_interleave(self.views, dim=0) for values in self._to_model_axes(inputs, states[:, :-1])
+        )
         predicted = self._model.rollout(frame, inputs, before, camera)
         return predicted.reshape(samples, self.views, steps, -1, dim).transpose(1, 2).flatten(2, 3), states
 
     def _energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
-        predicted, _ = self.imagine(actions)
-        target = self._goal.ahead(self._done, actions.shape[1])
+        predicted, _ = self.rollout(actions)
+        target = self._goal.get_latents(self._done, actions.shape[1])
         if self._energy.config.steps == "last":
             predicted, target = predicted[:, -1:], target[-1:]
         distances = distance(predicted, target, self._energy, self._goal.weights)
@@ -234,16 +249,16 @@ class WorldModelCost:
 
 def distance(
     predicted: Latents, target: Target, energy: EnergyConfig | EnergyFunction, weights: Weights | None = None
-) -> OfEach:
+) -> Distances:
     """Return the distance between latents that a config names, averaged over patches (weights None: equal weights).
 
     For several calls pass an `EnergyFunction`, so that an energy that is a class is constructed once.
     """
-    by_token = EnergyFunction.of(energy).by_token(predicted, target)
+    by_token = EnergyFunction.from_config(energy).by_token(predicted, target)
     return by_token.mean(dim=-1) if weights is None else (by_token * (weights / weights.sum())).sum(dim=-1)
 
 
-def mean_difference(predicted: Latents, target: Target) -> OfTokens:
+def mean_difference(predicted: Latents, target: Target) -> TokenDistances:
     """Return the mean absolute difference of each token.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, l1.
@@ -251,12 +266,12 @@ def mean_difference(predicted: Latents, target: Target) -> OfTokens:
     return absolute_difference(predicted, target).mean(dim=-1)
 
 
-def mean_square(predicted: Latents, target: Target) -> OfTokens:
+def mean_square(predicted: Latents, target: Target) -> TokenDistances:
     """Return the mean squared difference of each token."""
     return squared_difference(predicted, target).mean(dim=-1)
 
 
-def one_minus_cosine(predicted: Latents, target: Target) -> OfTokens:
+def one_minus_cosine(predicted: Latents, target: Target) -> TokenDistances:
     """Return 1 - cosine of each token."""
     return 1 - cosine_similarity(predicted, target, dim=-1)
 
@@ -266,8 +281,8 @@ class ChunkScores:
     """Energies of action chunks towards a goal; lower is better."""
 
     energies: Float[np.ndarray, " chunks"]  # predicted energy of each chunk
-    doing_nothing: float  # predicted energy of the zero action for the same number of steps
-    now: float  # energy of the current image
+    zero_action_energy: float  # predicted energy of the zero action for the same number of steps
+    current_energy: float  # energy of the current image
     goal: int  # index of the goal that applies
 
     @property
@@ -289,7 +304,7 @@ class ChunkScores:
     @property
     def spread(self) -> float:
         """Standard deviation of the energies, divided by the current energy; 0: the model predicts no difference."""
-        return float(self.energies.std() / max(self.now, 1e-12))
+        return float(self.energies.std() / max(self.current_energy, 1e-12))
 
     def as_dict(self, *, is_blind: bool) -> dict[str, Any]:
         """Return plain values for JSON; `best` is None for a model that cannot rank actions (`is_blind`)."""
@@ -297,8 +312,8 @@ class ChunkScores:
         return {**values, "best": None if is_blind else self.best, "is_blind": is_blind}
 
 
-_BEYOND = 1.25  # half-width of a slice, relative to the limit
-_LEAST = 0.05  # metres; smallest half-width of a slice along a fixed axis
+_SLICE_FACTOR = 1.25  # half-width of a slice, relative to the limit
+_MIN_HALF_WIDTH_M = 0.05  # metres; smallest half-width of a slice along a fixed axis
 
 
 @dataclass(frozen=True)
@@ -311,7 +326,7 @@ class EnergySlice:
     energy: Float[np.ndarray, "nodes nodes"]  # [up, across]; NaN where the prediction is not finite
 
 
-def energy_slices(
+def compute_energy_slices(
     cost: Cost,
     actions: Float[Tensor, "steps dim"],
     space: SearchSpace,
@@ -336,14 +351,14 @@ def energy_slices(
     total, slices = comb(len(axes), 2) * nodes**2, []
     progress(0, total)
     for number, pair in enumerate(combinations(axes, 2)):
-        with reporting(cost, progress, done=number * nodes**2, share=nodes**2, total=total):
-            slices.append(_slice(cost, actions, space, pair, nodes))
+        with report_progress(cost, progress, done=number * nodes**2, share=nodes**2, total=total):
+            slices.append(_compute_slice(cost, actions, space, pair, nodes))
     return tuple(slices)
 
 
 @torch.no_grad()
-def _slice(cost: Cost, actions: Tensor, space: SearchSpace, axes: tuple[int, int], nodes: int) -> EnergySlice:
-    across, up = (_BEYOND * _half_width(space, axis, axes) * torch.linspace(-1, 1, nodes) for axis in axes)
+def _compute_slice(cost: Cost, actions: Tensor, space: SearchSpace, axes: tuple[int, int], nodes: int) -> EnergySlice:
+    across, up = (_SLICE_FACTOR * _half_width(space, axis, axes) * torch.linspace(-1, 1, nodes) for axis in axes)
     evaluated = actions.repeat(nodes * nodes, 1, 1)
     evaluated[:, : space.repeat, axes[0]] = across.repeat(nodes)[:, None]
     evaluated[:, : space.repeat, axes[1]] = up.repeat_interleave(nodes)[:, None]
@@ -353,4 +368,4 @@ def _slice(cost: Cost, actions: Tensor, space: SearchSpace, axes: tuple[int, int
 
 def _half_width(space: SearchSpace, axis: int, axes: Sequence[int]) -> float:
     reach = float(torch.maximum(space.upper[0, axis].abs(), space.lower[0, axis].abs()))
-    return reach or max(*(float(space.upper[0, number]) for number in axes), _LEAST)
+    return reach or max(*(float(space.upper[0, number]) for number in axes), _MIN_HALF_WIDTH_M)

@@ -49,34 +49,39 @@ class SubGoal:
         if self.share is not None and not 0.0 < self.share < 1.0:
             raise InputError(where=where, found=f"share {self.share}", needed="a number between 0 and 1, or none")
 
-    def why_reached(self, energy: float, began: float) -> str:
-        """Return why the goal counts as reached at an energy (`began`: its energy at the start); empty: not reached."""
+    def why_reached(self, energy: float, initial_energy: float) -> str:
+        """Return why the goal counts as reached at an energy; empty: not reached.
+
+        `initial_energy` is the energy when the goal began to apply.
+        """
         if self.share is None:
             return ""
-        if energy < self.share * began:
-            return f"energy {energy:.4g} is below {self.share:.0%} of {began:.4g}"
+        if energy < self.share * initial_energy:
+            return f"energy {energy:.4g} is below {self.share:.0%} of {initial_energy:.4g}"
         return "the image equals the goal's" if energy <= REACHED else ""
 
 
-def equal_durations(horizon: int, goals: int) -> tuple[int, ...]:
+def split_horizon(horizon: int, goals: int) -> tuple[int, ...]:
     """Return equal durations, in model steps, for all goals of a plan but the last, which gets the rest."""
     return (max(1, horizon // goals),) * (goals - 1)
 
 
-def timed(images: Sequence[np.ndarray], durations: Sequence[int]) -> tuple[SubGoal, ...]:
+def make_timed_goals(images: Sequence[np.ndarray], durations: Sequence[int]) -> tuple[SubGoal, ...]:
     """Return goals that apply for fixed numbers of model steps; the last goal has no duration.
 
     Raises:
         ValueError: No images, or the number of durations is not the number of images minus one, or one is below 1.
     """
     if not images or len(durations) != len(images) - 1 or min(durations, default=1) < 1:
-        raise ValueError(f"no goal, or {len(images)} goals with durations {durations}: one for each but the last")
+        raise ValueError(
+            f"{len(images)} goals with durations {durations}; expected one duration per goal except the last"
+        )
     first = [SubGoal(image, at_least=steps, at_most=steps) for image, steps in zip(images, durations, strict=False)]
     return (*first, SubGoal(images[-1]))
 
 
-def require_ends(goals: Sequence[SubGoal], *, first: int = 0) -> None:
-    """Refuse goals that would never end (neither `at_most` nor `share`), or a last goal with a bound.
+def require_goal_ends(goals: Sequence[SubGoal], *, first: int = 0) -> None:
+    """Refuse goals without an end (neither `at_most` nor `share`), or a last goal with a bound.
 
     Args:
         goals: In order.
@@ -88,10 +93,10 @@ def require_ends(goals: Sequence[SubGoal], *, first: int = 0) -> None:
     *all_but_last, last = goals
     for number, goal in enumerate(all_but_last, start=first):
         if goal.at_most is None and goal.share is None:
-            raise InputError(where=f"goal {number}", found="a goal that would never end", needed="at_most or share")
+            raise InputError(where=f"goal {number}", found="a goal without an end", needed="at_most or share")
     if last.at_most is not None:
-        found = f"at_most {last.at_most} of the last goal, after which there is none"
-        raise InputError(where=f"goal {len(all_but_last) + first}", found=found, needed="null: no bound")
+        found = f"at_most {last.at_most} for the last goal, which has no next goal"
+        raise InputError(where=f"goal {len(all_but_last) + first}", found=found, needed="null (no bound)")
 
 
 @dataclass(frozen=True)
@@ -102,13 +107,13 @@ class GoalProgress:
     at the beginning of the sub-goal, within bounds on the number of steps.
     """
 
-    place: int  # index of the goal
-    since: int  # model step, counted from the reset, at which the goal began
-    began: float  # energy between the image at that step and the goal
+    goal_index: int  # index of the goal
+    start_step: int  # model step, counted from the reset, at which the goal began
+    initial_energy: float  # energy between the image at that step and the goal
     changed: str = ""  # why the goal changed, or why the last goal is reached; empty: nothing changed
-    done: bool = False  # whether the last goal has been reached
+    is_done: bool = False  # whether the last goal has been reached
 
-    def after(self, goals: Sequence[SubGoal], step: int, energy: Callable[[int], float]) -> GoalProgress:
+    def advance(self, goals: Sequence[SubGoal], step: int, energy: Callable[[int], float]) -> GoalProgress:
         """Return the progress at a later decision: the same goal, or the next one.
 
         Args:
@@ -116,22 +121,22 @@ class GoalProgress:
             step: Number of model steps since the reset.
             energy: Returns the energy between the current image and the goal with an index.
         """
-        goal, steps, unchanged = goals[self.place], step - self.since, replace(self, changed="")
-        if self.done or steps < goal.at_least:
+        goal, steps, unchanged = goals[self.goal_index], step - self.start_step, replace(self, changed="")
+        if self.is_done or steps < goal.at_least:
             return unchanged
-        now, is_last = energy(self.place), self.place == len(goals) - 1
-        why = goal.why_reached(now, self.began)
+        now, is_last = energy(self.goal_index), self.goal_index == len(goals) - 1
+        why = goal.why_reached(now, self.initial_energy)
         if not why and goal.at_most is not None and steps >= goal.at_most and not is_last:
-            why = f"it ends after {counted(goal.at_most, 'step')}, at energy {now:.4g}"
-            if self.began > 0 and math.isfinite(now):
-                why += f", {now / self.began:.0%} of {self.began:.4g}"
+            why = f"the limit of {counted(goal.at_most, 'step')} is reached, at energy {now:.4g}"
+            if self.initial_energy > 0 and math.isfinite(now):
+                why += f", {now / self.initial_energy:.0%} of {self.initial_energy:.4g}"
         if not why:
             return unchanged
-        name = f"Goal {self.place + 1} ({goal.name})" if goal.name else f"Goal {self.place + 1}"
+        name = f"Goal {self.goal_index + 1} ({goal.name})" if goal.name else f"Goal {self.goal_index + 1}"
         text = f"{name}, after {counted(steps, 'step')}: {why}."
         if is_last:
-            return replace(self, changed=text, done=True)
-        return GoalProgress(self.place + 1, step, energy(self.place + 1), text)
+            return replace(self, changed=text, is_done=True)
+        return GoalProgress(self.goal_index + 1, step, energy(self.goal_index + 1), text)
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_weight_dtype
 from vjepa2_ac.model.compilation import require_compiler
 from vjepa2_ac.model.lora import copy_with_merged_adapter, merge_adapter
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
+from vjepa2_ac.planning.settings import load_planning_config, warn_if_limits_exceed_data
 from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.subject import Subject, load_subject
 
 
-def load_to_plan(
+def load_for_planning(
     subject: str, *, checkpoint: str = SELECTED, config: str | Path | None = None, overrides: Sequence[str] = ()
 ) -> Subject:
     """Load a run or a model for planning, on its device.
@@ -40,13 +40,13 @@ def load_to_plan(
             effect.
     """
     dtype = "bfloat16" if torch.cuda.is_available() and has_bf16() else "float32"
-    settings = planning_settings(subject, config=config, overrides=overrides, dtype=dtype)
+    settings = load_planning_config(subject, config=config, overrides=overrides, dtype=dtype)
     device = torch.device("cpu" if is_on_cpu(settings.training) else "cuda")
     require_weight_dtype(settings.model, device)  # without autocast
     loaded = load_subject(subject, checkpoint, config=settings)
     warnings = loaded.warnings
     if loaded.checkpoint is not None:
-        warnings += warn_beyond_taught(settings, Path(subject))
+        warnings += warn_if_limits_exceed_data(settings, Path(subject))
         loaded.world_model.merged_from = loaded.world_model.fingerprints()
         merge_adapter(loaded.world_model)
     loaded.world_model.to(device)

@@ -22,7 +22,7 @@ from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.planning.search_space import SearchSpace, pose_space
+from vjepa2_ac.planning.search_space import SearchSpace, make_pose_search_space
 from vjepa2_ac.planning.solvers import EvaluatedPlans, PlanStart, Samples, Solver
 from vjepa2_ac.registry import PLANNERS
 
@@ -48,7 +48,7 @@ class Cost(Protocol):
         ...
 
 
-def until_cancelled(cancelled: Cancelled, progress: Progress = no_progress) -> Progress:
+def raise_if_cancelled(cancelled: Cancelled, progress: Progress = no_progress) -> Progress:
     """Return a progress callback that raises `SearchCancelledError` in its caller once `cancelled` returns true."""
 
     def report(done: int, total: int) -> None:
@@ -60,7 +60,7 @@ def until_cancelled(cancelled: Cancelled, progress: Progress = no_progress) -> P
 
 
 @contextmanager
-def reporting(cost: Cost, progress: Progress, *, done: int, share: int, total: int) -> Iterator[None]:
+def report_progress(cost: Cost, progress: Progress, *, done: int, share: int, total: int) -> Iterator[None]:
     """Report the progress of the evaluation in a `with` block: after each part that the cost reports, and at the end.
 
     Args:
@@ -122,17 +122,17 @@ class Plan:
     evaluations: int  # number of evaluated action sequences
     seconds: float
 
-    def start_after(self) -> PlanStart:
+    def make_next_start(self) -> PlanStart:
         """Return the start of the next search, one model step later.
 
         Each decision starts at the mean of this plan's actions in the same model steps. If actions are repeated, such
         model steps can belong to two decisions of this plan. The last action is repeated.
         """
         elites = self.iterations[-1].elites if self.iterations else self.mean[None][:0]
-        return PlanStart(_one_step_later(self.mean[None], self.repeat)[0], _one_step_later(elites, self.repeat))
+        return PlanStart(_shift_by_one_step(self.mean[None], self.repeat)[0], _shift_by_one_step(elites, self.repeat))
 
 
-def _one_step_later(decisions: Samples, repeat: int) -> Samples:
+def _shift_by_one_step(decisions: Samples, repeat: int) -> Samples:
     steps = decisions.shape[1] * repeat
     indices = (torch.arange(steps) + 1).clamp(max=steps - 1) // repeat
     return reduce(
@@ -140,20 +140,20 @@ def _one_step_later(decisions: Samples, repeat: int) -> Samples:
     )
 
 
-def samples_of_iterations(config: PlanningConfig) -> tuple[int, ...]:
+def count_samples_per_iteration(config: PlanningConfig) -> tuple[int, ...]:
     """Return the number of new action sequences that each iteration evaluates, without those that icem reuses."""
     zeros = torch.zeros(1, 1)
-    search = _solver(config, SearchSpace(zeros, zeros, zeros), Generator(), PlanStart(zeros, zeros[None]))
-    return _samples_of(search, config)
+    search = _make_solver(config, SearchSpace(zeros, zeros, zeros), Generator(), PlanStart(zeros, zeros[None]))
+    return _count_samples(search, config)
 
 
-def _solver(config: PlanningConfig, space: SearchSpace, generator: Generator, start: PlanStart | None) -> Solver:
+def _make_solver(config: PlanningConfig, space: SearchSpace, generator: Generator, start: PlanStart | None) -> Solver:
     name, options = config.planner.name, config.planner.options
     search: Solver = PLANNERS.find(name)(space, config, generator, start, **PLANNERS.options(name, options))
     return search
 
 
-def _samples_of(search: Solver, config: PlanningConfig) -> tuple[int, ...]:
+def _count_samples(search: Solver, config: PlanningConfig) -> tuple[int, ...]:
     """Return the number of samples of each iteration; a third-party solver need not have `num_samples`."""
     number = getattr(search, "num_samples", lambda _: config.samples)
     return tuple(itertools.takewhile(bool, map(number, range(config.iterations))))
@@ -191,7 +191,7 @@ class Planner:
         Args:
             cost: The cost of action sequences. Called without gradients except by planner gradient.
             generator: On the CPU; the same seed gives the same plan. Its initial seed is recorded.
-            start: Start of the search, from the previous plan (`Plan.start_after`), a prior or a policy; None: zero
+            start: Start of the search, from the previous plan (`Plan.make_next_start`), a prior or a policy; None: zero
                 motion.
             cancelled: Called before every iteration, and after each part that the cost reports; returns whether to
                 stop.
@@ -201,10 +201,10 @@ class Planner:
             SearchCancelledError: `cancelled` returned true.
             ValueError: The cost does not return one number per sample.
         """
-        began, config, space = self.clock(), self.config, space or self.space or pose_space(self.config)
-        search = _solver(config, space, generator, start)
+        began, config, space = self.clock(), self.config, space or self.space or make_pose_search_space(self.config)
+        search = _make_solver(config, space, generator, start)
         record: list[Iteration] = []
-        shares = _samples_of(search, config)
+        shares = _count_samples(search, config)
         total = sum(shares)
         self.progress(0, total)
         while len(record) < len(shares):
@@ -214,11 +214,11 @@ class Planner:
             if cancelled():
                 raise SearchCancelledError
             done, share = sum(shares[: len(record)]), shares[len(record)]
-            report = until_cancelled(cancelled, self.progress)
-            with reporting(cost, report, done=done, share=share, total=total):
-                record.append(self._iterate(search, cost, space))
+            report = raise_if_cancelled(cancelled, self.progress)
+            with report_progress(cost, report, done=done, share=share, total=total):
+                record.append(self._run_iteration(search, cost, space))
         stopped: Stopped = "finished" if len(record) == len(shares) else "out of time"
-        actions, energy, evaluated = _chosen(search.result(), record, cost, space, lowest=stopped == "out of time")
+        actions, energy, evaluated = _select_plan(search.result(), record, cost, space, lowest=stopped == "out of time")
         if actions is None:
             actions, stopped = torch.zeros(space.steps, space.dim), "no finite energy"
         return Plan(
@@ -234,20 +234,20 @@ class Planner:
             seconds=self.clock() - began,
         )
 
-    def _iterate(self, search: Solver, cost: Cost, space: SearchSpace) -> Iteration:
+    def _run_iteration(self, search: Solver, cost: Cost, space: SearchSpace) -> Iteration:
         began = self.clock()
         decisions = search.sample()
-        plans = _evaluated(cost, decisions, space, gradients=search.uses_gradients)
-        best = plans.best(search.elites)
+        plans = _evaluate(cost, decisions, space, gradients=search.uses_gradients)
+        best = plans.select_best(search.elites)
         search.update(plans)
         counts = len(decisions), len(plans.energies)
         return Iteration(*counts, best.decisions, best.energies, search.mean, search.std, self.clock() - began)
 
 
-def _evaluated(cost: Cost, decisions: Samples, space: SearchSpace, *, gradients: bool) -> EvaluatedPlans:
+def _evaluate(cost: Cost, decisions: Samples, space: SearchSpace, *, gradients: bool) -> EvaluatedPlans:
     decisions = decisions.detach().requires_grad_(gradients)
     with torch.set_grad_enabled(gradients):
-        energies = cost(space.over_steps(decisions))
+        energies = cost(space.repeat_over_steps(decisions))
         if energies.shape != (len(decisions),):
             raise ValueError(f"energies of shape {tuple(energies.shape)} for {len(decisions)} action sequences")
         finite = torch.isfinite(energies)
@@ -259,7 +259,7 @@ def _evaluated(cost: Cost, decisions: Samples, space: SearchSpace, *, gradients:
     return EvaluatedPlans(decisions.detach()[finite], energies.detach().float().cpu()[finite], gradient)
 
 
-def _chosen(
+def _select_plan(
     answer: Tensor | None, record: list[Iteration], cost: Cost, space: SearchSpace, *, lowest: bool
 ) -> tuple[Float[Tensor, "steps dim"] | None, float, int]:
     """Return actions, their energy, and the number of extra evaluations.
@@ -273,10 +273,10 @@ def _chosen(
     for decisions in (answer, best):
         if decisions is None or (chosen is not None and not lowest):
             continue
-        finished, energies = space.finished(decisions), [best_iteration.lowest]
+        finished, energies = space.finalize(decisions), [best_iteration.lowest]
         if decisions is not best or not torch.equal(finished, decisions):
-            energies = _evaluated(cost, finished[None], space, gradients=False).energies.tolist()
+            energies = _evaluate(cost, finished[None], space, gradients=False).energies.tolist()
             evaluated += 1
         if energies and not energies[0] >= lowest_energy:
-            chosen, lowest_energy = space.over_steps(finished), energies[0]
+            chosen, lowest_energy = space.repeat_over_steps(finished), energies[0]
     return chosen, lowest_energy, evaluated

@@ -58,7 +58,7 @@ class SearchSpace:
         """The standard deviation of the first samples, zero where a component is fixed."""
         return torch.where(self.lower < self.upper, self.std, 0.0)
 
-    def allowed(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch decisions dim"]:
+    def clip(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch decisions dim"]:
         """Return each decision, clipped to the limits; the result is always allowed, and NaN becomes the allowed zero.
 
         If dx, dy and dz exceed the limit of the L1 norm, they are scaled down together.
@@ -71,45 +71,47 @@ class SearchSpace:
         share = (self.l1 * (1 - _ROUNDING) / length).clamp(max=1.0)
         return torch.cat([clipped[..., :3] * share, clipped[..., 3:]], dim=-1)
 
-    def finished(self, decisions: Float[Tensor, "decisions dim"]) -> Float[Tensor, "decisions dim"]:
+    def finalize(self, decisions: Float[Tensor, "decisions dim"]) -> Float[Tensor, "decisions dim"]:
         """Return decisions as a robot receives them: allowed, with small changes of the gripper rounded to zero.
 
         Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, round_small_elements.
         """
-        rounded = self.allowed(decisions)
+        rounded = self.clip(decisions)
         if self.gripper is not None:
             gripper = rounded[:, self.gripper]
             rounded[:, self.gripper] = torch.where(gripper.abs() < self.gripper_rounding, 0.0, gripper)
         return rounded
 
-    def over_steps(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch steps dim"]:
+    def repeat_over_steps(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch steps dim"]:
         """Return the action of each model step."""
         return decisions.repeat_interleave(self.repeat, dim=-2)
 
 
-def search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
+def make_search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
     """Return the allowed changes of a state: poses within the limits of an arm, vectors within `limits.axes`.
 
     Raises:
         InputError: There are no limits for a vector, or their number is wrong.
     """
     if space.is_pose:
-        return pose_space(config)
+        return make_pose_search_space(config)
     limits, width = config.limits.axes, len(space)
     if not isinstance(limits, tuple) or len(limits) not in {1, width}:
-        without_record = "data, for a model without a record of the motions in its training data"
+        without_record = "data, but the model has no record of the motions in its training data"
         found = without_record if limits == "data" else f"{limits}"
-        needed = f"the largest change of each of the {width} numbers in a model step, or one for all, such as [0.05]"
+        needed = (
+            f"the largest change in a model step for each of the {width} numbers, or one value for all, such as [0.05]"
+        )
         raise InputError(where="planning.limits.axes", found=found, needed=needed)
-    upper = _towards_zero(list(limits) * (width // len(limits))).repeat(config.horizon // config.action_repeat, 1)
+    upper = _round_towards_zero(list(limits) * (width // len(limits))).repeat(config.horizon // config.action_repeat, 1)
     return SearchSpace(-upper, upper, upper, config.action_repeat)
 
 
-def pose_space(config: PlanningConfig) -> SearchSpace:
+def make_pose_search_space(config: PlanningConfig) -> SearchSpace:
     """Return the allowed actions of an arm: dx, dy, dz, three rotations, gripper (see `vjepa2_ac.episode`)."""
     limits, decisions = config.limits, config.horizon // config.action_repeat
     gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
-    reach = _towards_zero([*limits.xyz_m, *[limits.rotation] * 3, gripper])
+    reach = _round_towards_zero([*limits.xyz_m, *[limits.rotation] * 3, gripper])
     upper = reach.repeat(decisions, 1)
     lower = -upper
     if limits.gripper_mode in {"open", "close"}:
@@ -127,7 +129,7 @@ def pose_space(config: PlanningConfig) -> SearchSpace:
     )
 
 
-def _towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
+def _round_towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
     """Return values in float32, rounded towards zero, so that no limit is exceeded: float32's 0.05 is above 0.05."""
     exact = torch.tensor(values, dtype=torch.float64)
     nearest = exact.float()
@@ -145,7 +147,7 @@ class Workspace:
     high: Float[np.ndarray, " 3"]
 
     @classmethod
-    def of(cls, limits: LimitsConfig, space: StateSpace) -> Workspace | None:
+    def from_limits(cls, limits: LimitsConfig, space: StateSpace) -> Workspace | None:
         """Return the box of `planning.limits.workspace`; None: there is none.
 
         Raises:
@@ -155,14 +157,15 @@ class Workspace:
             return None
         if not space.is_base_pose:
             found = "a model whose states are not poses in the robot base frame"
-            fix = "Bound a vector by planning.limits.axes, and by the limits of the robot's own controller"
-            raise InputError(where="planning.limits.workspace", found=found, needed="no box", fix=fix)
+            fix = "Limit vector states with planning.limits.axes and in the robot's own controller"
+            raise InputError(where="planning.limits.workspace", found=found, needed="no workspace", fix=fix)
         return cls(*(np.array(corner, dtype=np.float64) for corner in limits.workspace))
 
-    def narrowed(self, space: SearchSpace, state: Float[np.ndarray, " 7"]) -> SearchSpace:
+    def narrow(self, space: SearchSpace, state: Float[np.ndarray, " 7"]) -> SearchSpace:
         """Return a search space whose first decision stays inside the box in each model step of its repetition.
 
-        From a position outside along an axis, motions farther outwards are excluded; `kept` adds the motion inwards.
+        From a position outside along an axis, motions farther outwards are excluded. `clip_actions` adds the motion
+        inwards.
         """
         lower, upper = space.lower.clone(), space.upper.clone()
         lowest = torch.from_numpy(np.minimum(self.low - state[:3], 0.0)).float() / space.repeat
@@ -171,7 +174,7 @@ class Workspace:
         upper[0, :3] = torch.minimum(upper[0, :3], highest)
         return replace(space, lower=lower, upper=upper)
 
-    def kept(
+    def clip_actions(
         self, state: Float[np.ndarray, " 7"], actions: Float[np.ndarray, "steps 7"], limits: LimitsConfig
     ) -> Float[np.ndarray, "steps 7"]:
         """Return actions whose target positions are all inside the box.
@@ -190,16 +193,16 @@ class Workspace:
         for action in kept:
             motion = np.clip(position + action[:3], self.low, self.high) - position
             if abs(motion - action[:3]).max() > _NEAR_M:
-                action[:3] = _shortened(np.clip(motion, -reach, reach), self.way_back(position), limits.l1)
+                action[:3] = _shorten_to_l1(np.clip(motion, -reach, reach), self.get_return_motion(position), limits.l1)
             position = position + action[:3]
         return kept
 
-    def way_back(self, position: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    def get_return_motion(self, position: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Return the shortest motion that ends inside the box; zeros for a position inside."""
         return np.asarray(np.clip(position, self.low, self.high) - position)
 
 
-def _shortened(
+def _shorten_to_l1(
     motion: Float[np.ndarray, " 3"], shortest: Float[np.ndarray, " 3"], l1: float | None
 ) -> Float[np.ndarray, " 3"]:
     """Return a motion whose L1 norm is within its limit, and that still ends inside the workspace.
@@ -219,7 +222,7 @@ def _shortened(
     return np.asarray(shortest + beyond * min(1.0, max(allowed, 0.0) / max(length, _NEAR_M)))
 
 
-def is_allowed(way: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
+def is_within_limits(way: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
     """Return whether motions of the flange are within the limits of each axis and of the L1 norm."""
     longest = np.inf if limits.l1 is None else limits.l1
     return bool((abs(way) <= np.array(limits.xyz_m) + slack_m).all() and (abs(way).sum(-1) <= longest + slack_m).all())

@@ -23,7 +23,7 @@ from vjepa2_ac.storage.structured import parse_record, read_json_object
 
 logger = logging.getLogger(__name__)
 
-USED = (
+USED_KEYS = (
     "planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype",
     "training.device", *MOVABLE_PATHS,
 )  # fmt: skip
@@ -31,7 +31,7 @@ _ANY_TYPE = "training.precision=bf16"  # allows any model.dtype: the rule about 
 _SLACK = 1.1  # the 99th percentile of uniform motion is below its maximum, and is inexact for few episodes
 
 
-def planning_settings(
+def load_planning_config(
     subject: str, *, config: str | Path | None = None, overrides: Sequence[str] = (), dtype: str = "float32"
 ) -> Config:
     """Return the config for planning: the run's config; for a model the given config, or the defaults.
@@ -48,10 +48,11 @@ def planning_settings(
     _require_relevant(subject, overrides)
     if is_run(subject):
         if config is not None:
-            found, fix = f"{subject}, a run, which has a config of its own", "Change single settings by key=value"
+            found = f"{subject} is a run, and the config of a run is used"
+            fix = "Leave --config out, and override single settings with key=value"
             raise InputError(where=f"--config {config}", found=found, fix=fix)
         folder = Path(subject)
-        settings = with_taught_limits(read_run_config(folder, [*overrides, _ANY_TYPE]), folder)
+        settings = resolve_data_limits(read_run_config(folder, [*overrides, _ANY_TYPE]), folder)
     elif config is None:
         settings = config_of_model(subject, overrides, dtype=dtype)
     else:
@@ -93,8 +94,8 @@ def read_axes(path: str | Path) -> AxesFile:
     values = read_json_object(path, needed=needed, fix=_FIX)
     axes = parse_record(AxesFile, values, where=where, needed=needed, fix=_FIX)
     if axes.problem is not None:
-        fix = "Record varied moves and fit to more pairs (--limit); or the model does not see the actions: adapt it"
-        raise InputError(where=where, found=f"axes that are {axes.problem}", fix=fix)
+        fix = "Record more diverse motions and use more pairs (--limit). If this does not help, fine-tune the model"
+        raise InputError(where=where, found=f"axes that cannot be used: {axes.problem}", fix=fix)
     return axes
 
 
@@ -105,19 +106,19 @@ def require_base_frame(where: str, *, is_base: bool) -> None:
         InputError: The states are not such poses.
     """
     if not is_base:
-        found = "states that are no poses in the robot's base frame"
-        needed = "data.states: pose and data.pose_frame: base, whose vertical axis moves are turned about"
+        found = "states that are not poses in the robot's base frame"
+        needed = "data.states: pose and data.pose_frame: base"
         raise InputError(where=where, found=found, needed=needed)
 
 
-def require_axes_in(data: DataConfig) -> None:
+def require_calibratable(data: DataConfig) -> None:
     """Refuse data whose axes cannot be calibrated, before a model is loaded.
 
     Raises:
         InputError: The states are not poses in the base frame, or the stride is not chosen yet.
     """
     require_base_frame("data calibrate --axes", is_base=_is_base_pose(data))
-    require_stride(data, to="calibrate axes, for axes are those of a model step")
+    require_stride(data, to="calibrate axes")
 
 
 def _is_base_pose(data: DataConfig) -> bool:
@@ -135,15 +136,19 @@ def _require_relevant(subject: str, overrides: Sequence[str]) -> None:
         except KeyError:  # an unknown key; loading the config reports it
             continue
         if sets_movable_path(override) and not is_run(subject):
-            found = f"{subject}, which is not the folder of a run"
-            raise InputError(where=f"override {override}", found=found, needed="a run, whose base was moved")
+            found = f"{subject} is not the folder of a run"
+            raise InputError(
+                where=f"override {override}", found=found, needed="the folder of a run, to change this path"
+            )
         if not is_relevant:
             found = "a setting that planning does not use"
-            raise InputError(where=f"override {override}", found=found, needed=f"one of {', '.join(USED)}")
+            raise InputError(where=f"override {override}", found=found, needed=f"one of {', '.join(USED_KEYS)}")
 
 
 def require_limits(config: Config) -> None:
-    """Refuse `planning.limits.xyz: data` for poses if no run has recorded its motions (vectors: see `search_space`).
+    """Refuse `planning.limits.xyz: data` for poses if no run recorded the motions in its data.
+
+    `make_search_space` checks the limits of vectors.
 
     Raises:
         InputError: As `LimitsConfig.xyz_m`.
@@ -153,15 +158,16 @@ def require_limits(config: Config) -> None:
 
 
 @dataclass(frozen=True)
-class Taught:
+class DataLimits:
     """Statistics of the motions in a run's training data."""
 
     # 99th percentile of the absolute change of each number in a model step
     changes: tuple[Annotated[float, Field(ge=0.0, allow_inf_nan=False)], ...]
-    narrow: str = ""  # why the data have a low diversity; empty: they do not, or this is unknown
+    # why the data have a low diversity; empty: they do not, or this is unknown
+    low_diversity: Annotated[str, Field(validation_alias="narrow")] = ""
 
 
-def taught_in(folder: Path, *, poses: bool) -> Taught | None:
+def read_data_limits(folder: Path, *, is_pose: bool) -> DataLimits | None:
     """Read the statistics of the motions in a run's training data; None: the run has none, as older runs of poses.
 
     Raises:
@@ -171,78 +177,86 @@ def taught_in(folder: Path, *, poses: bool) -> Taught | None:
     if not path.is_file():
         return None
     values = {name: value for name, value in read_json_object(path).items() if name in {"changes", "narrow"}}
-    taught = parse_record(Taught, values, where=str(path), needed="a number of 0 or more for each of the state's")
-    if poses and (len(taught.changes) != len(POSE) or max(taught.changes[:3]) > REACH_M):
+    data_limits = parse_record(
+        DataLimits, values, where=str(path), needed="one number of 0 or more per component of a state"
+    )
+    if is_pose and (len(data_limits.changes) != len(POSE) or max(data_limits.changes[:3]) > REACH_M):
         needed = f"{len(POSE)} numbers: {', '.join(POSE.change_names)}, positions in metres"
-        raise InputError(where=str(path), found=str(taught.changes), needed=needed)
-    return taught
+        raise InputError(where=str(path), found=str(data_limits.changes), needed=needed)
+    return data_limits
 
 
-def with_taught_limits(config: Config, folder: Path) -> Config:
+def resolve_data_limits(config: Config, folder: Path) -> Config:
     """Return the config of a run with `data` in `planning.limits` replaced by the recorded limits, if there are any.
 
     Raises:
-        InputError: As `taught_in`.
+        InputError: As `read_data_limits`.
     """
-    limits, poses = config.planning.limits, config.data.states == "pose"
-    if (limits.xyz if poses else limits.axes) != "data" or (taught := taught_in(folder, poses=poses)) is None:
+    limits, is_pose = config.planning.limits, config.data.states == "pose"
+    if (limits.xyz if is_pose else limits.axes) != "data" or (
+        data_limits := read_data_limits(folder, is_pose=is_pose)
+    ) is None:
         return config
     # Rounded down to 0.1 mm, so that an axis with nothing but measurement noise is fixed.
-    metres = tuple(math.floor(1e4 * change) / 1e4 for change in taught.changes[:3])
-    numbers = {"xyz": metres} if poses else {"axes": taught.changes}
+    metres = tuple(math.floor(1e4 * change) / 1e4 for change in data_limits.changes[:3])
+    numbers = {"xyz": metres} if is_pose else {"axes": data_limits.changes}
     planning = config.planning.model_copy(update={"limits": limits.model_copy(update=numbers)})
     return config.model_copy(update={"planning": planning})
 
 
-def warn_beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
+def warn_if_limits_exceed_data(config: Config, folder: Path) -> tuple[str, ...]:
     """Log and return warnings if a run was trained on low-diversity data, or if the limits exceed the data's motions.
 
-    Limits are compared with the 99th percentile of each number's change, which they may exceed by 10 %.
+    Each limit is compared with the 99th percentile of each number's change, which it may exceed by 10 %.
 
     Args:
         config: The config of the run, with the limits for planning.
         folder: The folder of the run.
 
     Raises:
-        InputError: As `taught_in`.
+        InputError: As `read_data_limits`.
     """
-    poses = config.data.states == "pose"
-    if (taught := taught_in(folder, poses=poses)) is None:
+    is_pose = config.data.states == "pose"
+    if (data_limits := read_data_limits(folder, is_pose=is_pose)) is None:
         return ()
-    warnings = [f"{folder} learned from narrow data: {taught.narrow}"] if taught.narrow else []
-    names = POSE.change_names if poses else vector_states(len(taught.changes)).names
-    reach = _reach(config.planning.limits, taught, poses=poses)
-    for key, (unit, factor, numbers) in (_OF_POSES if poses else _OF_VECTORS).items():
+    warnings = (
+        [f"{folder} was trained on low-diversity data: {data_limits.low_diversity}"]
+        if data_limits.low_diversity
+        else []
+    )
+    names = POSE.change_names if is_pose else vector_states(len(data_limits.changes)).names
+    reach = _largest_changes(config.planning.limits, data_limits, is_pose=is_pose)
+    for key, (unit, factor, numbers) in (_POSE_LIMITS if is_pose else _VECTOR_LIMITS).items():
         beyond = [
             f"{name} {factor * limit:.3g} ({factor * change:.3g}){unit}"
-            for name, limit, change in list(zip(names, reach, taught.changes, strict=False))[numbers]
+            for name, limit, change in list(zip(names, reach, data_limits.changes, strict=False))[numbers]
             if limit > _SLACK * change
         ]
         if beyond:
             name = f"planning.limits.{key}"
-            fix = f"{name}=data stays within" if key in {"xyz", "axes"} else f"lower {name}"
+            fix = f"Set {name}=data" if key in {"xyz", "axes"} else f"Lower {name}"
             warnings.append(
                 f"{name} exceeds the motions in the training data of {folder}: {', '.join(beyond)} (99th percentile of"
-                f" the data in parentheses). Predictions beyond it are unreliable; {fix}"
+                f" the data in parentheses). Predictions for larger motions are unreliable. {fix}"
             )
     for text in warnings:
         logger.warning(text)
     return tuple(warnings)
 
 
-_OF_POSES = {  # config key: displayed unit, its factor, and the numbers of a state that the key limits
+_POSE_LIMITS = {  # config key: displayed unit, its factor, and the numbers of a state that the key limits
     "xyz": (" cm", 100.0, slice(0, 3)),
     "rotation": (" degrees", 180 / math.pi, slice(3, 6)),
     "gripper": ("", 1.0, slice(6, 7)),
 }
-_OF_VECTORS = {"axes": ("", 1.0, slice(None))}
+_VECTOR_LIMITS = {"axes": ("", 1.0, slice(None))}
 
 
-def _reach(limits: LimitsConfig, taught: Taught, *, poses: bool) -> Sequence[float]:
+def _largest_changes(limits: LimitsConfig, data_limits: DataLimits, *, is_pose: bool) -> Sequence[float]:
     """Return the largest change of each number in a model step; empty if the limits do not define one for each."""
-    if not poses:
-        axes = limits.axes if isinstance(limits.axes, tuple) else taught.changes
-        axes = axes * len(taught.changes) if len(axes) == 1 else axes
-        return axes if len(axes) == len(taught.changes) else ()
+    if not is_pose:
+        axes = limits.axes if isinstance(limits.axes, tuple) else data_limits.changes
+        axes = axes * len(data_limits.changes) if len(axes) == 1 else axes
+        return axes if len(axes) == len(data_limits.changes) else ()
     gripper = limits.gripper if limits.gripper_mode in {"rounded", "free"} else 0.0
     return [*limits.xyz_m, *[limits.rotation] * 3, gripper]

@@ -21,7 +21,7 @@ from vjepa2_ac.config.section import Positive, PositiveInt, Section, Share, Zero
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.search_space import SearchSpace
 
-_NARROWEST = 0.1  # lower bound on the std from a prior, relative to the usual std: a prior is overconfident
+_MIN_PRIOR_STD = 0.1  # lower bound on the std from a prior, relative to the usual std: a prior is overconfident
 Momentum = float | Tensor  # share of the old mean or standard deviation in the new one
 Elites = Annotated[int, Field(ge=2)]
 
@@ -35,14 +35,14 @@ class PlanStart:
     std: Float[Tensor, "decisions dim"] | None = None  # None: the planner's
 
     @classmethod
-    def of_samples(cls, samples: Float[Tensor, "samples steps dim"], space: SearchSpace) -> PlanStart:
+    def from_samples(cls, samples: Float[Tensor, "samples steps dim"], space: SearchSpace) -> PlanStart:
         """Return the mean and the standard deviation of actions that a policy proposes.
 
         Raises:
             InputError: The actions have fewer model steps than a plan, or another number of components.
         """
         if samples.ndim != 3 or not len(samples) or samples.shape[1] < space.steps or samples.shape[2] != space.dim:
-            needed = f"one or more, of {counted(space.steps, 'model step')} or more and {space.dim} numbers"
+            needed = f"one or more samples with at least {counted(space.steps, 'model step')} of {space.dim} numbers"
             raise InputError(where="samples of a policy", found=f"shape {tuple(samples.shape)}", needed=needed)
         steps = samples[:, : space.steps].float()
         decisions = reduce(
@@ -51,7 +51,7 @@ class PlanStart:
         return cls(decisions.mean(dim=0), decisions, decisions.std(dim=0, correction=0))
 
 
-Before = PlanStart | None
+OptionalStart = PlanStart | None
 Samples = Float[Tensor, "samples decisions dim"]
 
 
@@ -63,7 +63,7 @@ class EvaluatedPlans:
     energies: Float[Tensor, " finite"]
     gradients: Samples | None = None  # for all samples; 0 where the energy is not finite
 
-    def best(self, count: int) -> EvaluatedPlans:
+    def select_best(self, count: int) -> EvaluatedPlans:
         """Return the decisions of lowest energy, best first; fewer if there are not enough."""
         order = self.energies.sort(stable=True).indices[:count]
         return EvaluatedPlans(self.decisions[order], self.energies[order])
@@ -90,14 +90,14 @@ class Solver:
         space: SearchSpace,
         config: PlanningConfig,
         generator: Generator,
-        start: Before = None,
+        start: OptionalStart = None,
         options: Any = None,
     ) -> None:
         self._space, self._config, self._generator, self._options = space, config, generator, options
-        self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
-        self.std = space.first_std * self._for_gripper(getattr(options, "start_std", 1.0), gripper=1.0)
+        self.mean = space.clip(torch.zeros_like(space.lower) if start is None else start.mean)
+        self.std = space.first_std * self._fill_action(getattr(options, "start_std", 1.0), gripper=1.0)
         if start is not None and start.std is not None:
-            self.std = torch.minimum(torch.maximum(start.std, _NARROWEST * self.std), self.std)
+            self.std = torch.minimum(torch.maximum(start.std, _MIN_PRIOR_STD * self.std), self.std)
         self.begin(start)
 
     @property
@@ -105,7 +105,7 @@ class Solver:
         """Number of best decisions that are recorded."""
         return int(getattr(self._options, "elites", ELITES))
 
-    def begin(self, start: Before) -> None:
+    def begin(self, start: OptionalStart) -> None:
         """Prepare the search from its start."""
 
     def num_samples(self, iteration: int) -> int:  # noqa: ARG002 - the same in all iterations
@@ -124,19 +124,21 @@ class Solver:
         """Return the current result; None: the best evaluated decisions."""
         return None
 
-    def _for_gripper(self, others: float, *, gripper: float) -> Float[Tensor, " dim"]:
+    def _fill_action(self, others: float, *, gripper: float) -> Float[Tensor, " dim"]:
         """Return a vector with `others` for each component of an action and `gripper` for the gripper."""
         numbers = torch.full((self._space.dim,), others)
         if self._space.gripper is not None:
             numbers[self._space.gripper] = gripper
         return numbers
 
-    def _around_mean(self, *, try_mean: bool) -> Samples:
-        noise = white_noise(self._space, self._config.samples, self._generator)
+    def _sample_around_mean(self, *, try_mean: bool) -> Samples:
+        noise = draw_white_noise(self._space, self._config.samples, self._generator)
         noise[: int(try_mean)] = 0.0
-        return self._space.allowed(self.mean + self.std * noise)
+        return self._space.clip(self.mean + self.std * noise)
 
-    def _fit(self, best: Float[Tensor, "elites decisions dim"], keep_mean: Momentum, keep_std: Momentum) -> None:
+    def _fit_to_elites(
+        self, best: Float[Tensor, "elites decisions dim"], keep_mean: Momentum, keep_std: Momentum
+    ) -> None:
         """Move the distribution towards the elites; a single elite does not change the standard deviation."""
         if len(best):
             self.mean = keep_mean * self.mean + (1 - keep_mean) * best.mean(dim=0)
@@ -144,7 +146,7 @@ class Solver:
             self.std = keep_std * self.std + (1 - keep_std) * best.std(dim=0)
 
 
-def white_noise(space: SearchSpace, samples: int, generator: Generator) -> Samples:
+def draw_white_noise(space: SearchSpace, samples: int, generator: Generator) -> Samples:
     """Return independent standard normal numbers, zero on axes that are fixed in all decisions.
 
     Drawn decision by decision and for free axes only, in upstream's order: the same seed gives upstream's samples.
@@ -189,14 +191,14 @@ class CemSolver(Solver):
 
     def sample(self) -> Samples:
         """Return samples of the distribution, clipped to the allowed set."""
-        return self._around_mean(try_mean=self._options.try_mean)
+        return self._sample_around_mean(try_mean=self._options.try_mean)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Fit the distribution to the elites."""
         options = self._options
-        keep_mean = self._for_gripper(options.momentum_mean, gripper=options.momentum_mean_gripper)
-        keep_std = self._for_gripper(options.momentum_std, gripper=options.momentum_std_gripper)
-        self._fit(evaluated.best(self.elites).decisions, keep_mean, keep_std)
+        keep_mean = self._fill_action(options.momentum_mean, gripper=options.momentum_mean_gripper)
+        keep_std = self._fill_action(options.momentum_std, gripper=options.momentum_std_gripper)
+        self._fit_to_elites(evaluated.select_best(self.elites).decisions, keep_mean, keep_std)
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
         """Return the mean."""
@@ -226,10 +228,10 @@ class IcemSolver(Solver):
         kept: ZeroToOne = 0.3
         """Share of the elites that are reused, in the next iteration and, with warm_start, in the next decision."""
 
-    def begin(self, start: Before) -> None:
+    def begin(self, start: OptionalStart) -> None:
         """Reuse the elites of the previous decision."""
         self._iteration = 0
-        self._kept = self.mean[None][:0] if start is None else self._few(start.elites)
+        self._reused = self.mean[None][:0] if start is None else self._select_reused(start.elites)
 
     def num_samples(self, iteration: int) -> int:
         """Return the number of new decisions, which decreases in each iteration."""
@@ -238,27 +240,27 @@ class IcemSolver(Solver):
     def sample(self) -> Samples:
         """Return new samples, the reused elites, and in the last iteration the mean."""
         options, space = self._options, self._space
-        noise = coloured_noise(
+        noise = draw_coloured_noise(
             self.num_samples(self._iteration), space.decisions, space.dim, options.noise_exponent, self._generator
         )
-        evaluated = [self.mean + self.std * noise, self._kept]
+        evaluated = [self.mean + self.std * noise, self._reused]
         self._iteration += 1
         if self._iteration == self._config.iterations:
             evaluated.append(self.mean[None])
-        return space.allowed(torch.cat(evaluated))
+        return space.clip(torch.cat(evaluated))
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Fit the distribution to the elites, and keep some of them."""
-        best, keep = evaluated.best(self.elites).decisions, self._options.momentum
-        self._fit(best, keep, keep)
+        best, keep = evaluated.select_best(self.elites).decisions, self._options.momentum
+        self._fit_to_elites(best, keep, keep)
         if len(best):
-            self._kept = self._few(best)
+            self._reused = self._select_reused(best)
 
-    def _few(self, elites: Float[Tensor, "elites decisions dim"]) -> Float[Tensor, "kept decisions dim"]:
+    def _select_reused(self, elites: Float[Tensor, "elites decisions dim"]) -> Float[Tensor, "kept decisions dim"]:
         return elites[: round(self._options.kept * self.elites)]
 
 
-def coloured_noise(samples: int, decisions: int, dim: int, exponent: float, generator: Generator) -> Samples:
+def draw_coloured_noise(samples: int, decisions: int, dim: int, exponent: float, generator: Generator) -> Samples:
     """Return normal numbers of variance 1 with a power spectrum 1 / frequency^exponent along decisions; 0: white.
 
     The constant component has the power of the lowest frequency.
@@ -296,7 +298,7 @@ class MppiSolver(Solver):
 
     def sample(self) -> Samples:
         """Return the mean and samples around it."""
-        return self._around_mean(try_mean=True)
+        return self._sample_around_mean(try_mean=True)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Move the mean to the weighted mean of the samples."""
@@ -324,10 +326,13 @@ class PriorSolver(Solver):
         """Return one for the only iteration."""
         return int(iteration == 0)
 
-    def begin(self, start: Before) -> None:
+    def begin(self, start: OptionalStart) -> None:
         """Refuse a search without a prior."""
         if start is None:
-            found, needed = "prior, in a command that loads none", "a planner that searches, such as cem"
+            found, needed = (
+                "prior, but no action prior is loaded",
+                "planning.prior, or a planner that searches, such as cem",
+            )
             raise InputError(where="planning.planner", found=found, needed=needed)
 
     def sample(self) -> Samples:
@@ -361,17 +366,17 @@ class GradientSolver(Solver):
         """Number of recorded decisions: one for each descent."""
         return int(self._options.starts)
 
-    def begin(self, start: Before) -> None:
+    def begin(self, start: OptionalStart) -> None:
         """Draw the starting points of the descents."""
         space, config, options = self._space, self._config, self._options
-        noise = white_noise(space, options.starts, self._generator)
+        noise = draw_white_noise(space, options.starts, self._generator)
         noise[0] = 0.0
         origin = torch.zeros_like(space.lower)
         if start is not None:
             origin = start.elites[0] if len(start.elites) else start.mean
         half = (space.upper - space.lower) / 2
         self._unit = torch.where(half > 0, half, 1.0)
-        self._scaled = space.allowed(origin + self.std * noise) / self._unit
+        self._scaled = space.clip(origin + self.std * noise) / self._unit
         self._adam = torch.optim.Adam([self._scaled], lr=options.learning_rate)
         self._schedule = torch.optim.lr_scheduler.LambdaLR(
             self._adam, lambda step: max(0.0, 1 - step / config.iterations)
@@ -383,7 +388,7 @@ class GradientSolver(Solver):
 
     def sample(self) -> Samples:
         """Return the current decisions of each descent."""
-        return self._space.allowed(self._scaled * self._unit)
+        return self._space.clip(self._scaled * self._unit)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Take one gradient step.

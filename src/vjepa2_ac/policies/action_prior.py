@@ -162,12 +162,12 @@ class ActionPrior(nn.Module):
             remaining: Estimated number of model steps to the goal.
             space: The allowed actions.
         """
-        seen, state = cost.now
+        seen, state = cost.current
         decisions, spread = torch.zeros_like(space.lower), torch.zeros_like(space.lower)
         for number in range(space.decisions):
             done = number * space.repeat
             if done:
-                predicted, states = cost.imagine(space.over_steps(space.allowed(decisions))[None])
+                predicted, states = cost.rollout(space.repeat_over_steps(space.clip(decisions))[None])
                 seen, state = predicted[0, done - 1], states[0, done]
             decisions[number], spread[number] = self.next_action(seen, state, wanted, remaining - done)
         return PlanStart(decisions, decisions[None], spread)

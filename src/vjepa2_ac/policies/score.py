@@ -193,7 +193,7 @@ def score_policies(
             cameras than the controller has views, or chunks are invalid.
     """
     views, stride, space = controller.config.views, dataset.config.model_stride, controller.spaces.state
-    require_views(dataset.config, views, to="score policies at")
+    require_views(dataset.config, views, to="score policies")
     places = sorted(set.intersection(*(set(one.places) for one in policies)))
     if not places:
         raise InputError(where="--policy", found="no frame that all of them have", needed="the same places in all")
@@ -219,7 +219,7 @@ def score_policies(
         true, worse, rest = np.split(scored.energies, [1, 1 + len(others)])
         by_policy = np.split(rest, np.cumsum([len(one) for one in chunks])[:-1])
         of_chunks = [float(take(one)) for take in (np.mean, np.min) for one in by_policy]
-        energies.append(np.array([scored.doing_nothing, true[0], float((worse < true).mean()), *of_chunks]))
+        energies.append(np.array([scored.zero_action_energy, true[0], float((worse < true).mean()), *of_chunks]))
         progress(number + 1, len(kept))
     nothing, demonstrated, better, *of_policies = np.stack(energies).T
     means, bests = of_policies[: len(policies)], of_policies[len(policies) :]

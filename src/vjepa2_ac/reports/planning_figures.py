@@ -69,14 +69,14 @@ def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = No
 
 
 def _pictures(part: Any, answer: PlanResult) -> None:
-    goals = [goal.image for goal in answer.question.goals]
+    goals = [goal.image for goal in answer.request.goals]
     shown = sorted({*range(len(goals))[: _MOST_GOALS - 1], len(goals) - 1})
-    named = {"start": answer.question.start}
+    named = {"start": answer.request.start}
     named |= {f"goal {place + 1} of {len(goals)}" if len(goals) > 1 else "goal": goals[place] for place in shown}
     for axes, (name, picture) in zip(part.subplots(1, len(named), squeeze=False)[0], named.items(), strict=True):
         axes.imshow(picture)
-        if answer.question.mask is not None and name != "start":
-            hidden = np.where(answer.question.mask > 0, np.nan, 1.0)
+        if answer.request.mask is not None and name != "start":
+            hidden = np.where(answer.request.mask > 0, np.nan, 1.0)
             axes.imshow(hidden, cmap="gray", vmin=0, vmax=2, alpha=0.6)
         box = crop_box(picture.shape[0], picture.shape[1], answer.controller.crop)
         corner = box.left - 0.5, box.top - 0.5
@@ -144,8 +144,8 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
     axes.plot(numbers, elites, "o-", color=BLUE, markersize=3, label="mean of the best")
     axes.plot(numbers, lowest, "o--", color=BLUE, markersize=3, label="lowest")
     levels = {
-        "now": (answer.decision.energy_now, GREY, "-"),
-        "zero action": (answer.doing_nothing, GREY, ":"),
+        "now": (answer.decision.current_energy, GREY, "-"),
+        "zero action": (answer.zero_action_energy, GREY, ":"),
         "the plan": (plan.energy, RED, "--"),
     }
     for name, (level, colour, dashes) in levels.items():

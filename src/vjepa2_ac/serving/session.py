@@ -24,7 +24,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
-from vjepa2_ac.planning.search_space import Workspace, is_allowed
+from vjepa2_ac.planning.search_space import Workspace, is_within_limits
 from vjepa2_ac.policies.score import changes_of_chunks
 from vjepa2_ac.serving.recording import Recorder
 from vjepa2_ac.serving.request import IMAGE_KEYS, GoalRequest, Request, read_request
@@ -243,10 +243,15 @@ class Session:
         }  # fmt: skip
         if decision is not None:
             progress, plan = decision.progress, decision.plan
-            name = self._names[progress.place]
-            goal = {"index": progress.place, "name": name, "since": progress.since, "changed": progress.changed}
-            energy = {"now": decision.energy_now, "plan": None if plan is None else plan.energy}
-            reply |= {"goal": goal, "done": decision.done, "energy": energy}
+            name = self._names[progress.goal_index]
+            goal = {
+                "index": progress.goal_index,
+                "name": name,
+                "since": progress.start_step,
+                "changed": progress.changed,
+            }
+            energy = {"now": decision.current_energy, "plan": None if plan is None else plan.energy}
+            reply |= {"goal": goal, "done": decision.is_done, "energy": energy}
             if (surprise := decision.surprise) is not None:
                 reply["surprise"] = {"score": surprise.score, "is_alarm": surprise.is_alarm}
                 if surprise.is_alarm:
@@ -348,12 +353,12 @@ def find_limit_violation(
     if not space.is_pose:
         largest = np.array(limits.axes if isinstance(limits.axes, tuple) else (0.0,))
         return "a change exceeds planning.limits.axes" if (abs(changes) > largest + _ROUNDING).any() else ""
-    if not is_allowed(changes[:, :3], limits, _ROUNDING):
+    if not is_within_limits(changes[:, :3], limits, _ROUNDING):
         return "a translation exceeds planning.limits.xyz or l1"
     if (abs(changes[:, 3:6]) > min(limits.rotation + _ROUNDING, math.pi)).any():
         return "a rotation exceeds planning.limits.rotation"
     if abs(changes[:, 6]).max() > 1.0:  # opening and closing are changes of 1, independently of the limit
         return "a gripper change exceeds 1"
-    box, targets = Workspace.of(limits, space), state[:3] + np.cumsum(changes[:, :3], axis=0)
-    is_out = box is not None and changes[:, :3].any() and (abs(box.way_back(targets)) > _ROUNDING).any()
+    box, targets = Workspace.from_limits(limits, space), state[:3] + np.cumsum(changes[:, :3], axis=0)
+    is_out = box is not None and changes[:, :3].any() and (abs(box.get_return_motion(targets)) > _ROUNDING).any()
     return "a target is outside planning.limits.workspace" if is_out else ""
