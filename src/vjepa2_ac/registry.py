@@ -213,7 +213,7 @@ TRANSFORMS = Registry("transform", "vjepa2_ac.transforms", {})
 PLANNING_FILES = Registry(
     "file of planning",
     "",  # no entry points
-    {"prior": "policies.action_prior:read_for_planning", "monitor": "policies.monitor:read_for_planning"},
+    {"prior": "policies.action_prior:load_prior_for_planning", "monitor": "policies.monitor:load_monitor_for_planning"},
 )
 """Readers of the files that `planning` names and that packages beside the core make."""
 TRAINING_HOOKS = Registry(
@@ -221,7 +221,7 @@ TRAINING_HOOKS = Registry(
     "",  # no entry points
     {
         "data.stride": "inspection.variants:choose_stride",
-        "validation.decoder": "decoding.imagine:ImaginedStrip",
+        "validation.decoder": "decoding.imagine:ValidationStrip",
         "motion": "inspection.motion:warnings_from_index",
         "coverage": "inspection.coverage:coverage_in",
     },

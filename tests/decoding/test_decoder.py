@@ -104,7 +104,7 @@ def test_a_decoder_of_other_data_warns_with_both_data_sets(
     for (one, shown), is_own in fits.items():
         said = one.require_fit(model, DataConfig(path=str(shown)), subject="run")
         learned = SIMULATED if one is ours else str(own)
-        warning = f"The decoder {one.name} was trained on {learned}, not on {shown}: its images may be wrong."
+        warning = f"The decoder {one.name} was trained on {learned}, not on {shown}: its images may be inaccurate."
         assert said == (() if is_own else (warning,))
     monkeypatch.chdir(own.parent)
     assert decoder.require_fit(model, DataConfig(path=own.name), subject="run") == (), "the same folder"
@@ -149,7 +149,7 @@ def test_how_many_frames_are_decoded_at_once_does_not_matter(size: str) -> None:
 def test_a_decoder_begins_as_the_linear_one() -> None:
     linear, decoder, latents = decoder_of("linear", seed=3), decoder_of("tiny"), latents_of(3)
     assert not torch.equal(decoder(latents), linear(latents))
-    decoder.start_from(linear)
+    decoder.copy_linear(linear)
     assert torch.equal(decoder(latents), linear(latents))
     loss, _ = decoder_loss(decoder(latents), torch.rand(3, 3, 24, 24, generator=torch.Generator().manual_seed(4)))
     loss.backward()

@@ -12,7 +12,7 @@ from run_fixtures import MakeConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.transforms import crop_frames, input_to_pixels, pixels_to_input
 from vjepa2_ac.decoding.decoder import Decoder, DecoderShape
-from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, measure_decoders, wanted_frames
+from vjepa2_ac.decoding.frame_pairs import FramePairs, PairBatch, fit_linear, measure_decoders, select_frames
 from vjepa2_ac.encoding.latent_cache import needed_frames
 from vjepa2_ac.episode import no_progress
 from vjepa2_ac.errors import InputError
@@ -29,7 +29,7 @@ def test_pairs_are_what_the_encoder_saw_and_what_it_gave(
     numbers = [len(pairs) - 1, 0, 7]
     read, place = pairs.read(numbers), 0
     places = {}
-    for one in wanted_frames(dataset, "train", frames=20):
+    for one in select_frames(dataset, "train", frames=20):
         for step in one.steps.tolist():
             places[place] = (one.episode, step)
             place += 1
@@ -51,7 +51,7 @@ def test_frames_are_of_the_split_at_most_as_many_as_asked_and_spread(
     config = make_config(data__camera=["wrist_left", "exterior_1_left"])
     dataset = open_dataset(config.data)
     members = dataset.split_mask(split)  # type: ignore[arg-type]
-    wanted = wanted_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
+    wanted = select_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
     needed = {(one.episode, one.camera): set(one.steps.tolist()) for one in needed_frames(dataset)}
     there = sum(len(steps) for (episode, _), steps in needed.items() if members[episode])
     assert sum(len(one.steps) for one in wanted) == min(frames, there)
@@ -102,8 +102,8 @@ class Linear:
     def __len__(self) -> int:
         return self.frames
 
-    def read(self, numbers: list[int]) -> Pairs:
-        return Pairs(self.latents[list(numbers)], self.images[list(numbers)], ("",) * len(numbers))
+    def read(self, numbers: list[int]) -> PairBatch:
+        return PairBatch(self.latents[list(numbers)], self.images[list(numbers)], ("",) * len(numbers))
 
 
 def fit(pairs: Linear) -> Decoder:

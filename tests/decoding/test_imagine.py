@@ -10,7 +10,7 @@ from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.data.transforms import crop_frames, to_display_frames
 from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
-from vjepa2_ac.decoding.imagine import Start, rolled_out, shown
+from vjepa2_ac.decoding.imagine import Start, compute_rollout, decode_views
 from vjepa2_ac.evaluation.imagined import imagine_plan
 from vjepa2_ac.planning.counterfactual import make_named_actions
 from vjepa2_ac.spaces import POSE, counterfactual_states
@@ -37,7 +37,7 @@ def start_of(latents: Tensor, **more: Tensor) -> Start:
 
 def test_states_under_other_actions_are_integrated_from_the_first_one() -> None:
     latents, model = truth(), Remembering()
-    rolled_out(model.rollout, start_of(latents), make_named_actions("left", STEPS, size_m=0.03))
+    compute_rollout(model.rollout, start_of(latents), make_named_actions("left", STEPS, size_m=0.03))
     context, actions, states, extrinsics = model.given
     assert torch.equal(context, latents[None, :1]), "one frame"
     assert states.shape == actions.shape == (1, STEPS, 7)
@@ -48,7 +48,7 @@ def test_states_under_other_actions_are_integrated_from_the_first_one() -> None:
 
 def test_a_gripper_changes_as_far_as_it_can() -> None:
     model = Remembering()
-    rolled_out(model.rollout, start_of(truth()), make_named_actions("close", STEPS))
+    compute_rollout(model.rollout, start_of(truth()), make_named_actions("close", STEPS))
     _, actions, states, _ = model.given
     np.testing.assert_allclose(actions[0, :, 6].numpy(), [0.1, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(states[0, :, 6].numpy(), [0.9, 1, 1, 1], atol=1e-6)
@@ -56,14 +56,14 @@ def test_a_gripper_changes_as_far_as_it_can() -> None:
 
 def test_the_camera_of_the_first_frame_holds_for_all_steps() -> None:
     model, camera = Remembering(), torch.arange(6.0)
-    rolled_out(model.rollout, start_of(truth(), extrinsics=camera), make_named_actions("none", STEPS))
+    compute_rollout(model.rollout, start_of(truth(), extrinsics=camera), make_named_actions("none", STEPS))
     assert torch.equal(model.given[3], camera.expand(1, STEPS, 6))
 
 
 def test_known_states_are_given_as_they_are() -> None:
     model, actions = Remembering(), make_named_actions("up", STEPS)
     states = counterfactual_states(STATE, actions)[:-1] + 0.5
-    rolled_out(model.rollout, start_of(truth()), actions, states)
+    compute_rollout(model.rollout, start_of(truth()), actions, states)
     np.testing.assert_allclose(model.given[2][0].numpy(), states, atol=1e-6)
 
 
@@ -81,9 +81,9 @@ def test_the_imagined_steps_are_the_decoded_rollout_of_the_chosen_actions(decode
     with torch.no_grad():
         latents, _ = cost.rollout(plan.actions[None])
     assert list(found.steps) == [1, 2, 3]
-    assert np.array_equal(np.stack([*found.steps.values()]), shown(decoder.decoder, latents[0]))
+    assert np.array_equal(np.stack([*found.steps.values()]), decode_views(decoder.decoder, latents[0]))
     encoded = torch.stack([answer.controller.encode(image(seed)) for seed in (0, 101)])
-    assert np.array_equal(np.stack([found.start, found.decoded_goal]), shown(decoder.decoder, encoded))
+    assert np.array_equal(np.stack([found.start, found.decoded_goal]), decode_views(decoder.decoder, encoded))
     assert np.array_equal(found.goal, to_display_frames(crop_frames(image(101)[None]), 48)[0])
 
 

@@ -15,8 +15,8 @@ from killable import KILLED, Nursery
 from run_fixtures import TINY, MakeConfig, SilentReporter, as_yaml
 from vjepa2_ac.config import DecoderConfig, ModelSizes
 from vjepa2_ac.decoding import training
-from vjepa2_ac.decoding.decoder import CARD, WEIGHTS, as_images, load_decoder, read_card
-from vjepa2_ac.decoding.frame_pairs import Pairs
+from vjepa2_ac.decoding.decoder import CARD, WEIGHTS, load_decoder, read_card, to_images
+from vjepa2_ac.decoding.frame_pairs import PairBatch
 from vjepa2_ac.decoding.training import DecoderSteps, learning_rate_at, train_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import psnr
@@ -44,7 +44,7 @@ def test_it_memorises_four_frames(make_decoder: MakeConfig, encode_split: Encode
     config = make_decoder(knobs={"frames": 4, "steps": 80}, data__cache_dtype="fp32")
     pairs = encode_split(config, frames=4).read(range(4))
     decoder = load_decoder(train_decoder(config)).decoder
-    assert psnr(decoder.decode(pairs.latents), as_images(pairs.images)).min() > 30
+    assert psnr(decoder.decode(pairs.latents), to_images(pairs.images)).min() > 30
 
 
 # ---- whatever happens ----------------------------------------------------------------------------------------------
@@ -54,16 +54,16 @@ def test_it_memorises_four_frames(make_decoder: MakeConfig, encode_split: Encode
 def test_a_training_that_was_asked_to_stop_resumes_exactly(
     make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    learn = DecoderSteps.do
+    learn = DecoderSteps.run
 
-    def step(self: object, number: int, pairs: Pairs) -> dict:
+    def step(self: object, number: int, pairs: PairBatch) -> dict:
         if number == 3:
             os.kill(os.getpid(), signal.SIGTERM)
         return learn(self, number, pairs)  # type: ignore[arg-type]
 
     config = make_decoder()
     with monkeypatch.context() as patch:
-        patch.setattr(DecoderSteps, "do", step)
+        patch.setattr(DecoderSteps, "run", step)
         with pytest.raises(StoppedError, match="stopped after step 3"):
             train_decoder(config)
     assert not (tmp_path / "decoder" / CARD).exists()

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, DecoderShape, TrainedDecoder, as_pixels
+from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, DecoderShape, TrainedDecoder, to_pixels
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.decoded import (
     DECODED_PERSISTENCE,
@@ -41,7 +41,7 @@ def clips(batch: LatentBatch, trained: TrainedDecoder, size: int = 4, noise: flo
     """Return clips whose true frames are the decoder's images with some noise that it cannot draw."""
     images = trained.decoder.decode(batch.latents)
     drawn = torch.randn(images.shape[-3:], generator=torch.Generator().manual_seed(4))
-    frames = as_pixels(images + noise * drawn)
+    frames = to_pixels(images + noise * drawn)
     places = {name: place for place, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True))}
 
     def read(names):  # type: ignore[no-untyped-def]

@@ -12,7 +12,7 @@ from decoders import whole_decoder  # noqa: F401 - a fixture
 from run_fixtures import MakeConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_windows
-from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined
+from vjepa2_ac.decoding.imagine import AS_RECORDED, DecodedRollout, RolloutComparison
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import imagined
 from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
@@ -22,12 +22,12 @@ from vjepa2_ac.simulation.counterfactual import simulated_outcome
 from vjepa2_ac.spaces import actions_from_states
 
 STEPS = 3
-Imagine = Callable[..., Imagination]
+Imagine = Callable[..., RolloutComparison]
 
 
 @pytest.fixture
 def imagine(whole_run: Path, whole_decoder: Path) -> Imagine:  # noqa: F811 - the fixture
-    def of(subject: Path = whole_run, **asked: object) -> Imagination:
+    def of(subject: Path = whole_run, **asked: object) -> RolloutComparison:
         options = {"decoder": str(whole_decoder), "steps": STEPS, **asked}
         return imagine_clip(str(subject), ImagineOptions(**options))  # type: ignore[arg-type]
 
@@ -63,7 +63,7 @@ def true_latents(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
     return found
 
 
-def named(imagination: Imagination) -> dict[tuple[str, str], Imagined]:
+def named(imagination: RolloutComparison) -> dict[tuple[str, str], DecodedRollout]:
     return {(one.model, one.name): one for one in imagination.rollouts}
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from vjepa2_ac.decoding.imagine import Start, rolled_out
+from vjepa2_ac.decoding.imagine import Start, compute_rollout
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.explore.explorer import MAX_STEPS, Explorer, RolloutPosition
 from vjepa2_ac.explore.views import Views
@@ -18,7 +18,7 @@ def rollout(explorer: Explorer, model_index: int, position: RolloutPosition) -> 
     first = explorer.get_observation(position.episode, position.start)
     start = Start(first.latents, first.state, explorer.spaces.state)
     with explorer.evaluated_models[model_index].prediction_context():
-        return rolled_out(explorer.get_model(model_index).rollout, start, np.array(position.actions))[-1]
+        return compute_rollout(explorer.get_model(model_index).rollout, start, np.array(position.actions))[-1]
 
 
 def recorded_path(explorer: Explorer, steps: int) -> RolloutPosition:

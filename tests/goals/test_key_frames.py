@@ -6,13 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vjepa2_ac.goals.key_frames import (
-    OF_MODEL_STEPS,
+    MODEL_STEP_RULE,
     KeyFrame,
     Timing,
-    every_key_frame,
-    gripper_key_frames,
-    sub_goals_of,
-    with_frames_between,
+    add_frames_between,
+    find_gripper_key_frames,
+    make_sub_goals,
+    select_every_nth_frame,
 )
 
 
@@ -28,7 +28,7 @@ def way(*parts: tuple[int, float, float]) -> np.ndarray:
 
 
 def named(states: np.ndarray) -> list[tuple[int, str]]:
-    return [(key.frame, key.name) for key in gripper_key_frames(states)]
+    return [(key.frame, key.name) for key in find_gripper_key_frames(states)]
 
 
 GO, LIFT = (10, 0.2, 0), (9, 0.2, 0)  # without the gripper
@@ -68,15 +68,15 @@ def test_key_frames_are_where_the_gripper_changes_and_the_arm_stops(parts: tuple
 def test_key_frames_ascend_leave_out_the_start_and_are_few(parts: list) -> None:
     states = way(*parts)
     states[:, 6] = np.abs((states[:, 6] + 1) % 2 - 1)  # to and fro between 0 and 1
-    for rule in (None, OF_MODEL_STEPS):
-        frames = [key.frame for key in gripper_key_frames(states, rule)]
+    for rule in (None, MODEL_STEP_RULE):
+        frames = [key.frame for key in find_gripper_key_frames(states, rule)]
         assert frames == sorted(set(frames))
         assert 0 < frames[0] <= frames[-1] < len(states)
 
 
 @given(st.integers(2, 60), st.integers(1, 20))
 def test_every_so_many_frames_end_with_the_last(frames: int, step: int) -> None:
-    found = [key.frame for key in every_key_frame(frames, step)]
+    found = [key.frame for key in select_every_nth_frame(frames, step)]
     gaps = np.diff([0, *found])
     assert found[-1] == frames - 1
     assert (gaps[:-1] == step).all()
@@ -86,7 +86,7 @@ def test_every_so_many_frames_end_with_the_last(frames: int, step: int) -> None:
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=5), st.integers(1, 6))
 def test_frames_between_keep_the_key_frames_and_are_so_far_apart(gaps: list[int], step: int) -> None:
     keys = [KeyFrame(int(frame), f"key {frame}") for frame in np.cumsum(gaps)]
-    found = with_frames_between(keys, step)
+    found = add_frames_between(keys, step)
     assert [key for key in found if key.name != "on the way"] == keys
     ways = np.diff([0, *(key.frame for key in found)])
     assert (ways >= 1).all()
@@ -95,11 +95,11 @@ def test_frames_between_keep_the_key_frames_and_are_so_far_apart(gaps: list[int]
 
 def test_goals_have_the_durations_and_the_gripper_of_the_demonstration() -> None:
     states = way((10, 0.2, 0), (5, 0, 0.5), (21, 0.2, 0))
-    keys = gripper_key_frames(states)
+    keys = find_gripper_key_frames(states)
     images = [np.full((16, 16, 3), place, np.uint8) for place in range(len(keys))]
-    goals = sub_goals_of(images, keys, Timing(stride=4, slack=2, share=0.5), states)
+    goals = make_sub_goals(images, keys, Timing(stride=4, slack=2, share=0.5), states)
     assert [(goal.at_least, goal.at_most) for goal in goals] == [(1, 5), (1, 4), (4, None)]
     assert [goal.gripper for goal in goals] == ["held", "close", "held"]
     assert [goal.share for goal in goals] == [0.5, 0.5, None]
     assert [goal.name for goal in goals] == ["before closing", "closed", "end"]
-    assert [goal.gripper for goal in sub_goals_of(images, keys, Timing())] == [None] * 3
+    assert [goal.gripper for goal in make_sub_goals(images, keys, Timing())] == [None] * 3

@@ -326,8 +326,8 @@ def test_imagination_without_pyav_writes_a_gif_and_a_note(tmp_path: Path, monkey
         ("schedule_loop", [(1, 0.1), (0, 0.1)]),
     ):
         monkeypatch.setattr(imagine, name, lambda *_, value=value, **__: value)
-    monkeypatch.setattr(imagine, "strip_of", lambda _: {})
-    written = imagine.write_imagination(None, tmp_path, reporter=SimpleNamespace(note=noted.append))  # type: ignore[arg-type]
+    monkeypatch.setattr(imagine, "make_strip", lambda _: {})
+    written = imagine.write_rollouts(None, tmp_path, reporter=SimpleNamespace(note=noted.append))  # type: ignore[arg-type]
     assert imagine.VIDEO not in {path.name for path in written}
     assert all(path.is_file() for path in written)
     assert "pip install" in noted[0]

@@ -114,7 +114,7 @@ def test_axes_of_other_weights_and_of_no_file_are_refused(tmp_path: Path) -> Non
     model, other = tiny_model(), tiny_model()
     with torch.no_grad():
         other.base_predictor.predictor_proj.weight.add_(0.1)
-    with pytest.raises(InputError, match="fitted for another model, tiny"):
+    with pytest.raises(InputError, match="calibrated for another model, tiny"):
         controller(model, axes=write(tmp_path / "axes.json", other))
     with pytest.raises(InputError, match=r"no/axes\.json: cannot be read"):
         controller(model, axes="no/axes.json")
@@ -129,7 +129,7 @@ def test_a_run_plans_by_axes_of_its_own_trained_weights_merged_or_not(make_confi
     session = load_for_planning(str(run), overrides=[f"planning.axes={path}"])
     Controller.of_subject(session)
     Controller.of_run(loaded, config.planning.model_copy(update={"axes": path}))
-    with pytest.raises(InputError, match="fitted for another model"):
+    with pytest.raises(InputError, match="calibrated for another model"):
         Controller.of_subject(load_for_planning(str(run), overrides=[f"planning.axes={for_base}"]))
 
 

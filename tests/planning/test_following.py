@@ -127,7 +127,7 @@ def test_the_pages_example_runs(tmp_path: Path) -> None:
 
 def test_a_gripper_mode_needs_a_gripper_and_something_to_plan() -> None:
     run = vector_controller("difference")
-    with pytest.raises(InputError, match=r"'held' of a goal: .*vectors"):
+    with pytest.raises(InputError, match=r"'held' of a goal: .*vector states"):
         run.follow([SubGoal(image(100), gripper="held")])
     held = controller(limits=LimitsConfig(xyz=(0.0, 0.0, 0.0)))
     with pytest.raises(InputError, match="'held' of a goal: no free component"):

@@ -32,7 +32,7 @@ def test_steps_are_as_long_as_asked_and_never_beyond_the_limits() -> None:
     assert make_named_actions("forward", 1, limits=taught)[0, 0] == 0.03
     assert make_named_actions("right", 1, limits=taught, size_m=0.01)[0, 1] == -0.01
     assert make_named_actions("open", 1, limits=taught)[0, 6] == -0.5
-    with pytest.raises(InputError, match=r"planning\.limits\.xyz: 0, so that nothing can move up"):
+    with pytest.raises(InputError, match=r"planning\.limits\.xyz: 0, so that no action can move up"):
         make_named_actions("up", 1, limits=taught)
     with pytest.raises(InputError, match=r"planning\.limits\.gripper: 0"):
         make_named_actions("close", 1, limits=LimitsConfig(gripper=0.0))

@@ -56,7 +56,7 @@ def test_a_mask_may_leave_one_view_out() -> None:
     actions = torch.zeros(1, 2, 7)
     left = energies(decided(image(100), image(1), 1), actions)
     torch.testing.assert_close(energies(decided(goal, frame, 2, mask), actions), left)
-    with pytest.raises(InputError, match="nothing of what the model sees"):
+    with pytest.raises(InputError, match="no pixel inside the cropped image"):
         decided(goal, frame, 2, np.zeros_like(mask))
 
 

@@ -22,9 +22,9 @@ from vjepa2_ac.policies.monitor import (
     MONITOR,
     Monitor,
     calibrate_monitor,
-    conformal_threshold,
-    surprise_of,
-    watch_episodes,
+    compute_conformal_threshold,
+    compute_surprise,
+    measure_episodes,
 )
 from vjepa2_ac.serving.session import Session
 from vjepa2_ac.serving.wire import pack, unpack
@@ -39,7 +39,7 @@ def dataset(data_folder: Path) -> Dataset:
 
 def test_every_frame_is_predicted_from_the_one_before_it(whole_run: Path, dataset: Dataset) -> None:
     model = load_run(whole_run, device="cpu").world_model
-    (found,) = watch_episodes(model, dataset, [2])
+    (found,) = measure_episodes(model, dataset, [2])
     episode = dataset.source.read(2)
     assert found.steps.tolist() == list(range(STRIDE, len(episode.states), STRIDE))
     assert found.errors.shape == (len(found.steps), model.num_tokens)
@@ -55,7 +55,7 @@ def test_the_threshold_is_of_the_held_out_episodes_alone(whole_run: Path, datase
     model = load_run(whole_run, device="cpu").world_model
     monitor = calibrate_monitor(model, dataset, 0.3)
     held_out = np.flatnonzero(dataset.split_mask("validation") | dataset.split_mask("test"))
-    watched = list(watch_episodes(model, dataset, held_out.tolist()))
+    watched = list(measure_episodes(model, dataset, held_out.tolist()))
     np.testing.assert_allclose(monitor.expected, np.concatenate([one.errors for one in watched]).mean(axis=0))
     others = np.concatenate([one.errors for one in watched[1:]]).mean(axis=0)
     assert monitor.scores[0] == pytest.approx(watched[0].scores(others).max())
@@ -116,7 +116,7 @@ def acting(monitor: str | None, frames: int = 4, **changes: object) -> list:
 @given(st.integers(19, 200), st.sampled_from([0.05, 0.1, 0.3]), st.integers(0, 1000))
 def test_a_further_episode_is_above_the_threshold_as_often_as_promised(count: int, share: float, seed: int) -> None:
     drawn = torch.rand(count, generator=torch.Generator().manual_seed(seed))
-    threshold = conformal_threshold(drawn, share)
+    threshold = compute_conformal_threshold(drawn, share)
     above = int((drawn > threshold).sum())
     assert above / (count + 1) <= share < (above + 2) / (count + 1)  # exactly k of n + 1 equally likely places
 
@@ -124,13 +124,13 @@ def test_a_further_episode_is_above_the_threshold_as_often_as_promised(count: in
 @pytest.mark.parametrize(("count", "share"), [(18, 0.05), (5, 0.1), (3, 0.0)])
 def test_too_few_episodes_for_a_promise_are_refused(count: int, share: float) -> None:
     with pytest.raises(InputError, match=f"{count} held-out episodes"):
-        conformal_threshold(torch.rand(count), share)
+        compute_conformal_threshold(torch.rand(count), share)
 
 
 def test_the_score_is_what_patches_are_farther_off_than_usual() -> None:
     errors, usual = torch.zeros(2, 4), torch.tensor([1.0, 0.0, 0.0, 0.0])
     errors[0, 0], errors[1, 0], errors[1, 3] = 1.0, 3.0, 2.0  # in a patch that is often far off, and in a calm one
-    assert surprise_of(errors, usual).tolist() == [0.0, 1.0]
+    assert compute_surprise(errors, usual).tolist() == [0.0, 1.0]
 
 
 def test_what_is_not_a_number_is_an_alarm(tmp_path: Path) -> None:

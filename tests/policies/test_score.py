@@ -16,8 +16,8 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import ChunkScores
 from vjepa2_ac.policies.score import (
     PolicyChunks,
-    ranking_of_run,
     read_policy_chunks,
+    read_run_ranking_error,
     score_policies,
 )
 
@@ -157,10 +157,10 @@ def test_files_are_read_and_nothing_in_them_runs(tmp_path: Path) -> None:
 
 
 def test_a_run_knows_from_its_validation_whether_it_can_tell(tmp_path: Path, whole_run: Path) -> None:
-    found = ranking_of_run(str(whole_run), "step-00000006 (the newest)")
+    found = read_run_ranking_error(str(whole_run), "step-00000006 (the newest)")
     assert found is not None
     assert 0 <= found.value <= 1
-    assert ranking_of_run(str(tmp_path), "") is None
+    assert read_run_ranking_error(str(tmp_path), "") is None
 
 
 def test_the_command_scores_policies(whole_run: Path, data_folder: Path, tmp_path: Path) -> None:

@@ -408,7 +408,7 @@ def test_cancelled_score_stops_after_the_current_batch(ended_by: str, monkeypatc
 @pytest.mark.parametrize("endpoint", ["infer", "reset"])
 def test_goal_encoding_stops_at_the_deadline(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     served, encoded = session(), []
-    monkeypatch.setattr(served.controller, "encoded", lambda _: encoded.append(1) or torch.zeros(9, 32))
+    monkeypatch.setattr(served.controller, "encode", lambda _: encoded.append(1) or torch.zeros(9, 32))
     served._clock = _ExpiringClock(3)
     goals = {"goal/images": np.stack([image(seed) for seed in range(5)]), "goal/rules": [{"at_most": 1}] * 4 + [{}]}
     answer = served.answer(pack(request(**goals) | {"endpoint": endpoint}))

@@ -16,7 +16,7 @@ from projections import hand_pixel, pixel_of
 from run_fixtures import MakeConfig
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds import RldsSource
-from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination
+from vjepa2_ac.decoding.imagine import AS_RECORDED, RolloutComparison
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
@@ -129,7 +129,7 @@ def test_a_recording_that_shows_something_else_is_refused(recorded, tmp_path: Pa
 
 @pytest.fixture
 def film_of(base_folder: Path, whole_decoder: Path, make_config: MakeConfig, tmp_path: Path):  # noqa: F811
-    def film(data: Path, *actions: str) -> Imagination:
+    def film(data: Path, *actions: str) -> RolloutComparison:
         config = make_config(data__path=str(data), data__validation_share=0.0, data__test_share=0.5)
         evaluation = EvaluationOptions(data=config, out=tmp_path)
         asked = ImagineOptions(str(whole_decoder), actions=actions, steps=FILMED, evaluation=evaluation)
@@ -147,7 +147,7 @@ def test_of_simulated_data_the_truth_of_every_sequence_is_shown(simulated: Path,
     still = np.abs(truths["none"].astype(int) - found.first).mean()
     moved = np.abs(truths["up"].astype(int) - found.first).mean()
     assert moved > 1.5 * still
-    assert all("does not know this scene" in note for note in found.notes)  # the decoder is of other data
+    assert all("compared with" in note for note in found.notes)  # the decoder is of other data
     assert {one.name for one in found.rollouts if one.outlines is not None} == {"none", "up"}
 
 

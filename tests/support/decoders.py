@@ -10,7 +10,7 @@ from run_fixtures import MakeConfig, one_thread, tiny_config
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.sources.latent_files import LatentFiles
-from vjepa2_ac.decoding.frame_pairs import FramePairs, wanted_frames
+from vjepa2_ac.decoding.frame_pairs import FramePairs, select_frames
 from vjepa2_ac.decoding.training import train_decoder
 from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, encode_files
 from vjepa2_ac.model.checkpoints import load_base
@@ -47,7 +47,7 @@ def encode_split(tmp_path: Path) -> EncodeSplit:
         dataset = open_dataset(config.data)
         model = load_base(config.model, seed=config.seed)
         encoder = EncoderOnDevice.from_model(config, model, torch.device("cpu"))
-        wanted = wanted_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
+        wanted = select_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
         files = LatentFiles(tmp_path / folder, "key")
         encode_files(dataset, wanted, encoder, files, lossless_images=True)
         return FramePairs.of(dataset, wanted, files)

@@ -53,7 +53,7 @@ def test_the_clip_is_the_one_with_the_most_motion_and_its_rows_are_true(make_con
     run = set_up(make_config(validation__decoder=decoder), reporter)
     validate(run, reporter)
     assert run.strip is not None
-    found = run.strip.imagine(run.world_model, run.accelerator.device, "run")
+    found = run.strip.rollout(run.world_model, run.accelerator.device, "run")
     windows = validation_windows(run.dataset, "validation", clips=4)
     moved = {}
     for episode, start in windows:
@@ -78,7 +78,7 @@ def test_a_strip_that_fails_costs_a_warning_and_never_the_run(
     monkeypatch.setattr(imagine, failing, fail)
     run_folder = train(make_config(validation__decoder=decoder, training__steps=3), reporter)
     assert list((run_folder / "checkpoints").iterdir())
-    assert "could not be drawn: [Errno 28] No space left" in caplog.text
+    assert "could not be drawn ([Errno 28] No space left" in caplog.text
 
 
 def test_a_decoder_that_will_not_do_is_told_before_what_is_expensive(

@@ -111,7 +111,7 @@ def _loaded(options: argparse.Namespace, goals: NamedGoals | None) -> tuple[Sess
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.planning.controller import Controller
     from vjepa2_ac.planning.goals import require_goal_ends
-    from vjepa2_ac.policies.score import is_blind, ranking_of_run
+    from vjepa2_ac.policies.score import is_blind, read_run_ranking_error
     from vjepa2_ac.serving.metadata import describe_server, make_metadata, warm_up
     from vjepa2_ac.serving.recording import Recorder
     from vjepa2_ac.serving.request import IMAGE_KEYS
@@ -125,7 +125,7 @@ def _loaded(options: argparse.Namespace, goals: NamedGoals | None) -> tuple[Sess
         image_keys=IMAGE_KEYS if options.image_key is None else (options.image_key,),
         deadline_s=options.deadline,
         dry_run=options.dry_run,
-        is_blind=is_blind(ranking_of_run(options.subject, loaded.chosen)),
+        is_blind=is_blind(read_run_ranking_error(options.subject, loaded.chosen)),
     )
     controller = Controller.of_subject(loaded, extrinsics=options.extrinsics)
     for sequence in (goals or {}).values():

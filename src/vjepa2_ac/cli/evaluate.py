@@ -16,7 +16,7 @@ from vjepa2_ac.runs.folder import is_run, sets_movable_path
 _NAMED = ("none", "up", "left", "close")  # default actions of `imagine --image`, which has no recorded actions
 
 if TYPE_CHECKING:
-    from vjepa2_ac.decoding.imagine import Imagination
+    from vjepa2_ac.decoding.imagine import RolloutComparison
     from vjepa2_ac.evaluation.result import About
     from vjepa2_ac.reports.write import WrittenEvaluation
 
@@ -180,13 +180,13 @@ def _imagine(options: argparse.Namespace) -> None:
     """
     _require_one_start(options)
 
-    from vjepa2_ac.decoding.imagine import write_imagination
+    from vjepa2_ac.decoding.imagine import write_rollouts
 
     home = Path(options.subject) if is_run(options.subject) else Path()
     out = options.out or home / "imagined"
     with cli.reporter() as reporter:
         imagination = _of_image(options) if options.image is not None else _of_clip(options, out, reporter)
-        written = write_imagination(imagination, out, reporter=reporter)
+        written = write_rollouts(imagination, out, reporter=reporter)
     cli.show(*imagination.notes, files=written)
 
 
@@ -205,7 +205,7 @@ def _require_one_start(options: argparse.Namespace) -> None:
         raise InputError(where="--image", found=f"{', '.join(used)}, too", needed="a clip or an image, not both")
 
 
-def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imagination:
+def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> RolloutComparison:
     from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
     from vjepa2_ac.evaluation.request import resolve_config
     from vjepa2_ac.simulation.counterfactual import simulated_outcome
@@ -217,7 +217,7 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
     return imagine_clip(options.subject, request, simulate=simulated_outcome, reporter=reporter)
 
 
-def _of_image(options: argparse.Namespace) -> Imagination:
+def _of_image(options: argparse.Namespace) -> RolloutComparison:
     from vjepa2_ac.evaluation.imagined import ImageObservation, ImagineOptions, imagine_image
     from vjepa2_ac.media.images import read_image
 

@@ -139,9 +139,9 @@ def _goals_of(options: argparse.Namespace, config: Config) -> tuple[SubGoal, ...
     if options.goals is not None:
         return read_goal_folder(options.goals)
     if options.goal_from is not None:
-        from vjepa2_ac.goals.make_goals import frame_of_episode
+        from vjepa2_ac.goals.make_goals import read_episode_frame
 
-        return make_timed_goals([frame_of_episode(config.data, options.goal_from)], [])
+        return make_timed_goals([read_episode_frame(config.data, options.goal_from)], [])
     images = [read_image(path) for path in options.goal]
     for path, image in zip(options.goal, images, strict=True):
         require_image(image, where=f"--goal {path}", like=images[0])

@@ -103,7 +103,7 @@ def _monitor(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.cli.tables import watched_table
     from vjepa2_ac.data.dataset import find_episode
-    from vjepa2_ac.policies.monitor import MONITOR, Monitor, calibrate_monitor, watch_episodes
+    from vjepa2_ac.policies.monitor import MONITOR, Monitor, calibrate_monitor, measure_episodes
 
     session = cli.load_planning_session(options)
     model, files = session.world_model, []
@@ -119,7 +119,7 @@ def _monitor(options: argparse.Namespace) -> int:
             monitor = Monitor.read(
                 options.threshold, model.fingerprints(), tokens=model.num_tokens, where="--threshold"
             )
-        watched = list(watch_episodes(model, watched_data, episodes, reporter.task("watching", "episodes")))
+        watched = list(measure_episodes(model, watched_data, episodes, reporter.task("watching", "episodes")))
     source = f"{counted(len(monitor.scores), 'held-out episode')} of up to {counted(monitor.steps, 'model step')}"
     note = f"An alarm is a surprise above {monitor.threshold:.4g}, calibrated on {source}. At most"
     note += f" {monitor.false_alarms:.1%} of undisturbed episodes have an alarm."

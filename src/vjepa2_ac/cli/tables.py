@@ -20,11 +20,11 @@ from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:
     from vjepa2_ac.decoding.decoder import DecoderCard
-    from vjepa2_ac.goals.make_goals import MadeGoals
+    from vjepa2_ac.goals.make_goals import DemonstrationGoals
     from vjepa2_ac.inspection.findings import Finding
     from vjepa2_ac.inspection.variants import VariantResult
     from vjepa2_ac.planning.decision import PlanResult
-    from vjepa2_ac.policies.monitor import Monitor, WatchedEpisode
+    from vjepa2_ac.policies.monitor import EpisodeErrors, Monitor
     from vjepa2_ac.policies.score import PolicyScores
     from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
 
@@ -85,7 +85,7 @@ def plan_table(answer: PlanResult) -> Table:
     return table
 
 
-def goals_table(made: MadeGoals) -> Table:
+def goals_table(made: DemonstrationGoals) -> Table:
     """Return a table with one row per goal that was extracted from a demonstration."""
     columns = ["goal", "frame", "at least", "at most", "share", "gripper"]
     table = MetricsTable(f"Goals of {made.origin['episode']} (at least and at most: model steps)", columns)
@@ -178,7 +178,7 @@ def scores_table(scores: PolicyScores) -> Table:
     return table
 
 
-def watched_table(watched: Sequence[WatchedEpisode], monitor: Monitor) -> Table:
+def watched_table(watched: Sequence[EpisodeErrors], monitor: Monitor) -> Table:
     """Return a table of the highest surprise and the first alarm of each monitored episode."""
     table = MetricsTable("Surprise, over the threshold", ["episode", "highest", "first alarm at control step"])
     for episode in watched:

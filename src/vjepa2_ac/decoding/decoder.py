@@ -81,7 +81,7 @@ class Decoder(nn.Module):
         self.linear = nn.Linear(shape.dim, 3 * shape.patch_size**2)
         patches = "n (rows columns) (c p q) -> n c (rows p) (columns q)"
         self.unfold = Rearrange(patches, rows=shape.grid, c=3, p=shape.patch_size)
-        self.further = None if shape.size == "linear" else _convolved(shape)
+        self.further = None if shape.size == "linear" else _make_convolutions(shape)
 
     def initialise(self, generator: Generator) -> None:
         """Initialise all weights from a random generator."""
@@ -94,12 +94,12 @@ class Decoder(nn.Module):
                     nn.init.zeros_(module.bias)
 
     @torch.no_grad()
-    def start_from(self, linear: Decoder) -> None:
-        """Begin as another decoder's matrix: the further layers add nothing yet."""
+    def copy_linear(self, linear: Decoder) -> None:
+        """Copy the matrix of a linear decoder, and zero the last further layer, so that both outputs are equal."""
         self.linear.load_state_dict(linear.linear.state_dict())
         if self.further is not None:
-            for one in self.further[_LAST].parameters():
-                one.zero_()
+            for parameter in self.further[_LAST].parameters():
+                parameter.zero_()
 
     def forward(self, latents: Latents) -> Images:
         """Return images, black 0 to white 1; not clipped.
@@ -113,7 +113,7 @@ class Decoder(nn.Module):
         shape = self.shape
         if tuple(latents.shape[-2:]) != (shape.grid**2, shape.dim):
             found = "x".join(map(str, latents.shape[-2:]))
-            raise ValueError(f"latents of {found} numbers; this decoder takes {shape.grid**2}x{shape.dim}")
+            raise ValueError(f"latents of shape {found}; this decoder expects {shape.grid**2}x{shape.dim}")
         frames = latents.reshape(-1, *latents.shape[-2:])
         numbers: Tensor = self.unfold(self.linear(frames))
         if self.further is not None:
@@ -122,7 +122,7 @@ class Decoder(nn.Module):
         return images.reshape(*latents.shape[:-2], *images.shape[-3:])
 
     @staticmethod
-    def as_numbers(images: Images) -> Images:
+    def to_outputs(images: Images) -> Images:
         """Return the outputs of the network that correspond to images."""
         return (images - _MIDDLE) / _RANGE
 
@@ -134,7 +134,7 @@ class Decoder(nn.Module):
         return images.reshape(*latents.shape[:-2], *images.shape[-3:])
 
 
-def _convolved(shape: DecoderShape) -> nn.Sequential:
+def _make_convolutions(shape: DecoderShape) -> nn.Sequential:
     blocks, width, heads, first, second = _SIZES[shape.size]
     last = shape.patch_size // UPSAMPLED
     return nn.Sequential(
@@ -190,12 +190,12 @@ class _Block(nn.Module):
         return added
 
 
-def as_images(pixels: UInt8[Tensor, "*batch 3 size size"]) -> Images:
+def to_images(pixels: UInt8[Tensor, "*batch 3 size size"]) -> Images:
     """Convert 8-bit images to the decoder's range: black 0, white 1."""
     return pixels.float() / 255.0
 
 
-def as_pixels(images: Images) -> UInt8[np.ndarray, "*batch size size 3"]:
+def to_pixels(images: Images) -> UInt8[np.ndarray, "*batch size size 3"]:
     """Convert images between 0 and 1 to 8-bit images with the channels last."""
     rounded = (images.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()
     return np.asarray(rearrange(rounded, "... c h w -> ... h w c").numpy())
@@ -206,7 +206,7 @@ BUILTIN_DECODER = "decoder"  # name of the decoder's folder in the folder of a b
 SIMULATED = "frames of the simulated arm"
 
 _NEEDED = "the folder of a decoder, as `vjepa2-ac decoder` writes it"
-_FIX = "Copy the folder again, or train the decoder again"
+_FIX = "Copy the folder again, or train the decoder again with `vjepa2-ac decoder CONFIG`"
 
 
 @dataclass(frozen=True)
@@ -265,24 +265,30 @@ class TrainedDecoder:
             ("encoder", card.encoder, model.encoder_fingerprint()),
             ("data.crop", card.crop, data.crop),
         )
-        if differing := [f"{name} {ours}, not {theirs}" for name, ours, theirs in compared if ours != theirs]:
-            found = f"the decoder of another encoder or crop than that of {subject} ({'; '.join(differing)})"
-            needed = "one that was trained on the latents of both: others would be read wrongly"
-            fix = "Train one with `vjepa2-ac decoder CONFIG`, on the config of this model"
+        if differing := [
+            f"{name} {decoder_value}, the model's is {model_value}"
+            for name, decoder_value, model_value in compared
+            if decoder_value != model_value
+        ]:
+            found = f"the decoder does not fit the encoder and crop of {subject} ({'; '.join(differing)})"
+            needed = "a decoder trained on latents of the same encoder and crop"
+            fix = "Train a decoder with `vjepa2-ac decoder CONFIG` and the config of this model"
             raise InputError(where=f"{self.where} {self.name}", found=found, needed=needed, fix=fix)
-        learned = SIMULATED if self.name.startswith(BUILTIN) else card.data
-        shown = NO_DATA if data.is_cache else data.path
-        if shown == NO_DATA or _is_same_data(learned, shown):
+        decoder_data = SIMULATED if self.name.startswith(BUILTIN) else card.data
+        model_data = NO_DATA if data.is_cache else data.path
+        if model_data == NO_DATA or _is_same_data(decoder_data, model_data):
             return ()
-        warning = f"The decoder {self.name} was trained on {learned}, not on {shown}: its images may be wrong."
+        warning = (
+            f"The decoder {self.name} was trained on {decoder_data}, not on {model_data}: its images may be inaccurate."
+        )
         logger.warning(warning)
         return (warning,)
 
 
-def _is_same_data(one: str, other: str) -> bool:
+def _is_same_data(first_path: str, second_path: str) -> bool:
     """Return whether two values of `data.path` are the same data set, or are both of the simulated arm."""
-    are_simulated = (path == SIMULATED or Path(path, SIMULATION_FILE).is_file() for path in (one, other))
-    return Path(one).resolve() == Path(other).resolve() or all(are_simulated)
+    are_simulated = (path == SIMULATED or Path(path, SIMULATION_FILE).is_file() for path in (first_path, second_path))
+    return Path(first_path).resolve() == Path(second_path).resolve() or all(are_simulated)
 
 
 def save_decoder(folder: Path, card: DecoderCard, weights: Mapping[str, Tensor]) -> None:
@@ -306,8 +312,8 @@ def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecode
     Raises:
         InputError: There is no decoder, or it is incomplete or damaged.
     """
-    is_ours = str(name).startswith(BUILTIN)
-    folder = ASSETS / str(name).removeprefix(BUILTIN) / BUILTIN_DECODER if is_ours else Path(name)
+    is_builtin = str(name).startswith(BUILTIN)
+    folder = ASSETS / str(name).removeprefix(BUILTIN) / BUILTIN_DECODER if is_builtin else Path(name)
     card = read_card(folder, where=where)
     decoder = Decoder(card.shape).eval().requires_grad_(False)
     decoder.load_state_dict(read_tensors(folder / WEIGHTS, decoder.state_dict(), needed=_NEEDED, fix=_FIX))
@@ -324,7 +330,7 @@ def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
     try:
         values = read_json_object(path, needed=_NEEDED, fix=_FIX)
     except MissingFileError:
-        fix = "Train one with `vjepa2-ac decoder CONFIG`; one that is unfinished goes on with the same command"
-        found = f"no {CARD} there"
+        fix = "Train a decoder with `vjepa2-ac decoder CONFIG`; the same command resumes an unfinished training"
+        found = f"no {CARD}"
         raise InputError(where=f"{where} {folder}", found=found, needed=_NEEDED, fix=fix) from None
     return parse_record(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)

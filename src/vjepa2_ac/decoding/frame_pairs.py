@@ -21,7 +21,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latent_files import LatentFiles, unpack_latents
 from vjepa2_ac.data.windows import spread_indices
-from vjepa2_ac.decoding.decoder import Decoder, DecoderShape, as_images
+from vjepa2_ac.decoding.decoder import Decoder, DecoderShape, to_images
 from vjepa2_ac.encoding.latent_cache import FramesToEncode, needed_frames
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.intervals import mean_of
@@ -29,7 +29,7 @@ from vjepa2_ac.media.image_similarity import psnr, ssim
 
 
 @dataclass(frozen=True)
-class Pairs:
+class PairBatch:
     """Frames with their latents, and the episode of each frame."""
 
     latents: Float[Tensor, "frames tokens dim"]
@@ -46,57 +46,60 @@ class FramePairs:
     episode_ids: tuple[str, ...]  # episode of each file
 
     @classmethod
-    def of(cls, dataset: Dataset, wanted: Sequence[FramesToEncode], files: LatentFiles) -> FramePairs:
-        """Return those of the wanted frames that could be encoded."""
-        there = tuple(one for one in wanted if files.has_file(one.episode, one.camera))
-        return cls(files, there, tuple(dataset.table.identity(one.episode) for one in there))
+    def of(cls, dataset: Dataset, selected: Sequence[FramesToEncode], files: LatentFiles) -> FramePairs:
+        """Return the selected frames that could be encoded."""
+        encoded = tuple(frames for frames in selected if files.has_file(frames.episode, frames.camera))
+        return cls(files, encoded, tuple(dataset.table.identity(frames.episode) for frames in encoded))
 
     @cached_property
     def _ends(self) -> Int[np.ndarray, " files"]:
-        return np.cumsum([len(one.steps) for one in self.frames])
+        return np.cumsum([len(frames.steps) for frames in self.frames])
 
     def __len__(self) -> int:
         return int(self._ends[-1]) if self.frames else 0
 
-    def read(self, numbers: Sequence[int]) -> Pairs:
+    def read(self, indices: Sequence[int]) -> PairBatch:
         """Read pairs by their indices, in this order.
 
         Raises:
             InputError: A file is missing or damaged.
         """
-        owners = np.searchsorted(self._ends, numbers, side="right").tolist()
-        files = {owner: self.files.open(self.frames[owner].episode, self.frames[owner].camera) for owner in set(owners)}
+        file_indices = np.searchsorted(self._ends, indices, side="right").tolist()
+        files = {
+            file_index: self.files.open(self.frames[file_index].episode, self.frames[file_index].camera)
+            for file_index in set(file_indices)
+        }
         latents, images = list[Tensor](), list[Tensor]()
-        for number, owner in zip(numbers, owners, strict=True):
-            row = int(number - self._ends[owner]) + len(self.frames[owner].steps)
-            latents.append(unpack_latents(files[owner].read_latents([row])))
-            images.append(torch.from_numpy(files[owner].read_images([row])).permute(0, 3, 1, 2))
-        ids = tuple(self.episode_ids[owner] for owner in owners)
-        return Pairs(torch.cat(latents), torch.cat(images).contiguous(), ids)
+        for index, file_index in zip(indices, file_indices, strict=True):
+            row = int(index - self._ends[file_index]) + len(self.frames[file_index].steps)
+            latents.append(unpack_latents(files[file_index].read_latents([row])))
+            images.append(torch.from_numpy(files[file_index].read_images([row])).permute(0, 3, 1, 2))
+        ids = tuple(self.episode_ids[file_index] for file_index in file_indices)
+        return PairBatch(torch.cat(latents), torch.cat(images).contiguous(), ids)
 
 
-def wanted_frames(dataset: Dataset, split: Split, *, frames: int) -> list[FramesToEncode]:
+def select_frames(dataset: Dataset, split: Split, *, frames: int) -> list[FramesToEncode]:
     """Return at most about this many frames of a split, spread over its episodes and cameras.
 
-    They are among those that clips use: the decoder is to show clips. None, if the split has no clips.
+    Only frames that clips use are selected. The list is empty if the split has no clips.
     """
     members = dataset.split_mask(split)
-    needed = [one for one in needed_frames(dataset) if members[one.episode]]
-    total = sum(len(one.steps) for one in needed)
-    places, counted = np.linspace(0, total, min(frames, total), endpoint=False).astype(int), 0
-    wanted = []
-    for one in needed:
-        count = int(((places >= counted) & (places < counted + len(one.steps))).sum())
-        counted += len(one.steps)
+    candidates = [entry for entry in needed_frames(dataset) if members[entry.episode]]
+    total = sum(len(entry.steps) for entry in candidates)
+    positions, first = np.linspace(0, total, min(frames, total), endpoint=False).astype(int), 0
+    selected = []
+    for entry in candidates:
+        count = int(((positions >= first) & (positions < first + len(entry.steps))).sum())
+        first += len(entry.steps)
         if count:
-            steps = one.steps[spread_indices(len(one.steps), count)]
-            wanted.append(FramesToEncode(one.episode, one.camera, steps))
-    return wanted
+            steps = entry.steps[spread_indices(len(entry.steps), count)]
+            selected.append(FramesToEncode(entry.episode, entry.camera, steps))
+    return selected
 
 
 _FRAMES = 4_000  # largest number of frames for the linear fit; enough for a matrix of 1,408 x 768 numbers
 _FRAMES_OF_MEAN = 1_000
-_FITTED_AT_ONCE, _MEASURED_AT_ONCE = 64, 32
+_FIT_BATCH_SIZE, _MEASURE_BATCH_SIZE = 64, 32
 _RIDGE = 1e-4  # ridge, relative to the mean second moment of the latents' components
 
 
@@ -113,21 +116,21 @@ def fit_linear(pairs: FramePairs, shape: DecoderShape, device: torch.device, pro
         progress: Called with (done, total) in frames.
     """
     decoder = Decoder(DecoderShape("linear", shape.dim, shape.grid, shape.patch_size))
-    numbers = spread_indices(len(pairs), _FRAMES)
+    indices = spread_indices(len(pairs), _FRAMES)
     inner: Float[Tensor, "dim+1 dim+1"] = torch.zeros(shape.dim + 1, shape.dim + 1, dtype=torch.float64)
     outer: Float[Tensor, "dim+1 pixels"] = torch.zeros(shape.dim + 1, 3 * shape.patch_size**2, dtype=torch.float64)
     done = 0
-    for some in _parts(pairs, numbers, _FITTED_AT_ONCE):
-        tokens = some.latents.to(device).flatten(0, 1)
+    for batch in _read_parts(pairs, indices, _FIT_BATCH_SIZE):
+        tokens = batch.latents.to(device).flatten(0, 1)
         tokens = torch.cat([tokens, torch.ones_like(tokens[:, :1])], dim=1)
-        wanted = decoder.as_numbers(as_images(some.images.to(device)))
+        outputs = decoder.to_outputs(to_images(batch.images.to(device)))
         patches = rearrange(
-            wanted, "n c (rows p) (columns q) -> (n rows columns) (c p q)", p=shape.patch_size, q=shape.patch_size
+            outputs, "n c (rows p) (columns q) -> (n rows columns) (c p q)", p=shape.patch_size, q=shape.patch_size
         )
         inner += (tokens.T @ tokens).cpu()
         outer += (tokens.T @ patches).cpu()
-        done += len(some.episode_ids)
-        progress(done, len(numbers))
+        done += len(batch.episode_ids)
+        progress(done, len(indices))
     ridge = _RIDGE * inner.diagonal()[:-1].mean()
     inner.diagonal()[:-1] += ridge
     solved = torch.linalg.solve(inner, outer).float()
@@ -137,11 +140,11 @@ def fit_linear(pairs: FramePairs, shape: DecoderShape, device: torch.device, pro
 
 
 @torch.no_grad()
-def mean_image(pairs: FramePairs) -> Float[Tensor, "3 size size"]:
-    """Return the mean of some images, spread over the pairs: what a decoder shows that has learned nothing else."""
-    numbers = spread_indices(len(pairs), _FRAMES_OF_MEAN)
-    total = sum(as_images(some.images).sum(dim=0) for some in _parts(pairs, numbers, _MEASURED_AT_ONCE))
-    return torch.as_tensor(total / len(numbers))
+def compute_mean_image(pairs: FramePairs) -> Float[Tensor, "3 size size"]:
+    """Return the mean of some images, spread over the pairs: the output of a decoder that ignores its input."""
+    indices = spread_indices(len(pairs), _FRAMES_OF_MEAN)
+    total = sum(to_images(batch.images).sum(dim=0) for batch in _read_parts(pairs, indices, _MEASURE_BATCH_SIZE))
+    return torch.as_tensor(total / len(indices))
 
 
 @torch.no_grad()
@@ -158,19 +161,19 @@ def measure_decoders(
         mean: Mean image of the training frames.
         progress: Called with (done, total) in frames.
     """
-    found: dict[str, list[np.ndarray]] = defaultdict(list)
+    measured: dict[str, list[np.ndarray]] = defaultdict(list)
     ids: list[str] = []
     device = next(next(iter(decoders.values())).parameters()).device
-    for some in _parts(pairs, range(len(pairs)), _MEASURED_AT_ONCE):
-        latents, true = some.latents.to(device), as_images(some.images.to(device))
-        shown = {name: decoder.decode(latents) for name, decoder in decoders.items()}
-        shown["mean_image"] = mean.to(device).expand_as(true)
-        for name, images in shown.items():
-            found[name].append(torch.stack([psnr(images, true), ssim(images, true)]).double().cpu().numpy())
-        ids += some.episode_ids
+    for batch in _read_parts(pairs, range(len(pairs)), _MEASURE_BATCH_SIZE):
+        latents, true = batch.latents.to(device), to_images(batch.images.to(device))
+        decoded = {name: decoder.decode(latents) for name, decoder in decoders.items()}
+        decoded["mean_image"] = mean.to(device).expand_as(true)
+        for name, images in decoded.items():
+            measured[name].append(torch.stack([psnr(images, true), ssim(images, true)]).double().cpu().numpy())
+        ids += batch.episode_ids
         progress(len(ids), len(pairs))
     means: dict[str, Any] = {"frames": len(ids), "episodes": len(set(ids))}
-    for name, parts in found.items():
+    for name, parts in measured.items():
         decibels, similar = np.concatenate(parts, axis=1)
         finite = np.isfinite(decibels)
         means[name] = {
@@ -181,7 +184,7 @@ def measure_decoders(
     return means
 
 
-def _parts(pairs: FramePairs, numbers: Sequence[int], size: int) -> Iterator[Pairs]:
+def _read_parts(pairs: FramePairs, indices: Sequence[int], size: int) -> Iterator[PairBatch]:
     """Yield pairs in parts of at most `size`."""
-    for first in range(0, len(numbers), size):
-        yield pairs.read(numbers[first : first + size])
+    for first in range(0, len(indices), size):
+        yield pairs.read(indices[first : first + size])

@@ -20,7 +20,7 @@ from torch import Tensor
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, frames_for_display
 from vjepa2_ac.data.transforms import to_display_frames
-from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, TrainedDecoder, as_pixels, load_decoder
+from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, TrainedDecoder, load_decoder, to_pixels
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.media.figure import RolloutStrip, StripRow, draw_strip, render_frames, schedule_loop
@@ -38,17 +38,17 @@ logger = logging.getLogger(__name__)
 
 Actions = Float[np.ndarray, "steps action_dim"]
 Image = UInt8[np.ndarray, "size size 3"]  # with the crop and size of the encoder's input
-Film = UInt8[np.ndarray, "steps size size 3"]
+Frames = UInt8[np.ndarray, "steps size size 3"]
 
 STRIP, VIDEO, GIF = "imagined.png", "imagined.mp4", "imagined.gif"
 AS_RECORDED = "as recorded"
 _GROUND_TRUTH, _TITLE = "ground truth", "Frames predicted from one input frame and the actions"
 _MUCH_WORSE_DB = 5.0
 _RATE_HZ = 15.0  # frame rate of the video
-_LONGEST_NAME = 44  # characters
-_LEAST_CM, _LEAST_GRIP = 0.15, 0.05  # smaller components of an action are left out of captions
+_MAX_NAME_LENGTH = 44  # characters
+_MIN_SHOWN_CM, _MIN_SHOWN_GRIPPER = 0.15, 0.05  # smaller components of an action are left out of captions
 _POSE = 7  # width of a pose
-_WAYS = (("forward", "back"), ("left", "right"), ("up", "down"))  # names of +/- x, y, z in the robot base frame
+_DIRECTIONS = (("forward", "back"), ("left", "right"), ("up", "down"))  # names of +/- x, y, z in the robot base frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,19 +68,19 @@ class Start:
 
 
 @dataclass(frozen=True, eq=False)
-class Imagined:
+class DecodedRollout:
     """A decoded rollout, and the true frames if they are known."""
 
     model: str  # base, adapter, model
     name: str  # name of the actions: as recorded, up, ...
     actions: Actions
-    frames: Film  # predicted frame after each action
-    truth: Film | None = None
+    frames: Frames  # predicted frame after each action
+    truth: Frames | None = None
     outlines: Bool[np.ndarray, "time size size"] | None = None  # true silhouette of the arm, start included
 
 
 @dataclass(frozen=True, eq=False)
-class Imagination:
+class RolloutComparison:
     """All decoded rollouts from one start. All frames have the crop and size of the encoder's input."""
 
     subject: str
@@ -89,14 +89,14 @@ class Imagination:
     seconds_per_step: float
     first: Image
     decoded_first: Image
-    rollouts: tuple[Imagined, ...]
-    truth: Film | None = None  # true frames for the recorded actions
-    decoded_truth: Film | None = None
+    rollouts: tuple[DecodedRollout, ...]
+    truth: Frames | None = None  # true frames for the recorded actions
+    decoded_truth: Frames | None = None
     notes: tuple[str, ...] = ()
 
 
 @torch.no_grad()
-def rolled_out(
+def compute_rollout(
     rollout: Callable[..., Tensor],
     start: Start,
     actions: Actions,
@@ -115,12 +115,14 @@ def rolled_out(
         states = counterfactual_states(start.state, actions, start.space)[:-1]
         actions = feasible_actions(start.state, actions, start.space)
     device = start.latents.device
-    taken, known = (torch.as_tensor(one, dtype=torch.float32, device=device)[None] for one in (actions, states))
+    action_inputs, state_inputs = (
+        torch.as_tensor(values, dtype=torch.float32, device=device)[None] for values in (actions, states)
+    )
     extrinsics = None if start.extrinsics is None else start.extrinsics.expand(1, len(actions), -1)
-    return rollout(start.latents[None, None], taken, known, extrinsics)[0]
+    return rollout(start.latents[None, None], action_inputs, state_inputs, extrinsics)[0]
 
 
-def worth_knowing(card: DecoderCard, first: Image, decoded_first: Image) -> tuple[str, ...]:
+def describe_poor_reconstruction(card: DecoderCard, first: Image, decoded_first: Image) -> tuple[str, ...]:
     """Return a note if the decoder reconstructs the start much worse than its own held-out frames."""
     usual = card.held_out.get("decoder", {}).get("psnr_db", {}).get("value")
     error = np.square(first.astype(np.float64) - decoded_first).mean() / 255**2
@@ -128,100 +130,106 @@ def worth_knowing(card: DecoderCard, first: Image, decoded_first: Image) -> tupl
     if usual is None or decibels > usual - _MUCH_WORSE_DB:
         return ()
     note = (
-        f"The decoder does not know this scene: it shows the start with {decibels:.1f} dB, its own held-out frames with"
-        f" {usual:.1f} dB. What the images lack, the model need not lack; train a decoder on frames of this scene."
+        f"The decoder reconstructs the start frame with a PSNR of {decibels:.1f} dB, compared with {usual:.1f} dB on"
+        f" its held-out frames. Details that the images lack may be in the latents. Train a decoder on this scene."
     )
     return (note,)
 
 
-def shown(
+def decode_views(
     decoder: Decoder, latents: Float[Tensor, "steps tokens dim"], views: int = 1
 ) -> UInt8[np.ndarray, "steps size all 3"]:
     """Decode latents to 8-bit images; several views, whose tokens are concatenated, are put side by side."""
-    images = as_pixels(decoder.decode(latents.float().reshape(len(latents) * views, -1, latents.shape[-1])))
+    images = to_pixels(decoder.decode(latents.float().reshape(len(latents) * views, -1, latents.shape[-1])))
     return np.concatenate([images[number::views] for number in range(views)], axis=2)
 
 
-def strip_of(imagination: Imagination) -> RolloutStrip:
-    """Return the image strip of an imagination: for each action sequence the true frames, then those of each model.
+def make_strip(comparison: RolloutComparison) -> RolloutStrip:
+    """Return the image strip of a comparison: for each action sequence the true frames, then those of each model.
 
     The recorded action sequence comes first.
     """
-    told, first, decoded_first = imagination, imagination.first[None], imagination.decoded_first[None]
+    first, decoded_first = comparison.first[None], comparison.decoded_first[None]
     rows: list[StripRow] = []
-    ordered = sorted(told.rollouts, key=lambda one: one.name != AS_RECORDED)
-    for name, rollouts in groupby(ordered, key=lambda one: one.name):
-        for number, one in enumerate(rollouts):
-            sequence, recorded = _story(one), name == AS_RECORDED
-            if not number and (truth := told.truth if recorded else one.truth) is not None:
-                captions = ("", *map(_short_action, one.actions)) if recorded else ()
+    ordered = sorted(comparison.rollouts, key=lambda rollout: rollout.name != AS_RECORDED)
+    for name, rollouts in groupby(ordered, key=lambda rollout: rollout.name):
+        for number, rollout in enumerate(rollouts):
+            sequence, recorded = _describe_actions(rollout), name == AS_RECORDED
+            if not number and (truth := comparison.truth if recorded else rollout.truth) is not None:
+                captions = ("", *map(_describe_action, rollout.actions)) if recorded else ()
                 frames = np.concatenate([first, truth])
                 rows.append(
                     StripRow(_GROUND_TRUTH, "recorded" if recorded else "simulated", frames, captions, sequence)
                 )
-            if not number and recorded and told.decoded_truth is not None:
-                frames = np.concatenate([decoded_first, told.decoded_truth])
+            if not number and recorded and comparison.decoded_truth is not None:
+                frames = np.concatenate([decoded_first, comparison.decoded_truth])
                 rows.append(StripRow("ground truth,\ndecoded", "decoded", frames, sequence=sequence))
-            frames = np.concatenate([decoded_first, one.frames])
+            frames = np.concatenate([decoded_first, rollout.frames])
             rows.append(
-                StripRow(f"prediction of\n{one.model}", "predicted", frames, sequence=sequence, outlines=one.outlines)
+                StripRow(
+                    f"prediction of\n{rollout.model}", "predicted", frames, sequence=sequence, outlines=rollout.outlines
+                )
             )
-    clip = f"{_short(told.episode_id)} from control step {told.start}" if told.episode_id else "from an image"
-    seconds = tuple(time * told.seconds_per_step for time in range(len(rows[0].frames) if rows else 0))
-    return RolloutStrip(_TITLE, tuple(rows), seconds, source=f"{told.subject}, {clip}")
+    clip = (
+        f"{_shorten_name(comparison.episode_id)} from control step {comparison.start}"
+        if comparison.episode_id
+        else "from an image"
+    )
+    seconds = tuple(time * comparison.seconds_per_step for time in range(len(rows[0].frames) if rows else 0))
+    return RolloutStrip(_TITLE, tuple(rows), seconds, source=f"{comparison.subject}, {clip}")
 
 
-def _story(one: Imagined) -> str:
+def _describe_actions(rollout: DecodedRollout) -> str:
     """Return a short label of a rollout's actions."""
-    if one.name == AS_RECORDED:
+    if rollout.name == AS_RECORDED:
         return AS_RECORDED
-    length = 100 * float(np.linalg.norm(one.actions[0, :3])) if one.actions.shape[1] == _POSE else 0.0
-    name = "zero action" if one.name == "none" else one.name
-    return name + (f", {length:.3g} cm a step" if length >= _LEAST_CM else "")
+    length = 100 * float(np.linalg.norm(rollout.actions[0, :3])) if rollout.actions.shape[1] == _POSE else 0.0
+    name = "zero action" if rollout.name == "none" else rollout.name
+    return name + (f", {length:.3g} cm per step" if length >= _MIN_SHOWN_CM else "")
 
 
-def _short_action(action: Float[np.ndarray, " action_dim"]) -> str:
+def _describe_action(action: Float[np.ndarray, " action_dim"]) -> str:
     """Return a short description of a pose action in the robot's directions; empty for a vector."""
     if len(action) != _POSE:
         return ""
-    words = []
-    for amount, (plus, minus) in zip(100 * action[:3], _WAYS, strict=True):
-        if abs(amount) >= _LEAST_CM:
-            words.append((abs(amount), f"{plus if amount > 0 else minus} {abs(amount):.1f}"))
-    named = [text for _, text in sorted(words, reverse=True)[:2]]
-    if abs(action[6]) >= _LEAST_GRIP:
-        named.append("close" if action[6] > 0 else "open")
-    return ", ".join(named) + " cm" * bool(words) if named else "still"
+    components = []
+    for amount, (plus, minus) in zip(100 * action[:3], _DIRECTIONS, strict=True):
+        if abs(amount) >= _MIN_SHOWN_CM:
+            components.append((abs(amount), f"{plus if amount > 0 else minus} {abs(amount):.1f}"))
+    parts = [text for _, text in sorted(components, reverse=True)[:2]]
+    if abs(action[6]) >= _MIN_SHOWN_GRIPPER:
+        parts.append("close" if action[6] > 0 else "open")
+    return ", ".join(parts) + (" cm" if components else "") if parts else "still"
 
 
-def _short(name: str) -> str:
+def _shorten_name(name: str) -> str:
     """Return the end of an episode's name; of DROID's, which name several files, that of the first folder."""
-    own = name.split("--", maxsplit=1)[0].removesuffix("/recordings/MP4").rstrip("/")
-    return own if len(own) <= _LONGEST_NAME else f"...{own[-_LONGEST_NAME:]}"
+    short = name.split("--", maxsplit=1)[0].removesuffix("/recordings/MP4").rstrip("/")
+    return short if len(short) <= _MAX_NAME_LENGTH else f"...{short[-_MAX_NAME_LENGTH:]}"
 
 
-def write_imagination(imagination: Imagination, folder: Path, *, reporter: Reporter = SILENT) -> list[Path]:
+def write_rollouts(comparison: RolloutComparison, folder: Path, *, reporter: Reporter = SILENT) -> list[Path]:
     """Write image strip, video and GIF; return their paths. Without PyAV the video is left out, with a note.
 
     Raises:
         InputError: The folder cannot be written.
     """
-    strip = strip_of(imagination)
+    strip = make_strip(comparison)
     with translate_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / STRIP, encode_png(draw_strip(strip)))
         images, loop = list(render_frames(strip)), schedule_loop(strip)
-        frames, seconds = [images[place] for place, _ in loop], [shown_s for _, shown_s in loop]
-        times = [max(1, round(shown_s * _RATE_HZ)) for shown_s in seconds]  # that a video repeats each frame
+        frames, seconds = [images[index] for index, _ in loop], [duration_s for _, duration_s in loop]
+        repeats = [max(1, round(duration_s * _RATE_HZ)) for duration_s in seconds]
         written = [folder / STRIP, write_gif(folder / GIF, frames, seconds=seconds)]
         try:
-            written.append(write_video(folder / VIDEO, np.repeat(frames, times, axis=0), rate_hz=_RATE_HZ))
+            written.append(write_video(folder / VIDEO, np.repeat(frames, repeats, axis=0), rate_hz=_RATE_HZ))
         except UnreachableError as error:  # PyAV is not installed
-            reporter.note(f"No {VIDEO}: {error}")
+            reporter.note(f"{VIDEO} was not written: {error}")
     return written
 
 
-class ImaginedStrip:
+class ValidationStrip:
     """A training hook that draws an image strip at each validation: true frames, and predictions of base and model.
 
     The clip is always the validation clip with the most motion (with several processes: of rank 0's clips). An error
@@ -236,7 +244,7 @@ class ImaginedStrip:
 
     def __init__(self, config: Config) -> None:
         self._decoder: TrainedDecoder = load_decoder(str(config.validation.decoder), where="validation.decoder:")
-        self._most = -1.0  # motion of the selected clip
+        self._max_motion = -1.0  # motion of the selected clip
         self._clip: tuple[Batch, int, LatentBatch] | None = None  # its batch, its row in it, and its latents and states
         self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # its true frames, read once
 
@@ -248,36 +256,36 @@ class ImaginedStrip:
         """
         self._decoder.require_fit(world_model, config.data, subject=config.model.base)
 
-    def seen(self, dataset: Dataset, batch: Batch, encoded: LatentBatch) -> None:
+    def update(self, dataset: Dataset, batch: Batch, encoded: LatentBatch) -> None:
         """Update the clip with the most motion from a batch of validation clips and its latents."""
         self._dataset = dataset
         for row, states in enumerate(encoded.states.double().cpu().numpy()):
             motion = dataset.spaces.state.path_length(states)
-            if motion > self._most:
+            if motion > self._max_motion:
                 clip = encoded.clip(row)
-                own = replace(clip, latents=clip.latents.detach().float().cpu().clone())  # or all clips would stay
-                self._most, self._clip = motion, (replace(batch, latents=None), row, own)
+                copied = replace(clip, latents=clip.latents.detach().float().cpu().clone())  # frees the other clips
+                self._max_motion, self._clip = motion, (replace(batch, latents=None), row, copied)
 
     def draw(self, world_model: WorldModel, device: torch.device, run: Path, step: int) -> np.ndarray | None:
         """Write RUN/imagined/step-XXXXXXXX.png; return the image, None if none was drawn."""
         try:
-            image = draw_strip(strip_of(self.imagine(world_model, device, f"{run.name}, step {step:,}")))
+            image = draw_strip(make_strip(self.rollout(world_model, device, f"{run.name}, step {step:,}")))
             (run / IMAGINED).mkdir(exist_ok=True)
             write_atomically(run / IMAGINED / f"{checkpoint_name(step)}.png", encode_png(image))
         except Exception as error:  # an error in this image must not end the run
-            logger.warning("The predictions at step %d could not be drawn: %s", step, error)
+            logger.warning("validation.decoder: the image strip of step %d could not be drawn (%s)", step, error)
             return None
         return image
 
     @torch.no_grad()
-    def imagine(self, world_model: WorldModel, device: torch.device, subject: str) -> Imagination:
+    def rollout(self, world_model: WorldModel, device: torch.device, subject: str) -> RolloutComparison:
         """Return the decoded rollout of the model, and of the base model if the adapter can be switched off.
 
         Raises:
-            ValueError: `seen` was not called before.
+            ValueError: `update` was not called before.
         """
         if self._clip is None:
-            raise ValueError("no clip was seen")
+            raise ValueError("no validation clip; call update first")
         batch, row, clip = self._clip
         if self._frames is None:
             self._frames = to_display_frames(frames_for_display(self._dataset, batch, row), world_model.image_size)
@@ -286,16 +294,16 @@ class ImaginedStrip:
         start = Start.of(replace(clip, latents=latents), self._dataset.spaces.state)
         world_model.eval()
 
-        def rollout(name: str) -> Imagined:
-            rolled = rolled_out(world_model.rollout, start, actions, states[:-1])
-            return Imagined(name, AS_RECORDED, actions, shown(decoder, rolled))
+        def predict(name: str) -> DecodedRollout:
+            predicted = compute_rollout(world_model.rollout, start, actions, states[:-1])
+            return DecodedRollout(name, AS_RECORDED, actions, decode_views(decoder, predicted))
 
-        rollouts, adaptation = [rollout("model now")], world_model.adaptation
+        rollouts, adaptation = [predict("model now")], world_model.adaptation
         if adaptation is not None and adaptation.kind == "lora" and world_model.new_input_heads is None:
             with use_base_weights(world_model):
-                rollouts.insert(0, rollout("base"))
-        decoded = shown(decoder, latents[0])
-        return Imagination(
+                rollouts.insert(0, predict("base"))
+        decoded = decode_views(decoder, latents[0])
+        return RolloutComparison(
             subject=subject,
             episode_id=batch.episode_ids[row],
             start=batch.starts[row],

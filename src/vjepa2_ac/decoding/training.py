@@ -34,11 +34,18 @@ from vjepa2_ac.decoding.decoder import (
     DecoderCard,
     DecoderShape,
     Images,
-    as_images,
     read_card,
     save_decoder,
+    to_images,
 )
-from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
+from vjepa2_ac.decoding.frame_pairs import (
+    FramePairs,
+    PairBatch,
+    compute_mean_image,
+    fit_linear,
+    measure_decoders,
+    select_frames,
+)
 from vjepa2_ac.distributed import autocast, select_device
 from vjepa2_ac.encoding.batch import get_encoding
 from vjepa2_ac.encoding.latent_cache import (
@@ -69,7 +76,9 @@ _SCALES = 3
 _WARMUP, _WARMUP_SHARE = 500, 15  # the warm-up has at most 500 steps, and at most 1/15 of all steps
 _WEIGHT_DECAY, _BETAS, _MAX_GRAD_NORM = 0.05, (0.9, 0.95), 1.0
 _AVERAGE, _AVERAGED_SHARE = 0.999, 4.5  # largest decay of the average; a short training averages over its last 22 %
-_YOUNG = 9.0  # in early steps the decay is at most step / (step + 9), so that the initial weights are soon forgotten
+_AVERAGE_DELAY = (
+    9.0  # in early steps the decay is at most step / (step + 9), so that the initial weights are soon forgotten
+)
 
 
 def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bool = False) -> Path:
@@ -87,46 +96,46 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
         InputError: An input cannot be used, or the folder contains something else.
         StoppedError: A signal asked to stop; the same command resumes.
     """
-    ready = _setup(config, reporter)
-    folder = ready.folder
+    setup = _prepare(config, reporter)
+    folder = setup.folder
     with RunLock(folder) as lock:
         if is_done := (folder / CARD).is_file():
             read_card(folder)
-            reporter.note(f"The decoder is there already, in {folder}")
+            reporter.note(f"{folder} contains a trained decoder; nothing to do.")
         else:
-            _require_space(ready, reporter)
+            _require_disk_space(setup, reporter)
         if check_only:
             return folder
         if not is_done:
             lock.take()
             with translate_write_errors(folder):
-                write_atomically(folder / KEY, json.dumps({"key": dict(ready.key.parts)}, indent=1) + "\n")
-            _try_one_step(ready)
-            _make(ready, reporter)
-            reporter.note(f"The decoder is in {folder}: {folder / CARD} says how good it is")
-        shutil.rmtree(ready.files.folder, ignore_errors=True)  # also if an earlier start was killed before this line
+                write_atomically(folder / KEY, json.dumps({"key": dict(setup.key.parts)}, indent=1) + "\n")
+            _try_one_step(setup)
+            _encode_and_train(setup, reporter)
+            reporter.note(f"Saved the decoder to {folder} (PSNR and SSIM: {folder / CARD})")
+        shutil.rmtree(setup.files.folder, ignore_errors=True)  # also if an earlier start was killed before this line
         (folder / STATE).unlink(missing_ok=True)
     return folder
 
 
-def _make(ready: Setup, reporter: Reporter) -> None:
+def _encode_and_train(setup: Setup, reporter: Reporter) -> None:
     """Encode the frames, fit the linear decoder, train, measure, and write the decoder."""
-    device, config = ready.encoder.device, ready.config
+    device, config = setup.encoder.device, setup.config
     with stop_on_signals() as stop:
-        pairs, held_out = (_encoded(ready, split, reporter, stop) for split in ("train", "test"))
-        linear = fit_linear(pairs, ready.shape, device, reporter.task("fitting the linear decoder"))
-        steps = DecoderSteps(ready, linear)
-        _train(ready, steps, pairs, reporter, stop)
-    decoder = Decoder(ready.shape).to(device).eval()
+        pairs, held_out = (_encode_split(setup, split, reporter, stop) for split in ("train", "test"))
+        linear = fit_linear(pairs, setup.shape, device, reporter.task("fitting the linear decoder"))
+        steps = DecoderSteps(setup, linear)
+        _train(setup, steps, pairs, reporter, stop)
+    decoder = Decoder(setup.shape).to(device).eval()
     decoder.load_state_dict(steps.average)
-    found: dict[str, Any] = {}
+    measured: dict[str, Any] = {}
     if len(held_out):
         decoders = {"decoder": decoder, "linear": linear.to(device)}
-        found = measure_decoders(held_out, decoders, mean_image(pairs), reporter.task("measuring", "frames"))
+        measured = measure_decoders(held_out, decoders, compute_mean_image(pairs), reporter.task("measuring", "frames"))
     card = DecoderCard(
         format="vjepa2-ac decoder 1",
-        shape=ready.shape,
-        encoder=ready.encoding.parts["encoder"],
+        shape=setup.shape,
+        encoder=setup.encoding.parts["encoder"],
         crop=config.data.crop,
         precision=config.training.precision,
         data=config.data.path,
@@ -134,10 +143,10 @@ def _make(ready: Setup, reporter: Reporter) -> None:
         episodes=len(set(pairs.episode_ids)),
         frames=len(pairs),
         steps=config.decoder.steps,
-        held_out=found,
+        held_out=measured,
         time=utc_now(),
     )
-    save_decoder(ready.folder, card, decoder.state_dict())
+    save_decoder(setup.folder, card, decoder.state_dict())
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +160,7 @@ class Setup:
     key: CacheKey
     dataset: Dataset
     encoder: EncoderOnDevice
-    wanted: dict[Split, list[FramesToEncode]]
+    frames: dict[Split, list[FramesToEncode]]
 
     @property
     def files(self) -> LatentFiles:
@@ -159,7 +168,7 @@ class Setup:
         return LatentFiles(self.folder / PAIRS, self.key.digest)
 
 
-def _setup(config: Config, reporter: Reporter) -> Setup:
+def _prepare(config: Config, reporter: Reporter) -> Setup:
     """Check and load config, folder, data and model.
 
     Raises:
@@ -167,25 +176,25 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
     """
     decoder = config.decoder
     folder = Path(config.run_dir).parent / "decoder" if decoder.folder is None else Path(decoder.folder)
-    require_frames(config.data, to="learn from")
-    require_stride(config.data, to="know which frames clips use")
+    require_frames(config.data, to="train a decoder")
+    require_stride(config.data, to="select the frames that clips use")
     device = select_device(config.training)
     with translate_write_errors(folder):
         check_local_writable(folder)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-    wanted: dict[Split, list[FramesToEncode]] = {
-        "train": wanted_frames(dataset, "train", frames=decoder.frames),
-        "test": wanted_frames(dataset, "test", frames=_HELD_OUT_FRAMES),  # may be none
+    frames: dict[Split, list[FramesToEncode]] = {
+        "train": select_frames(dataset, "train", frames=decoder.frames),
+        "test": select_frames(dataset, "test", frames=_HELD_OUT_FRAMES),  # may be none
     }
-    if not wanted["train"]:
-        found, needed = "no frames of train episodes", "one episode or more that is as long as a clip"
+    if not frames["train"]:
+        found, needed = "no training frames", "at least one training episode that is as long as a clip"
         fix = "Lower data.validation_share or data.test_share"
         raise InputError(where=f"data.path: {config.data.path}", found=found, needed=needed, fix=fix)
     reporter.task(LOADING)
     model = load_base(config.model, seed=config.seed)
     encoding, size, patch = get_encoding(model, config), model.image_size, model.sizes.patch_size
     if patch % UPSAMPLED or size < _SMALLEST:
-        needed = f"{_SMALLEST} px or more, and patches of a multiple of {UPSAMPLED} px"
+        needed = f"images of at least {_SMALLEST} px, and a patch size that is a multiple of {UPSAMPLED} px"
         raise InputError(where="model", found=f"images of {size} px in patches of {patch} px", needed=needed)
     key = CacheKey({
         "decoder": decoder.model_dump(mode="json", exclude={"folder"}),
@@ -197,50 +206,50 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
     require_matching_folder(folder, KEY, key, where=f"decoder.folder {folder}")
     shape = DecoderShape(decoder.size, model.latent_dim, size // patch, patch)
     return Setup(
-        config, folder, shape, encoding, key, dataset, EncoderOnDevice.from_model(config, model, device), wanted
+        config, folder, shape, encoding, key, dataset, EncoderOnDevice.from_model(config, model, device), frames
     )
 
 
-def _require_space(ready: Setup, reporter: Reporter) -> None:
-    encoding, kind = ready.encoding, ready.config.data.cache_dtype
+def _require_disk_space(setup: Setup, reporter: Reporter) -> None:
+    encoding, kind = setup.encoding, setup.config.data.cache_dtype
     per_frame = bytes_per_frame(encoding.tokens, encoding.dim, kind) + 3 * encoding.image_size**2
-    everything = [one for some in ready.wanted.values() for one in some]
-    left = count_frames([one for one in everything if not ready.files.has_file(one.episode, one.camera)])
+    all_frames = [entry for entries in setup.frames.values() for entry in entries]
+    num_missing = count_frames([entry for entry in all_frames if not setup.files.has_file(entry.episode, entry.camera)])
     fix = "Lower decoder.frames, set data.cache_dtype: int8, or put decoder.folder on a larger disk"
-    require_space(ready.folder, left, per_frame, fix=fix)
-    size = f"{left * per_frame / 1e9:.3g} GB of disk for them and their latents, while training"
-    reporter.note(f"{count_frames(everything):,} frames; {size}")
+    require_space(setup.folder, num_missing, per_frame, fix=fix)
+    size = f"{num_missing * per_frame / 1e9:.3g} GB"
+    reporter.note(f"{count_frames(all_frames):,} frames; the training needs {size} of disk for frames and latents")
 
 
-def _try_one_step(ready: Setup) -> None:
+def _try_one_step(setup: Setup) -> None:
     """Run one step on zeros as a memory check, before the frames are encoded."""
-    if ready.encoder.device.type == "cuda":
-        shape, count = ready.shape, ready.config.decoder.batch_size
+    if setup.encoder.device.type == "cuda":
+        shape, count = setup.shape, setup.config.decoder.batch_size
         latents = torch.zeros(count, shape.grid**2, shape.dim)
         images = torch.zeros(count, 3, shape.image_size, shape.image_size).byte()
-        DecoderSteps(ready, None).do(1, Pairs(latents, images, ()))
+        DecoderSteps(setup, None).run(1, PairBatch(latents, images, ()))
 
 
-def _encoded(ready: Setup, split: Split, reporter: Reporter, stop: StopRequest) -> FramePairs:
+def _encode_split(setup: Setup, split: Split, reporter: Reporter, stop: StopRequest) -> FramePairs:
     """Encode the frames of a split that are not encoded yet; unreadable episodes follow `data.broken_episodes`."""
-    shown, wanted, files = reporter.task(f"encoding {split} frames", "frames"), ready.wanted[split], ready.files
+    report, frames, files = reporter.task(f"encoding {split} frames", "frames"), setup.frames[split], setup.files
 
     def progress(done: int, total: int) -> None:
-        shown(done, total)
+        report(done, total)
         if stop.reason is not None:
-            raise StoppedError(ready.folder, 0, stop.reason)
+            raise StoppedError(setup.folder, 0, stop.reason)
 
-    left = [one for one in wanted if not files.is_done(one.episode, one.camera)]
-    encode_files(ready.dataset, left, ready.encoder, files, progress, lossless_images=True)
-    pairs = FramePairs.of(ready.dataset, wanted, files)
-    if wanted and not len(pairs):
-        raise InputError(where=ready.config.data.path, found="no frame that can be read", needed="one or more")
+    missing = [entry for entry in frames if not files.is_done(entry.episode, entry.camera)]
+    encode_files(setup.dataset, missing, setup.encoder, files, progress, lossless_images=True)
+    pairs = FramePairs.of(setup.dataset, frames, files)
+    if frames and not len(pairs):
+        raise InputError(where=setup.config.data.path, found=f"no readable {split} frame", needed="one or more")
     return pairs
 
 
-def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Reporter, stop: StopRequest) -> None:
+def _train(setup: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Reporter, stop: StopRequest) -> None:
     """Run all steps after the last saved one, and save checkpoints."""
-    config, saved = ready.config.decoder, ready.folder / STATE
+    config, saved = setup.config.decoder, setup.folder / STATE
     first = 0
     if saved.is_file():
         state = read_torch(saved)
@@ -251,12 +260,12 @@ def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Repor
             value.copy_(state["average"][name])
     progress = reporter.task("training the decoder", "steps")
     with (
-        MetricsLog(ready.folder, first_step=first) as log,
-        contextlib.closing(_batches(pairs, ready.config, first)) as batches,
+        MetricsLog(setup.folder, first_step=first) as log,
+        contextlib.closing(_iterate_batches(pairs, setup.config, first)) as batches,
     ):
         every = max(1, min(_CHECKPOINT_EVERY, config.steps // 3))
         for step, batch in batches:
-            metrics = steps.do(step, batch)
+            metrics = steps.run(step, batch)
             progress(step, config.steps)
             is_last = step == config.steps
             if step % _LOG_EVERY == 0 or is_last:
@@ -266,22 +275,24 @@ def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Repor
                     parts = {"decoder": steps.decoder.state_dict(), "optimizer": steps.optimizer.state_dict()}
                     write_torch({"step": step, "average": steps.average, **parts}, file)
             if stop.reason is not None and not is_last:
-                raise StoppedError(ready.folder, step, stop.reason)
+                raise StoppedError(setup.folder, step, stop.reason)
 
 
-def _batches(pairs: FramePairs, config: Config, done: int) -> Generator[tuple[int, Pairs], None, None]:
+def _iterate_batches(pairs: FramePairs, config: Config, done: int) -> Generator[tuple[int, PairBatch], None, None]:
     """Yield the frames of each step after `done`; the next batch is read in the background."""
     size, count, seed = config.decoder.batch_size, len(pairs), config.seed
 
-    def read(step: int) -> Pairs:
-        places = range((step - 1) * size, step * size)
-        return pairs.read([permute_index(at % count, size=count, seed=seed, epoch=at // count) for at in places])
+    def read(step: int) -> PairBatch:
+        positions = range((step - 1) * size, step * size)
+        return pairs.read(
+            [permute_index(position % count, size=count, seed=seed, epoch=position // count) for position in positions]
+        )
 
     with ThreadPoolExecutor(1, thread_name_prefix="pairs") as pool:
-        ahead = pool.submit(read, done + 1)
+        next_batch = pool.submit(read, done + 1)
         for step in range(done + 1, config.decoder.steps + 1):
-            batch = ahead.result()
-            ahead = pool.submit(read, step + 1)
+            batch = next_batch.result()
+            next_batch = pool.submit(read, step + 1)
             yield step, batch
 
 
@@ -326,40 +337,40 @@ class DecoderSteps:
         self.decoder = Decoder(setup.shape)
         self.decoder.initialise(torch.Generator().manual_seed(setup.config.seed))
         if linear is not None:
-            self.decoder.start_from(linear)
+            self.decoder.copy_linear(linear)
         self.decoder.to(self._device)
-        matrices = [one for one in self.decoder.parameters() if one.ndim > 1]
-        others = [one for one in self.decoder.parameters() if one.ndim <= 1]
-        groups = [{"params": matrices, "weight_decay": _WEIGHT_DECAY}, {"params": others, "weight_decay": 0.0}]
+        decayed = [parameter for parameter in self.decoder.parameters() if parameter.ndim > 1]
+        not_decayed = [parameter for parameter in self.decoder.parameters() if parameter.ndim <= 1]
+        groups = [{"params": decayed, "weight_decay": _WEIGHT_DECAY}, {"params": not_decayed, "weight_decay": 0.0}]
         self.optimizer = torch.optim.AdamW(groups, lr=setup.config.decoder.learning_rate, betas=_BETAS)
-        self.average = {name: one.detach().clone() for name, one in self.decoder.state_dict().items()}
+        self.average = {name: tensor.detach().clone() for name, tensor in self.decoder.state_dict().items()}
 
-    def do(self, step: int, pairs: Pairs) -> dict[str, float]:
+    def run(self, step: int, pairs: PairBatch) -> dict[str, float]:
         """Run one optimizer step, counted from 1, and return its metrics.
 
         Raises:
             InputError: Loss or gradients are not finite; the weights are unchanged.
         """
-        latents, images = pairs.latents.to(self._device), as_images(pairs.images.to(self._device))
+        latents, images = pairs.latents.to(self._device), to_images(pairs.images.to(self._device))
         learning_rate = learning_rate_at(step, self._config.decoder)
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
         needs_loss_scale = self._config.training.precision == "fp16"  # not implemented here, so float32 is used
         with contextlib.nullcontext() if needs_loss_scale else autocast(self._config.training, self._device):
-            shown = self.decoder(latents)
-        loss, parts = decoder_loss(shown, images)
+            decoded = self.decoder(latents)
+        loss, parts = decoder_loss(decoded, images)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch
         norm = torch.nn.utils.clip_grad_norm_(self.decoder.parameters(), _MAX_GRAD_NORM)
-        numbers = {"loss": loss, **parts, "gradient_norm": norm}
-        read = torch.stack([value.detach().float() for value in numbers.values()]).tolist()  # waits for the device once
-        metrics = dict(zip(numbers, read, strict=True))
+        values = {"loss": loss, **parts, "gradient_norm": norm}
+        read = torch.stack([value.detach().float() for value in values.values()]).tolist()  # waits for the device once
+        metrics = dict(zip(values, read, strict=True))
         if not math.isfinite(metrics["gradient_norm"]):
-            found = f"{self._config.decoder.learning_rate:g}: loss or gradients of step {step} are not finite"
-            fix = "Lower it, delete the newest checkpoint if it was written by then, and start again"
+            found = f"{self._config.decoder.learning_rate:g}; loss or gradients of step {step} are not finite"
+            fix = f"Lower it and start again; delete {STATE} if it was saved after the loss had diverged"
             raise InputError(where="decoder.learning_rate", found=found, fix=fix)
         self.optimizer.step()
-        decay = min(_AVERAGE, 1 - _AVERAGED_SHARE / self._config.decoder.steps, step / (step + _YOUNG))
-        for name, one in self.decoder.state_dict().items():  # detached tensors
-            self.average[name].lerp_(one, 1.0 - decay)
+        decay = min(_AVERAGE, 1 - _AVERAGED_SHARE / self._config.decoder.steps, step / (step + _AVERAGE_DELAY))
+        for name, tensor in self.decoder.state_dict().items():  # detached tensors
+            self.average[name].lerp_(tensor, 1.0 - decay)
         return metrics | {"learning_rate": learning_rate}

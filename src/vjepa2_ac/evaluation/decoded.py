@@ -22,7 +22,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.decoding.decoder import TrainedDecoder, as_images, as_pixels
+from vjepa2_ac.decoding.decoder import TrainedDecoder, to_images, to_pixels
 from vjepa2_ac.distributed import gather_shared
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.distribution import frechet_distance
@@ -117,9 +117,9 @@ class _Images:
 
     def strip(self, row: int, example: Example, models: Sequence[str]) -> DecodedStrip:
         """Return the images of the clip in one row, frame 0 included."""
-        rows = {} if self.true is None else {TRUE_FRAMES: as_pixels(self.true[row])}
+        rows = {} if self.true is None else {TRUE_FRAMES: to_pixels(self.true[row])}
         for source in (DECODED_TRUTH, *models):
-            rows[source] = as_pixels(torch.cat([self.decoded_first[row], self.sources[source][row]]))
+            rows[source] = to_pixels(torch.cat([self.decoded_first[row], self.sources[source][row]]))
         return DecodedStrip(example.why, example.episode_id, example.start, rows)
 
 
@@ -141,7 +141,7 @@ def _decoded(
         return _Images(sources, first, None)
     rows = [frames_of_row(row) for row in range(len(batch.starts))]
     pixels = torch.from_numpy(np.stack([row for row in rows if row is not None])).to(latents.device)
-    true = as_images(rearrange(pixels, "batch time h w c -> batch time c h w"))
+    true = to_images(rearrange(pixels, "batch time h w c -> batch time c h w"))
     return _Images({**sources, RAW_PERSISTENCE: true[:, :1].expand_as(true[:, 1:])}, first, true)
 
 

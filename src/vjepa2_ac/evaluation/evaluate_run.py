@@ -17,7 +17,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, frames_for_display, open_dataset
 from vjepa2_ac.data.loader import read_batches, validation_windows
 from vjepa2_ac.data.transforms import pixels_to_input, to_display_frames
-from vjepa2_ac.decoding.decoder import TrainedDecoder, as_pixels, load_decoder
+from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder, to_pixels
 from vjepa2_ac.distributed import join_processes, own_share, run_first_per_machine, run_on_first, share_work
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.encode_dataset import use_finished_cache
@@ -184,7 +184,7 @@ def _encoded(
     world_model: WorldModel, images: Float[Tensor, "batch time 3 size size"]
 ) -> Float[Tensor, "batch time tokens dim"]:
     """Return the latents of decoded images, which are first rounded to 8 bits, as camera images are."""
-    pixels = torch.from_numpy(as_pixels(images)).to(images.device)
+    pixels = torch.from_numpy(to_pixels(images)).to(images.device)
     return world_model.encode(pixels_to_input(pixels, world_model.image_size))
 
 

@@ -17,7 +17,15 @@ from vjepa2_ac.data.sources.indexed_source import get_state_space
 from vjepa2_ac.data.transforms import crop_frames, split_views, to_display_frames
 from vjepa2_ac.data.windows import require_frames, spread_indices_with_ends
 from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
-from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown, worth_knowing
+from vjepa2_ac.decoding.imagine import (
+    AS_RECORDED,
+    DecodedRollout,
+    RolloutComparison,
+    Start,
+    compute_rollout,
+    decode_views,
+    describe_poor_reconstruction,
+)
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch
@@ -65,7 +73,7 @@ class ImagineOptions:
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, split
 
 
-def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservation) -> Imagination:
+def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservation) -> RolloutComparison:
     """Predict and decode the frames after an image, for actions by name or from files.
 
     With `planning.views` above 1 the image contains the views of several cameras, as for a planner.
@@ -94,24 +102,26 @@ def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservat
     starts = [Start(view_latents, state, space, camera) for view_latents in latents[0].chunk(views)]
     cut = crop_frames(split_views(seen.image[None], views), config.data.crop)
     first = np.concatenate(to_display_frames(cut, model.image_size), axis=1)
-    decoded_first = shown(decoder.decoder, latents, views)[0]
+    decoded_first = decode_views(decoder.decoder, latents, views)[0]
 
     def predicted_frames(actions: Float[np.ndarray, "steps 7"]) -> Frames:
-        rollout = torch.cat([rolled_out(model.rollout, start, actions) for start in starts], dim=1)
-        return shown(decoder.decoder, rollout, views)
+        rollout = torch.cat([compute_rollout(model.rollout, start, actions) for start in starts], dim=1)
+        return decode_views(decoder.decoder, rollout, views)
 
-    return Imagination(
+    return RolloutComparison(
         subject=session.name,
         episode_id="",
         start=0,
         seconds_per_step=(config.data.model_stride if config.data.stride != "auto" else 1) / _RATE_HZ,
         first=first,
         decoded_first=decoded_first,
-        rollouts=tuple(Imagined("model", name, actions, predicted_frames(actions)) for name, actions in chosen.items()),
+        rollouts=tuple(
+            DecodedRollout("model", name, actions, predicted_frames(actions)) for name, actions in chosen.items()
+        ),
         notes=(
             f"Times in the film suppose {_RATE_HZ:g} control steps in a second.",
             *warnings,
-            *worth_knowing(decoder.card, first, decoded_first),
+            *describe_poor_reconstruction(decoder.card, first, decoded_first),
         ),
     )
 
@@ -131,7 +141,7 @@ def _actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig)
 
 def imagine_clip(
     subject: str, options: ImagineOptions, *, simulate: Simulate | None = None, reporter: Reporter = SILENT
-) -> Imagination:
+) -> RolloutComparison:
     """Predict and decode a held-out clip with each model, for the recorded actions and for counterfactual actions.
 
     Args:
@@ -168,18 +178,22 @@ def imagine_clip(
                 truths[name] = _as_seen(*outcome(chosen[name]), config=config, size=size)
     except UserError as error:
         notes = (f"What really happens under other actions is not known: {error}",)
-    rollouts: list[Imagined] = []
+    rollouts: list[DecodedRollout] = []
     with accelerator.autocast():
         latents = encode_batch(models.world_model, batch, device=accelerator.device)
         start, states = Start.of(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
         for name, actions in chosen.items():
             for model in models.evaluated_models:
                 with model.prediction_context():
-                    rollout = rolled_out(model.model.rollout, start, actions, states if name == AS_RECORDED else None)
+                    rollout = compute_rollout(
+                        model.model.rollout, start, actions, states if name == AS_RECORDED else None
+                    )
                 truth = truths.get(name, (None, None))
-                rollouts.append(Imagined(model.name, name, actions, shown(decoder.decoder, rollout), *truth))
-        decoded = shown(decoder.decoder, latents.latents[0])
-    return Imagination(
+                rollouts.append(
+                    DecodedRollout(model.name, name, actions, decode_views(decoder.decoder, rollout), *truth)
+                )
+        decoded = decode_views(decoder.decoder, latents.latents[0])
+    return RolloutComparison(
         subject=subject,
         episode_id=batch.episode_ids[0],
         start=batch.starts[0],
@@ -189,7 +203,7 @@ def imagine_clip(
         rollouts=tuple(rollouts),
         truth=frames[1:],
         decoded_truth=decoded[1:],
-        notes=(*worth_knowing(decoder.card, frames[0], decoded[0]), *notes),
+        notes=(*describe_poor_reconstruction(decoder.card, frames[0], decoded[0]), *notes),
     )
 
 
@@ -268,7 +282,7 @@ def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
     controller, goal = answer.controller, answer.request.goals[answer.decision.goals[-1]].image
     decoder.to(controller.device)
     latents = torch.stack([controller.encode(image) for image in (answer.request.start, goal)])
-    start, decoded_goal = shown(decoder.decoder, latents, controller.config.views)
+    start, decoded_goal = decode_views(decoder.decoder, latents, controller.config.views)
     frames = _rollout(answer.decision, decoder)
     shown_steps = spread_indices_with_ends(len(frames), _MOST_PLAN_STEPS)
     views = crop_frames(split_views(goal[None], controller.config.views), controller.crop)
@@ -284,4 +298,8 @@ def _rollout(decision: Decision, decoder: TrainedDecoder) -> Frames:
     if decision.plan is None or decision.cost is None:
         return no_frames
     latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.rollout(decision.plan.actions[None])[0][0]
-    return shown(decoder.decoder, latents, decision.cost.views) if bool(torch.isfinite(latents).all()) else no_frames
+    return (
+        decode_views(decoder.decoder, latents, decision.cost.views)
+        if bool(torch.isfinite(latents).all())
+        else no_frames
+    )

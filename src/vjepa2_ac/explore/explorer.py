@@ -21,7 +21,7 @@ from vjepa2_ac.data.loader import read_batches
 from vjepa2_ac.data.transforms import crop_frames, to_display_frames
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.decoding.decoder import TrainedDecoder
-from vjepa2_ac.decoding.imagine import shown
+from vjepa2_ac.decoding.imagine import decode_views
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Progress
@@ -288,7 +288,7 @@ class Explorer:
 
     def decode(self, latents: Float[Tensor, "tokens dim"]) -> Pixels:
         """Decode latents into an image."""
-        return np.asarray(shown(self.decoder.decoder, latents[None])[0])
+        return np.asarray(decode_views(self.decoder.decoder, latents[None])[0])
 
 
 def compute_relative_spread(latents: Float[Tensor, "tokens dim"], like: Float[Tensor, "tokens dim"]) -> float:
@@ -366,7 +366,7 @@ class Search:
         Raises:
             InputError: There are no limits for vectors.
         """
-        return search_space(self._with_horizon(steps), self._explorer.spaces.state)
+        return make_search_space(self._with_horizon(steps), self._explorer.spaces.state)
 
     def _with_horizon(self, steps: int) -> PlanningConfig:
         return self.config.model_copy(update={"horizon": steps, "action_repeat": 1})
@@ -406,8 +406,8 @@ class Search:
         """
         around = torch.tensor([list(action)], dtype=torch.float32)
         with self._open_cost(model_index, position, goal) as cost:
-            checked_progress = until_cancelled(cancelled, progress)
-            return energy_slices(
+            checked_progress = raise_if_cancelled(cancelled, progress)
+            return compute_energy_slices(
                 cost, around, self.make_search_space(), self.axes, nodes=_GRID_POINTS, progress=checked_progress
             )
 

@@ -19,11 +19,11 @@ from vjepa2_ac.spaces import actions_from_states
 
 States = Float[np.ndarray, "frames 7"]
 
-GRIPS = 0.15  # smallest difference of closedness that counts as a change of the gripper
-_MOVES = 0.02  # smallest change of closedness between two frames that counts as motion of the fingers
+MIN_GRIPPER_CHANGE = 0.15  # smallest difference of closedness that counts as a change of the gripper
+_MIN_FINGER_MOTION = 0.02  # smallest change of closedness between two frames that counts as motion of the fingers
 _PAUSE = 2  # frames for which the fingers may rest within one change
 _STILL_M, _STILL_RAD = 0.002, 0.02  # the arm rests if it moves less than this between two frames
-_LEFT_M = 0.01  # the arm has left the position of a grip if it is farther away than this
+_MIN_DEPARTURE_M = 0.01  # the arm has left the position of a grip if it is farther away than this
 _SAME_M, _SAME_RAD = 0.005, 0.05  # two states count as equal if they differ by less than this
 
 
@@ -43,11 +43,11 @@ class StillRule:
     apart: int = 4  # a stop closer than this to another key frame is left out
 
 
-OF_MODEL_STEPS = StillRule(lasts=1, apart=1)
+MODEL_STEP_RULE = StillRule(lasts=1, apart=1)
 """The rule if a frame is a model step."""
 
 
-def gripper_key_frames(states: States, rule: StillRule | None = None) -> tuple[KeyFrame, ...]:
+def find_gripper_key_frames(states: States, rule: StillRule | None = None) -> tuple[KeyFrame, ...]:
     """Return the frames at which the gripper begins and ends to change, the stops of the arm, and the last frame.
 
     If the arm leaves before the fingers rest, the change ends at the last frame before the arm leaves, provided that
@@ -67,13 +67,13 @@ def gripper_key_frames(states: States, rule: StillRule | None = None) -> tuple[K
     """
     rule, last = rule or StillRule(), len(states) - 1
     names: dict[int, str] = {}  # by frame
-    changes = _gripper_changes(states[:, GRIPPER])
+    changes = _find_gripper_changes(states[:, GRIPPER])
     for begin, end in changes:
         closes = states[end, GRIPPER] > states[begin, GRIPPER]
         if begin >= rule.apart:
             names.setdefault(begin, "before closing" if closes else "before opening")
-        names[_before_leaving(states, begin, end)] = "closed" if closes else "opened"
-    for begin in _stops(states, rule.lasts):
+        names[_find_end_of_change(states, begin, end)] = "closed" if closes else "opened"
+    for begin in _find_stops(states, rule.lasts):
         is_near = [abs(begin - frame) < rule.apart for frame in (0, last, *names)]
         if not any(is_near) and not any(first <= begin <= end for first, end in changes):
             names[begin] = "stop"
@@ -84,36 +84,36 @@ def gripper_key_frames(states: States, rule: StillRule | None = None) -> tuple[K
     return tuple(KeyFrame(frame, names[frame]) for frame in sorted(names))
 
 
-def _gripper_changes(closedness: Float[np.ndarray, " frames"]) -> list[tuple[int, int]]:
+def _find_gripper_changes(closedness: Float[np.ndarray, " frames"]) -> list[tuple[int, int]]:
     """Return the first and the last frame of each change of the gripper in one direction."""
     changes: list[tuple[int, int, float]] = []  # first frame, last frame, direction
     for frame, difference in enumerate(np.diff(closedness)):
-        if abs(difference) < _MOVES:
+        if abs(difference) < _MIN_FINGER_MOTION:
             continue
         if changes and changes[-1][2] == np.sign(difference) and frame - changes[-1][1] <= _PAUSE:
             changes[-1] = (changes[-1][0], frame + 1, changes[-1][2])
         else:
             changes.append((frame, frame + 1, float(np.sign(difference))))
-    return [(begin, end) for begin, end, _ in changes if abs(closedness[end] - closedness[begin]) >= GRIPS]
+    return [(begin, end) for begin, end, _ in changes if abs(closedness[end] - closedness[begin]) >= MIN_GRIPPER_CHANGE]
 
 
-def _before_leaving(states: States, begin: int, end: int) -> int:
+def _find_end_of_change(states: States, begin: int, end: int) -> int:
     """Return the last frame of a gripper change before the arm leaves its position, or the end of the change."""
     changed = np.abs(states[begin : end + 1, GRIPPER] - states[begin, GRIPPER])
     moved = np.linalg.norm(states[begin : end + 1, :3] - states[begin, :3], axis=1)
-    candidates = np.flatnonzero((moved < _LEFT_M) & (changed >= max(GRIPS, changed[-1] / 2)))
+    candidates = np.flatnonzero((moved < _MIN_DEPARTURE_M) & (changed >= max(MIN_GRIPPER_CHANGE, changed[-1] / 2)))
     return begin + int(candidates[-1]) if len(candidates) else end
 
 
-def _stops(states: States, lasts: int) -> list[int]:
+def _find_stops(states: States, lasts: int) -> list[int]:
     """Return the frames at which the arm comes to rest for at least `lasts` frames; a rest at the start is left out."""
-    still = _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MOVES)
+    still = _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MIN_FINGER_MOTION)
     begins = [frame for frame in range(1, len(still)) if still[frame] and not still[frame - 1]]
     return [begin for begin in begins if still[begin : begin + lasts].all() and begin + lasts <= len(still)]
 
 
 def _is_same(one: Float[np.ndarray, " 7"], other: Float[np.ndarray, " 7"]) -> bool:
-    return bool(_are_below(actions_from_states(np.stack([one, other])), _SAME_M, _SAME_RAD, GRIPS)[0])
+    return bool(_are_below(actions_from_states(np.stack([one, other])), _SAME_M, _SAME_RAD, MIN_GRIPPER_CHANGE)[0])
 
 
 def _are_below(
@@ -123,7 +123,7 @@ def _are_below(
     return np.asarray((moved < metres) & (turned < radians) & (np.abs(changes[:, GRIPPER]) < closedness))
 
 
-def with_frames_between(keys: Sequence[KeyFrame], step: int, name: str = "on the way") -> tuple[KeyFrame, ...]:
+def add_frames_between(keys: Sequence[KeyFrame], step: int, name: str = "on the way") -> tuple[KeyFrame, ...]:
     """Return key frames, and every `step`-th frame between two of them, counted from the earlier one or the start.
 
     A planner with a horizon of one step moves straight towards a distant goal, with all axes at their limits. Closer
@@ -141,7 +141,7 @@ def with_frames_between(keys: Sequence[KeyFrame], step: int, name: str = "on the
     return tuple(with_between)
 
 
-def every_key_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:
+def select_every_nth_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:
     """Return every `step`-th frame except the first, and the last frame.
 
     A frame less than half a step before the last frame is left out.
@@ -150,7 +150,7 @@ def every_key_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:
         frames: Number of frames of the demonstration, two or more.
         step: Number of frames from one key frame to the next, one or more.
     """
-    return with_frames_between([KeyFrame(frames - 1, "end")], step, "frame {}")
+    return add_frames_between([KeyFrame(frames - 1, "end")], step, "frame {}")
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class Timing:
     stop_share: float | None = None  # `SubGoal.share` of the last goal
 
 
-def sub_goals_of(
+def make_sub_goals(
     images: Sequence[np.ndarray], keys: Sequence[KeyFrame], timing: Timing, states: States | None = None
 ) -> tuple[SubGoal, ...]:
     """Return key frames as goals, with the demonstration's durations and, if states are given, gripper modes.
@@ -180,15 +180,15 @@ def sub_goals_of(
     goals, before = [], 0
     for image, key in zip(images, keys, strict=True):
         steps = max(1, math.ceil((key.frame - before) / timing.stride))
-        gripper = None if states is None else _gripper_mode(states[before], states[key.frame])
+        gripper = None if states is None else _get_gripper_mode(states[before], states[key.frame])
         low, high = max(1, steps - timing.slack), steps + timing.slack
         goals.append(SubGoal(image, key.name, low, high, timing.share, gripper))
         before = key.frame
     return (*goals[:-1], replace(goals[-1], at_most=None, share=timing.stop_share))
 
 
-def _gripper_mode(before: Float[np.ndarray, " 7"], after: Float[np.ndarray, " 7"]) -> GripperMode:
+def _get_gripper_mode(before: Float[np.ndarray, " 7"], after: Float[np.ndarray, " 7"]) -> GripperMode:
     change = after[GRIPPER] - before[GRIPPER]
-    if abs(change) < GRIPS:
+    if abs(change) < MIN_GRIPPER_CHANGE:
         return "held"
     return "close" if change > 0 else "open"

@@ -21,9 +21,9 @@ from vjepa2_ac.goals.key_frames import (
     KeyFrame,
     StillRule,
     Timing,
-    every_key_frame,
-    gripper_key_frames,
-    sub_goals_of,
+    find_gripper_key_frames,
+    make_sub_goals,
+    select_every_nth_frame,
 )
 from vjepa2_ac.planning.cameras import read_views, require_views
 from vjepa2_ac.planning.goals import SubGoal, write_goals
@@ -46,7 +46,7 @@ class KeyFrameOptions(Timing):
 
 
 @dataclass(frozen=True, eq=False)
-class MadeGoals:
+class DemonstrationGoals:
     """The goals of a demonstration, and a description of their source."""
 
     options: KeyFrameOptions
@@ -71,7 +71,7 @@ class MadeGoals:
 
 def make_goals(
     config: DataConfig, episode_name: str, options: KeyFrameOptions, progress: Progress | None = None
-) -> MadeGoals:
+) -> DemonstrationGoals:
     """Return the key frames of an episode of a data set as goals.
 
     Args:
@@ -92,18 +92,18 @@ def make_goals(
         raise InputError(where=name, found=f"{len(states)} frames", needed="2 at least")
     poses = states if config.states == "pose" else None
     if options.every is not None:
-        keys = every_key_frame(len(states), options.every)
+        keys = select_every_nth_frame(len(states), options.every)
     elif poses is None:
         found, needed = f"{name}: no measured poses", "an episode with poses and gripper"
         raise InputError(where="goals", found=found, needed=needed, fix="Take every n-th frame: --every N")
     else:
-        keys = gripper_key_frames(poses, StillRule(apart=options.apart))
+        keys = find_gripper_key_frames(poses, StillRule(apart=options.apart))
     first, *images = read_views(dataset, index, options.views, [0, *(key.frame for key in keys)])
-    goals, origin = sub_goals_of(images, keys, options, poses), {"data": config.path, "episode": name}
-    return MadeGoals(options, keys, goals, first, len(states), poses, {**origin, "camera": config.camera})
+    goals, origin = make_sub_goals(images, keys, options, poses), {"data": config.path, "episode": name}
+    return DemonstrationGoals(options, keys, goals, first, len(states), poses, {**origin, "camera": config.camera})
 
 
-def frame_of_episode(config: DataConfig, place: str) -> UInt8[np.ndarray, "height width 3"]:
+def read_episode_frame(config: DataConfig, place: str) -> UInt8[np.ndarray, "height width 3"]:
     """Return the image at EPISODE:STEP of a data set, or the last image of EPISODE.
 
     Raises:

@@ -308,8 +308,15 @@ class ChunkScores:
 
     def as_dict(self, *, is_blind: bool) -> dict[str, Any]:
         """Return plain values for JSON; `best` is None for a model that cannot rank actions (`is_blind`)."""
-        values = {name: getattr(self, name) for name in ("energies", "doing_nothing", "now", "spread", "tied")}
-        return {**values, "best": None if is_blind else self.best, "is_blind": is_blind}
+        return {
+            "energies": self.energies,
+            "doing_nothing": self.zero_action_energy,
+            "now": self.current_energy,
+            "spread": self.spread,
+            "tied": self.tied,
+            "best": None if is_blind else self.best,
+            "is_blind": is_blind,
+        }
 
 
 _SLICE_FACTOR = 1.25  # half-width of a slice, relative to the limit

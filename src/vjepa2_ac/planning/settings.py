@@ -164,7 +164,7 @@ class DataLimits:
     # 99th percentile of the absolute change of each number in a model step
     changes: tuple[Annotated[float, Field(ge=0.0, allow_inf_nan=False)], ...]
     # why the data have a low diversity; empty: they do not, or this is unknown
-    low_diversity: Annotated[str, Field(validation_alias="narrow")] = ""
+    low_diversity: str = ""
 
 
 def read_data_limits(folder: Path, *, is_pose: bool) -> DataLimits | None:
@@ -176,7 +176,8 @@ def read_data_limits(folder: Path, *, is_pose: bool) -> DataLimits | None:
     path = folder / CHANGES
     if not path.is_file():
         return None
-    values = {name: value for name, value in read_json_object(path).items() if name in {"changes", "narrow"}}
+    fields = {"changes": "changes", "narrow": "low_diversity"}  # by key of the file
+    values = {fields[key]: value for key, value in read_json_object(path).items() if key in fields}
     data_limits = parse_record(
         DataLimits, values, where=str(path), needed="one number of 0 or more per component of a state"
     )

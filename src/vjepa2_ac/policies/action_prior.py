@@ -198,7 +198,7 @@ def load_prior(folder: str | Path, *, where: str) -> tuple[PriorCard, ActionPrio
     return card, prior
 
 
-def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> PriorStart:
+def load_prior_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> PriorStart:
     """Load `planning.prior` on the device of the model, and return its function for the start of a search.
 
     Raises:
@@ -212,8 +212,8 @@ def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> Prior
     return prior.to(cameras.model.device).start
 
 
-_FIRST = 8  # number of batches from which the scale of the actions is computed
-_WARM_UP, _CLIP, _HELD_OUT = 50, 1.0, 256
+_NUM_SCALE_BATCHES = 8  # number of batches from which the scale of the actions is computed
+_WARM_UP, _CLIP, _NUM_HELD_OUT = 50, 1.0, 256
 
 
 @dataclass(frozen=True)
@@ -267,7 +267,7 @@ def train_prior(
     dataset = use_finished_cache(config, frames, model)
     if options.ahead is not None:
         dataset = dataset.with_frames(options.ahead + 1)
-    prior = _trained(dataset, model, config, options, reporter)
+    prior = _train(dataset, model, config, options, reporter)
     card = PriorCard(
         format="vjepa2-ac prior 1",
         sizes=prior.sizes,
@@ -275,20 +275,23 @@ def train_prior(
         crop=data.crop,
         data=data.path,
         steps=options.steps,
-        held_out=_measured(dataset, model, prior, spaces),
+        held_out=_measure(dataset, model, prior, spaces),
         time=utc_now(),
     )
     save_prior(folder, card, prior)
     return card
 
 
-def _trained(
+def _train(
     dataset: Dataset, model: WorldModel, config: Config, options: PriorOptions, reporter: Reporter
 ) -> ActionPrior:
     drawn, spaces = torch.Generator().manual_seed(config.seed), dataset.spaces
     progress, steps = reporter.task("training the prior", "steps"), options.steps
     with closing(training_loader(dataset, seed=config.seed, batch_size=options.batch_size)) as batches:
-        first = [_pairs(clips, spaces, drawn) for clips in itertools.islice(_encoded(batches, model), _FIRST)]
+        first = [
+            _draw_pairs(clips, spaces, drawn)
+            for clips in itertools.islice(_encode_batches(batches, model), _NUM_SCALE_BATCHES)
+        ]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             grid, widths = model.image_size // model.sizes.patch_size, dataset.spaces.widths
@@ -297,7 +300,7 @@ def _trained(
             prior = ActionPrior(sizes).to(model.device)
         prior.scale.copy_(torch.cat([batch.changes for batch in first]).std(dim=0).clamp(min=1e-6))
         optimizer = torch.optim.AdamW(prior.parameters(), lr=options.learning_rate, weight_decay=0.01)
-        pairs = (_pairs(clips, spaces, drawn) for clips in _encoded(batches, model))
+        pairs = (_draw_pairs(clips, spaces, drawn) for clips in _encode_batches(batches, model))
         for step, batch in enumerate(itertools.islice(itertools.chain(first, pairs), steps), start=1):
             for group in optimizer.param_groups:
                 share = min(1.0, step / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * (step - 1) / steps))
@@ -324,14 +327,14 @@ def prior_loss(mean: Tensor, deviation: Tensor, changes: Tensor) -> Tensor:
     return (off + off.detach() / deviation + deviation.log()).mean()
 
 
-def _encoded(batches: Iterator[Batch], model: WorldModel) -> Iterator[LatentBatch]:
+def _encode_batches(batches: Iterator[Batch], model: WorldModel) -> Iterator[LatentBatch]:
     """Yield clips as latents; batches of which no clip could be read are left out."""
     for batch in batches:
         if len(batch.episode_ids):
             yield encode_batch(model, batch, device=model.device)
 
 
-def _pairs(clips: LatentBatch, spaces: Spaces, drawn: torch.Generator) -> _Pairs:
+def _draw_pairs(clips: LatentBatch, spaces: Spaces, drawn: torch.Generator) -> _Pairs:
     """Draw a frame of each clip, and a later frame as its goal."""
     count, steps = clips.actions.shape[:2]
     rows, at = torch.arange(count), torch.randint(steps, (count,), generator=drawn)
@@ -344,7 +347,7 @@ def _pairs(clips: LatentBatch, spaces: Spaces, drawn: torch.Generator) -> _Pairs
 
 
 @torch.no_grad()
-def _measured(dataset: Dataset, model: WorldModel, prior: ActionPrior, spaces: Spaces) -> dict[str, Any]:
+def _measure(dataset: Dataset, model: WorldModel, prior: ActionPrior, spaces: Spaces) -> dict[str, Any]:
     """Measure the error of the predicted mean on held-out clips, relative to the zero action's.
 
     It is measured with true goals and with goals of other clips. Empty: there are no held-out clips.
@@ -353,8 +356,8 @@ def _measured(dataset: Dataset, model: WorldModel, prior: ActionPrior, spaces: S
     errors: dict[str, list[Tensor]] = {"true_goals": [], "goals_of_others": [], "nothing": []}
     ids: list[str] = []
     if dataset.split_mask("test").any():
-        for clips in _encoded(validation_batches(dataset, "test", clips=_HELD_OUT, batch_size=32), model):
-            pairs = _pairs(clips, spaces, drawn)
+        for clips in _encode_batches(validation_batches(dataset, "test", clips=_NUM_HELD_OUT, batch_size=32), model):
+            pairs = _draw_pairs(clips, spaces, drawn)
             for name, goals in (("true_goals", pairs.wanted), ("goals_of_others", pairs.wanted.roll(1, dims=0))):
                 mean, _ = prior(pairs.seen, goals, pairs.remaining, pairs.states)
                 errors[name].append((mean * prior.scale - pairs.changes)[:, size].norm(dim=1))

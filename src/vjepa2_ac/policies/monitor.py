@@ -28,11 +28,11 @@ from vjepa2_ac.storage.structured import parse_record, read_json_object
 MONITOR = "monitor.json"
 _FIX = "Make it with `vjepa2-ac monitor RUN`"
 Number = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-MOST_EPISODES = 200  # largest number of episodes for a calibration
-_AT_ONCE = 16
+MAX_EPISODES = 200  # largest number of episodes for a calibration
+_BATCH_SIZE = 16
 
 
-def surprise_of(
+def compute_surprise(
     errors: Float[Tensor, "*batch tokens"], expected: Float[Tensor, "*batch tokens"] | Float[Tensor, " tokens"]
 ) -> Float[Tensor, "*batch"]:
     """Return the surprise of each step: the mean over patches of the error's excess over the patch's usual error."""
@@ -55,7 +55,7 @@ class Monitor:
     def compare(self, predicted: Float[Tensor, "tokens dim"], seen: Float[Tensor, "tokens dim"]) -> Surprise:
         """Return the surprise of a frame, given its prediction."""
         errors = mean_difference(predicted, seen).float().cpu()
-        score = float(surprise_of(errors, torch.tensor(self.expected)))
+        score = float(compute_surprise(errors, torch.tensor(self.expected)))
         return Surprise(score, errors, not score <= self.threshold)  # NaN is an alarm, too
 
     @classmethod
@@ -80,7 +80,7 @@ class Monitor:
         return monitor
 
 
-def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> Compare:
+def load_monitor_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> Compare:
     """Read `planning.monitor`, and return its function that compares a frame with its prediction.
 
     Raises:
@@ -89,7 +89,7 @@ def read_for_planning(path: str, known: Fingerprints, cameras: Cameras) -> Compa
     return Monitor.read(path, known, tokens=cameras.model.num_tokens, where="planning.monitor").compare
 
 
-def conformal_threshold(scores: Float[Tensor, " episodes"], false_alarms: float) -> float:
+def compute_conformal_threshold(scores: Float[Tensor, " episodes"], false_alarms: float) -> float:
     """Return the score that a new undisturbed episode exceeds with a probability of at most `false_alarms`.
 
     Split conformal prediction: the k-th smallest of n scores with k = ceil((n + 1) (1 - false_alarms)). It assumes that
@@ -109,7 +109,7 @@ def conformal_threshold(scores: Float[Tensor, " episodes"], false_alarms: float)
 
 
 @dataclass(frozen=True, eq=False)
-class WatchedEpisode:
+class EpisodeErrors:
     """The prediction errors of each model step of an episode."""
 
     name: str
@@ -118,7 +118,7 @@ class WatchedEpisode:
 
     def scores(self, expected: Sequence[float] | np.ndarray) -> Float[np.ndarray, " time"]:
         """Return the surprise of each step, given the usual error of each patch."""
-        return surprise_of(torch.from_numpy(self.errors), torch.tensor(np.asarray(expected))).numpy()
+        return compute_surprise(torch.from_numpy(self.errors), torch.tensor(np.asarray(expected))).numpy()
 
     def first_alarm(self, by: Monitor) -> int | None:
         """Return the index of the first step whose surprise is above the threshold; None: there is none."""
@@ -127,9 +127,9 @@ class WatchedEpisode:
 
 
 @torch.no_grad()
-def watch_episodes(
+def measure_episodes(
     model: WorldModel, dataset: Dataset, episodes: Iterable[int], progress: Progress = no_progress
-) -> Iterator[WatchedEpisode]:
+) -> Iterator[EpisodeErrors]:
     """Yield the prediction errors of episodes: each frame is predicted from the previous frame, as in planning.
 
     Args:
@@ -148,14 +148,14 @@ def watch_episodes(
         length = len(dataset.source.read(index).states)
         starts = range(0, length - stride, stride)
         errors = []
-        for batch in read_batches(pairs, [(index, start) for start in starts], batch_size=_AT_ONCE):
-            seen = encode_batch(model, batch, device=model.device, chunk=_AT_ONCE)
+        for batch in read_batches(pairs, [(index, start) for start in starts], batch_size=_BATCH_SIZE):
+            seen = encode_batch(model, batch, device=model.device, chunk=_BATCH_SIZE)
             camera = None if seen.extrinsics is None else seen.extrinsics[:, :1]
             predicted = model.predict(seen.latents[:, :1], seen.actions, seen.states[:, :1], camera)
             errors.append(mean_difference(predicted[:, 0].float(), seen.latents[:, 1]).cpu())
         if errors:
             all_errors = torch.cat(errors).double().numpy()
-            yield WatchedEpisode(dataset.table.identity(index), np.array(starts) + stride, all_errors)
+            yield EpisodeErrors(dataset.table.identity(index), np.array(starts) + stride, all_errors)
         progress(done, len(chosen))
 
 
@@ -176,11 +176,11 @@ def calibrate_monitor(
     require_frames(dataset.config, to="watch")
     require_stride(dataset.config, to="know how long a model step is")
     held_out = np.flatnonzero(dataset.split_mask("validation") | dataset.split_mask("test"))
-    chosen = held_out[np.linspace(0, len(held_out), min(MOST_EPISODES, len(held_out)), endpoint=False).astype(int)]
+    chosen = held_out[np.linspace(0, len(held_out), min(MAX_EPISODES, len(held_out)), endpoint=False).astype(int)]
     if not len(chosen):
         needed = "validation or test episodes, which the threshold is of"
         raise InputError(where=f"data.path: {dataset.config.path}", found="no held-out episodes", needed=needed)
-    watched = list(watch_episodes(model, dataset, chosen.tolist(), progress))
+    watched = list(measure_episodes(model, dataset, chosen.tolist(), progress))
     if len(watched) < 2:
         raise InputError(where=f"data.path: {dataset.config.path}", found="one held-out episode", needed="two or more")
     sums = np.stack([episode.errors.sum(axis=0) for episode in watched])
@@ -193,7 +193,7 @@ def calibrate_monitor(
     known = model.fingerprints()
     return Monitor(
         format="vjepa2-ac monitor 1",
-        threshold=conformal_threshold(torch.tensor(highest), false_alarms),
+        threshold=compute_conformal_threshold(torch.tensor(highest), false_alarms),
         false_alarms=false_alarms,
         steps=int(steps.max()),
         scores=tuple(map(float, highest)),

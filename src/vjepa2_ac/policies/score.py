@@ -29,7 +29,7 @@ from vjepa2_ac.spaces import POSE, StateSpace, apply_actions, states_along
 from vjepa2_ac.storage.structured import to_plain
 
 CHANCE = 0.5  # share of other actions with a lower energy than the true ones, if a model ignores the actions
-_OTHERS = 16  # number of actions from other evaluation points that the true actions are compared with
+_NUM_ALTERNATIVES = 16  # number of actions from other evaluation points that the true actions are compared with
 _NEEDED = "arrays `episodes` (names), `frames` (control steps) and `chunks` (places x chunks x control steps x numbers)"
 
 ChunkForm = Literal["targets", "deltas", "offsets"]
@@ -150,7 +150,7 @@ def is_blind(error: Estimate | None) -> bool:
     return error is not None and not (error.high if error.has_interval else error.value) < CHANCE
 
 
-def ranking_of_run(subject: str, checkpoint: str) -> Estimate | None:
+def read_run_ranking_error(subject: str, checkpoint: str) -> Estimate | None:
     """Return the action-ranking error in the validation of a run's checkpoint; None: not measured.
 
     Args:
@@ -199,7 +199,7 @@ def score_policies(
         raise InputError(where="--policy", found="no frame that all of them have", needed="the same places in all")
     control_steps = control_steps or stride
     ahead = max(1, min(one.chunks.shape[2] for one in policies) // control_steps) * stride
-    known = (_place_of(dataset, place, ahead, space) for place in places)
+    known = (_read_point(dataset, place, ahead, space) for place in places)
     kept = [one for one in known if one is not None]
     if not kept:
         needed = f"{counted(ahead, 'control step')} after it in the episode"
@@ -207,7 +207,7 @@ def score_policies(
     rng, energies, ids = np.random.default_rng(0), list[np.ndarray](), [name for (name, _), *_ in kept]
     rows = [{place: row for row, place in reversed([*enumerate(one.places)])} for one in policies]
     for number, (place, episode, state, changes) in enumerate(kept):
-        others = [kept[other].changes for other in _drawn(rng, number, ids)]
+        others = [kept[other].changes for other in _draw_alternatives(rng, number, ids)]
         chunks = [
             changes_of_chunks(one.chunks[row[place]], state, form=form, control_steps=control_steps, space=space)
             for one, row in zip(policies, rows, strict=True)
@@ -245,7 +245,7 @@ def score_policies(
     )
 
 
-class _Place(NamedTuple):
+class _EvaluationPoint(NamedTuple):
     """An evaluation point: a frame of an episode, its state, and the demonstrated changes after it."""
 
     place: tuple[str, int]  # name of the episode, control step
@@ -254,7 +254,7 @@ class _Place(NamedTuple):
     changes: Float[np.ndarray, "steps dim"]
 
 
-def _place_of(dataset: Dataset, place: tuple[str, int], ahead: int, space: StateSpace) -> _Place | None:
+def _read_point(dataset: Dataset, place: tuple[str, int], ahead: int, space: StateSpace) -> _EvaluationPoint | None:
     """Read an evaluation point with a goal `ahead` control steps later; None: the episode ends before the goal.
 
     Raises:
@@ -268,10 +268,10 @@ def _place_of(dataset: Dataset, place: tuple[str, int], ahead: int, space: State
     if not 0 <= step < len(states) - ahead:
         return None
     path = states[step : step + ahead + 1 : dataset.config.model_stride]
-    return _Place(place, index, states[step], space.differences(path))
+    return _EvaluationPoint(place, index, states[step], space.differences(path))
 
 
-def _drawn(rng: np.random.Generator, number: int, episodes: Sequence[str]) -> Int[np.ndarray, " others"]:
+def _draw_alternatives(rng: np.random.Generator, number: int, episodes: Sequence[str]) -> Int[np.ndarray, " others"]:
     """Draw evaluation points from other episodes; from the same episode if there is only one.
 
     Args:
@@ -281,4 +281,4 @@ def _drawn(rng: np.random.Generator, number: int, episodes: Sequence[str]) -> In
     """
     apart = [other for other, name in enumerate(episodes) if name != episodes[number]]
     choices = apart or [other for other in range(len(episodes)) if other != number] or [number]
-    return rng.choice(np.array(choices), size=_OTHERS)
+    return rng.choice(np.array(choices), size=_NUM_ALTERNATIVES)

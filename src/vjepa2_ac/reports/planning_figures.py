@@ -29,7 +29,7 @@ from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:  # not imported at run time: each plot needs only one of these packages
     from vjepa2_ac.evaluation.imagined import ImaginedPlan
-    from vjepa2_ac.goals.make_goals import MadeGoals
+    from vjepa2_ac.goals.make_goals import DemonstrationGoals
     from vjepa2_ac.planning.planner import Plan
 
 PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
@@ -186,7 +186,7 @@ def _slices(part: Any, answer: PlanResult) -> None:
     part.colorbar(image, ax=list(all_axes), label="energy", shrink=0.85)
 
 
-def plot_goals(made: MadeGoals, path: Path) -> Path:
+def plot_goals(made: DemonstrationGoals, path: Path) -> Path:
     """Write the contact sheet of goals as a PNG file, atomically."""
     images = [made.first, *(goal.image for goal in made.goals)]
     rows = -(-len(images) // _ACROSS)
@@ -213,7 +213,7 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
     return path
 
 
-def _caption(made: MadeGoals, place: int) -> str:
+def _caption(made: DemonstrationGoals, place: int) -> str:
     if not place:
         return "start, frame 0"
     goal, key = made.goals[place - 1], made.keys[place - 1]

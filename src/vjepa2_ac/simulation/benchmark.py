@@ -19,12 +19,12 @@ from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.goals.key_frames import (
-    OF_MODEL_STEPS,
+    MODEL_STEP_RULE,
     KeyFrame,
     Timing,
-    gripper_key_frames,
-    sub_goals_of,
-    with_frames_between,
+    add_frames_between,
+    find_gripper_key_frames,
+    make_sub_goals,
 )
 from vjepa2_ac.media.figure import stack_horizontally, stack_vertically
 from vjepa2_ac.media.video import import_pyav, write_video
@@ -268,8 +268,8 @@ def demonstrated_goals(
         InputError: The oracle does not succeed within these limits and the steps of the task.
     """
     episode = demonstrate(trial, arm, limits)
-    keys = gripper_key_frames(episode.states, OF_MODEL_STEPS)
-    return goals_of_episode(episode, with_frames_between(keys, 1) if sub_goals == "every-step" else keys, sub_goals)
+    keys = find_gripper_key_frames(episode.states, MODEL_STEP_RULE)
+    return goals_of_episode(episode, add_frames_between(keys, 1) if sub_goals == "every-step" else keys, sub_goals)
 
 
 def demonstrate(trial: Trial, arm: SimulatedArm, limits: LimitsConfig) -> EpisodeResult:
@@ -292,7 +292,7 @@ def goals_of_episode(shown: EpisodeResult, keys: Sequence[KeyFrame], sub_goals: 
     The allowed duration of each sub-goal is that in the episode, plus or minus 3 model steps (1 for `every-step`).
     """
     images = [] if shown.frames is None else [shown.frames[key.frame] for key in keys]
-    return sub_goals_of(images, keys, Timing(1, slack=1 if sub_goals == "every-step" else 3), shown.states)
+    return make_sub_goals(images, keys, Timing(1, slack=1 if sub_goals == "every-step" else 3), shown.states)
 
 
 def with_goals(trials: Trials, goals: Sequence[Sequence[SubGoal]]) -> Trials:

@@ -29,7 +29,7 @@ from pydantic import Field
 
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.goals.key_frames import OF_MODEL_STEPS, every_key_frame, gripper_key_frames
+from vjepa2_ac.goals.key_frames import MODEL_STEP_RULE, find_gripper_key_frames, select_every_nth_frame
 from vjepa2_ac.media.video import import_pyav
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.subject import Subject
@@ -323,9 +323,11 @@ def find_trials(
         else:
             trial = replace(episode.trial, goal_image=episode.goal_image)
             if options.sub_goals == "every-step":
-                trial = replace(trial, goals=goals_of_episode(episode, every_key_frame(steps + 1, 1), "every-step"))
+                trial = replace(
+                    trial, goals=goals_of_episode(episode, select_every_nth_frame(steps + 1, 1), "every-step")
+                )
             elif options.sub_goals == "demonstration":
-                keys = gripper_key_frames(episode.states, OF_MODEL_STEPS)
+                keys = find_gripper_key_frames(episode.states, MODEL_STEP_RULE)
                 trial = replace(trial, goals=goals_of_episode(episode, keys, "demonstration"))
             trials.append(trial)
             episodes.append(replace(episode, trial=trial, frames=None))

@@ -52,7 +52,7 @@ class Run:
     micro_batches: int  # number per optimizer step, summed over all processes
     calibration: Mapping[str, Any] | None = None  # how the stride was chosen; None unless data.stride was auto
     replayed: Dataset | None = None  # the replay data set
-    strip: Any = None  # the hook `validation.decoder`: decoding.imagine.ImaginedStrip
+    strip: Any = None  # the hook `validation.decoder`: decoding.imagine.ValidationStrip
 
     @property
     def folder(self) -> Path:

@@ -147,7 +147,7 @@ def _encoded(
     for batch in batches:
         latents = encode(run, batch)
         if run.strip is not None:
-            run.strip.seen(run.dataset, batch, latents)
+            run.strip.update(run.dataset, batch, latents)
         for row, name in enumerate(zip(latents.episode_ids, latents.starts, strict=True)):
             if name in chosen:
                 moves += select_moves(latents, row, run.dataset.spaces.action, RANKING_REACH_CM / 100)
