@@ -14,14 +14,14 @@ UP, LEFT, CLOSE = (0.0, 0.0, 0.02, 0.0, 0.0, 0.0, 0.0), (0.0, 0.02, 0, 0, 0, 0.0
 PATH = (UP, LEFT, CLOSE, CLOSE)
 
 
-def rollout(explorer: Explorer, model_index: int, position: RolloutPosition) -> torch.Tensor:
+def predict_by_rollout(explorer: Explorer, model_index: int, position: RolloutPosition) -> torch.Tensor:
     first = explorer.get_observation(position.episode, position.start)
     start = Start(first.latents, first.state, explorer.spaces.state)
     with explorer.evaluated_models[model_index].prediction_context():
         return compute_rollout(explorer.get_model(model_index).rollout, start, np.array(position.actions))[-1]
 
 
-def recorded_path(explorer: Explorer, steps: int) -> RolloutPosition:
+def make_recorded_path(explorer: Explorer, steps: int) -> RolloutPosition:
     position = RolloutPosition(0, 0)
     for _ in range(steps):
         action = explorer.get_next_recorded_action(position)
@@ -32,10 +32,10 @@ def recorded_path(explorer: Explorer, steps: int) -> RolloutPosition:
 
 def test_step_by_step_predictions_equal_a_rollout(recorded: Views) -> None:
     explorer, position = recorded.explorer, RolloutPosition(0, 2, PATH)
-    assert [one.name for one in explorer.evaluated_models] == ["base", "adapter"]
+    assert [model.name for model in explorer.evaluated_models] == ["base", "adapter"]
     for model_index in range(2):
         torch.testing.assert_close(
-            explorer.predict_latents(model_index, position), rollout(explorer, model_index, position)
+            explorer.predict_latents(model_index, position), predict_by_rollout(explorer, model_index, position)
         )
     assert not torch.equal(explorer.predict_latents(0, position), explorer.predict_latents(1, position))
 
@@ -56,7 +56,7 @@ def test_prediction_does_not_depend_on_earlier_requests(recorded: Views) -> None
 
 def test_recorded_path_has_recorded_states_and_frames(recorded: Views) -> None:
     explorer, steps = recorded.explorer, 3
-    position, stride = recorded_path(explorer, steps), explorer.stride
+    position, stride = make_recorded_path(explorer, steps), explorer.stride
     states = explorer.dataset.source.read(explorer.episodes[0]).states[: steps * stride + 1 : stride]
     np.testing.assert_allclose(explorer.integrate_states(position), states, atol=1e-6)
     true = recorded.explorer.get_true_observation(position)
@@ -68,7 +68,7 @@ def test_recorded_path_has_recorded_states_and_frames(recorded: Views) -> None:
 
 def test_rounded_action_of_a_link_is_the_recorded_action(recorded: Views) -> None:
     explorer = recorded.explorer
-    position = recorded_path(explorer, 2)
+    position = make_recorded_path(explorer, 2)
     rounded = RolloutPosition(0, 0, tuple(tuple(round(number, 5) for number in action) for action in position.actions))
     assert explorer.validate(rounded) == position
     assert explorer.validate(RolloutPosition(0, 0, (UP,))).actions == (UP,)

@@ -14,8 +14,8 @@ from windows import header, serving
 
 
 def get(url: str, path: str, **headers: str) -> http.client.HTTPResponse:
-    position = urlsplit(url)
-    connection = http.client.HTTPConnection(position.hostname or "", position.port, timeout=60)
+    parts = urlsplit(url)
+    connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=60)
     connection.request("GET", path, headers=headers)
     response = connection.getresponse()
     response.body = response.read()  # type: ignore[attr-defined]
@@ -43,9 +43,9 @@ def test_page_is_served_with_a_content_security_policy(recorded: Views) -> None:
 
 @pytest.mark.parametrize("origin", ["http://other.example", "null", "", "http://127.0.0.1:1", "http://["])
 def test_socket_rejects_other_origins(recorded: Views, origin: str) -> None:
-    with serving(recorded) as url, pytest.raises(InvalidStatus) as refused:
+    with serving(recorded) as url, pytest.raises(InvalidStatus) as rejection:
         socket(url, origin)
-    assert refused.value.response.status_code == 403
+    assert rejection.value.response.status_code == 403
 
 
 def test_unknown_host_name_gets_no_page(recorded: Views) -> None:
@@ -65,15 +65,15 @@ def test_newest_request_is_answered_and_cancels_a_search(recorded: Views) -> Non
         answers = []
         while not answers or answers[-1]["seq"] != 29:
             answers.append(header(page.recv()))
-        predicted = [one["seq"] for one in answers if one["kind"] == "predict"]
+        predicted = [answer["seq"] for answer in answers if answer["kind"] == "predict"]
         assert predicted == sorted(predicted)
 
 
 def test_invalid_request_gets_an_error_and_the_next_one_is_answered(recorded: Views) -> None:
     with serving(recorded) as url, socket(url) as page:
         page.recv()
-        for wrong in ("{}", b"\x00", "[" * 1000, json.dumps({"seq": 1, "kind": "predict", "episode": 999})):
-            page.send(wrong)
+        for invalid in ("{}", b"\x00", "[" * 1000, json.dumps({"seq": 1, "kind": "predict", "episode": 999})):
+            page.send(invalid)
             assert header(page.recv())["kind"] == "error"
         page.send(json.dumps({"seq": 2, "kind": "predict"}))
         assert header(page.recv())["seq"] == 2

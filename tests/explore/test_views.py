@@ -23,8 +23,9 @@ GOAL = GoalFrame(0, 6)
 def parse_message(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     size = int.from_bytes(message[:4], "big")
     header, rest, images = json.loads(message[4 : 4 + size]), message[4 + size :], {}
-    for one in header["images"]:
-        images[one["name"]], rest = decode_image(rest[: one["bytes"]], one["name"]), rest[one["bytes"] :]
+    for image in header["images"]:
+        name, size = image["name"], image["bytes"]
+        images[name], rest = decode_image(rest[:size], name), rest[size:]
     assert not rest
     return header, images
 
@@ -36,12 +37,12 @@ def get_answer(views: Views, **values: Any) -> tuple[dict[str, Any], dict[str, n
 def test_hello_lists_models_episodes_and_moves(live: Views) -> None:
     content, images = parse_message(live.make_hello())
     assert not images
-    assert [one["id"] for one in content["models"]] == ["base", "adapter"]
+    assert [model["id"] for model in content["models"]] == ["base", "adapter"]
     assert content["truth"] == "simulated"
     assert len(content["episodes"]) == len(live.explorer.episodes)
-    assert [one["name"] for one in content["action"]] == ["dx", "dy", "dz", "droll", "dpitch", "dyaw", "dgripper"]
-    assert all(0 < one["step"] < one["most"] for one in content["action"])
-    assert {"left", "up", "close", "zero action"} <= {one["id"] for one in content["moves"]}
+    assert [number["name"] for number in content["action"]] == ["dx", "dy", "dz", "droll", "dpitch", "dyaw", "dgripper"]
+    assert all(0 < number["step"] < number["most"] for number in content["action"])
+    assert {"left", "up", "close", "zero action"} <= {move["id"] for move in content["moves"]}
     live.explorer.validate(RolloutPosition(content["position"]["episode"], content["position"]["start"]))
 
 
@@ -61,8 +62,8 @@ def test_prediction_has_images_and_metrics_of_all_models(live: Views) -> None:
     assert content["truth"] == "simulated"
     assert content["actions"] == [UP, UP]
     assert len(content["path"]) == 3
-    for one in content["models"]:
-        assert min(one["error"], one["spread"], one["energy"]) > 0
+    for model in content["models"]:
+        assert min(model["error"], model["spread"], model["energy"]) > 0
     assert content["persistence_error"] > 0
 
 
@@ -80,16 +81,17 @@ def test_ground_truth_without_simulator_exists_only_for_recorded_actions(recorde
 
 def test_energy_map_has_the_energy_of_each_action(recorded: Views) -> None:
     content, _ = get_answer(recorded, kind="energy", actions=[UP], goal=GOAL, model="adapter", action=ZERO_ACTION)
-    explorer, one = recorded.explorer, content["maps"][0]
+    explorer, energy_map = recorded.explorer, content["maps"][0]
     position = RolloutPosition(0, 0, (tuple(UP),))
     state = torch.tensor(explorer.integrate_states(position)[-1], dtype=torch.float32)
     scene = Scene(explorer.predict_latents(1, position), state)
     goal = Goal(explorer.get_observation(0, GOAL.step).latents[None])
     cost = WorldModelCost(explorer.get_model(1), scene, goal, recorded.search.config.energy)
     action = torch.zeros(1, 1, 7)
-    action[0, 0, one["across"]], action[0, 0, one["up"]] = one["across_values"][5], one["up_values"][2]
+    action[0, 0, energy_map["across"]] = energy_map["across_values"][5]
+    action[0, 0, energy_map["up"]] = energy_map["up_values"][2]
     with torch.no_grad():
-        assert one["energy"][2][5] == pytest.approx(float(cost(action)[0]), rel=1e-5)
+        assert energy_map["energy"][2][5] == pytest.approx(float(cost(action)[0]), rel=1e-5)
     assert len(content["maps"]) == 3
 
 
@@ -98,7 +100,9 @@ def test_plan_is_within_the_limits_and_shows_each_iteration(recorded: Views) -> 
     assert np.abs(np.array(content["actions"])[:, :3]).max() <= recorded.search.config.limits.xyz_m[0]
     assert len(content["actions"]) == 3
     assert list(images) == [f"best-{number}" for number in range(len(content["iterations"]))]
-    assert content["energy_plan"] == pytest.approx(min(one["lowest"] for one in content["iterations"]), rel=0.2)
+    assert content["energy_plan"] == pytest.approx(
+        min(iteration["lowest"] for iteration in content["iterations"]), rel=0.2
+    )
     assert content == get_answer(recorded, kind="plan", goal=GOAL, model="base", steps=3)[0]
 
 
@@ -132,16 +136,16 @@ def test_search_with_invalid_goal_or_model_raises(recorded: Views, goal: GoalFra
 
 
 def test_cancelled_simulation_stops_before_the_next_action(live: Views) -> None:
-    actions = [UP, ZERO_ACTION, [-one for one in UP], UP]
-    asked_times, request = [], PageRequest(seq=7, kind="predict", start=2, actions=actions)
+    actions = [UP, ZERO_ACTION, [-number for number in UP], UP]
+    calls, request = [], PageRequest(seq=7, kind="predict", start=2, actions=actions)
 
     def cancelled() -> bool:
-        asked_times.append(1)
-        return len(asked_times) == 3
+        calls.append(1)
+        return len(calls) == 3
 
     with pytest.raises(SearchCancelledError):
         live.answer(request, no_progress, cancelled)
-    assert len(asked_times) == 3
+    assert len(calls) == 3
     again, images = parse_message(live.answer(request, no_progress, lambda: False))
     other, expected = get_answer(live, kind="predict", start=2, actions=actions)
     assert again["truth_state"] == other["truth_state"]

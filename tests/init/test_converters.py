@@ -1,4 +1,4 @@
-"""Each converter makes of its form what was recorded, and says what is wrong; `data converter` prints it."""
+"""Each converter reproduces the recorded data and reports invalid input; `data converter` prints the scripts."""
 
 import argparse
 import csv
@@ -38,14 +38,14 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def run(script: str, *words: object) -> None:
+def run(script: str, *arguments: object) -> None:
     """Run a converter in this process."""
-    before = sys.argv
-    sys.argv = [script, *map(str, words)]
+    original_arguments = sys.argv
+    sys.argv = [script, *map(str, arguments)]
     try:
         runpy.run_path(str(ROOT / f"examples/convert/{script}.py"), run_name="__main__")
     finally:
-        sys.argv = before
+        sys.argv = original_arguments
 
 
 def test_data_converter_prints_the_script_and_lists_all_scripts(name: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -86,7 +86,7 @@ def write_video_at(path: Path, times: np.ndarray) -> None:
         file.mux(stream.encode(None))
 
 
-def states_in(folder: Path) -> np.ndarray:
+def read_converted_states(folder: Path) -> np.ndarray:
     dataset = open_dataset(folder, source="npz", frames=3, stride=2, validation_share=0.0, test_share=0.0)
     assert dataset.control_rate_hz == RATE_HZ
     return np.asarray(dataset.source.read(0).states)
@@ -120,7 +120,7 @@ def test_videos_and_tables_become_episodes(
     header: str, rows: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run("mp4_and_csv", write_recording(tmp_path / "own", header=header, rows=rows), tmp_path / "npz", "--height", 32)
-    assert np.abs(states_in(tmp_path / "npz") - STATES).max() < 1e-6
+    assert np.abs(read_converted_states(tmp_path / "npz") - STATES).max() < 1e-6
     assert "warning" not in capsys.readouterr().out
     with np.load(tmp_path / "npz/first.npz") as file:
         assert file["frames"].shape == (STEPS, 32, 48, 3)
@@ -137,7 +137,7 @@ def damage_video(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "spoil", "found"),
+    ("changes", "damage", "message"),
     [
         ({"rows": STATES[:-2]}, None, "18 rows for 20 frames"),
         ({"header": "x,y,z,roll,pitch,yaw,grip"}, None, "no column gripper; it has x, y, z, roll, pitch, yaw, grip"),
@@ -165,12 +165,12 @@ def damage_video(folder: Path) -> None:
     ids=["lengths", "column", "no table", "damaged video", "another clock", "short table", "half as many rows"],
 )
 def test_inconsistent_recording_raises_with_the_reason(
-    changes: dict[str, Any], spoil: Callable[[Path], None] | None, found: str, tmp_path: Path
+    changes: dict[str, Any], damage: Callable[[Path], None] | None, message: str, tmp_path: Path
 ) -> None:
     folder = write_recording(tmp_path / "own", **changes)
-    if spoil is not None:
-        spoil(folder)
-    with pytest.raises(SystemExit, match=found):
+    if damage is not None:
+        damage(folder)
+    with pytest.raises(SystemExit, match=message):
         run("mp4_and_csv", folder, tmp_path / "npz")
     assert not list(tmp_path.rglob("*.npz"))
 
@@ -178,21 +178,21 @@ def test_inconsistent_recording_raises_with_the_reason(
 # Steps at even times.
 
 
-def converted(folder: Path, times: np.ndarray, *words: object, row_times: np.ndarray | None = None) -> Any:
-    """Convert a recording whose frames have these times; `row_times`: a column `time`."""
+def convert(folder: Path, times: np.ndarray, *arguments: object, row_times: np.ndarray | None = None) -> Any:
+    """Convert a recording whose frames have these times; `row_times` adds a column `time`."""
     write_recording(folder)
     write_video_at(folder / "first.mp4", times)
     if row_times is not None:
         table = np.insert(STATES, 0, row_times, axis=1)
         (folder / "first.csv").write_text(table_of(f"time,{EULER_HEADER}", table))
-    run("mp4_and_csv", folder, folder / "npz", "--height", 64, *words)
+    run("mp4_and_csv", folder, folder / "npz", "--height", 64, *arguments)
     return np.load(folder / "npz/first.npz")
 
 
-def require_steps(made: Any, expected: np.ndarray) -> None:
-    """Require these rows as the states, and the frames that were taken with them."""
-    assert np.abs(made["states"] - STATES[expected]).max() < 1e-9
-    away = np.abs(made["frames"][:, None].astype(int) - FRAMES).mean(axis=(2, 3, 4))
+def require_steps(converted_file: Any, expected: np.ndarray) -> None:
+    """Check that the states are those of the expected rows, and the frames those of the same rows."""
+    assert np.abs(converted_file["states"] - STATES[expected]).max() < 1e-9
+    away = np.abs(converted_file["frames"][:, None].astype(int) - FRAMES).mean(axis=(2, 3, 4))
     assert np.array_equal(away.argmin(axis=1), expected)
 
 
@@ -203,16 +203,16 @@ def test_uneven_frame_times_raise_and_name_the_resampling_option(tmp_path: Path)
     with pytest.raises(
         SystemExit, match=r"first.mp4: frames are 0\.030 to 0\.600 s apart.*up to 1\.65 no step repeats"
     ):
-        converted(tmp_path, UNEVEN)
+        convert(tmp_path, UNEVEN)
 
 
 @pytest.mark.parametrize("has_times", [False, True], ids=["rows by number", "rows by time"])
 def test_fps_selects_the_nearest_frame_and_its_pose(has_times: bool, tmp_path: Path) -> None:
-    made = converted(tmp_path, UNEVEN, "--fps", 1.65, row_times=UNEVEN if has_times else None)
+    converted_file = convert(tmp_path, UNEVEN, "--fps", 1.65, row_times=UNEVEN if has_times else None)
     grid = np.arange(0, UNEVEN[-1], 1 / 1.65)
     expected = np.abs(UNEVEN - grid[:, None]).argmin(axis=1)
-    assert made["fps_hz"] == 1.65
-    require_steps(made, expected)
+    assert converted_file["fps_hz"] == 1.65
+    require_steps(converted_file, expected)
 
 
 # Orientation of a phone.
@@ -244,8 +244,8 @@ def test_frames_are_rotated_by_the_display_matrix(turn: str, tmp_path: Path) -> 
     run("mp4_and_csv", folder, tmp_path / "stored", "--height", 64)
     set_display_matrix(folder / "first.mp4", entries)
     run("mp4_and_csv", folder, tmp_path / "npz", "--height", 96 if entries[0] == 0 else 64)
-    with np.load(tmp_path / "stored/first.npz") as stored, np.load(tmp_path / "npz/first.npz") as made:
-        assert np.array_equal(made["frames"], displayed(stored["frames"]))
+    with np.load(tmp_path / "stored/first.npz") as stored, np.load(tmp_path / "npz/first.npz") as converted_file:
+        assert np.array_equal(converted_file["frames"], displayed(stored["frames"]))
 
 
 # Cells of a table.
@@ -277,7 +277,7 @@ ONE = "0.1,0.2,0.3,0.4,0.5,0.6,0.7"
 
 
 @pytest.mark.parametrize(
-    ("rows", "found"),
+    ("rows", "message"),
     [
         (f"{EULER_HEADER}\n{ONE}\n,0.2,0.3,0.4,0.5,0.6,0.7", "line 3, column x: an empty cell. Expected a number"),
         (f"{EULER_HEADER}\n\n{ONE.replace('0.7', 'open')}", "line 3, column gripper: 'open'. Expected a number"),
@@ -295,8 +295,8 @@ ONE = "0.1,0.2,0.3,0.4,0.5,0.6,0.7"
         (f"{EULER_HEADER}\n{ONE.replace('0.7', '85')}", "line 2: 85. Expected .*0 to 1. Set --gripper-open"),
     ],
 )
-def test_invalid_table_raises_with_line_and_column(rows: str | bytes, found: str, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=rf"a\.csv: {found}"):
+def test_invalid_table_raises_with_line_and_column(rows: str | bytes, message: str, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=rf"a\.csv: {message}"):
         read_table(tmp_path / "a.csv", rows)
 
 
@@ -333,7 +333,7 @@ JOINTS = [*(f"arm/joint{number}" for number in range(7)), "left.finger", "right.
 NO_ORIENTATION = (0.0, 0.0, 0.0, 0.0)
 
 
-def messages(
+def make_messages(
     *,
     encoding: str = "jpeg",
     skip: range = range(0),
@@ -341,10 +341,10 @@ def messages(
     joints: Sequence[str] = (),
     arm: np.ndarray | None = None,
 ) -> Iterator[tuple[str, str, float, Any]]:
-    """Yield topic, type, time in seconds and message; the camera is 20 ms late, so that the newest frame is its own.
+    """Yield topic, type, time in seconds and message; the camera is 20 ms late.
 
     Args:
-        encoding: Of the frames.
+        encoding: Encoding of the frames.
         skip: Steps without a frame.
         orientations: Quaternions of the pose that replace the true ones, by step.
         joints: Names of the joints in /fingers.
@@ -355,8 +355,8 @@ def messages(
     for step, (state, frame) in enumerate(zip(STATES, FRAMES, strict=True)):
         time, fingers = step / RATE_HZ, np.repeat(FINGER[step], 2)
         quaternion = (orientations or {}).get(step, tuple(Rotation.from_euler("xyz", state[3:6]).as_quat()))
-        turned = kinds["geometry_msgs/msg/Quaternion"](*quaternion)
-        pose = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](*state[:3]), turned)
+        orientation = kinds["geometry_msgs/msg/Quaternion"](*quaternion)
+        pose = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](*state[:3]), orientation)
         yield "/pose", "geometry_msgs/msg/PoseStamped", time, kinds["geometry_msgs/msg/PoseStamped"](header, pose)
         numbers = fingers if arm is None else np.r_[arm[step], fingers]
         positions = kinds["sensor_msgs/msg/JointState"](header, list(joints), numbers, np.zeros(0), np.zeros(0))
@@ -380,14 +380,14 @@ def messages(
 def write_bag(path: Path, storage: StoragePlugin, **changes: Any) -> Path:
     with Writer(path, version=9, storage_plugin=storage) as writer:
         topics: dict[str, Any] = {}
-        for topic, kind, time, message in messages(**changes):
+        for topic, kind, time, message in make_messages(**changes):
             if topic not in topics:
                 topics[topic] = writer.add_connection(topic, kind, typestore=TYPES)
             writer.write(topics[topic], int(time * 1e9), TYPES.serialize_cdr(message, kind))
     return path
 
 
-CHOSEN = ("--pose", "/pose", "--gripper", "/fingers:position", "--gripper-open", 0.08, "--gripper-closed", 0)
+TOPIC_ARGUMENTS = ("--pose", "/pose", "--gripper", "/fingers:position", "--gripper-open", 0.08, "--gripper-closed", 0)
 
 
 @pytest.mark.parametrize(("storage", "encoding"), [(StoragePlugin.SQLITE3, "jpeg"), (StoragePlugin.MCAP, "bgr8")])
@@ -395,53 +395,65 @@ def test_bag_is_converted_to_one_episode(storage: StoragePlugin, encoding: str, 
     bag = write_bag(tmp_path / "bags/first", storage, encoding=encoding)
     bags = bag.parent if encoding == "jpeg" else next(file for file in bag.iterdir() if file.suffix != ".yaml")
     out = tmp_path / "npz"
-    run("ros2_bag", bags, "--out", out, "--rate", RATE_HZ, "--camera", "frames=/camera", *CHOSEN, "--height", 64)
-    first = 1  # from the first picture on
-    assert np.abs(states_in(out) - STATES[first - 1 : -1]).max() < 1e-6
+    run(
+        "ros2_bag",
+        bags,
+        "--out",
+        out,
+        "--rate",
+        RATE_HZ,
+        "--camera",
+        "frames=/camera",
+        *TOPIC_ARGUMENTS,
+        "--height",
+        64,
+    )
+    first = 1  # the episode starts at the first frame
+    assert np.abs(read_converted_states(out) - STATES[first - 1 : -1]).max() < 1e-6
     with np.load(next(out.glob("*.npz"))) as file:
         away = np.abs(file["frames"].astype(int) - FRAMES[:-1])
         assert away.max() == 0 if encoding == "bgr8" else away.mean() < 3
 
 
 @pytest.mark.parametrize(
-    ("changes", "words", "found"),
+    ("changes", "arguments", "message"),
     [
-        ({"encoding": "16UC1"}, CHOSEN, r"images of 16UC1; read are rgb8.*depth is not"),
-        ({"skip": range(5, 15)}, CHOSEN, r"/camera: silent for 1\.\d+ s"),
-        ({}, ("--pose", "/tf", *CHOSEN[2:]), "no topic /tf; it has /camera, /fingers, /pose"),
+        ({"encoding": "16UC1"}, TOPIC_ARGUMENTS, r"images of 16UC1; read are rgb8.*depth is not"),
+        ({"skip": range(5, 15)}, TOPIC_ARGUMENTS, r"/camera: silent for 1\.\d+ s"),
+        ({}, ("--pose", "/tf", *TOPIC_ARGUMENTS[2:]), "no topic /tf; it has /camera, /fingers, /pose"),
         (
             {},
-            (*CHOSEN[:4], "--gripper-open", 0.001, "--gripper-closed", 0),
+            (*TOPIC_ARGUMENTS[:4], "--gripper-open", 0.001, "--gripper-closed", 0),
             r"goes from 0\.02957 to 0\.07884: set --gripper-open",
         ),
         (
             {"joints": JOINTS, "arm": ARM},
-            CHOSEN,
+            TOPIC_ARGUMENTS,
             r"/fingers:position: 9 joints, numbered from 0 to 8: arm/joint0, .*right.finger. Expected the gripper",
         ),
         (
             {"orientations": dict.fromkeys(range(STEPS), NO_ORIENTATION)},
-            CHOSEN,
+            TOPIC_ARGUMENTS,
             "/pose: no message has a measurement",
         ),
         (
             {"orientations": {7: (0.0, 0.0, 0.0, 0.5)}},
-            CHOSEN,
+            TOPIC_ARGUMENTS,
             r"/pose at 0\.70 s: the rotation \[0\.0, 0\.0, 0\.0, 0\.5\]\. Expected a unit quaternion",
         ),
     ],
     ids=lambda value: "" if not isinstance(value, str) else value[:20],
 )
 def test_inconsistent_bag_raises_with_the_reason(
-    changes: dict[str, Any], words: tuple[object, ...], found: str, tmp_path: Path
+    changes: dict[str, Any], arguments: tuple[object, ...], message: str, tmp_path: Path
 ) -> None:
     bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, **changes)
-    with pytest.raises(SystemExit, match=found):
-        run("ros2_bag", bag, "--out", tmp_path / "npz", "--camera", "frames=/camera", *words)
+    with pytest.raises(SystemExit, match=message):
+        run("ros2_bag", bag, "--out", tmp_path / "npz", "--camera", "frames=/camera", *arguments)
     assert not (tmp_path / "npz").exists()
 
 
-# Lance tables. In processes of their own: Lance warns of every fork in the process that has imported it.
+# Lance tables. The converter runs in a subprocess, because Lance warns about forks in the process that imports it.
 
 HOSTILE = """
 import sys, lance, pyarrow as pa
@@ -451,15 +463,15 @@ lance.write_dataset(pa.Table.from_pylist(rows, schema=kind), sys.argv[1])
 """
 
 
-def apart(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *map(str, words)], text=True, capture_output=True, check=False)
+def run_in_subprocess(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *map(str, arguments)], text=True, capture_output=True, check=False)
 
 
 def test_lance_tables_are_converted_to_the_original_files(tmp_path: Path) -> None:
-    """By the original writer: the tests' own data set, and what lerobot-lancedb made of it."""
+    """The original files are the tests' data set; lerobot-lancedb wrote the tables from them."""
     original, out = GOLDEN / "lerobot_lance/original", tmp_path / "files"
-    done = apart(ROOT / "examples/convert/lance_to_files.py", GOLDEN / "lerobot_lance/tables", out)
-    assert done.returncode == 0, done.stderr
+    process = run_in_subprocess(ROOT / "examples/convert/lance_to_files.py", GOLDEN / "lerobot_lance/tables", out)
+    assert process.returncode == 0, process.stderr
     files = sorted(path.relative_to(original) for path in original.rglob("*") if path.is_file())
     assert files == sorted(path.relative_to(out) for path in out.rglob("*") if path.is_file())
     videos = [path for path in files if path.suffix == ".mp4"]
@@ -473,8 +485,8 @@ def test_lance_tables_are_converted_to_the_original_files(tmp_path: Path) -> Non
 
 
 def test_file_names_in_lance_metadata_cannot_leave_the_folder(tmp_path: Path) -> None:
-    assert apart("-c", HOSTILE, tmp_path / "in/meta.lance").returncode == 0
-    done = apart(ROOT / "examples/convert/lance_to_files.py", tmp_path / "in", tmp_path / "deep/out")
-    assert done.returncode == 1
-    assert "a file of meta called ../../away" in done.stderr
+    assert run_in_subprocess("-c", HOSTILE, tmp_path / "in/meta.lance").returncode == 0
+    process = run_in_subprocess(ROOT / "examples/convert/lance_to_files.py", tmp_path / "in", tmp_path / "deep/out")
+    assert process.returncode == 1
+    assert "a file of meta called ../../away" in process.stderr
     assert not (tmp_path / "away").exists()

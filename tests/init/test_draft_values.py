@@ -15,9 +15,9 @@ SECTIONS = st.recursive(DRAFT_VALUES, lambda inner: st.dictionaries(NAMES, inner
 
 
 @settings(max_examples=200)
-@given(values=st.dictionaries(NAMES, SECTIONS, min_size=1, max_size=4), head=st.lists(WORDS, max_size=2))
-def test_yaml_text_parses_to_the_same_values(values: dict[str, object], head: list[str]) -> None:
-    assert parse_yaml(format_yaml(head, values), where="here") == plain_values(values)  # type: ignore[arg-type]
+@given(values=st.dictionaries(NAMES, SECTIONS, min_size=1, max_size=4), header=st.lists(WORDS, max_size=2))
+def test_yaml_text_parses_to_the_same_values(values: dict[str, object], header: list[str]) -> None:
+    assert parse_yaml(format_yaml(header, values), where="here") == plain_values(values)  # type: ignore[arg-type]
 
 
 def test_guesses_are_marked_and_listed() -> None:
