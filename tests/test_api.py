@@ -121,7 +121,7 @@ def test_a_model_that_cannot_be_had_is_told(arguments: dict[str, Any], words: st
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA")
 def test_cuda_that_is_not_there_is_told() -> None:
-    with pytest.raises(UserError, match="sees no CUDA device"):
+    with pytest.raises(UserError, match="finds no CUDA device"):
         load_model(TINY, device="cuda:0")
 
 

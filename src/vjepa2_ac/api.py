@@ -342,7 +342,7 @@ def _device(device: Device) -> torch.device:
     except (RuntimeError, TypeError):
         raise InputError(where="device", found=repr(device), needed="auto, cpu, cuda, or one such as cuda:1") from None
     if found.type == "cuda" and not has_cuda:
-        raise no_cuda_error(where="device", asked=str(device), instead="Take device='cpu'")
+        raise no_cuda_error(where="device", requested=str(device), instead="Take device='cpu'")
     if found.type == "cuda" and (found.index or 0) >= (count := torch.cuda.device_count()):
         needed = f"one of the {count} CUDA devices of this machine, cuda:0 to cuda:{count - 1}"
         raise InputError(where="device", found=str(device), needed=needed)

@@ -144,9 +144,9 @@ def raising(error: BaseException) -> Callable[..., int]:
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (OSError(errno.EMFILE, "Too many open files"), r"error: ulimit -n: too many open files: this process may have"),
-        (MemoryError("Unable to allocate 9 TiB"), r"memory is not enough \(Unable to allocate 9 TiB\)"),
-        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 9 bytes"), "memory is not enough"),
+        (OSError(errno.EMFILE, "Too many open files"), r"error: ulimit -n: too many open files: the limit of this process is"),
+        (MemoryError("Unable to allocate 9 TiB"), r"too little memory \(Unable to allocate 9 TiB\)"),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 9 bytes"), "too little memory"),
         (
             torch.OutOfMemoryError("CUDA out of memory. Tried\nto"),
             r"GPU's .*\(CUDA out of memory. Tried\). Set training",
