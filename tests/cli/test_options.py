@@ -144,7 +144,10 @@ def raising(error: BaseException) -> Callable[..., int]:
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (OSError(errno.EMFILE, "Too many open files"), r"error: ulimit -n: too many open files: the limit of this process is"),
+        (
+            OSError(errno.EMFILE, "Too many open files"),
+            r"error: ulimit -n: too many open files: the limit of this process is",
+        ),
         (MemoryError("Unable to allocate 9 TiB"), r"too little memory \(Unable to allocate 9 TiB\)"),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 9 bytes"), "too little memory"),
         (
