@@ -67,6 +67,12 @@ def test_every_camera_is_found_by_its_name_or_serial_number(tmp_path: Path) -> N
             assert psnr(episode.read_frames([7])[0], FRAMES[serial][7]) > 30
 
 
+def test_mistyped_camera_name_raises_with_a_suggestion(tmp_path: Path) -> None:
+    write(tmp_path)
+    with pytest.raises(InputError, match=r"wirst\.mp4: no such file.*Did you mean wrist\?"):
+        source(tmp_path, camera="wirst").infos()
+
+
 @pytest.mark.parametrize("part", ["", "LAB", "LAB/success", PLACE])
 def test_an_identity_does_not_depend_on_which_part_of_the_tree_is_named(tree: Path, part: str) -> None:
     assert PLACE in [info.id for info in source(tree / part).infos()]

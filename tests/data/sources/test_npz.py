@@ -100,6 +100,10 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "no rate worth the name": (lambda path: write(path, fps_hz=0.0), "fps_hz: 0"),
     "another rate": (lambda path: write(path, fps_hz=30.0), "30 steps a second.*Expected 15 steps a second"),
     "no such camera": (lambda path: write(path, without="frames", wrist=WRIST), "frames: no such array"),
+    "mistyped camera": (
+        lambda path: write(path, without="frames", frame=FRAMES),
+        r"frames: no such array.*Did you mean frame\?",
+    ),
     "too few frames": (lambda path: write(path, frames=FRAMES[:-1]), r"frames: shape \(19, 36, 64, 3\)"),
     "float frames": (lambda path: write(path, frames=FRAMES / 255), "frames: shape .* float64"),
     "pickled frames": (lambda path: write(path, frames=np.array([{}, []], object)), "frames: .*objects"),

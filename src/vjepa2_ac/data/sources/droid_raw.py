@@ -22,7 +22,7 @@ from vjepa2_ac.data.files import CONNECTIONS, DEEPEST, list_folder, map_in_threa
 from vjepa2_ac.data.index import EpisodeTable, get_or_build_index, hash_key, index_key, summarize_states
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, IndexEntry, make_frame_reader, require_indexed_length
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
-from vjepa2_ac.errors import InputError, counted, require_library
+from vjepa2_ac.errors import InputError, counted, did_you_mean, require_library
 from vjepa2_ac.media.video import read_frame_times, read_frames, read_header
 from vjepa2_ac.spaces import POSE, require_finite
 from vjepa2_ac.storage import FileInfo
@@ -144,9 +144,10 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         for serial in serials:
             video = self._path(folder, f"{VIDEOS}/{serial}.mp4")
             if not any(one.name == f"{serial}.mp4" for one in listed.videos):
-                there = ", ".join(one.name for one in listed.videos) or "none"
-                needed = f"the MP4 that {listed.metadata} or data.camera names; there are {there}"
-                raise InputError(where=video, found="no such file", needed=needed, fix=_FIX)
+                existing = ", ".join(file.name for file in listed.videos) or "none"
+                needed = f"the MP4 of a camera in {listed.metadata} or data.camera; the folder has {existing}"
+                fix = f"{did_you_mean(serial, [*RAW_CAMERAS, *known.values()])}{_FIX}"
+                raise InputError(where=video, found="no such file", needed=needed, fix=fix)
             counts[serial] = read_header(video, where=video).num_frames
         place = _EpisodeLocation(folder, version, known, counts)
         states = _join_states(self._read_arrays(place, serials))

@@ -48,7 +48,7 @@ from vjepa2_ac.data.sources.indexed_source import (
     require_indexed_length,
 )
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
-from vjepa2_ac.errors import InputError, UserError
+from vjepa2_ac.errors import InputError, UserError, did_you_mean
 from vjepa2_ac.media.images import require_decodable_size
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
@@ -309,8 +309,10 @@ class NpzFile:
     def _require(self, name: str, shape: tuple[int | None, ...], kinds: str, meaning: str) -> None:
         """Refuse an array that is missing or has another shape or type."""
         if name not in self.names:
-            there = ", ".join(self.names)[:200] or "none"
-            raise self.array_error(name, "no such array", f"{meaning}; there are {there}")
+            existing = ", ".join(self.names)[:200] or "none"
+            error = self.array_error(name, "no such array", f"{meaning}; the file has {existing}")
+            fix = f"{did_you_mean(name, self.names)}{error.fix}"
+            raise InputError(where=error.where, found=error.found, needed=error.needed, fix=fix)
         header = self.read_header(name)
         alike = len(header.shape) == len(shape) and all(
             b in {a, None} for a, b in zip(header.shape, shape, strict=True)
