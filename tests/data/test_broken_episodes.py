@@ -55,7 +55,7 @@ def broken_in_a_clip(episodes: int, broken: int, _folder: Path) -> Use:
     return use
 
 
-def of_one_identity(episodes: int, broken: int, _folder: Path) -> Use:
+def duplicate_identities(episodes: int, broken: int, _folder: Path) -> Use:
     names = ["same"] * (broken + 1) + [f"episode {number}" for number in range(episodes - broken - 1)]
     return lambda **values: open_in_memory(MemorySource([20] * episodes, names=names), **values)
 
@@ -71,7 +71,7 @@ def broken_files(episodes: int, broken: int, folder: Path) -> Use:
     return lambda **values: open_dataset(NpzData(path=str(folder), **shares, **values))
 
 
-def fixes_of(error: InputError) -> dict[str, Mapping[str, Any]]:
+def parse_fixes(error: InputError) -> dict[str, Mapping[str, Any]]:
     """Return the config values that a fix names, by the name of the option."""
     fixes: dict[str, Mapping[str, Any]] = {}
     if "data.broken_episodes: skip" in error.fix:
@@ -88,7 +88,7 @@ def follow_exclusions(use: Use, **values: Any) -> None:
         try:
             use(exclude=excluded, **values)
         except InputError as error:
-            more = fixes_of(error)["exclude"]["exclude"]
+            more = parse_fixes(error)["exclude"]["exclude"]
             assert not set(more) & set(excluded)
             excluded += more
         else:
@@ -98,9 +98,9 @@ def follow_exclusions(use: Use, **values: Any) -> None:
 SIZES = [(1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (4, 2), (4, 3), (6, 3), (6, 4), (20, 1), (20, 12), (100, 4), (400, 4)]
 CASES = [
     (make, episodes, broken)
-    for make in (broken_in_the_index, broken_in_the_idle_pass, broken_in_a_clip, of_one_identity, broken_files)
+    for make in (broken_in_the_index, broken_in_the_idle_pass, broken_in_a_clip, duplicate_identities, broken_files)
     for episodes, broken in (SIZES if make is not broken_files else SIZES[:-2])
-    if make is not of_one_identity or broken < episodes
+    if make is not duplicate_identities or broken < episodes
 ]
 
 
@@ -111,17 +111,17 @@ def test_each_fix_in_a_broken_episode_error_works(
     use = make(episodes, broken, tmp_path)
     with pytest.raises(InputError) as caught:
         use()
-    fixes = fixes_of(caught.value)
+    fixes = parse_fixes(caught.value)
     known = 1 if make is broken_in_a_clip else broken  # when the error is raised
-    is_few = known <= max_broken(episodes) and make is not of_one_identity
-    is_rest = known < (episodes - 1 if make is of_one_identity else episodes)
+    is_few = known <= max_broken(episodes) and make is not duplicate_identities
+    is_rest = known < (episodes - 1 if make is duplicate_identities else episodes)
     assert list(fixes) == ["skip"] * is_few + ["exclude"] * is_rest
     if "exclude" in fixes and broken < episodes:
         follow_exclusions(use)
     if broken <= max_broken(episodes) and "skip" in fixes:
         assert len(use(**fixes["skip"]).broken) == broken
-    elif make is not of_one_identity and broken < episodes:
+    elif make is not duplicate_identities and broken < episodes:
         with pytest.raises(InputError, match=rf"of {episodes} episodes are broken.* at most") as caught:
             use(broken_episodes="skip")
-        assert list(fixes_of(caught.value)) == ["exclude"]
+        assert list(parse_fixes(caught.value)) == ["exclude"]
         follow_exclusions(use, broken_episodes="skip")

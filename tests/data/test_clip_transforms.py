@@ -29,7 +29,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return things
 
 
-def opened(*transforms: dict[str, Any], **keys: Any) -> Dataset:
+def open_set(*transforms: dict[str, Any], **keys: Any) -> Dataset:
     return open_in_memory(MemorySource([30] * 10), transforms=transforms, **keys)
 
 
@@ -42,8 +42,8 @@ OFFSET = {"name": "offset"}
 
 
 def test_transforms_depend_on_seed_and_position_and_apply_to_training_clips_only() -> None:
-    dataset = opened(OFFSET, validation_share=0.5)
-    plain = opened(validation_share=0.5)
+    dataset = open_set(OFFSET, validation_share=0.5)
+    plain = open_set(validation_share=0.5)
     offsets = (frames(dataset, 20) - frames(plain, 20))[:, 0, 0, 0]
     assert torch.equal(offsets[:, 0], offsets[:, 1])  # one number for a clip
     assert 10 < len(set(offsets[:, 0].tolist())) <= 40
@@ -72,15 +72,15 @@ def test_transforms_are_identical_after_resume_and_in_workers(droid: Path) -> No
 
 
 def test_transforms_run_in_config_order_with_independent_random_numbers() -> None:
-    plain, offset = frames(opened(), 8), frames(opened(OFFSET), 8)
-    assert torch.equal(frames(opened(OFFSET, {"name": "halve"}), 8), offset // 2)
-    assert not torch.equal(frames(opened({"name": "halve"}, OFFSET), 8), offset // 2)
-    assert not torch.equal(frames(opened(OFFSET, OFFSET), 8) - offset, offset - plain)
+    plain, offset = frames(open_set(), 8), frames(open_set(OFFSET), 8)
+    assert torch.equal(frames(open_set(OFFSET, {"name": "halve"}), 8), offset // 2)
+    assert not torch.equal(frames(open_set({"name": "halve"}, OFFSET), 8), offset // 2)
+    assert not torch.equal(frames(open_set(OFFSET, OFFSET), 8) - offset, offset - plain)
 
 
 def test_transform_options_are_passed_to_the_class_and_validated() -> None:
-    least = opened({"name": "offset", "options": {"most": 2}})
-    assert torch.equal(frames(least, 4), frames(opened(), 4) + 1)
+    least = open_set({"name": "offset", "options": {"most": 2}})
+    assert torch.equal(frames(least, 4), frames(open_set(), 4) + 1)
     for transform, words in (
         ({"name": "offset", "options": {"mots": 2}}, "mots"),
         ({"name": "halve", "options": {"most": 2}}, "no options of its own"),
@@ -114,7 +114,7 @@ def test_invalid_transform_result_raises_without_marking_an_episode_broken(
     registered: dict[str, Any], change: Callable[[Clip], Any], words: str, policy: str
 ) -> None:
     registered["wrong"] = lambda clip, _: change(clip)
-    dataset = opened({"name": "wrong"}, broken_episodes=policy)
+    dataset = open_set({"name": "wrong"}, broken_episodes=policy)
     with pytest.raises(InputError, match=f"data.transforms: wrong: .*({words})") as caught:
         frames(dataset, 1)
     assert "exclude" not in str(caught.value)

@@ -20,7 +20,7 @@ from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError
 
 
-def opened(folder: Path, **keys: Any) -> Dataset:
+def open_set(folder: Path, **keys: Any) -> Dataset:
     chosen = {"frames": 3, "stride": 2, "validation_share": 0.3, "test_share": 0.0} | keys
     return open_dataset(DataConfig(path=str(folder), **chosen))
 
@@ -30,7 +30,7 @@ def names(clips: list[Clip]) -> list[tuple[str, int]]:
 
 
 def test_clips_are_sorted_by_identity_and_start(droid: Path) -> None:
-    dataset = opened(droid)
+    dataset = open_set(droid)
     clips, windows = dataset.clips("train"), dataset.windows("train")
     assert isinstance(clips, TorchDataset)
     assert len(clips) == len(windows) > 10
@@ -78,7 +78,7 @@ def test_broken_episode_error_names_the_episode_and_a_working_fix(
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
 
-    clips = opened(spoiled(spoil), broken_episodes=policy, validation_share=0.0).clips()
+    clips = open_set(spoiled(spoil), broken_episodes=policy, validation_share=0.0).clips()
     reasons = []
     for index in range(len(clips)):
         try:

@@ -51,8 +51,8 @@ def test_outcome_filter_without_success_labels_raises() -> None:
 
 
 def test_broken_episodes_count_across_resume_unless_excluded() -> None:
-    def resumed(**knobs: Any) -> BrokenEpisodes:
-        ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip", **knobs), 300)
+    def resumed(**options: Any) -> BrokenEpisodes:
+        ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip", **options), 300)
         ledger.restore({name: f"{name} is damaged" for name in "abc"})
         return ledger
 

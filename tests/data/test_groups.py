@@ -29,7 +29,7 @@ def config_of(**changes: Any) -> DataConfig:
     return DataConfig.model_validate({"path": "somewhere", "frames": 3, "stride": 2, "workers": 0, **SHARES, **changes})
 
 
-def opened(names: list[str] | None = None, **changes: Any) -> Dataset:
+def open_set(names: list[str] | None = None, **changes: Any) -> Dataset:
     names = NAMES if names is None else names
     return open_in_memory(MemorySource([20] * len(names), names=names), **(SHARES | changes))
 
@@ -52,7 +52,7 @@ def groups_split(dataset: Dataset, group: Any) -> dict[str, set[str]]:
 
 @pytest.mark.parametrize("by", ["day", r"/(\d{4}-\d\d-\d\d)/"])
 def test_episodes_of_a_group_are_in_the_same_split(by: str) -> None:
-    dataset = opened(split_by=by)
+    dataset = open_set(split_by=by)
     days = groups_split(dataset, lambda name: name.split("/")[7])
     assert days == {day: {split_of(day, dataset.config)} for day in days}
     assert len(days) == 7
@@ -68,10 +68,10 @@ def test_identity_without_a_group_raises() -> None:
     with pytest.raises(
         InputError, match=r"split_by: day: .*does not match the identities of 2 of 22 episodes: elsewhere/one, "
     ):
-        opened(names, split_by="day")
+        open_set(names, split_by="day")
     with pytest.raises(InputError, match=r"2 of 22 episodes: elsewhere/one, elsewhere/two.*data\.exclude"):
-        opened(names, split_by=r"LAB(\d?)")
-    opened(names, split_by="day", exclude=("elsewhere/one", "elsewhere/two"))
+        open_set(names, split_by=r"LAB(\d?)")
+    open_set(names, split_by="day", exclude=("elsewhere/one", "elsewhere/two"))
 
 
 @pytest.mark.parametrize(

@@ -56,11 +56,11 @@ def test_idle_steps_are_detected_where_roll_wraps() -> None:
 
 
 def test_short_idle_runs_are_kept_and_short_moves_removed() -> None:
-    def ranges(rests: list[tuple[int, int]], **knobs: Any) -> list[tuple[int, int]]:
+    def ranges(rests: list[tuple[int, int]], **options: Any) -> list[tuple[int, int]]:
         idle = np.zeros(80, bool)
         for start, end in rests:
             idle[start:end] = True
-        return moving_ranges(idle, IdleConfig(rule="motion", **knobs))
+        return moving_ranges(idle, IdleConfig(rule="motion", **options))
 
     assert ranges([(30, 36)]) == [(0, 70)]
     assert ranges([(30, 37)]) == [(0, 20), (37, 70)]
@@ -90,9 +90,9 @@ def open_with(tmp_path: Path) -> Any:
     return partial(open_in_memory, path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
 
 
-def restful(lengths: list[int] | None = None, **knobs: Any) -> MemorySource:
+def source_with_rests(lengths: list[int] | None = None, **options: Any) -> MemorySource:
     return MemorySource(
-        lengths or [60, 40, 80], states=lambda index: resting((lengths or [60, 40, 80])[index], [(20, 35)]), **knobs
+        lengths or [60, 40, 80], states=lambda index: resting((lengths or [60, 40, 80])[index], [(20, 35)]), **options
     )
 
 
@@ -102,7 +102,7 @@ def starts(dataset: Dataset) -> set[tuple[int, int]]:
 
 
 def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
-    dataset = open_with(restful(), idle=MOTION)
+    dataset = open_with(source_with_rests(), idle=MOTION)
     assert [dataset.kept_steps.ranges_of(episode) for episode in range(3)] == [
         ((0, 10), (35, 50)),
         ((0, 10),),
@@ -120,7 +120,7 @@ def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
 
 
 def test_idle_ranges_are_computed_once(open_with: Any) -> None:
-    first, second, third = restful(), restful(), restful()
+    first, second, third = source_with_rests(), source_with_rests(), source_with_rests()
     kept = open_with(first, idle=MOTION).kept_steps
     again = open_with(second, idle=MOTION, exclude=("episode 1",), stride=3).kept_steps
     assert [index for index, *_ in first.reads] == [0, 1, 2]
@@ -133,7 +133,7 @@ def test_idle_ranges_are_computed_once(open_with: Any) -> None:
 
 def test_episode_that_fails_while_ranges_are_computed_is_broken(open_with: Any, caplog: Any) -> None:
     lengths = [60] * 200
-    source = restful(lengths, unreadable=frozenset({7, 9}))
+    source = source_with_rests(lengths, unreadable=frozenset({7, 9}))
     with pytest.raises(InputError, match=r"memory: episode 7: damaged\. 1 more.*\[\"episode 7\", \"episode 9\"\]"):
         open_with(source, idle=MOTION)
     dataset = open_with(source, idle=MOTION, broken_episodes="skip")
@@ -161,7 +161,7 @@ def published(tmp_path: Path, content: object) -> dict[str, Any]:
 
 def test_published_ranges_are_matched_by_identity(open_with: Any, tmp_path: Path, caplog: Any, gcs: Gcs) -> None:
     ranges = {"episode 1": [[0, 12], [20, 40]], "elsewhere": [[0, 9999]], "episode 2": []}
-    source = restful()
+    source = source_with_rests()
     dataset = open_with(source, **published(tmp_path, ranges))
     assert [dataset.kept_steps.ranges_of(episode) for episode in range(3)] == [(), ((0, 12), (20, 40)), ()]
     assert "lists 2 of the 3 episodes; the other 1 are treated as idle" in caplog.text
@@ -192,5 +192,5 @@ BAD_LISTS = {
 @pytest.mark.parametrize(("content", "complaint"), BAD_LISTS.values(), ids=BAD_LISTS.keys())
 def test_mismatched_range_list_raises(open_with: Any, tmp_path: Path, content: object, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint) as caught:
-        open_with(restful(), **published(tmp_path, content))
+        open_with(source_with_rests(), **published(tmp_path, content))
     assert "ranges.json" in caught.value.where

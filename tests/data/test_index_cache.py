@@ -36,7 +36,9 @@ def ids(table: EpisodeTable) -> list[str]:
     return [info.id for info in table]
 
 
-def kept(tmp_path: Path, key: str = KEY, place: str = "/data/set", table: EpisodeTable | None = None) -> EpisodeTable:
+def cached_table(
+    tmp_path: Path, key: str = KEY, place: str = "/data/set", table: EpisodeTable | None = None
+) -> EpisodeTable:
     """Return the cached table; without one to build it must be there."""
     return get_or_build_index(
         DiskCacheConfig(dir=str(tmp_path)), key, place, lambda: table or pytest.fail("built again")
@@ -45,19 +47,19 @@ def kept(tmp_path: Path, key: str = KEY, place: str = "/data/set", table: Episod
 
 def test_table_is_built_once_and_rebuilt_after_deletion(tmp_path: Path) -> None:
     for table in (TABLE, None):
-        found = kept(tmp_path, table=table)
+        found = cached_table(tmp_path, table=table)
         assert (ids(found), found.problems, compute_fingerprint(found)) == (ids(TABLE), TABLE.problems, KEY)
         assert found.labels["task"].name_at(2) == "push"
         assert np.array_equal(found.id_rank, TABLE.id_rank)
     (tmp_path / f"index/{KEY}.index").unlink()
-    assert ids(kept(tmp_path, table=EpisodeTable.from_infos([EpisodeInfo("other", 1)]))) == ["other"]
+    assert ids(cached_table(tmp_path, table=EpisodeTable.from_infos([EpisodeInfo("other", 1)]))) == ["other"]
 
 
 def test_index_of_a_moved_folder_is_reused_with_updated_paths(tmp_path: Path) -> None:
     problem = EpisodeProblem("bad", "/data/set/a.npz: x", "damaged")
     broken = replace(EpisodeTable.from_infos([EpisodeInfo("one", 3)]), problems=(problem,))
-    kept(tmp_path, table=broken)
-    table = kept(tmp_path, index_key({"files": 3}, "/mnt/set"), "/mnt/set")
+    cached_table(tmp_path, table=broken)
+    table = cached_table(tmp_path, index_key({"files": 3}, "/mnt/set"), "/mnt/set")
     assert [problem.where for problem in table.problems] == ["/mnt/set/a.npz: x"]
     others = [index_key({"files": 4}, "/data/set"), index_key({"files": 3}, "/data/set", identity="other/success")]
     others += [index_key({"files": 3}, f"gs://{bucket}/set") for bucket in "ab"]  # servers say little of versions
@@ -66,7 +68,7 @@ def test_index_of_a_moved_folder_is_reused_with_updated_paths(tmp_path: Path) ->
 
 def test_damaged_index_is_rebuilt(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     chance, rebuilt = random.Random(0), 0  # noqa: S311 - no secret
-    whole = kept(tmp_path, table=TABLE).to_bytes()
+    whole = cached_table(tmp_path, table=TABLE).to_bytes()
     [path] = (tmp_path / "index").iterdir()
     content = path.read_bytes()
     with caplog.at_level(logging.CRITICAL):
@@ -74,20 +76,20 @@ def test_damaged_index_is_rebuilt(tmp_path: Path, caplog: pytest.LogCaptureFixtu
             damaged = bytearray(content)
             damaged[chance.randrange(len(damaged))] ^= 1 << chance.randrange(8)
             path.write_bytes(damaged[: len(damaged) if chance.random() < 0.9 else chance.randrange(len(damaged))])
-            assert kept(tmp_path, table=TABLE).to_bytes() == whole
+            assert cached_table(tmp_path, table=TABLE).to_bytes() == whole
             rebuilt += path.read_bytes() == content
             path.write_bytes(content)
     assert rebuilt > 150
 
 
 def test_index_of_another_key_is_not_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    kept(tmp_path, table=TABLE)
+    cached_table(tmp_path, table=TABLE)
     [path] = (tmp_path / "index").iterdir()
     other = index_key({"files": 4}, "/data/set")
     path.rename(path.with_name(f"{other}.index"))
-    assert ids(kept(tmp_path, other, table=EpisodeTable.from_infos([EpisodeInfo("other", 1)]))) == ["other"]
+    assert ids(cached_table(tmp_path, other, table=EpisodeTable.from_infos([EpisodeInfo("other", 1)]))) == ["other"]
     assert "for other data" in caplog.text
-    assert ids(kept(tmp_path, other)) == ["other"]
+    assert ids(cached_table(tmp_path, other)) == ["other"]
 
 
 def test_unwritable_cache_folder_logs_a_warning(
@@ -97,5 +99,5 @@ def test_unwritable_cache_folder_logs_a_warning(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(storage, "write_atomically", refuse)
-    assert len(kept(tmp_path, table=TABLE)) == 5
+    assert len(cached_table(tmp_path, table=TABLE)) == 5
     assert "No space left on device" in caplog.text

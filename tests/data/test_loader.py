@@ -29,13 +29,13 @@ from vjepa2_ac.spaces import actions_from_states, states_in_camera_frame
 Names = list[tuple[str, int]]
 
 
-def config_of(folder: Path, **knobs: Any) -> DataConfig:
-    chosen = {"frames": 3, "stride": 2, "workers": 0, "validation_share": 0.3, "test_share": 0.0} | knobs
+def config_of(folder: Path, **options: Any) -> DataConfig:
+    chosen = {"frames": 3, "stride": 2, "workers": 0, "validation_share": 0.3, "test_share": 0.0} | options
     return DataConfig(path=str(folder), **chosen)
 
 
-def take(count: int, config: DataConfig, **knobs: Any) -> list[Batch]:
-    chosen = {"seed": 1, "batch_size": 2} | knobs
+def take(count: int, config: DataConfig, **options: Any) -> list[Batch]:
+    chosen = {"seed": 1, "batch_size": 2} | options
     return list(itertools.islice(training_loader(open_dataset(config), **chosen), count))
 
 
@@ -146,8 +146,8 @@ def test_frames_of_different_sizes_raise_in_collate(droid: Path) -> None:
 # Laws of the order, on episodes in memory: what is read can be counted.
 
 
-def first(dataset: Dataset, count: int, **knobs: Any) -> list[Batch]:
-    chosen = {"seed": 1, "batch_size": 2} | knobs
+def first(dataset: Dataset, count: int, **options: Any) -> list[Batch]:
+    chosen = {"seed": 1, "batch_size": 2} | options
     return list(itertools.islice(training_loader(dataset, **chosen), count))
 
 
@@ -212,9 +212,9 @@ def test_camera_frame_poses_give_camera_frame_actions() -> None:
 # Clips that cannot be read.
 
 
-def broken_set(broken: set[int], **knobs: Any) -> Dataset:
+def broken_set(broken: set[int], **options: Any) -> Dataset:
     source = MemorySource([5] * 300, pictureless=frozenset(broken))
-    return open_in_memory(source, **({"broken_episodes": "skip"} | knobs))
+    return open_in_memory(source, **({"broken_episodes": "skip"} | options))
 
 
 def test_unreadable_clip_is_dropped_without_replacement(caplog: pytest.LogCaptureFixture) -> None:

@@ -49,7 +49,7 @@ Opened = Callable[..., Dataset]
 
 
 @pytest.fixture
-def opened(tmp_path: Path) -> Opened:
+def open_set(tmp_path: Path) -> Opened:
     """Open a data set with shares that draw some of 8 episodes."""
 
     def open_with(folder: Path, **changes: Any) -> Dataset:
@@ -79,8 +79,8 @@ def numbers_in(dataset: Dataset, split: Split) -> set[int]:
 
 
 @pytest.mark.parametrize("val", ["val", "valid", "validation", "Val"])
-def test_rlds_splits_are_used(val: str, opened: Opened, tmp_path: Path) -> None:
-    dataset = opened(write_rlds_splits(tmp_path / "set", "test", "train", val))
+def test_rlds_splits_are_used(val: str, open_set: Opened, tmp_path: Path) -> None:
+    dataset = open_set(write_rlds_splits(tmp_path / "set", "test", "train", val))
     assert [numbers_in(dataset, split) for split in ("test", "train", "validation")] == [
         set(range(start, 3 * EPISODES, 3)) for start in range(3)
     ]
@@ -94,8 +94,8 @@ def test_rlds_splits_are_used(val: str, opened: Opened, tmp_path: Path) -> None:
     assert "drawn" not in text
 
 
-def test_missing_split_is_drawn_from_train_only(opened: Opened, tmp_path: Path) -> None:
-    dataset = opened(write_rlds_splits(tmp_path / "set", "train", "train_2", "val"), test_share=0.4)
+def test_missing_split_is_drawn_from_train_only(open_set: Opened, tmp_path: Path) -> None:
+    dataset = open_set(write_rlds_splits(tmp_path / "set", "train", "train_2", "val"), test_share=0.4)
     assert numbers_in(dataset, "validation") == set(range(2, 3 * EPISODES, 3))
     by_hash = dataset.config.model_copy(update={"validation_share": 0.0})
     drawn = {name: split_of(name, by_hash) for name, split in members(dataset).items() if split != "validation"}
@@ -117,41 +117,41 @@ def test_missing_split_is_drawn_from_train_only(opened: Opened, tmp_path: Path) 
     ],
 )
 def test_unusable_splits_are_pooled_and_drawn_by_hash(
-    names: tuple[str, ...], changes: dict[str, str], why: str, opened: Opened, tmp_path: Path
+    names: tuple[str, ...], changes: dict[str, str], why: str, open_set: Opened, tmp_path: Path
 ) -> None:
-    dataset = opened(write_rlds_splits(tmp_path / "set", *names), **changes)
+    dataset = open_set(write_rlds_splits(tmp_path / "set", *names), **changes)
     assert members(dataset) == {one.id: split_of(one.id, dataset.config) for one in dataset.table}
     text = describe_splits(dataset.table, dataset.config)
     assert f"because {why}: " in text
     assert all(f"{name} (4 episodes)" in text for name in names)
 
 
-def test_single_split_is_drawn_by_hash_with_the_same_index(opened: Opened, tmp_path: Path) -> None:
+def test_single_split_is_drawn_by_hash_with_the_same_index(open_set: Opened, tmp_path: Path) -> None:
     folder = write_rlds(tmp_path / "set", range(8))
-    one, pooled = opened(folder), opened(folder, splits="hash")
+    one, pooled = open_set(folder), open_set(folder, splits="hash")
     assert one.table.to_bytes() == pooled.table.to_bytes()
     assert "split" not in one.table.labels
     assert members(one) == {info.id: split_of(info.id, one.config) for info in one.table}
     assert describe_splits(one.table, one.config) == ""
 
 
-def test_lerobot_splits_are_ranges_of_episode_numbers(opened: Opened, tmp_path: Path) -> None:
+def test_lerobot_splits_are_ranges_of_episode_numbers(open_set: Opened, tmp_path: Path) -> None:
     folder = write_lerobot_splits(tmp_path / "set", 6, {"train": "0:3", "val": "3:5", "test": "5:6"})
-    found = members(opened(folder, source="lerobot"))
+    found = members(open_set(folder, source="lerobot"))
     assert [found[f"episode_{number:06d}"] for number in range(6)] == [
         "train", "train", "train", "validation", "validation", "test",
     ]  # fmt: skip
 
 
-def test_excluding_a_whole_own_split_raises_with_the_config_key(opened: Opened, tmp_path: Path) -> None:
+def test_excluding_a_whole_own_split_raises_with_the_config_key(open_set: Opened, tmp_path: Path) -> None:
     folder = write_rlds_splits(tmp_path / "set", "train", "val")
-    held_out = [name for name, split in members(opened(folder)).items() if split == "validation"]
+    held_out = [name for name, split in members(open_set(folder)).items() if split == "validation"]
     with pytest.raises(InputError, match=r"no validation episodes among 4 .*Set data\.splits: hash"):
-        opened(folder, exclude=tuple(held_out)).windows("validation")
+        open_set(folder, exclude=tuple(held_out)).windows("validation")
 
 
-def test_check_reports_the_used_splits(opened: Opened, tmp_path: Path) -> None:
-    config = opened(write_rlds_splits(tmp_path / "set", "train", "test")).config
+def test_check_reports_the_used_splits(open_set: Opened, tmp_path: Path) -> None:
+    config = open_set(write_rlds_splits(tmp_path / "set", "train", "test")).config
     findings = list(check_data(config, clips=2))
     assert [one.text for one in findings if one.about == "splits"] == [
         "the data set's own: test (4 episodes), train (4 episodes); validation is drawn from train by hash"

@@ -27,7 +27,7 @@ JOINTS = ("steps/observation/joint_position", "steps/observation/gripper_positio
 VELOCITIES = ("steps/action_dict/joint_velocity", "steps/action_dict/gripper_velocity")
 
 
-def knobs(path: object, **changes: Any) -> DataConfig:
+def vector_config(path: object, **changes: Any) -> DataConfig:
     values = {
         "source": "npz", "path": str(path), "states": "vector", "frames": 3, "stride": 2, "workers": 0,
         "validation_share": 0.3, "test_share": 0.0,
@@ -41,7 +41,7 @@ def recorded_by(how: str | None, **changes: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("width", [1, 7, 14])
 def test_vector_states_are_the_stored_numbers_and_actions_their_differences(tmp_path: Path, width: int) -> None:
-    dataset = open_dataset(knobs(write_vectors(tmp_path, width=width)))
+    dataset = open_dataset(vector_config(write_vectors(tmp_path, width=width)))
     assert dataset.widths == Widths(width, width)
     clip = clip_at(dataset, 0, 3)
     written = vectors(24, width, seed=0)
@@ -53,7 +53,7 @@ def test_vector_states_are_the_stored_numbers_and_actions_their_differences(tmp_
 def test_commands_of_a_model_step_are_joined_control_steps(
     tmp_path: Path, how: str, join: Callable[..., np.ndarray]
 ) -> None:
-    dataset = open_dataset(knobs(write_vectors(tmp_path, width=14, action_width=5), **recorded_by(how)))
+    dataset = open_dataset(vector_config(write_vectors(tmp_path, width=14, action_width=5), **recorded_by(how)))
     assert dataset.widths == Widths(14, 5)
     clip = clip_at(dataset, 1, 4)
     written = vectors(24, 5, seed=1001)  # of control steps 4, 5 and 6, 7
@@ -62,7 +62,7 @@ def test_commands_of_a_model_step_are_joined_control_steps(
 
 def test_rlds_reads_the_configured_features(droid: Path) -> None:
     fields = {"state": JOINTS, "action": VELOCITIES}
-    config = knobs(droid, source="rlds", fields=fields, **recorded_by("mean"))
+    config = vector_config(droid, source="rlds", fields=fields, **recorded_by("mean"))
     dataset = open_dataset(config)
     assert dataset.widths == Widths(8, 8)
     episode = dataset.source.read(0)
@@ -80,7 +80,7 @@ def test_rlds_vector_width_is_unknown_without_a_flag_per_step(
 ) -> None:
     folder = spoiled(lambda features: features.pop("steps/is_first"))
     with pytest.raises(InputError, match="steps/is_first"):
-        open_dataset(knobs(folder, source="rlds", fields={"state": JOINTS}))
+        open_dataset(vector_config(folder, source="rlds", fields={"state": JOINTS}))
 
 
 def bimanual(number: int, steps: int) -> Recorded:
@@ -95,14 +95,14 @@ def bimanual(number: int, steps: int) -> Recorded:
 def test_lerobot_reads_the_configured_columns(tmp_path: Path, write: Callable[..., Path]) -> None:
     folder = write(tmp_path / "set", [bimanual(number, 12) for number in range(4)])
     lerobot = {"state": ["observation.state"], "success": None}
-    dataset = open_dataset(knobs(folder, source="lerobot", lerobot=lerobot, **recorded_by("last")))
+    dataset = open_dataset(vector_config(folder, source="lerobot", lerobot=lerobot, **recorded_by("last")))
     assert dataset.widths == Widths(14, 16)
     clip = clip_at(dataset, 2, 1)
     np.testing.assert_array_equal(clip.states, vectors(12, 14, seed=2)[[1, 3, 5]].astype(np.float32))
     np.testing.assert_array_equal(clip.actions, vectors(12, 16, seed=52)[[2, 4]].astype(np.float32))
-    some = open_source(knobs(folder, source="lerobot", lerobot=lerobot | {"select": [13, 0]}))
+    some = open_source(vector_config(folder, source="lerobot", lerobot=lerobot | {"select": [13, 0]}))
     np.testing.assert_array_equal(some.read(0).states, vectors(12, 14, seed=0)[:, [13, 0]].astype(np.float32))
-    wrong = knobs(folder, source="lerobot", lerobot=lerobot | {"action": ["actions"]}, **recorded_by("last"))
+    wrong = vector_config(folder, source="lerobot", lerobot=lerobot | {"action": ["actions"]}, **recorded_by("last"))
     with pytest.raises(InputError, match=r"data\.lerobot\.action.*Did you mean action"):
         open_dataset(wrong)
 
@@ -111,16 +111,16 @@ def test_episode_of_another_width_is_broken(tmp_path: Path) -> None:
     write_vectors(tmp_path, width=14)
     write_vectors(tmp_path / "other", width=8, episodes=1)
     with pytest.raises(InputError, match=r"other.*8 numbers a state.*14 numbers a state, as in most"):
-        open_dataset(knobs(tmp_path))
+        open_dataset(vector_config(tmp_path))
 
 
 def test_missing_or_short_recorded_commands_raise(tmp_path: Path) -> None:
     write_vectors(tmp_path / "none", width=8)
     with pytest.raises(InputError, match=r"actions: no such array"):
-        open_dataset(knobs(tmp_path / "none", **recorded_by("sum")))
+        open_dataset(vector_config(tmp_path / "none", **recorded_by("sum")))
     write_vectors(tmp_path / "few", width=8, actions=np.zeros((23, 3)))
     with pytest.raises(InputError, match=r"actions: shape \(23, 3\).*24 x any"):
-        open_dataset(knobs(tmp_path / "few", **recorded_by("sum")))
+        open_dataset(vector_config(tmp_path / "few", **recorded_by("sum")))
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_check_reports_constant_states_and_zero_actions(states: np.ndarray, abou
 
 @pytest.mark.usefixtures("drawn")
 def test_inspection_of_vector_states(tmp_path: Path) -> None:
-    dataset = open_dataset(knobs(write_vectors(tmp_path / "set", width=14)))
+    dataset = open_dataset(vector_config(write_vectors(tmp_path / "set", width=14)))
     found = inspect_dataset(dataset)
     figures = json.loads(json.dumps(found.values))
     assert len(figures["ranges"]) == 14

@@ -29,8 +29,8 @@ from vjepa2_ac.data.windows import (
 from vjepa2_ac.episode import EpisodeInfo
 
 
-def settings_of(**knobs: Any) -> DataConfig:
-    return DataConfig(path="nowhere", **({"frames": 4, "stride": 3} | knobs))
+def settings_of(**options: Any) -> DataConfig:
+    return DataConfig(path="nowhere", **({"frames": 4, "stride": 3} | options))
 
 
 def episodes(*lengths: int) -> list[EpisodeInfo]:
@@ -142,9 +142,9 @@ def test_larger_held_out_share_only_takes_episodes_from_train() -> None:
     assert not (before["validation"] & ~after["validation"]).any()
 
 
-def splits_of(source: MemorySource, **knobs: object) -> dict[str, Split]:
+def splits_of(source: MemorySource, **options: object) -> dict[str, Split]:
     """Return the split of every episode that takes part."""
-    dataset = open_in_memory(source, **({"validation_share": 0.02, "test_share": 0.02} | knobs))
+    dataset = open_in_memory(source, **({"validation_share": 0.02, "test_share": 0.02} | options))
     return {
         dataset.table.identity(int(place)): split
         for split in SPLITS
@@ -156,13 +156,13 @@ def splits_of(source: MemorySource, **knobs: object) -> dict[str, Split]:
 @pytest.mark.parametrize("left_out", [0, 2, 6, 7])
 def test_excluding_an_episode_moves_no_other_between_splits(left_out: int, split_by: str | None) -> None:
     """Neither `data.exclude` nor an episode that breaks: what a run has trained on stays out of its validation."""
-    knobs = {"split_by": split_by, "idle": {"rule": "motion"}, "broken_episodes": "skip"}
-    before = splits_of(MemorySource([60] * 8), **knobs)
+    options = {"split_by": split_by, "idle": {"rule": "motion"}, "broken_episodes": "skip"}
+    before = splits_of(MemorySource([60] * 8), **options)
     assert set(before.values()) == set(SPLITS)
     without = {name: split for name, split in before.items() if name != f"episode {left_out}"}
     excluded = {"exclude": (f"episode {left_out}",)}
-    assert splits_of(MemorySource([60] * 8), **knobs, **excluded) == without
-    assert splits_of(MemorySource([61 + left_out] * 8, unreadable=frozenset({left_out})), **knobs) == without
+    assert splits_of(MemorySource([60] * 8), **options, **excluded) == without
+    assert splits_of(MemorySource([61 + left_out] * 8, unreadable=frozenset({left_out})), **options) == without
 
 
 def test_splits_contain_the_selected_outcome_only() -> None:

@@ -44,13 +44,13 @@ def bucket(gcs: Gcs) -> Gcs:
 
 
 @pytest.fixture
-def far(make_config: MakeConfig, tmp_path: Path) -> Callable[..., Config]:
+def bucket_config(make_config: MakeConfig, tmp_path: Path) -> Callable[..., Config]:
     """Return a config whose cache is in the bucket, on a machine of this name."""
 
     def make(machine: str = "one", **changes: object) -> Config:
         disk = {"dir": str(tmp_path / machine), "limit_gb": 1.0}
-        knobs = {"data__cache_dir": URL, "data__disk_cache": disk, "data__cache": "require"}
-        return make_config(**knobs | changes)
+        options = {"data__cache_dir": URL, "data__disk_cache": disk, "data__cache": "require"}
+        return make_config(**options | changes)
 
     return make
 
@@ -68,7 +68,7 @@ def opened(config: Config) -> Dataset:
     return found
 
 
-def alone(config: Config, folder: Path | str, **changes: object) -> Dataset:
+def open_cache_only(config: Config, folder: Path | str, **changes: object) -> Dataset:
     """Return the data of a finished cache without its data set."""
     return open_dataset(config.data.with_source("latents", path=str(folder), cache="off", **changes))
 
@@ -85,18 +85,18 @@ def equal(one: list[torch.Tensor], other: list[torch.Tensor]) -> bool:
 
 
 def test_second_machine_completes_a_cache_in_a_bucket(
-    bucket: Gcs, far: Callable[..., Config], encoded_frames: list[int], monkeypatch: pytest.MonkeyPatch
+    bucket: Gcs, bucket_config: Callable[..., Config], encoded_frames: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
-    found = encode_config(far("one"))
+    found = encode_config(bucket_config("one"))
     assert (found.encoded, found.is_finished) == (EPISODES // 2, False)
     encoded_frames.clear()
     monkeypatch.delenv("WORLD_SIZE")
-    found = encode_config(far("two"))
+    found = encode_config(bucket_config("two"))
     assert sum(encoded_frames) == EPISODES // 2 * 24
     encoded_frames.clear()
     bucket.forget()
-    assert encode_config(far("three")) == found
+    assert encode_config(bucket_config("three")) == found
     assert (found.encoded, found.is_finished, found.folder) == (EPISODES, True, f"{URL}/{found.folder[-32:]}")
     assert not encoded_frames
     assert not bucket.uploads()
@@ -106,24 +106,26 @@ def test_second_machine_completes_a_cache_in_a_bucket(
 
 @pytest.mark.usefixtures("bucket")
 def test_run_on_a_bucket_cache_equals_run_on_a_local_cache_bit_for_bit(
-    far: Callable[..., Config], tmp_path: Path, encoded_frames: list[int]
+    bucket_config: Callable[..., Config], tmp_path: Path, encoded_frames: list[int]
 ) -> None:
     runs = []
     for name, place in (("here", str(tmp_path / "caches")), ("there", URL)):
-        knobs = {"data__cache_dtype": "int8", "data__cache": "auto", "data__cache_dir": place, "training__steps": 3}
-        config = far(name, run_dir=str(tmp_path / f"run {name}"), **knobs)
+        options = {"data__cache_dtype": "int8", "data__cache": "auto", "data__cache_dir": place, "training__steps": 3}
+        config = bucket_config(name, run_dir=str(tmp_path / f"run {name}"), **options)
         runs.append(train(config, SilentReporter()))
     assert_same_run(*runs)
     assert sum(encoded_frames) == 2 * EPISODES * 24
 
 
-def test_bucket_cache_takes_one_listing_and_reads_each_range_once(bucket: Gcs, far: Callable[..., Config]) -> None:
-    knobs = {"data__start_every": 2, "data__frames": 8}
-    folder = encode_config(far(**knobs)).folder
-    far = partial(far, **knobs)
-    expected = batches(opened(far("two")))
+def test_bucket_cache_takes_one_listing_and_reads_each_range_once(
+    bucket: Gcs, bucket_config: Callable[..., Config]
+) -> None:
+    options = {"data__start_every": 2, "data__frames": 8}
+    folder = encode_config(bucket_config(**options)).folder
+    bucket_config = partial(bucket_config, **options)
+    expected = batches(opened(bucket_config("two")))
     bucket.forget()
-    dataset = alone(far("three"), folder)
+    dataset = open_cache_only(bucket_config("three"), folder)
     asked = [request.target for request in bucket.requests]
     assert len([one for one in asked if one.startswith("GET /storage/v1/b/bucket/o?")]) == 1
     assert not [one for one in asked if ".safetensors" in one], "nothing of any episode"
@@ -132,7 +134,7 @@ def test_bucket_cache_takes_one_listing_and_reads_each_range_once(bucket: Gcs, f
     assert bucket.bytes_read(".safetensors") <= CLIPS * clip + EPISODES * SMALL
     assert clip in [one.sent for one in bucket.reads(".safetensors")], "neighbouring frames come together"
     bucket.forget()
-    assert equal(batches(alone(far("three"), folder)), expected)
+    assert equal(batches(open_cache_only(bucket_config("three"), folder)), expected)
     assert not bucket.reads(".safetensors"), "all from this machine's disk"
 
 
@@ -147,32 +149,37 @@ def test_bucket_cache_takes_one_listing_and_reads_each_range_once(bucket: Gcs, f
     ],
 )
 def test_unwritable_cache_url_raises_before_encoding(
-    bucket: Gcs, far: Callable[..., Config], url: str, status: int | None, words: str, encoded_frames: list[int]
+    bucket: Gcs,
+    bucket_config: Callable[..., Config],
+    url: str,
+    status: int | None,
+    words: str,
+    encoded_frames: list[int],
 ) -> None:
     if status:
         bucket.fail_next(status, times=ALWAYS, match="POST /upload/")
     for start in (encode_config, lambda config: set_up(config, SilentReporter())):
         with pytest.raises(RefusedError, match=words):
-            start(far(data__cache_dir=url, data__cache="auto"))
+            start(bucket_config(data__cache_dir=url, data__cache="auto"))
     assert not encoded_frames
     assert bucket.names("bucket") == ["other"]
 
 
 def test_damaged_bucket_file_is_reported_and_encoded_again(
-    bucket: Gcs, far: Callable[..., Config], encoded_frames: list[int]
+    bucket: Gcs, bucket_config: Callable[..., Config], encoded_frames: list[int]
 ) -> None:
-    folder = encode_config(far()).folder
-    expected = batches(alone(far(), folder))
+    folder = encode_config(bucket_config()).folder
+    expected = batches(open_cache_only(bucket_config(), folder))
     for name in storage.file_sizes(folder):
         if name.endswith(".safetensors"):
             place = storage.join(folder, name)
             bucket.put(place.removeprefix("gs://"), storage.read_bytes(place)[:-10])
     with pytest.raises(InputError, match=r"gs://.*safetensors: not a whole file of latents.*vjepa2-ac encode"):
-        batches(alone(far(), folder))
+        batches(open_cache_only(bucket_config(), folder))
     encoded_frames.clear()
-    encode_config(far())
+    encode_config(bucket_config())
     assert sum(encoded_frames) == EPISODES * 24
-    assert equal(batches(alone(far(), folder)), expected)
+    assert equal(batches(open_cache_only(bucket_config(), folder)), expected)
 
 
 # ---- several processes, and their death --------------------------------------------------------------------------
@@ -190,12 +197,14 @@ def start(nursery: Nursery, config: Config, folder: Path, name: str, **environme
 
 
 def test_killed_upload_leaves_no_finished_file(
-    bucket: Gcs, far: Callable[..., Config], nursery: Nursery, tmp_path: Path, encoded_frames: list[int]
+    bucket: Gcs, bucket_config: Callable[..., Config], nursery: Nursery, tmp_path: Path, encoded_frames: list[int]
 ) -> None:
-    expected = batches(alone(far(), encode_config(far(data__cache_dir=str(tmp_path / "whole"))).folder))
+    expected = batches(
+        open_cache_only(bucket_config(), encode_config(bucket_config(data__cache_dir=str(tmp_path / "whole"))).folder)
+    )
     encoded_frames.clear()
     bucket.fail_next("hang", times=ALWAYS, match=r"POST /upload/.*00000[3-7]-")
-    child = start(nursery, far("two"), tmp_path, "killed")
+    child = start(nursery, bucket_config("two"), tmp_path, "killed")
     while bucket.faults_left == ALWAYS or len(latents_in(bucket)) < 3:  # the fourth upload is under way
         assert child.is_running()
         time.sleep(0.01)
@@ -203,10 +212,10 @@ def test_killed_upload_leaves_no_finished_file(
     bucket.forget()
     folder = f"gs://bucket/{os.path.commonpath([name for name in bucket.names('bucket') if 'caches/' in name])}"
     with pytest.raises(InputError, match="no latents of 5 of 8 episodes"):
-        alone(far("three"), folder)
-    found = encode_config(far("three"))
+        open_cache_only(bucket_config("three"), folder)
+    found = encode_config(bucket_config("three"))
     assert sum(encoded_frames) == 5 * 24
-    assert equal(batches(alone(far("three"), found.folder)), expected)
+    assert equal(batches(open_cache_only(bucket_config("three"), found.folder)), expected)
     assert not [
         name for name in bucket.names("bucket") if not name.endswith((".safetensors", ".json", ".npz", "other"))
     ]

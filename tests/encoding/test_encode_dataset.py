@@ -161,7 +161,7 @@ def test_next_encoding_writes_only_damaged_deleted_and_new_files(
 
 
 @pytest.fixture
-def mend(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+def repair_source(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Episode 3 has a frame that cannot be decoded; a call repairs it."""
     from vjepa2_ac.data.sources.rlds import RldsSource
 
@@ -187,7 +187,7 @@ def mend(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 
 
 def test_broken_episode_stops_the_encoding_or_is_skipped_and_retried(
-    make_config: MakeConfig, tmp_path: Path, mend: Callable[[], None]
+    make_config: MakeConfig, tmp_path: Path, repair_source: Callable[[], None]
 ) -> None:
     skip, out = make_config(data__broken_episodes="skip"), tmp_path / "out"
     with pytest.raises(InputError, match=r"damaged JPEG.*data\.exclude"):
@@ -197,11 +197,11 @@ def test_broken_episode_stops_the_encoding_or_is_skipped_and_retried(
     assert name == open_dataset(skip.data).table.identity(3)
     assert "damaged JPEG" in reason
     assert (found.encoded, found.is_finished) == (7, True)
-    mend()
+    repair_source()
     assert encode(skip, out).broken == {}
 
 
-@pytest.mark.usefixtures("mend")
+@pytest.mark.usefixtures("repair_source")
 def test_too_many_broken_episodes_over_all_processes_raise(
     make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

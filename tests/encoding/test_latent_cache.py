@@ -206,21 +206,25 @@ def droid_with_rests(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_droid_rlds(tmp_path_factory.mktemp("droid") / "1.0.0", drawn, shards=2)
 
 
-def config_of(data: Path, tmp_path: Path, **knobs: Any) -> DataConfig:
-    values = {"path": str(data), "cache_dir": str(tmp_path / "caches")} | KNOBS | knobs
+def config_of(data: Path, tmp_path: Path, **options: Any) -> DataConfig:
+    values = {"path": str(data), "cache_dir": str(tmp_path / "caches")} | KNOBS | options
     return DataConfig.model_validate(values)
 
 
-def cached(path: Path, tmp_path: Path, **knobs: Any) -> tuple[Dataset, Dataset]:
+def cached(path: Path, tmp_path: Path, **options: Any) -> tuple[Dataset, Dataset]:
     """Return a data set, and the same through its cache."""
-    original = open_dataset(config_of(path, tmp_path, **knobs))
+    original = open_dataset(config_of(path, tmp_path, **options))
     write_cache(original)
     return original, LatentCache.for_dataset(original, NUMBERS).open_dataset()
 
 
-def alone(through: Dataset, **knobs: Any) -> Dataset:
+def open_cache_only(through: Dataset, **options: Any) -> Dataset:
     """Return what a cache is without its data set, as a config that was changed in two places opens it."""
-    changes = {"source": "latents", "cache": "off", "disk_cache": {"dir": f"{through.config.cache_dir}-other"}} | knobs
+    changes = {
+        "source": "latents",
+        "cache": "off",
+        "disk_cache": {"dir": f"{through.config.cache_dir}-other"},
+    } | options
     config = through.config.model_dump() | changes
     return open_dataset(DataConfig.model_validate(config))
 
@@ -246,12 +250,12 @@ def assert_same_clips(original: list[Batch], cached: list[Batch]) -> None:
             torch.testing.assert_close(unpack_latents(other.latents), true, rtol=2**-8, atol=0)
 
 
-@pytest.mark.parametrize("knobs", EVERYTHING.values(), ids=EVERYTHING)
+@pytest.mark.parametrize("options", EVERYTHING.values(), ids=EVERYTHING)
 def test_cached_clips_equal_those_of_the_data_set(
-    droid_with_rests: Path, tmp_path: Path, knobs: dict[str, Any]
+    droid_with_rests: Path, tmp_path: Path, options: dict[str, Any]
 ) -> None:
-    original, through = cached(droid_with_rests, tmp_path, **knobs)
-    by_itself = alone(through)
+    original, through = cached(droid_with_rests, tmp_path, **options)
+    by_itself = open_cache_only(through)
     splits: tuple[Split, ...] = ("train", "validation", "test")
     for split in splits:
         windows = original.windows(split)
@@ -271,7 +275,7 @@ def test_cached_clips_equal_those_of_the_data_set(
 
 
 @pytest.fixture
-def with_a_broken_one(tmp_path: Path) -> Dataset:
+def cached_set_with_broken_episode(tmp_path: Path) -> Dataset:
     """A hundred episodes; the frames of one cannot be read."""
     unreadable = frozenset({5})
     source = MemorySource([6] * 100, pictureless=unreadable)
@@ -281,8 +285,8 @@ def with_a_broken_one(tmp_path: Path) -> Dataset:
     return Dataset(config, source, table, StepSelection.all_steps(table, is_selected), BrokenEpisodes(config, 100))
 
 
-def test_broken_episode_is_skipped_with_and_without_a_cache(with_a_broken_one: Dataset) -> None:
-    original = with_a_broken_one
+def test_broken_episode_is_skipped_with_and_without_a_cache(cached_set_with_broken_episode: Dataset) -> None:
+    original = cached_set_with_broken_episode
     write_cache(original)
     through = replace(
         LatentCache.for_dataset(original, NUMBERS).open_dataset(), broken=BrokenEpisodes(original.config, 100)
@@ -296,11 +300,11 @@ def test_broken_episode_is_skipped_with_and_without_a_cache(with_a_broken_one: D
     )
 
 
-def test_damaged_cache_file_follows_the_broken_episode_policy(with_a_broken_one: Dataset) -> None:
+def test_damaged_cache_file_follows_the_broken_episode_policy(cached_set_with_broken_episode: Dataset) -> None:
     def opened(policy: str) -> Dataset:
-        config = with_a_broken_one.config.model_copy(update={"broken_episodes": policy})
+        config = cached_set_with_broken_episode.config.model_copy(update={"broken_episodes": policy})
         source, broken = MemorySource([6] * 100), BrokenEpisodes(config, 100)
-        return replace(with_a_broken_one, config=config, source=source, broken=broken)
+        return replace(cached_set_with_broken_episode, config=config, source=source, broken=broken)
 
     write_cache(opened("error"))
     files = LatentCache.for_dataset(opened("error"), NUMBERS).files
@@ -324,7 +328,7 @@ def test_damaged_cache_file_follows_the_broken_episode_policy(with_a_broken_one:
 
 
 @pytest.fixture(scope="module")
-def a_cache(droid_with_rests: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Dataset, Path]:
+def shared_cache(droid_with_rests: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Dataset, Path]:
     """A data set, the same through its cache, and the folder of `cache_dir`; read only."""
     folder = tmp_path_factory.mktemp("cache")
     original, through = cached(droid_with_rests, folder, idle=IDLE, outcome="success")
@@ -332,7 +336,7 @@ def a_cache(droid_with_rests: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.mark.parametrize(
-    ("knobs", "reported"),
+    ("options", "reported"),
     [
         ({"stride": 3}, r"data\.stride: 2, not 3"),
         ({"crop": "letterbox"}, r"data\.crop: released, not letterbox"),
@@ -342,12 +346,12 @@ def a_cache(droid_with_rests: Path, tmp_path_factory: pytest.TempPathFactory) ->
     ids=lambda value: str(value)[:20],
 )
 def test_cache_of_other_clips_raises_with_the_difference(
-    a_cache: tuple[Dataset, Dataset, Path], knobs: dict[str, Any], reported: str
+    shared_cache: tuple[Dataset, Dataset, Path], options: dict[str, Any], reported: str
 ) -> None:
-    original, through, _ = a_cache
+    original, through, _ = shared_cache
     with pytest.raises(InputError, match=reported):
-        alone(through, **knobs)
-    config = DataConfig.model_validate(original.config.model_dump() | knobs)
+        open_cache_only(through, **options)
+    config = DataConfig.model_validate(original.config.model_dump() | options)
     with pytest.raises(InputError, match=reported):
         LatentCache.for_dataset(open_dataset(config), NUMBERS).open_dataset()
 
@@ -361,9 +365,9 @@ def test_cache_of_other_clips_raises_with_the_difference(
     ids=str,
 )
 def test_cache_of_another_encoder_raises_with_the_difference(
-    a_cache: tuple[Dataset, Dataset, Path], change: dict[str, Any], reported: str, monkeypatch: pytest.MonkeyPatch
+    shared_cache: tuple[Dataset, Dataset, Path], change: dict[str, Any], reported: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original, through, _ = a_cache
+    original, through, _ = shared_cache
     encoding = replace(NUMBERS, parts={**NUMBERS.parts, **change})
     monkeypatch.setattr(batch, "get_encoding", lambda model, _: model)
     with pytest.raises(
@@ -371,8 +375,8 @@ def test_cache_of_another_encoder_raises_with_the_difference(
     ):
         LatentCache.for_dataset(original, encoding).open_dataset()
     with pytest.raises(InputError, match=reported):
-        batch.require_same_encoder(encoding, alone(through), None)  # type: ignore[arg-type]
-    batch.require_same_encoder(NUMBERS, alone(through), None)  # type: ignore[arg-type]
+        batch.require_same_encoder(encoding, open_cache_only(through), None)  # type: ignore[arg-type]
+    batch.require_same_encoder(NUMBERS, open_cache_only(through), None)  # type: ignore[arg-type]
     batch.require_same_encoder(encoding, original, None)  # type: ignore[arg-type]  # no cache
 
 
@@ -383,18 +387,18 @@ def test_unfinished_or_damaged_cache_raises(droid_with_rests: Path, tmp_path: Pa
         sound = (folder / name).read_bytes()
         (folder / name).write_bytes(sound[:-40])
         with pytest.raises(InputError, match=name):
-            alone(through)
+            open_cache_only(through)
         (folder / name).write_bytes(sound)
     (folder / STEPS_FILE).rename(folder / "other")
     with pytest.raises(InputError, match=r"kept\.npz"):
-        alone(through)
+        open_cache_only(through)
     (folder / "other").rename(folder / STEPS_FILE)
     next(folder.rglob("*.safetensors")).unlink()
-    for read in (lambda: alone(through), lambda: LatentCache.for_dataset(original, NUMBERS).open_dataset()):
+    for read in (lambda: open_cache_only(through), lambda: LatentCache.for_dataset(original, NUMBERS).open_dataset()):
         with pytest.raises(InputError, match=r"no latents of 1 of \d+ episodes.*vjepa2-ac encode"):
             read()
     with pytest.raises(InputError, match="no latent cache"):
-        alone(through, path=str(tmp_path))
+        open_cache_only(through, path=str(tmp_path))
 
 
 def test_key_of_an_older_version_accepts_removed_keys_at_their_default(tmp_path: Path) -> None:

@@ -78,9 +78,9 @@ def actors(process: psutil.Process) -> list[psutil.Process]:
 
 
 def assert_finished(job: "subprocess.Popen[str]", folder: Path, config: MakeConfig) -> None:
-    said, errors = job.communicate(timeout=120)
+    output, errors = job.communicate(timeout=120)
     assert job.returncode == 0, errors
-    assert "8 of 8 episodes, 96 frames" in said
+    assert "8 of 8 episodes, 96 frames" in output
     encode_config(config(data__start_every=2), out=folder / "whole")
     assert contents(folder / "out") == contents(folder / "whole")
 
@@ -111,8 +111,8 @@ def test_actor_error_equals_the_single_process_error(start: Callable, tmp_path: 
     for word in ("go", "fail"):
         (tmp_path / word).touch()
     job = start("ray")
-    said, errors = job.communicate(timeout=120)
-    assert job.returncode == 2, said + errors
+    output, errors = job.communicate(timeout=120)
+    assert job.returncode == 2, output + errors
     assert "error: a frame: it is damaged" in errors
     assert "data.exclude" in errors
     assert "Traceback" not in errors
@@ -125,18 +125,18 @@ def test_actor_without_the_cache_folder_raises(
     config = make_config()
     task = _Task(list(needed_frames(open_dataset(config.data))))
     encode_config(make_config(data__crop="square"), out=tmp_path / "other")
-    for folder, words in (("none", "are not visible to another process"), ("other", "data.crop: square, not")):
+    for folder, message in (("none", "are not visible to another process"), ("other", "data.crop: square, not")):
         result = _Actor(config_as_dict(config), tmp_path / folder, Path.cwd())({"task": task})["result"]
         assert isinstance(result.error, InputError)
-        assert words in str(result.error)
+        assert message in str(result.error)
 
 
 @pytest.mark.parametrize(
-    ("engine", "words"),
+    ("engine", "message"),
     [("dask", "neither ray nor ray=ADDRESS"), ("ray=", "neither ray nor"), ("ray", r"Ray.*is not installed.*cluster")],
 )
 def test_missing_ray_or_unknown_engine_raises_one_error(
-    engine: str, words: str, make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    engine: str, message: str, make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.setitem(sys.modules, "ray", None)
@@ -147,4 +147,4 @@ def test_missing_ray_or_unknown_engine_raises_one_error(
         status = ended.code
     assert status == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
-    assert re.search(words, line)
+    assert re.search(message, line)

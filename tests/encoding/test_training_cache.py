@@ -20,7 +20,7 @@ def encoded(config: Config) -> Path:
     return encode_for(config, load_base(config.model, seed=config.seed), dataset)
 
 
-def of_cache(folder: Path, **changes: Any) -> dict[str, Any]:
+def cache_config(folder: Path, **changes: Any) -> dict[str, Any]:
     """Return the changes that make a config of a cache without its data set."""
     return {"data__source": "latents", "data__path": str(folder)} | changes
 
@@ -31,7 +31,7 @@ def test_training_on_a_lossless_cache_equals_on_the_fly_encoding_bit_for_bit(mak
     on_the_fly = make_config(run_dir=str(tmp_path / "fly"), **changes)
     train(on_the_fly, reporter)
     folder = encoded(on_the_fly)
-    train(make_config(run_dir=str(tmp_path / "cached"), **(changes | of_cache(folder))), reporter)
+    train(make_config(run_dir=str(tmp_path / "cached"), **(changes | cache_config(folder))), reporter)
     assert_same_run(tmp_path / "fly", tmp_path / "cached")
     train(make_config(run_dir=str(tmp_path / "through"), **(changes | {"data__cache": "require"})), reporter)
     assert_same_run(tmp_path / "fly", tmp_path / "through")

@@ -62,11 +62,11 @@ def test_unresponsive_server_is_retried(gcs: Gcs, file: str, monkeypatch: pytest
 
 
 @pytest.mark.parametrize(
-    ("failure", "words"), [(503, "HTTP 503: made to fail"), (429, "HTTP 429"), ("reset", "Disconnected")]
+    ("failure", "message"), [(503, "HTTP 503: made to fail"), (429, "HTTP 429"), ("reset", "Disconnected")]
 )
-def test_failed_retries_raise_with_attempts_url_and_reason(gcs: Gcs, file: str, failure: Failure, words: str) -> None:
+def test_failed_retries_raise_with_attempts_url_and_reason(gcs: Gcs, file: str, failure: Failure, message: str) -> None:
     gcs.fail_next(failure, times=100, match="/download/")
-    with pytest.raises(UnreachableError, match=rf"^{file}: 5 attempts in .* failed.*{words}.*Check the net"):
+    with pytest.raises(UnreachableError, match=rf"^{file}: 5 attempts in .* failed.*{message}.*Check the net"):
         storage.read_range(file, 0, 5)
     attempts = 5 if failure != "reset" else 10  # aiohttp asks again at once where a connection in use before was cut
     assert len(gcs.reads()) <= attempts, "gcsfs would make six of each"
@@ -164,7 +164,7 @@ def test_missing_protocol_library_raises_with_the_extra(url: str, extra: str, mo
 
 
 @pytest.fixture
-def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def no_google_login(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A machine without any login."""
     for name in ("STORAGE_EMULATOR_HOST", "GOOGLE_APPLICATION_CREDENTIALS"):
         monkeypatch.delenv(name, raising=False)
@@ -173,17 +173,17 @@ def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_google_token_is_user_machine_or_anonymous(nobody: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_google_token_is_user_machine_or_anonymous(no_google_login: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert remote.google_token() == "anon"
     assert remote.login_hint("gs://a/b").startswith("You are not logged in. Log in with `gcloud auth application-de")
-    (nobody / "product_name").write_text("Some other machine\n")
+    (no_google_login / "product_name").write_text("Some other machine\n")
     assert remote.google_token() == "anon"
-    (nobody / "product_name").write_text("Google Compute Engine\n")
+    (no_google_login / "product_name").write_text("Google Compute Engine\n")
     assert remote.google_token() == "cloud"
-    (nobody / "application_default_credentials.json").write_text("{}")
+    (no_google_login / "application_default_credentials.json").write_text("{}")
     assert remote.google_token() == "google_default"
     assert remote.login_hint("gcs://a/b").startswith("Log in with `gcloud")
-    (nobody / "application_default_credentials.json").unlink()
+    (no_google_login / "application_default_credentials.json").unlink()
     monkeypatch.setenv("GOOGLE_APPLICATION_CREDENTIALS", "key.json")
     assert remote.google_token() == "google_default"
     monkeypatch.setenv("STORAGE_EMULATOR_HOST", "http://127.0.0.1:1")
@@ -222,7 +222,7 @@ class NoCredentialsError(Exception):
 
 
 @pytest.mark.parametrize(
-    ("error", "attempts", "words"),
+    ("error", "attempts", "message"),
     [
         (ConnectionResetError("gone"), 3, "3 attempts in .* failed"),
         (OSError(5, "of a library that we do not know"), 3, "3 attempts in .* failed"),
@@ -238,14 +238,14 @@ class NoCredentialsError(Exception):
         (ValueError("Bad Request"), 1, "cannot be read.*Bad Request.*Check the URL"),
     ],
 )
-def test_library_errors_are_classified(error: Exception, attempts: int, words: str) -> None:
+def test_library_errors_are_classified(error: Exception, attempts: int, message: str) -> None:
     calls = []
 
     def action(timeout_s: float) -> None:
         calls.append(timeout_s)
         raise error
 
-    with pytest.raises(UnreachableError, match=words) as caught:
+    with pytest.raises(UnreachableError, match=message) as caught:
         call_with_retries("gs://a", action, policy=AT_ONCE, access="Log in so")
     assert len(calls) == attempts
     assert caught.value.__cause__ is error

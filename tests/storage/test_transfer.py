@@ -87,12 +87,12 @@ def test_stalled_upload_times_out_and_is_retried(bucket: Gcs, tmp_path: Path, mo
 
 
 @pytest.mark.parametrize(
-    ("failure", "words"),
+    ("failure", "message"),
     [(403, r"no permission .*You are not logged in\. Log in with `gcloud"), (412, "cannot be written")],
 )
-def test_refused_upload_is_not_retried(bucket: Gcs, tmp_path: Path, failure: int, words: str) -> None:
+def test_refused_upload_is_not_retried(bucket: Gcs, tmp_path: Path, failure: int, message: str) -> None:
     bucket.fail_next(failure, times=9)
-    with pytest.raises(RefusedError, match=words):
+    with pytest.raises(RefusedError, match=message):
         storage.upload(source_of(tmp_path, SMALL), PLACE)
     assert len(bucket.requests) == 1
 
@@ -109,7 +109,7 @@ def test_missing_bucket_raises_with_its_name(tmp_path: Path) -> None:
 
 
 @pytest.fixture(params=["gs", "memory", "folder"])
-def place(request: pytest.FixtureRequest, bucket: Gcs, tmp_path: Path) -> str:
+def target(request: pytest.FixtureRequest, bucket: Gcs, tmp_path: Path) -> str:
     """A place of every kind: an object store, a file system of fsspec with folders, a folder of this machine."""
     assert bucket.names("bucket") == ["before"]
     return {"gs": "gs://bucket/run", "memory": f"memory://{tmp_path.name}/run", "folder": str(tmp_path / "at/run")}[
@@ -117,25 +117,25 @@ def place(request: pytest.FixtureRequest, bucket: Gcs, tmp_path: Path) -> str:
     ]
 
 
-def test_each_kind_of_folder_is_written_listed_and_removed(place: str, tmp_path: Path) -> None:
+def test_each_kind_of_folder_is_written_listed_and_removed(target: str, tmp_path: Path) -> None:
     source = source_of(tmp_path, SMALL)
-    assert storage.file_sizes(place) == {}
+    assert storage.file_sizes(target) == {}
     for name in ("a", "inner/b", "inner/deep/c"):
-        storage.upload(source, storage.join(place, name))
-    assert storage.file_sizes(place) == dict.fromkeys(("a", "inner/b", "inner/deep/c"), SMALL)
+        storage.upload(source, storage.join(target, name))
+    assert storage.file_sizes(target) == dict.fromkeys(("a", "inner/b", "inner/deep/c"), SMALL)
     source.write_bytes(b"other")
-    storage.upload(source, storage.join(place, "a"))
-    assert storage.read_bytes(storage.join(place, "a")) == b"other"
-    storage.remove(storage.join(place, "a"))
-    storage.remove(storage.join(place, "a"))
-    storage.remove_folder(storage.join(place, "inner"), first="deep/c")
-    storage.remove_folder(storage.join(place, "inner"), first="deep/c")
-    assert storage.file_sizes(place) == {}
+    storage.upload(source, storage.join(target, "a"))
+    assert storage.read_bytes(storage.join(target, "a")) == b"other"
+    storage.remove(storage.join(target, "a"))
+    storage.remove(storage.join(target, "a"))
+    storage.remove_folder(storage.join(target, "inner"), first="deep/c")
+    storage.remove_folder(storage.join(target, "inner"), first="deep/c")
+    assert storage.file_sizes(target) == {}
 
 
-def test_check_writable_leaves_no_file(place: str, bucket: Gcs, tmp_path: Path) -> None:
-    storage.check_writable(place)
-    assert storage.file_sizes(place) == {}
+def test_check_writable_leaves_no_file(target: str, bucket: Gcs, tmp_path: Path) -> None:
+    storage.check_writable(target)
+    assert storage.file_sizes(target) == {}
     assert not (tmp_path / "at").exists()
     assert bucket.names("bucket") == ["before"]
 

@@ -30,8 +30,8 @@ def write(path: Path, *, compressed: bool = False, without: str = "", **changes:
     return path
 
 
-def source(path: Path | str, **knobs: Any) -> NpzSource:
-    return NpzSource(DataConfig(source="npz", path=str(path), **knobs))
+def source(path: Path | str, **options: Any) -> NpzSource:
+    return NpzSource(DataConfig(source="npz", path=str(path), **options))
 
 
 @pytest.mark.parametrize("compressed", [False, True])
