@@ -33,7 +33,7 @@ def test_all_errors_are_told_at_once_with_their_keys() -> None:
 def test_rules_about_several_values_are_told_when_each_is_right() -> None:
     found = complaints("training.decay_steps=5", "data.validation_share=0.97")
     assert any("nothing to train on" in line for line in found)
-    assert any("decay_steps belongs" in line for line in found)
+    assert any("decay_steps is only for" in line for line in found)
     assert "rollout_steps 16 needs data.frames" in complaints("training.rollout_steps=16")[0]
 
 

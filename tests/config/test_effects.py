@@ -164,7 +164,7 @@ def test_a_knob_that_does_not_say_what_it_affects_is_an_error() -> None:
         batch: Annotated[int, Affects.RUN] = 1
         workers: int = 1
 
-    with pytest.raises(TypeError, match=r"workers: say what it affects"):
+    with pytest.raises(TypeError, match=r"workers: not annotated with what it affects"):
         values_that_affect(Affects.RUN, Forgotten())
 
 

@@ -39,8 +39,8 @@ def test_every_config_of_the_project_loads_and_is_in_line(path: Path) -> None:
 
 def test_an_alpha_that_grows_with_the_rank_under_rslora_is_out_of_line() -> None:
     found = AdapterConfig(rank=64, alpha=128).alpha_warning
-    assert "a scale of 16, alpha 32 one of" in found
-    assert "Take adapter.alpha=32" in found
+    assert "a scale of 16; alpha 32 gives 4" in found
+    assert "Set adapter.alpha=32" in found
     for usual in (
         {"rank": 64},
         {"rank": 4, "alpha": 8},
@@ -54,7 +54,7 @@ def test_an_alpha_that_grows_with_the_rank_under_rslora_is_out_of_line() -> None
 def test_an_adapter_on_the_states_of_a_model_without_states_is_refused(adapter: dict[str, object]) -> None:
     model = {"base": "b.pt", "sizes": {"predictor": {"use_states": False}}}
     with pytest.raises(
-        InputError, match=rf"adapter\.{next(iter(adapter))}: no state_encoder where predictor.use_states"
+        InputError, match=rf"adapter\.{next(iter(adapter))}: with predictor.use_states: false there is no state_encoder"
     ):
         parse_config({**MINIMAL, "model": model, "adapter": adapter}, where="here")
     parse_config({**MINIMAL, "model": model, "adapter": {"modules_to_save": ["action_encoder"]}}, where="here")
@@ -112,7 +112,7 @@ def test_another_form_of_data_takes_the_place_of_that_in_the_file_with_its_knobs
     assert (cached.data.source, cached.data.is_cache) == ("latents", True)
     ported = load_config(write(tmp_path, resolved), ["data.lerobot.gripper_open=2", "data.source=lerobot"])
     assert ported.data.lerobot.gripper_open == 2
-    with pytest.raises(InputError, match=r"data\.lerobot: a section of source lerobot, and this is source rlds"):
+    with pytest.raises(InputError, match=r"data\.lerobot: only for source lerobot, and this is source rlds"):
         load_config(write(tmp_path, resolved), ["data.lerobot.gripper_open=2"])
 
 
@@ -144,7 +144,9 @@ def test_the_folder_of_a_checkout_is_that_of_the_package() -> None:
 
 @pytest.mark.parametrize("name", ["nothing", "", "../sim-tiny/config", "demo.yaml", "/etc/passwd"])
 def test_a_name_that_is_none_lists_those_that_are(name: str) -> None:
-    with pytest.raises(InputError, match=r"no config of that name.*builtin:demo, .*builtin:scratch_vitl"):
+    with pytest.raises(
+        InputError, match=r"the package has no config of this name.*builtin:demo, .*builtin:scratch_vitl"
+    ):
         config_path(f"builtin:{name}")
 
 

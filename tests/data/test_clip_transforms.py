@@ -127,7 +127,7 @@ def values(**data: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("data", [{"cache": "auto"}, {"cache": "require"}, {"source": "latents"}])
 def test_transforms_on_cached_latents_raise(data: dict[str, str]) -> None:
-    with pytest.raises(InputError, match="transforms change frames, latents in a cache stay"):
+    with pytest.raises(InputError, match="transforms change frames, but not cached latents"):
         parse_config(values(transforms=[{"name": "halve"}], **data), where="")
     parse_config(values(transforms=[], **data), where="")
     with pytest.raises(InputError, match=r"data\.transforms: .*Remove data\.transforms"):

@@ -126,17 +126,17 @@ def test_missing_or_short_recorded_commands_raise(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"source": "droid_raw"}, "source droid_raw: a matter of poses"),
-        ({"pose_frame": "camera"}, "pose_frame camera: a matter of poses"),
-        ({"idle": {"rule": "motion"}}, "idle.rule motion: a matter of poses"),
+        ({"source": "droid_raw"}, "source droid_raw: only for poses"),
+        ({"pose_frame": "camera"}, "pose_frame camera: only for poses"),
+        ({"idle": {"rule": "motion"}}, "idle.rule motion: only for poses"),
         ({"source": "rlds", "fields": {"gripper_open": 0.5}}, "fields.gripper_open"),
         ({"source": "lerobot", "lerobot": {"rotation": "quaternion_wxyz"}}, "lerobot.rotation"),
         ({"source": "lerobot", "lerobot": {"gripper_open": 0.08}}, "lerobot.gripper_open"),
-        ({"actions": "recorded"}, "set join_actions to sum"),
-        ({"actions": "recorded", "stride": "auto"}, "set join_actions to sum"),
-        ({"states": "pose", "actions": "recorded", "join_actions": "sum"}, "needs states vector"),
-        ({"join_actions": "sum"}, "join_actions belongs to actions recorded"),
-        ({"fields": {"gripper_open": 0.5}}, "data.fields: a section of source rlds, and this is source npz"),
+        ({"actions": "recorded"}, "needs join_actions. Set it to sum"),
+        ({"actions": "recorded", "stride": "auto"}, "needs join_actions. Set it to sum"),
+        ({"states": "pose", "actions": "recorded", "join_actions": "sum"}, "needs states: vector"),
+        ({"join_actions": "sum"}, "join_actions is only for actions: recorded"),
+        ({"fields": {"gripper_open": 0.5}}, "data.fields: only for source rlds, and this is source npz"),
     ],
 )
 def test_vector_config_that_needs_poses_or_is_incomplete_raises(changes: dict[str, Any], complaint: str) -> None:

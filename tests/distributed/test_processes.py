@@ -47,7 +47,7 @@ def test_two_processes_stopped_and_gone_on_as_one_make_the_run_of_one(without_dr
     ranks[1].send_signal(signal.SIGUSR1)
     (out, errors), (quiet_out, quiet_errors) = finish(ranks, EXIT_STATUS)
     assert errors.startswith("SIGUSR1: stopped after step"), "the first process says so"
-    assert "parameters are trained" in out
+    assert "Trained parameters: " in out
     assert (quiet_out, quiet_errors) == ("", ""), "only the first process speaks"
     state = read_state(newest_checkpoint(tmp_path / "shared/checkpoints"))
     assert 1 <= state.step < 16
@@ -95,7 +95,9 @@ def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
 
 def test_more_processes_than_micro_batches_are_refused(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
-    with pytest.raises(InputError, match=r"5 processes.*Expected 4 at most, for the 8 clips"):
+    with pytest.raises(
+        InputError, match=r"5 processes.*Expected at most 4 processes, because a step of this run has 8 clips"
+    ):
         count_micro_batches(config, RunState(step=3, clips_per_step=8, clips_per_process=8), 5, reporter)
 
 

@@ -85,7 +85,7 @@ def of_runs(found: Comparison, conclusion: Conclusion = "yes", **runs: tuple[flo
         ranks = replace(one.summary.ranks_actions, value=rank, conclusion=conclusion)
         about = replace(
             one.about,
-            checkpoint=f"step-{step:08d} (as asked for)",
+            checkpoint=f"step-{step:08d} (as requested)",
             checkpoint_path=f"run/step-{step:08d}",
             is_base=not step,
         )

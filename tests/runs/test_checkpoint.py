@@ -124,7 +124,7 @@ def test_an_error_of_the_disk_does_not_count_as_damage(
 def test_a_complete_checkpoint_of_another_process_is_never_replaced(tmp_path: Path) -> None:
     other = write(tmp_path, 20)
     for step in (20, 10):
-        with pytest.raises(InputError, match=r"step-00000020: a complete checkpoint that another process wrote"):
+        with pytest.raises(InputError, match=r"step-00000020: a complete checkpoint of another process"):
             write(tmp_path, step)
     assert list(tmp_path.iterdir()) == [other]
 
@@ -184,7 +184,7 @@ def test_a_manifest_that_names_too_little_or_a_file_elsewhere_is_no_manifest(tmp
     for text, words in [
         (manifest_of({}), "does not name state.json"),
         (manifest_of({name: digest for name, digest in files.items() if name != "state.json"}), "does not name"),
-        (manifest_of({**files, **elsewhere}), "names ../../elsewhere, which is outside"),
+        (manifest_of({**files, **elsewhere}), "the path '../../elsewhere', which is outside"),
         (manifest_of({**files, str(tmp_path / "elsewhere"): files["state.json"]}), "which is outside"),
         *((text, "manifest.json is damaged") for text in ("", "[]", "{}", '{"files": 3}')),
     ]:
@@ -309,7 +309,7 @@ def test_an_optimizer_file_that_would_run_code_is_refused_and_does_not(make_conf
     checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
     torch.save({"state": Bomb(tmp_path / "mark")}, checkpoint / "optimizer.pt")
     write_manifest(checkpoint)  # whoever can write the file can write the manifest
-    with pytest.raises(InputError, match=r"optimizer\.pt: more than tensors and plain values.*run foreign code"):
+    with pytest.raises(InputError, match=r"optimizer\.pt: objects other than tensors and plain values.*execute code"):
         train(make_config(training__steps=2), reporter, allow_config_change=True)
     assert not (tmp_path / "mark").exists()
     torch.load(checkpoint / "optimizer.pt", weights_only=False)
@@ -366,7 +366,7 @@ def run(tmp_path: Path) -> Path:
         ("newest", "step-00000030 (the newest)"),
         ("selected", "step-00000020 (the best by error)"),
         ("best", "step-00000020 (the best by error)"),
-        ("10", "step-00000010 (as asked for)"),
+        ("10", "step-00000010 (as requested)"),
     ],
 )
 def test_the_newest_the_best_and_that_of_a_step_are_found(run: Path, by: str, words: str) -> None:
@@ -391,10 +391,10 @@ def test_a_damaged_one_is_not_used_in_place_of_what_was_asked_for(run: Path) -> 
 
 
 def test_without_validations_there_is_no_best_and_without_checkpoints_nothing(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"without a whole checkpoint.*--resume"):
+    with pytest.raises(InputError, match=r"without a complete checkpoint.*--resume"):
         select_checkpoint(tmp_path)
     write(tmp_path / "checkpoints", 10)
-    assert str(select_checkpoint(tmp_path)) == "step-00000010 (the newest: none was selected)"
+    assert str(select_checkpoint(tmp_path)) == "step-00000010 (the newest, none was selected by validation)"
     with pytest.raises(InputError, match=r"no best checkpoint.*one of the steps 10"):
         select_checkpoint(tmp_path, "best")
 

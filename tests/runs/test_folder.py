@@ -68,7 +68,7 @@ def test_a_folder_of_other_things_stays_refused_though_a_lock_lies_in_it(make_co
     with RunLock(Path(config.run_dir)) as lock:
         lock.take()
     (tmp_path / "run" / "thesis.tex").write_text("years of work")
-    with pytest.raises(InputError, match="other things"):
+    with pytest.raises(InputError, match=r"other files and without config\.yaml"):
         check_run_folder(config)
 
 
@@ -90,14 +90,14 @@ def test_a_folder_in_use_is_refused_until_its_process_is_killed(tmp_path: Path) 
     words = [sys.executable, "-c", HOLD, str(tmp_path / "run")]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "held\n"
-        with RunLock(tmp_path / "run") as lock, pytest.raises(InputError, match="trained right now, by another"):
+        with RunLock(tmp_path / "run") as lock, pytest.raises(InputError, match="in use by another process"):
             lock.take()
         process.send_signal(signal.SIGKILL)
         assert process.wait(timeout=120) == -signal.SIGKILL
     with RunLock(tmp_path / "run") as lock:
         lock.take()
         lock.take()
-        with RunLock(tmp_path / "run") as other, pytest.raises(InputError, match="being trained right now"):
+        with RunLock(tmp_path / "run") as other, pytest.raises(InputError, match="in use by"):
             other.take()
 
 
@@ -110,7 +110,7 @@ def test_a_file_system_without_locks_costs_a_warning(
     monkeypatch.setattr(fcntl, "flock", refuse)
     with caplog.at_level(logging.WARNING), RunLock(tmp_path) as lock:
         lock.take()
-    assert "no locks here" in caplog.text
+    assert "no file locks" in caplog.text
 
 
 def test_a_run_holds_its_folder_while_it_trains_and_gives_it_back(make_config, reporter) -> None:
@@ -139,7 +139,7 @@ def test_a_start_that_another_one_overtook_leaves_its_run_alone(make_config, rep
         return run
 
     monkeypatch.setattr(loop, "restore", overtaken)
-    with pytest.raises(InputError, match="step 6, which another start wrote while this one stood at 0"):
+    with pytest.raises(InputError, match="step 6 from another start; this one is at step 0"):
         train(config, reporter)
     assert newest_checkpoint(Path(config.run_dir) / "checkpoints").name == "step-00000006"
 
@@ -275,7 +275,7 @@ def test_a_folder_is_locked_before_the_remote_is_asked_and_a_check_locks_nothing
                 assert options["lock"] is None
                 lock.take()
             else:
-                with pytest.raises(InputError, match="trained right now"):
+                with pytest.raises(InputError, match="in use by"):
                     lock.take()
         asked.append(options["into"])
         return config

@@ -200,7 +200,7 @@ def test_a_copy_that_does_not_end_in_time_is_named_and_left(
     write(run, 10)
     mirror = mirror_of(run, remote_wait_seconds=0.2)
     mirror.finish(lambda: held.waiting.is_set())
-    assert f"what {run / 'checkpoints'} has after that is on this machine only: there was no more time" in caplog.text
+    assert f"Later ones in {run / 'checkpoints'} are only on this machine, because the time" in caplog.text
     assert mirror.is_uploading
     held.opened.set()
     mirror._thread.join()
@@ -237,7 +237,7 @@ def test_a_place_of_another_run_is_never_written(run: Path, caplog: pytest.LogCa
     mirror.finish(lambda: False)
     assert content("gs://bucket") == before
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
-    assert f"holds a checkpoint of another run, {checkpoint_name(10)}" in caplog.text
+    assert f"contains a checkpoint of another run, {checkpoint_name(10)}" in caplog.text
     assert find_damage(other) is None
 
 
@@ -274,7 +274,7 @@ def test_a_manifest_there_names_no_file_outside_its_folder(bucket: Gcs, tmp_path
     bucket.put(f"bucket/run/checkpoints/{checkpoint_name(10)}/manifest.json", manifest)
     problem = RemoteCheckpoints(PLACE).download(checkpoint_name(10), tmp_path / "copy")
     assert problem is not None
-    assert "it names" in problem
+    assert "which is outside the folder" in problem
 
 
 # A place that fills up or is closed during a run: one warning, and up to date when it works again

@@ -69,8 +69,8 @@ def test_a_fresh_machine_gets_the_newest_checkpoint_and_the_small_files(bucket: 
     expected = {name: data for name, data in content(source).items() if checkpoint_name(5) not in name}
     assert content(local(config)) == expected
     assert reporter.notes == [
-        f"{PLACE} can be written: it is brought up to date every 30 minutes, and in the end.",
-        f"Fetched {checkpoint_name(20)} from {PLACE}.",
+        f"{PLACE} is writable. It is updated every 30 minutes, and at the end of the run.",
+        f"Downloaded {checkpoint_name(20)} from {PLACE}.",
     ]
     check_run_folder(config)
 
@@ -129,7 +129,7 @@ def test_another_config_is_refused_as_if_it_were_on_this_machine(bucket: Gcs, co
     run_there(bucket, config, 10)
     training = config.training.model_copy(update={"learning_rate": 0.5})
     other = config.model_copy(update={"training": training})
-    with pytest.raises(InputError, match=rf"{PLACE}: a run of another config; it differs in training.learning_rate"):
+    with pytest.raises(InputError, match=rf"{PLACE}: a run with another config; it differs in training.learning_rate"):
         open_remote(other, SILENT)
     assert not local(config).exists(), "nothing has come"
     open_remote(other, SILENT, allow_config_change=True)
@@ -140,7 +140,9 @@ def test_another_runs_place_is_refused(bucket: Gcs, config: Config) -> None:
     run_there(bucket, config, 10, run_id="other")
     before = bucket.names("bucket")
     write(local(config), 20)
-    with pytest.raises(InputError, match=rf"{PLACE} holds a checkpoint of another run, {checkpoint_name(10)}.*Set an"):
+    with pytest.raises(
+        InputError, match=rf"{PLACE} contains a checkpoint of another run, {checkpoint_name(10)}.*Set an"
+    ):
         open_remote(config, SILENT)
     assert bucket.names("bucket") == before
 
@@ -153,7 +155,7 @@ def test_a_place_that_cannot_be_reached_is_a_warning(
     assert len(bucket.requests) == 5, "one call, and no other once it failed"
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert "HTTP 503" in caplog.text
-    assert "what is on this machine, without a checkpoint" in caplog.text
+    assert "the state on this machine (no checkpoint)" in caplog.text
 
 
 def test_what_is_seen_there_and_cannot_be_fetched_is_not_done_again_from_the_start(
@@ -166,7 +168,7 @@ def test_what_is_seen_there_and_cannot_be_fetched_is_not_done_again_from_the_sta
     caplog.clear()
     write(local(config), 10)
     assert open_remote(config, SILENT) == config
-    assert f"what is on this machine, after step 10, though {checkpoint_name(20)} is there" in caplog.text
+    assert f"the state on this machine (step 10; {checkpoint_name(20)} is newer)" in caplog.text
 
 
 def test_a_run_without_a_complete_checkpoint_there_that_cannot_be_fetched_is_not_started_again(
@@ -188,21 +190,23 @@ def test_a_place_without_permission_is_an_error_with_the_way_out(
 ) -> None:
     bucket.fail_next(failure, times=9, match=match)
     with pytest.raises(
-        InputError, match=r"^checkpoint.remote: gs://bucket/run\S*: no permission.*Log in.*another place"
+        InputError, match=r"^checkpoint.remote: gs://bucket/run\S*: no permission.*Log in.*another checkpoint.remote"
     ):
         open_remote(config, SILENT)
 
 
 def test_a_bucket_that_does_not_exist_is_an_error(bucket: Gcs, make_config: Callable[..., Config]) -> None:
     assert bucket.names("bucket")
-    with pytest.raises(InputError, match=r"bucket buckett does not exist\..*check its name\. Or name another place"):
+    with pytest.raises(
+        InputError, match=r"bucket buckett does not exist\..*check its name\. Or set another checkpoint.remote"
+    ):
         open_remote(make_config(checkpoint__remote="gs://buckett/run"), SILENT)
 
 
 @pytest.mark.parametrize("inner", ["", "mirror"])
 def test_the_runs_own_folder_is_no_mirror(make_config: Callable[..., Config], inner: str) -> None:
     folder = local(make_config())
-    with pytest.raises(InputError, match="a place outside the run's folder"):
+    with pytest.raises(InputError, match="a folder outside run_dir"):
         open_remote(make_config(checkpoint__remote=str(folder / inner)), SILENT)
 
 
@@ -212,12 +216,12 @@ def test_a_folder_is_claimed_before_anything_is_fetched_into_it(bucket: Gcs, con
     with RunLock(local(config)) as first, RunLock(local(config)) as second:
         first.take()
         before = content(local(config))
-        with pytest.raises(InputError, match="being trained right now"):
+        with pytest.raises(InputError, match="in use by"):
             open_remote(config, SILENT, lock=second)
         assert content(local(config)) == before
     with RunLock(local(config)) as lock:
         open_remote(config, SILENT, lock=lock)
-        with RunLock(local(config)) as other, pytest.raises(InputError, match="being trained right now"):
+        with RunLock(local(config)) as other, pytest.raises(InputError, match="in use by"):
             other.take()
 
 
@@ -289,7 +293,7 @@ def test_a_place_that_is_down_for_the_whole_run_costs_warnings_and_no_step(
     assert len(warnings) == 3
     assert "HTTP 503" in warnings[0]
     assert "HTTP 503" in warnings[1], "once more, however often it is tried"
-    assert "is on this machine only" in warnings[2]
+    assert "are only on this machine" in warnings[2]
     assert bucket.names("bucket") == ["other"]
 
 

@@ -86,7 +86,7 @@ def test_a_run_is_used_with_its_moved_base_and_with_no_other(
 
 
 def test_nothing_else_is_changed_on_the_way(run: str, base_folder: Path) -> None:
-    with pytest.raises(InputError, match=r"adapter\.rank=8: a setting that loading does not use"):
+    with pytest.raises(InputError, match=r"adapter\.rank=8: a key that cannot be changed when a run is loaded"):
         load_run(run, overrides=["adapter.rank=8"])
     with pytest.raises(InputError, match="not the folder of a run"):
         load_for_planning(str(base_folder), overrides=["model.base=elsewhere"])

@@ -120,7 +120,7 @@ def test_a_base_no_better_than_persistence_is_refused(make_config, reporter) -> 
 def test_check_does_everything_but_writes_nothing(make_config, reporter) -> None:
     config = make_config()
     train(config, reporter, check_only=True)
-    assert "Everything is in place" in reporter.notes[-1]
+    assert "All checks passed" in reporter.notes[-1]
     assert not Path(config.run_dir).exists()
     with pytest.raises(InputError, match="copying the last frame"):
         train(make_config(training__allow_weak_base=False), reporter, check_only=True)
@@ -134,8 +134,8 @@ def test_an_allowed_config_change_is_written_and_reported(make_config, reporter)
     assert (folder / "config.yaml").read_text() != config_as_yaml(changed), "--check writes nothing"
     train(changed, reporter, allow_config_change=True)
     reported = ["training.learning_rate: 0.001 -> 0.002", "training.steps: 6 -> 8"]
-    assert [note for note in reporter.notes if "config changes" in note][-2:] == [
-        f"The config changes: {s}" for s in reported
+    assert [note for note in reporter.notes if "Config change" in note][-2:] == [
+        f"Config change: {s}" for s in reported
     ]
     assert (folder / "config.yaml").read_text() == config_as_yaml(changed)
     starts = json.loads((folder / "environment.json").read_text())
@@ -162,7 +162,7 @@ def test_a_run_goes_on_with_data_that_were_moved_and_with_no_others(
     assert read_run_config(folder).data.path == str(tmp_path / "moved"), "whoever evaluates it finds the data"
     next((tmp_path / "others").rglob("*.tfrecord*")).touch()
     others = make_config(training__steps=2, data__path=str(tmp_path / "others"))
-    with pytest.raises(InputError, match=r"others: other episodes or files than the run has seen.*moved\."):
+    with pytest.raises(InputError, match=r"others: episodes or files that differ from those of the run.*moved\."):
         train(others, type(reporter)())
     train(others, type(reporter)(), allow_config_change=True)
 

@@ -89,7 +89,7 @@ def test_a_validation_that_is_worse_than_at_the_start_is_reported_once(config: C
     assert list(found) == [3]
     text = found[3]
     assert (
-        "at step 3 the one-step error is 0.850 of persistence's in the validation (before training 0.800); the rollout"
+        "at step 3 the one-step error in validation is 0.850 of persistence's (before training 0.800); the rollout"
         in text
     )
     assert "copying" not in text
@@ -101,7 +101,7 @@ def test_a_loss_that_rises_far_above_its_lowest_is_reported_between_validations(
     found = {step: texts for step, loss in enumerate(losses) if (texts := watch("train", step, {"loss": loss}))}
     (step,) = found
     assert 20 < step < 30
-    assert "the loss is 0.7, and was 0.3 (medians of 10 rows)" in found[step]
+    assert "the loss is 0.7, its minimum was 0.3 (medians of 10 rows)" in found[step]
 
 
 def ranking(rank: float, low: float, high: float) -> dict[str, float]:

@@ -55,8 +55,8 @@ def test_from_recordings_to_a_model_of_its_own(
     fresh = [note for note in reporter.notes if "newly initialised" in note]
     assert len(fresh) == sum(width != 7 for width in widths)
     if widths.state != 7:
-        assert f"state encoder: {widths.state} numbers instead of the base's 7: newly initialised" in fresh
-    assert any("Base compared with persistence: skipped" in note for note in reporter.notes)
+        assert f"New state encoder for {widths.state} numbers, newly initialised; the base model's has 7." in fresh
+    assert any("skipped: the check that the base model is better than persistence" in note for note in reporter.notes)
     assert get_model_widths(load_subject(folder).world_model.sizes) == widths
 
     evaluation = evaluate_subject(str(folder), QUICK)
@@ -98,7 +98,7 @@ def test_vectors_as_wide_as_poses_keep_the_heads_and_must_prove_themselves(
     widths = Widths(7, 7)
     with pytest.raises(InputError, match="allow_weak_base"):
         train(make_robot(widths, adapter__modules_to_save=[]), reporter)
-    assert [note for note in reporter.notes if "encoder: the base's own" in note]
+    assert [note for note in reporter.notes if "encoder of the base model is kept" in note]
     folder = train(make_robot(widths, training__allow_weak_base=True, training__steps=1), reporter)
     evaluation = evaluate_subject(str(folder), replace(QUICK, checkpoint="newest"))
     assert list(evaluation.models) == ["base", "adapter"]

@@ -80,7 +80,7 @@ def test_a_run_that_replays_died_and_went_on_equals_the_one_that_did_not(replayi
         train(config, dying_reporter(type(reporter)(), 3))
     train(config, reporter)
     assert_same_run(tmp_path / "whole", tmp_path / "broken")
-    assert any("Replay: 25% of the clips are from" in note for note in reporter.notes)
+    assert any("Replay: 25% of the training clips are drawn from" in note for note in reporter.notes)
     assert (tmp_path / "b").exists()
     state = read_state(newest_checkpoint(tmp_path / "broken/checkpoints"))
     assert state.data[1].windows == len(open_dataset(config.replay.data).windows("train"))
@@ -112,10 +112,10 @@ def test_a_clip_that_cannot_be_read_counts_for_its_own_data_set(replaying, monke
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"replay__data__frames": 5}, r"replay.data.frames 5 is not data.frames 4"),
-        ({"replay__data__states": "vector"}, r"replay.data.states vector is not data.states pose"),
-        ({"data__cache": "auto"}, r"latents from a cache, and the other does not"),
-        ({"data__stride": "auto"}, r"stride auto with replay"),
+        ({"replay__data__frames": 5}, r"replay.data.frames 5 differs from data.frames 4"),
+        ({"replay__data__states": "vector"}, r"replay.data.states vector differs from data.states pose"),
+        ({"data__cache": "auto"}, r"only one of data and replay.data uses cached latents"),
+        ({"data__stride": "auto"}, r"stride: auto is not possible with replay"),
         ({"replay__share": 1.0}, r"replay.share: .*less than 1"),
         ({"replay__data__nonsense": 1}, r"replay.data.nonsense: unknown key"),
     ],
@@ -173,10 +173,10 @@ def test_frames_of_another_size_are_refused_before_the_first_step_and_go_through
 
 def test_held_out_episodes_that_would_be_replayed_are_named(replaying, reporter, data_folder) -> None:
     set_up(replaying(replay__data__path=str(data_folder)), reporter)
-    (warning,) = [note for note in reporter.notes if "holds out are replayed" in note]
+    (warning,) = [note for note in reporter.notes if "the replay data set would train on" in note]
     held_out = open_dataset(replaying().data).windows("validation")
     assert open_dataset(replaying().data).table.identity(held_out[0][0]) in warning
     reporter.notes.clear()
     same = {"replay__data__validation_share": 0.3, "replay__data__test_share": 0.2}
     set_up(replaying(replay__data__path=str(data_folder), **same), reporter)
-    assert not [note for note in reporter.notes if "holds out" in note]
+    assert not [note for note in reporter.notes if "held-out" in note]

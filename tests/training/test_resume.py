@@ -24,9 +24,9 @@ def test_the_best_of_other_frames_no_longer_counts_and_the_reason_is_named(make_
     folder = train(make_config(**every), reporter) / "checkpoints"
     assert read_state(newest_checkpoint(folder)).best_error == 0.2
     train(make_config(**{**every, "training__steps": 4}, data__frames=5), reporter, allow_config_change=True)
-    (reported,) = [note for note in reporter.notes if "no longer counts" in note]
+    (reported,) = [note for note in reporter.notes if "is discarded" in note]
     assert reported.startswith(
-        "Validation measures something else than before (other: data.frames, its clips): the error 0.2 "
+        "The validation has changed (data.frames, validation clips): the best error so far, 0.2 "
     )
     state = read_state(newest_checkpoint(folder))
     assert (state.best_step, state.best_error) == (4, 0.6), "0.2 was of three steps ahead"
@@ -83,4 +83,4 @@ def test_what_changes_the_measurement_is_named(
     assert {key for key in before | now if before.get(key) != now.get(key)} == named
     state = keep_comparable_best(replace(BEST, validation_settings=before), now, reporter)
     assert (state.best_step, state.best_error, state.validation_settings) == (None, None, now)
-    assert all(name in reporter.notes[0] for name in named)
+    assert all(name.replace("its", "validation") in reporter.notes[0] for name in named)

@@ -109,7 +109,7 @@ def test_a_run_without_a_better_one_ends_when_patience_does(make_config, reporte
     folder = train(config, reporter)
     assert [row["step"] for row in validations(folder)] == [0, 1, 2, 3]
     assert read_state(newest_checkpoint(folder / "checkpoints")).step == 3
-    assert any(note.startswith("Training ends at step 3: step 1 is the best") for note in reporter.notes)
+    assert any(note.startswith("Training stops at step 3: no improvement since step 1") for note in reporter.notes)
     train(config, reporter)
     assert read_state(newest_checkpoint(folder / "checkpoints")).step == 3, "it has ended"
 

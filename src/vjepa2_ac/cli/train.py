@@ -140,7 +140,7 @@ def _decoder(options: argparse.Namespace) -> None:
     with cli.reporter() as reporter:
         folder = train_decoder(config, reporter, check_only=options.check)
     if options.check:
-        cli.show("Everything is in place: data, model, folder and disk were checked; nothing was written.")
+        cli.show("All checks passed: data, model, folder and disk. Nothing was written.")
         return
     card = read_card(folder)
     cli.show(held_out_table(card) if card.held_out else "Held-out frames: not measured; they need a test split.")

@@ -76,7 +76,9 @@ class IdleConfig(Section):
     @model_validator(mode="after")
     def _published_ranges_are_named(self) -> IdleConfig:
         is_broken = (self.rule == "published") != (self.ranges is not None)
-        return self.check_rules((is_broken, "rule published and ranges (a file or URL) belong together"))
+        return self.check_rules(
+            (is_broken, "rule: published needs ranges (a file or URL), and no other rule uses them")
+        )
 
 
 class DiskCacheConfig(Section):
@@ -228,7 +230,7 @@ class DataConfig(Section):
             if not (isinstance(section, type) and issubclass(section, Section)):
                 continue
             if hasattr(DataConfig, name) or not (isinstance(base, type) and issubclass(section, base)):
-                raise TypeError(f"{cls.__name__}.{name}: all forms of data have a key of this name. Choose another")
+                raise TypeError(f"{cls.__name__}.{name}: all data formats have a key of this name. Choose another")
         name = cls.model_fields["source"].default
         DataConfig.kinds[name] = SOURCES.register(name)(cls)
 
@@ -246,18 +248,27 @@ class DataConfig(Section):
         unknown = [camera for camera in cameras if known is not None and camera not in known]
         splits, of_camera = self.validation_share + self.test_share, self.pose_frame == "camera"
         return self.check_rules(
-            (not cameras, "camera: an empty list; name one or more, or null for the source's first"),
-            (unknown, f"camera: source {self.source} has no {unknown[:1]}; it has {', '.join(known or ())}"),
-            (self.is_cache and self.stride == "auto", "stride auto: a latent cache has one stride; give its number"),
-            (self.is_cache and self.cache != "off", f"source {self.source} is itself a cache: set cache: off"),
+            (
+                not cameras,
+                "camera: the list is empty. Set one or more names, or null for the first camera of the source",
+            ),
+            (unknown, f"camera: source {self.source} has no {', '.join(unknown)}. Available: {', '.join(known or ())}"),
+            (
+                self.is_cache and self.stride == "auto",
+                "stride: auto is not possible with a latent cache. Set the stride of the cache",
+            ),
+            (
+                self.is_cache and self.cache != "off",
+                f"cache: source {self.source} is a latent cache itself. Set cache: off",
+            ),
             (
                 self.transforms and self.uses_cached_latents,
-                "transforms change frames, latents in a cache stay: choose one",
+                "transforms change frames, but not cached latents. Remove transforms, or set cache: off",
             ),
             (splits >= 1.0, "validation_share and test_share leave nothing to train on"),
             (
                 of_camera and not self.has_camera_poses,
-                f"pose_frame camera: a source of {self.source} has no camera poses",
+                f"pose_frame: source {self.source} has no camera poses. Set pose_frame: base",
             ),
         )
 
@@ -274,10 +285,13 @@ class DataConfig(Section):
         is_vector, is_recorded = self.states == "vector", self.actions == "recorded"
         has_many = is_recorded and self.stride != 1 and self.join_actions is None
         return self.check_rules(
-            (is_vector and asked, f"{', '.join(asked)}: a matter of poses, and states is vector"),
-            (is_recorded and not is_vector, "actions recorded needs states vector: that of a pose is its difference"),
-            (has_many, f"actions recorded at stride {self.stride}: set join_actions {_JOINED}"),
-            (not is_recorded and self.join_actions is not None, "join_actions belongs to actions recorded"),
+            (is_vector and asked, f"{', '.join(asked)}: only for poses, and states is vector"),
+            (
+                is_recorded and not is_vector,
+                "actions: recorded needs states: vector, because the action of a pose is its difference",
+            ),
+            (has_many, f"actions: recorded at stride {self.stride} needs join_actions. Set it {_JOINED}"),
+            (not is_recorded and self.join_actions is not None, "join_actions is only for actions: recorded"),
         )
 
     @classmethod

@@ -95,7 +95,7 @@ def config_path(name: str | Path) -> Path:
         return Path(name)
     if (known := str(name).removeprefix(BUILTIN)) not in packaged_configs():
         needed = f"one of {', '.join(f'{BUILTIN}{one}' for one in packaged_configs())}"
-        raise InputError(where=str(name), found="no config of that name comes with the package", needed=needed)
+        raise InputError(where=str(name), found="the package has no config of this name", needed=needed)
     return _PACKAGED / f"{known}.yaml"
 
 
@@ -201,7 +201,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         fix = "`vjepa2-ac init` writes one for your data; `vjepa2-ac config list` shows those of the package"
         raise InputError(where=str(path), found="no such file", needed="a config", fix=fix) from None
     except IsADirectoryError:
-        fix = f"If it holds data, run `{shell_command('init', path)}`, which writes a config"
+        fix = f"If it contains data, run `{shell_command('init', path)}`, which writes a config"
         if (path / "config.yaml").is_file():
             fix = f"The config of the run in it is {path / 'config.yaml'}"
         raise InputError(where=str(path), found="a folder", needed="a config, which is a YAML file", fix=fix) from None
@@ -219,7 +219,7 @@ def _as_json(values: Mapping[str, Any], where: str) -> str:
     try:
         return json.dumps(dict(values), default=os.fspath)
     except (TypeError, ValueError) as error:
-        raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
+        raise InputError(where=where, found=f"a value that a config cannot contain ({error})") from None
 
 
 _KEYS_OF_A_RUN = {"check_crc", "connections", "prefetch", "short_episodes"}
@@ -403,7 +403,7 @@ def _explain(key: str, detail: Any) -> str:
         return why
     if key in all_keys():
         owners = [source for source, kind in DataConfig.kinds.items() if name in kind.model_fields]
-        return f"a section of source {' or '.join(owners)}, and this is source {detail['loc'][-2]}"
+        return f"only for source {' or '.join(owners)}, and this is source {detail['loc'][-2]}"
     prefix = section + dot
     siblings = [one.removeprefix(prefix) for one in all_keys() if one.rpartition(".")[0] == section]
     close = difflib.get_close_matches(name, siblings, n=1)

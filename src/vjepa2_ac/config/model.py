@@ -84,7 +84,7 @@ class PredictorSizes(_PredictorShape):
     def _widths_are_used(self) -> PredictorSizes:
         is_broken = not self.use_states and self.state_dim != _STATE_DIM
         return self.check_rules(
-            (is_broken, f"state_dim {self.state_dim} with use_states false: any width fits, leave it out")
+            (is_broken, f"state_dim {self.state_dim} has no effect with use_states: false. Remove it")
         )
 
 
@@ -111,8 +111,9 @@ class ModelSizes(Section):
         if self.predictor.width >= self.encoder.width:
             return None
         return (
-            f"model.base random: a predictor of width {self.predictor.width} cannot copy latents of width"
-            f" {self.encoder.width}; it starts from a random part of them. A predictor as wide starts near copying"
+            f"model.base: random: a predictor of width {self.predictor.width} cannot copy latents of width"
+            f" {self.encoder.width}, so that it starts with a random part of them. A predictor of width"
+            f" {self.encoder.width} starts near persistence"
         )
 
     @model_validator(mode="after")
@@ -121,7 +122,7 @@ class ModelSizes(Section):
         old, as_image = self.encoder.family == "v2", self.encoder.frame == "image"
         self.check_rules(
             (image % patch, f"image_size {image} is not a multiple of patch_size {patch}"),
-            (old and as_image, "encoder.frame image: V-JEPA 2 has no path for images, only 2.1 has; take tubelet"),
+            (old and as_image, "encoder.frame: image needs V-JEPA 2.1. Set encoder.frame: tubelet"),
             (not old and image == patch, "image_size of one patch: V-JEPA 2.1 needs a grid of two patches or more"),
         )
         for name, part in (("encoder", self.encoder), ("predictor", self.predictor)):
@@ -132,7 +133,7 @@ class ModelSizes(Section):
                     head < 6 or head % 2,
                     f"{name}: heads of width / heads = {head} do not fit 3D RoPE (even, at least 6)",
                 ),
-                (part.width * part.mlp_ratio < 1, f"{name}.mlp_ratio {part.mlp_ratio} leaves nothing of {name}.width"),
+                (part.width * part.mlp_ratio < 1, f"{name}.mlp_ratio {part.mlp_ratio} makes the MLP narrower than 1"),
             )
         return self
 
@@ -276,9 +277,11 @@ class AdapterConfig(Section):
     @model_validator(mode="after")
     def _is_an_adapter_of_this_base(self) -> AdapterConfig:
         start = self.peft.get("init_lora_weights", True)
-        ours = [(True, f"peft.{name} is adapter.{PEFT_NAMES[name]} here") for name in self.peft if name in PEFT_NAMES]
+        ours = [
+            (True, f"peft.{name}: set adapter.{PEFT_NAMES[name]} instead") for name in self.peft if name in PEFT_NAMES
+        ]
         changes_base = start not in (True, False, "gaussian", "orthogonal")
-        why = "changes the base to weights that nobody has; take true, false, gaussian or orthogonal"
+        why = "changes the base weights, which are not saved. Set true, false, gaussian or orthogonal"
         return self.check_rules(*ours, (changes_base, f"peft.init_lora_weights {start!r} {why}"))
 
     @property
@@ -288,7 +291,7 @@ class AdapterConfig(Section):
             return None
         scale, usual = (alpha / math.sqrt(self.rank) for alpha in (self.alpha, _USUAL_ALPHA))
         return (
-            f"adapter.alpha {self.alpha:g} gives rank {self.rank} a scale of {scale:.3g}, alpha {_USUAL_ALPHA:g} one of"
-            f" {usual:.3g}. With adapter.rslora alpha stays the same at every rank: raised with it, it asks for a lower"
-            f" training.learning_rate. Take adapter.alpha={_USUAL_ALPHA:g}, or compare both"
+            f"adapter.alpha {self.alpha:g} at rank {self.rank} gives a scale of {scale:.3g}; alpha {_USUAL_ALPHA:g}"
+            f" gives {usual:.3g}. With adapter.rslora use the same alpha at every rank; a larger alpha needs a lower"
+            f" training.learning_rate. Set adapter.alpha={_USUAL_ALPHA:g}, or compare both"
         )

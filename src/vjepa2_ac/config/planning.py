@@ -62,7 +62,7 @@ class LimitsConfig(Section):
             return self.xyz
         found = "data, for a model or an older run without a record of the motions in its training data"
         needed = "the largest dx, dy, dz in metres, such as planning.limits.xyz=[0.05,0.05,0.05]"
-        fix = "`vjepa2-ac data inspect CONFIG` shows how far 99 % of the steps in your data go (line `axes`)"
+        fix = "`vjepa2-ac data inspect CONFIG` shows the 99th percentile of the motions in your data (line `axes`)"
         raise InputError(where="planning.limits.xyz", found=found, needed=needed, fix=fix)
 
     @model_validator(mode="after")
@@ -75,7 +75,7 @@ class LimitsConfig(Section):
     def _something_is_free(self) -> LimitsConfig:
         held = self.gripper_mode in {"held", "open", "close"} or not self.gripper
         is_broken = not any(self.xyz) and not self.rotation and held
-        return self.check_rules((is_broken, "nothing is left to plan: xyz, rotation and gripper are all held"))
+        return self.check_rules((is_broken, "nothing can be planned: xyz, rotation and gripper are all fixed"))
 
 
 class EnergyConfig(Section):

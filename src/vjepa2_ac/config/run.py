@@ -22,7 +22,7 @@ def _run_folder(path: str) -> str:
     except ValueError as error:
         if not paths.is_url(path):
             raise
-        raise ValueError(f"{error}; to keep a copy there as the run goes, set checkpoint.remote to it") from None
+        raise ValueError(f"{error}. To copy the run there during training, set checkpoint.remote") from None
 
 
 class ReplayConfig(Section):
@@ -43,11 +43,15 @@ class ReplayConfig(Section):
         """Return why clips of both data sets cannot be in one micro-batch, as far as their configs show."""
         same = ("frames", "states", "actions", "join_actions", "pose_frame")
         pairs = [(name, getattr(self.data, name), getattr(first, name)) for name in same]
-        lines = [f"replay.data.{name} {one} is not data.{name} {other}" for name, one, other in pairs if one != other]
+        lines = [
+            f"replay.data.{name} {one} differs from data.{name} {other}" for name, one, other in pairs if one != other
+        ]
         if self.data.uses_cached_latents != first.uses_cached_latents:
-            lines.append("replay.data or data takes latents from a cache, and the other does not: set cache alike")
+            lines.append("only one of data and replay.data uses cached latents. Set the same value of cache in both")
         if "auto" in (first.stride, self.data.stride):
-            lines.append("stride auto with replay: give the numbers, so that steps of both last equally long")
+            lines.append(
+                "stride: auto is not possible with replay. Set numbers that give both data sets equal model steps"
+            )
         return lines
 
 
@@ -107,14 +111,20 @@ class Config(Section):
         find_mismatches = [] if self.replay is None else self.replay.find_mismatches(self.data)
         return self.check_rules(
             (steps >= self.data.frames, f"training.rollout_steps {steps} needs data.frames of at least {steps + 1}"),
-            (model.is_random and lora, "model.base random with adapter.kind lora adapts noise; set adapter.kind: none"),
+            (
+                model.is_random and lora,
+                "model.base: random needs adapter.kind: none, because all weights must be trained",
+            ),
             (fp32 and model.dtype != "float32", "training.precision fp32 needs model.dtype float32"),
-            (compiled and adapter.dora, "training.compile blocks cannot trace adapter.dora; set one of them off"),
+            (compiled and adapter.dora, "training.compile: blocks does not support adapter.dora. Turn one of them off"),
             (graph and draws_or_scales, "training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"),
             (best == "ranking" and not ranked, "checkpoint.keep_best ranking needs validation.ranking_clips"),
-            (best == "off" and patient, "training.patience waits for a better one, and checkpoint.keep_best is off"),
+            (
+                best == "off" and patient,
+                "training.patience needs checkpoint.keep_best: ranking or error, and it is off",
+            ),
             (predictor.use_extrinsics and blind, f"predictor.use_extrinsics needs camera poses, not in source {blind}"),
-            (stray, f"adapter.{' and '.join(stray)}: no state_encoder where predictor.use_states is false"),
+            (stray, f"adapter.{' and '.join(stray)}: with predictor.use_states: false there is no state_encoder"),
             (find_mismatches, "; ".join(find_mismatches)),
         )
 

@@ -138,7 +138,9 @@ def _iterate_effects(section: type[BaseModel], outer: Affects | None, prefix: st
         if not inner:
             mark = outer if mark is None else mark
             if mark is None:
-                raise TypeError(f"{prefix}{name}: say what it affects, as in Annotated[int, Affects.RUN]")
+                raise TypeError(
+                    f"{prefix}{name}: not annotated with what it affects, as in Annotated[int, Affects.RUN]"
+                )
             yield prefix + name, mark
 
 

@@ -90,7 +90,7 @@ class TrainingConfig(Section):
         warmup, decay = self.warmup_steps, self.decay_steps
         return self.check_rules(
             (warmup + decay > self.steps, f"warmup_steps {warmup} and decay_steps {decay} exceed steps {self.steps}"),
-            (decay and self.schedule == "cosine", "decay_steps belongs to schedule warmup_stable_decay, not cosine"),
+            (decay and self.schedule == "cosine", "decay_steps is only for schedule: warmup_stable_decay"),
         )
 
 

@@ -129,7 +129,7 @@ def _load_lora(model: WorldModel, folder: Path) -> None:
         existing = parse_adapter_config(lora_config(model).to_dict(), where=str(folder))
         for name in AdapterConfig.model_fields.keys() - {"dropout"}:
             if (found := getattr(config, name)) != (needed := getattr(existing, name)):
-                found, needed = f"an adapter with {name} {found}", f"{needed}, as the model has"
+                found, needed = f"an adapter with {name} {found}", f"{needed}, as in the model"
                 raise InputError(where=str(folder), found=found, needed=needed)
     set_peft_model_state_dict(model.predictor, _read_weights(folder / LORA_WEIGHTS, lora_weights(model)))
 
@@ -151,7 +151,7 @@ def read_card(folder: Path, model: WorldModel) -> Card:
         if found != needed:
             own, others = f"{found[:12]}{this}", f"{needed[:12]}{trained_on}"
             description = f"an adapter trained on another {part} ({others}) than this model's ({own})"
-            fix = "Set model.base (or model.encoder) to what it was trained on"
+            fix = "Set model.base (or model.encoder) to the model on which it was trained"
             raise InputError(where=str(path), found=description, fix=fix)
     if model.adaptation is not None and model.adaptation.kind != card.kind:
         description = f"an adapter of kind {card.kind}, and the model has one of kind {model.adaptation.kind}"

@@ -51,7 +51,7 @@ logger = logging.getLogger(__name__)
 ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
 """Keys of encoders in a file; the first of them that the file contains is used. Meta uses an average of the weights;
 `encoder` contains the weights that were trained by gradient descent."""
-FIX = "`vjepa2-ac download --list` shows those that are published; the Hub has facebook/vjepa2-vitl-fpc64-256"
+FIX = "`vjepa2-ac download --list` shows the published files; the Hub has facebook/vjepa2-vitl-fpc64-256"
 
 Part = Family | Literal["predictor"]  # whose names
 Rename = Callable[[str], tuple[str, int | None]]
@@ -84,7 +84,7 @@ _ON_THE_HUB = [CONFIG, "*.safetensors"]
 _PREFIXES_ON_THE_HUB = ("vjepa2.encoder.", "encoder.")  # of a classification model, of a plain one
 _BLOCK = re.compile(r"(?:^|\.)(?:blocks|layer)\.(\d+)\.")  # in the names of Meta's files, of transformers, and of ours
 _ONLY_2_1 = ("norms_block.", "video_mod_embed", "img_mod_embed", "patch_embed_img.")
-_NON_COMMERCIAL = "The weights that jepa-wms publishes so are CC-BY-NC 4.0: for non-commercial use only"
+_NON_COMMERCIAL = "Such weights from jepa-wms have the licence CC-BY-NC 4.0: for non-commercial use only"
 
 
 def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
@@ -106,8 +106,8 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     path = find_base(config.base)
     file = None if path.is_dir() else MetaFile.open(path)
     if encoder is not None and (file is None or any(key in file.parts for key in ENCODER_KEYS)):
-        said = f"an encoder of its own, and model.encoder names another ({encoder.where}), on which it predicts noise"
-        fix = "Leave out model.encoder; or train a fresh predictor on it, with model.base: random"
+        said = f"a model with an encoder, and model.encoder sets another one ({encoder.where})"
+        fix = "Remove model.encoder; or train a new predictor on that encoder, with model.base: random"
         raise InputError(where=f"model.base: {config.base}", found=said, fix=fix)
     if file is not None:
         return _of_meta(file, encoder, config.sizes.model_sizes, dtype)
@@ -159,9 +159,9 @@ def to_official(model: WorldModel) -> dict[str, Any]:
         ValueError: The model has an adapter, which must be merged first.
     """
     if model.predictor is not model.base_predictor:
-        raise ValueError("an adapter is on: merge_adapter first")
+        raise ValueError("the model has an adapter: call merge_adapter first")
     if not model.sizes.predictor.use_states or get_model_widths(model.sizes) != POSE_WIDTHS:
-        found = f"a model that takes {describe_model_widths(model.sizes)}"
+        found = f"a model with {describe_model_widths(model.sizes)}"
         needed = f"states and actions of {POSE_WIDTHS.state} numbers: Meta's code has no other predictor"
         fix = "Export it with --to merged (WorldModel.save_pretrained), which `model.base` takes"
         raise InputError(where="the official format", found=found, needed=needed, fix=fix)
@@ -179,8 +179,8 @@ def _of_meta(file: MetaFile, encoder: EncoderSource | None, given: ModelSizes, d
     found = encoder or encoder_in_file(file, None, given.encoder.frame, given.encoder.heads)
     predictor = file.tensors("predictor")
     if "mask_tokens" in {name.partition(".")[0] for name in predictor} and "action_encoder.weight" not in predictor:
-        said = "a checkpoint of pretraining: its predictor fills in masked patches, and takes no actions"
-        fix = "Its encoder can be used: set model.encoder.path to this file, and model.base: random for a fresh"
+        said = "a checkpoint of pre-training, whose predictor has no action input"
+        fix = "Its encoder can be used: set model.encoder.path to this file, and model.base: random for a new"
         fix += " predictor (configs/scratch_vitb.yaml)"
         raise InputError(where=f"model.base: {file.path}", found=said, fix=fix)
     model = _on_encoder(found, _sizes(file, predictor, found, given), dtype)
@@ -190,7 +190,7 @@ def _of_meta(file: MetaFile, encoder: EncoderSource | None, given: ModelSizes, d
         partial(to_official_name, part="predictor"),
         dtype,
         where=f"{file.path}: predictor",
-        fix="Check model.base, model.sizes, and model.encoder: the predictor's latents are of one encoder",
+        fix="Check model.base, model.sizes and model.encoder: a predictor belongs to one encoder",
     )
     logger.info("read %s: %s", file.path, model.sizes.model_dump())
     if encoder is None:
@@ -199,8 +199,8 @@ def _of_meta(file: MetaFile, encoder: EncoderSource | None, given: ModelSizes, d
     if not model.sizes.predictor.use_states:
         logger.warning("%s: a predictor without states and without an encoder. %s", file.path, _NON_COMMERCIAL)
     logger.warning(
-        "%s does not say which encoder its predictor was trained on: on any other than %s it predicts noise. The first"
-        " validation shows it (its error compared with that of persistence).",
+        "%s does not record the encoder of its predictor. If it is not %s, the predictions are noise: compare the error"
+        " of the first validation with persistence.",
         file.path,
         encoder.origin,
     )
@@ -239,7 +239,7 @@ def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: EncoderSour
             "use_states": any(name.startswith("state_encoder.") for name in predictor),
         },
     }
-    fix = "Set image size and heads in model.sizes: the tensors cannot tell"
+    fix = "Set image size and heads in model.sizes: the tensors do not determine them"
     found = parse_record(ModelSizes, fields, where=str(file.path), needed="sizes that go with model.sizes", fix=fix)
     check_sizes(found, given, where=str(file.path))
     return found
@@ -296,8 +296,8 @@ def find_encoder(config: EncoderConfig) -> EncoderSource:
         name = config.path if path is None else path.name
         found = _in_folder(folder, config, name=name)
     if config.heads not in {None, found.sizes.heads}:
-        said = f"{found.sizes.heads} attention heads, and model.encoder.heads says {config.heads}"
-        raise InputError(where=found.where, found=said, fix="Leave out model.encoder.heads")
+        said = f"{found.sizes.heads} attention heads, and model.encoder.heads is {config.heads}"
+        raise InputError(where=found.where, found=said, fix="Remove model.encoder.heads")
     return found if config.layer is None else found.truncate(config.layer)
 
 
@@ -360,8 +360,10 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
         raise file.missing_error(f"tensor {missing}", part=key) from None
     heads = PUBLISHED_HEADS.get(width, heads)
     if heads is None:
-        said = f"an encoder of width {width}, which is none of the published ones: the tensors do not show its heads"
-        fix = "Set model.encoder.heads to those it was trained with: others give other latents without an error"
+        said = f"an encoder of width {width}, which no published encoder has: its number of heads is not known"
+        fix = (
+            "Set model.encoder.heads to the number used in its training; a wrong number causes wrong latents, no error"
+        )
         raise InputError(where=str(file.path), found=said, fix=fix)
     known = find_published_file(file.path.name)
     return EncoderSource(
@@ -403,8 +405,8 @@ def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> EncoderSour
     """Return the encoder in a folder of transformers or of this project; `name` is the value from the config."""
     card = read_json_object(folder / CONFIG, needed=ENCODER_NEEDED, fix=FIX)
     if config.key is not None:
-        found = f"{name}, a folder, which holds one encoder"
-        raise InputError(where=f"model.encoder.key: {config.key}", found=found, fix="Leave the key out")
+        found = f"{name}, a folder, which contains one encoder"
+        raise InputError(where=f"model.encoder.key: {config.key}", found=found, fix="Remove the key")
     if card.get("format") != FORMAT:
         return _of_transformers(folder, card, config.frame, name)
     model = read_sizes(folder)
@@ -561,7 +563,7 @@ def _problem_of(path: Path, error: Exception) -> tuple[str, str]:
     """Return a description of a file that torch could not load, with its first bytes, and the fix."""
     refused = re.search(r"GLOBAL ([\w.]+)", str(error))
     if refused:
-        found = f"a pickle that would call {refused[1]}: it was refused, since loading it could run foreign code"
+        found = f"a pickle that would call {refused[1]}, which could execute code; it was not loaded"
         old, new, keys = map(
             json.dumps, (str(path), str(path.with_suffix(".weights.pt")), [*ENCODER_KEYS, "predictor"])
         )
@@ -572,5 +574,5 @@ def _problem_of(path: Path, error: Exception) -> tuple[str, str]:
         head = file.read(24)
     reason = next(iter(str(error).splitlines()), type(error).__name__)[:120]
     size = path.stat().st_size / 1e9
-    found = f"{size:.2f} GB, beginning with {head!r}, that torch cannot read ({reason}): truncated, or of another kind"
+    found = f"{size:.2f} GB, beginning with {head!r}, that torch cannot read ({reason}): truncated, or another format"
     return found, FIX

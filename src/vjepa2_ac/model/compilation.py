@@ -89,7 +89,7 @@ def _compiled(function: Callable[..., Any], backend: str, override: str, dynamic
         try:
             return whole(*args, **kwargs)
         except FailOnRecompileLimitHit as error:
-            found = f"more than {config.recompile_limit} sizes of batches and clips, each of which is compiled anew"
+            found = f"more than {config.recompile_limit} sizes of batches and clips, each of which needs a compilation"
             fix = f"Set {override}, or use fewer sizes"
             raise InputError(where=override.partition("=")[0], found=found, fix=fix) from error
 

@@ -30,8 +30,8 @@ with quiet_imports():
     from peft.tuners.lora import Linear, LoraLayer
 
 _SETS = {"attention": ("q", "k", "v", "o"), "mlp": ("fc1", "fc2")}
-NEEDED = "a LoRA adapter of V-JEPA 2-AC's predictor, as this program writes it in PEFT's format"
-FIX = "Copy the adapter again, or train it again: other kinds of PEFT's are not read"
+NEEDED = "a LoRA adapter of V-JEPA 2-AC's predictor in PEFT's format, as written by vjepa2-ac"
+FIX = "Copy or train the adapter again; other methods of PEFT are not supported"
 _INFORMATIONAL = frozenset({  # origin and purpose
     "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_type", "peft_version",
     "revision", "task_type",
@@ -91,7 +91,7 @@ class TrainableReport(NamedTuple):
 
     def __str__(self) -> str:
         share = f"{self.trained / self.predictor:.2%} of the predictor's {self.predictor:,}"
-        return f"{self.trained:,} parameters are trained: {share}; the model has {self.total:,}"
+        return f"Trained parameters: {self.trained:,} ({share}); the model has {self.total:,}."
 
 
 def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
@@ -292,7 +292,7 @@ def parse_adapter_config(values: Mapping[str, Any], *, where: str) -> AdapterCon
     unread |= {peft: None for peft in ("r", "lora_alpha", "target_modules") if values.get(peft) is None}
     if unread:
         listed = ", ".join(f"{short_repr(name)} {short_repr(value)}" for name, value in unread.items())
-        found = f"an adapter with {listed}, which is not read here"
+        found = f"an adapter with unsupported options: {listed}"
         raise InputError(where=where, found=found, needed=NEEDED, fix=FIX)
     return parse_record(AdapterConfig, {**given, "peft": options}, where=where, needed=NEEDED, fix=FIX)
 
@@ -321,8 +321,8 @@ def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig
     """
     whole = config.modules_to_save
     if missing := [name for name in whole if not hasattr(predictor, name)]:
-        found = f"{', '.join(missing)}, which this predictor does not have: it was made without states"
-        raise InputError(where="adapter.modules_to_save", found=found, fix="Leave it out")
+        found = f"{', '.join(missing)}, which a predictor without states does not have"
+        raise InputError(where="adapter.modules_to_save", found=found, fix="Remove it")
     layers = {name for name, layer in predictor.named_modules() if isinstance(layer, nn.Linear)}
     layers -= set(predictor.unused_layers)
     kinds = {name.rpartition(".")[2] for name in layers}
@@ -334,7 +334,9 @@ def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig
         needed = f"some of {', '.join(sorted(kinds))}; or {', '.join(sets)}"
         raise InputError(where="adapter.targets", found=found, needed=needed)
     if twice := sorted(set(targets) & set(whole)):
-        found = f"{', '.join(twice)}, which adapter.targets names too: a layer is trained whole, or with an adapter"
+        found = (
+            f"{', '.join(twice)}, which adapter.targets contains, too: a layer is trained directly or with an adapter"
+        )
         raise InputError(where="adapter.modules_to_save", found=found)
     arguments = {peft: getattr(config, ours) for peft, ours in PEFT_NAMES.items()}
     return arguments | {"target_modules": targets, "modules_to_save": list(whole) or None} | config.peft

@@ -33,7 +33,7 @@ ENCODER_NEEDED = "an encoder of V-JEPA 2 or 2.1: Meta's .pt, a transformers fold
 _HEADS_KEY = "heads_are_told"  # in config.json, for `EncoderOrigin.has_heads_in_fingerprint`
 _TINY = f"{BUILTIN}sim-tiny"
 NEEDED_MODEL = "a folder written by `vjepa2-ac export` or WorldModel.save_pretrained"
-_FIX = "Of a run, `vjepa2-ac export RUN FOLDER` makes one"
+_FIX = "For a run, `vjepa2-ac export RUN FOLDER` writes one"
 
 
 def find_base(name: str) -> Path:
@@ -55,7 +55,7 @@ def find_encoder_path(name: str) -> Path | None:
     """
     if name.startswith(HUB):
         return None
-    fix = "`vjepa2-ac download --list` shows those that are published"
+    fix = "`vjepa2-ac download --list` shows the published files"
     return _find(name, f"model.encoder.path: {name}", ENCODER_NEEDED, fix)
 
 
@@ -87,7 +87,7 @@ def require_base_of_run(config: ModelConfig, run: Path, command: Sequence[str] =
     except InputError as error:
         key = error.where.partition(":")[0]
         moved = shell_command(*(command or ("train", run, "--resume")), f"{key}=PATH")
-        needed = f"what {run} was trained on. It may be at any path: the fingerprint of its weights is compared"
+        needed = f"the model on which {run} was trained, at any path: the fingerprint of the weights is compared"
         fix = f"If it was moved, run `{moved}`"
         raise InputError(where=error.where, found=error.found, needed=needed, fix=fix) from None
 
@@ -124,8 +124,8 @@ def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
     actual, configured, default = (flatten(sizes.model_dump()) for sizes in (found, given, ModelSizes()))
     wrong = [key for key in flatten(SizesConfig().model_dump()) if configured[key] not in (actual[key], default[key])]
     if wrong:
-        said = ", ".join(f"{key} {actual[key]}, and model.sizes says {configured[key]}" for key in wrong)
-        raise InputError(where=where, found=said, fix="Leave them out of model.sizes: the model file has them")
+        said = ", ".join(f"{key} {actual[key]}, and model.sizes has {configured[key]}" for key in wrong)
+        raise InputError(where=where, found=said, fix="Remove them from model.sizes: they are read from the model")
 
 
 def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
@@ -276,7 +276,7 @@ def find_published(text: str) -> Published:
     name = text.removesuffix(".pt")
     meant = next((one for one in PUBLISHED if name in {one.name, one.remote.removesuffix(".pt")}), None)
     if meant is None:
-        fix = "`vjepa2-ac download --list` shows all; where the file goes is set by --to"
+        fix = "`vjepa2-ac download --list` shows all names; --to sets the path of the file"
         raise InputError(where=f"download {text}", found="no published checkpoint of this name", fix=fix)
     return meant
 
@@ -349,18 +349,18 @@ def _fetch(url: str, part: Path, known: Published | None, reporter: Reporter, ti
         if error.headers.get("Content-Range", "").endswith(f"/{start}"):  # nothing is left
             return
         part.unlink()
-        raise http.client.HTTPException("the part that is here does not fit the file; starting again") from None
+        raise http.client.HTTPException("the partial download does not match the file; starting again") from None
     with answer:
         start = start if answer.headers.get("Content-Range", "").startswith(f"bytes {start}-") else 0
         promised = answer.headers.get("Content-Length", "")
         if not promised.isdigit():
-            needed = "its size (Content-Length): without it, half a file looks like a whole one"
-            raise InputError(where=url, found="a server that does not say it", needed=needed, fix=_PROXY)
+            needed = "the size of the file, without which an incomplete download is not detected"
+            raise InputError(where=url, found="a response without Content-Length", needed=needed, fix=_PROXY)
         whole = start + int(promised)
         _require_size(known, whole, where=url)
         free = storage.free_bytes(part.parent.absolute()) + _size(part)
         if whole > free:
-            needed = f"{whole / 1e9:.4g} GB, of which {start / 1e9:.4g} GB are here"
+            needed = f"{whole / 1e9:.4g} GB, of which {start / 1e9:.4g} GB are downloaded"
             fix = "Free some space, or name a file on a larger disk with --to"
             raise InputError(where=str(part), found=f"{free / 1e9:.4g} GB free on its disk", needed=needed, fix=fix)
         show = reporter.task(f"{part.name.removesuffix('.part')} (MB)")

@@ -149,7 +149,9 @@ class WorldModel(LatentDynamics):
                 encoder was removed.
         """
         if self.predictor is not self.base_predictor:
-            raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_trained saves it alone")
+            raise ValueError(
+                "the model has an adapter: merge it with merge_adapter, or save only the adapter with save_trained"
+            )
         card: dict[str, Any] = {"format": FORMAT, "sizes": self.sizes.model_dump(mode="json")}
         if self.encoder_origin is not None:
             card["encoder_origin"] = self.encoder_origin.as_dict()
@@ -187,7 +189,7 @@ class WorldModel(LatentDynamics):
         """
         if isinstance(self.encoder, Encoder):
             return self.encoder
-        raise ValueError("the encoder was set aside: latents come from a cache")
+        raise ValueError("the encoder was removed, because latents come from a cache")
 
     def remove_encoder(self) -> None:
         """Remove the encoder's weights permanently, because latents come from a cache. The fingerprint is kept."""
@@ -301,7 +303,7 @@ def require_trained_heads(heads: tuple[str, ...], config: AdapterConfig) -> None
     if config.kind == "none" or not missing:
         return
     whole = ", ".join([*config.modules_to_save, *missing])
-    found = f"nothing that trains the {_as_text(missing)}, fresh because the data has other widths than the base"
+    found = f"the new {_as_text(missing)} would not be trained; the data have other widths than the base model"
     raise InputError(where="adapter.modules_to_save", found=found, fix=f"Set adapter.modules_to_save=[{whole}]")
 
 
@@ -321,7 +323,7 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
     if not heads:
         return []
     if model.adaptation is not None or model.new_input_heads is not None:
-        raise ValueError("heads are replaced once, and before the model is adapted")
+        raise ValueError("input heads can be replaced only once, before the model is adapted")
     predictor = model.base_predictor
     replaced: dict[str, Tensor] = {}
     lines: list[str] = []
@@ -331,7 +333,9 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
         head = nn.Linear(width, own.out_features)
         initialise(head, torch.Generator().manual_seed(derive_seed(seed, name)))
         setattr(predictor, name, head.to(own.weight.device, own.weight.dtype).requires_grad_(False))
-        lines.append(f"{_as_text([name])}: {width} numbers instead of the base's {own.in_features}: newly initialised")
+        lines.append(
+            f"New {_as_text([name])} for {width} numbers, newly initialised; the base model's has {own.in_features}."
+        )
     dims = {"action_dim": widths.action}
     dims |= {"state_dim": widths.state} if model.sizes.predictor.use_states else {}
     predictor.config.update(dims)

@@ -40,8 +40,8 @@ _WRITING = ".writing-"
 SELECTED, NEWEST, BEST = "selected", "newest", "best"
 
 _NAME = re.compile(r"step-([0-9]{8,})")
-_NEEDED = "where a run stood, as this program wrote it"
-_FIX = "Delete this checkpoint, to use an older one"
+_NEEDED = "the state of a run, as written by vjepa2-ac"
+_FIX = "Delete this checkpoint to use an older one"
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 RANKING_TOLERANCE = 0.005  # smaller differences of the action-ranking error are ignored: other clips change it by more
@@ -172,8 +172,8 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
         path for path in list_checkpoints(folder) if (parse_step(path.name) or 0) >= state.step
     ]  # skipped at the start
     if complete := [path for path in damaged if find_damage(path) is None]:
-        found = "a complete checkpoint that another process wrote; it is left as it is"
-        raise InputError(where=str(complete[0]), found=found, fix="Start again: the run resumes from this checkpoint")
+        found = "a complete checkpoint of another process, which is not overwritten"
+        raise InputError(where=str(complete[0]), found=found, fix="Run the same command again to resume from it")
     try:
         remove_incomplete(folder)  # frees disk space
         shutil.rmtree(temporary, ignore_errors=True)
@@ -192,7 +192,7 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         found = f"the checkpoint cannot be written ({error.strerror or error})"
-        fix = "Older checkpoints are untouched: make room or pass another run_dir, then resume"
+        fix = "Older checkpoints are unchanged. Free disk space, then run the same command again to resume"
         raise InputError(where=str(final), found=found, fix=fix) from error
     return final
 
@@ -232,7 +232,7 @@ def find_damage(checkpoint: Path) -> str | None:
         for name, digest in files.items():
             with translate_read_errors(checkpoint / name):
                 if sha256_of_file(checkpoint / name) != digest:
-                    return f"{name} is damaged (its SHA-256 is not the manifest's)"
+                    return f"{name} is damaged (its SHA-256 differs from the manifest)"
     except MissingFileError:
         return f"{name} is missing"
     except InputError as error:
@@ -298,13 +298,15 @@ def parse_manifest(manifest: bytes) -> dict[str, str]:
     """
     files = parse_json_object(manifest, where=MANIFEST).get("files")
     if not isinstance(files, dict) or not all(isinstance(digest, str) for digest in files.values()):
-        raise InputError(
-            where=MANIFEST, found=f"files {short_repr(files)}", needed="the SHA-256 of each file, by its name"
-        )
+        raise InputError(where=MANIFEST, found=f"files {short_repr(files)}", needed="the SHA-256 of each file by name")
     for name in files:
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts or not path.parts or str(path) != name:
-            raise InputError(where=MANIFEST, found=f"it names {name}, which is outside", needed="files beside it")
+            raise InputError(
+                where=MANIFEST,
+                found=f"the path {name!r}, which is outside the folder",
+                needed="files in the folder of the manifest",
+            )
     return files
 
 
@@ -333,7 +335,7 @@ def read_torch(path: Path) -> Any:
     """
     import torch
 
-    needed = "a file that this program wrote"
+    needed = "a file written by vjepa2-ac"
     with translate_read_errors(path, needed=needed):
         try:
             _require_as_written(path)
@@ -343,7 +345,7 @@ def read_torch(path: Path) -> Any:
                 raise
             found = f"cannot be read ({error})"
             if isinstance(error, pickle.UnpicklingError):
-                found = "more than tensors and plain values: such a file can run foreign code"
+                found = "objects other than tensors and plain values, which could execute code"
             raise InputError(where=str(path), found=found, needed=needed) from None
 
 
@@ -356,7 +358,7 @@ def _require_as_written(path: Path) -> None:
     """
     with zipfile.ZipFile(path) as archive:
         if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
-            raise ValueError("its parts are compressed")
+            raise ValueError("it is compressed")
 
 
 # ---- selection ----
@@ -390,18 +392,18 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
     folder = run / CHECKPOINTS
     newest = newest_checkpoint(folder)
     if newest is None:
-        fix = f"Continue the training with `{shell_command('train', run, '--resume')}`"
-        raise InputError(where=str(run), found="a run without a whole checkpoint", needed="at least one", fix=fix)
+        fix = f"Resume training with `{shell_command('train', run, '--resume')}`"
+        raise InputError(where=str(run), found="a run without a complete checkpoint", needed="at least one", fix=fix)
     state = read_written_state(newest)
     if by == NEWEST or (by == SELECTED and state.best_step is None):
-        why = "the newest" if by == NEWEST else "the newest: none was selected"
+        why = "the newest" if by == NEWEST else "the newest, none was selected by validation"
         return SelectedCheckpoint(newest, why, by, state)
     is_best = by in {SELECTED, BEST}
     step = state.best_step if is_best else parse_step(f"step-{by.zfill(8)}")
     path = folder / checkpoint_name(step or 0)
     problem: str | None
     if step is None:
-        why = "no validation yet, it measured something else since, checkpoint.keep_best was off, or it was deleted"
+        why = "no validation yet, a changed validation, checkpoint.keep_best was off, or it was deleted"
         problem = f"no best checkpoint ({why})" if is_best else f"--checkpoint {by}"
     elif not path.is_dir():
         problem = f"no checkpoint of step {step:,}"
@@ -411,4 +413,4 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
         steps = ", ".join(str(parse_step(path.name)) for path in list_checkpoints(folder) if find_damage(path) is None)
         raise InputError(where=str(folder), found=problem, needed=f"selected, newest, best or one of the steps {steps}")
     measure = "error" if state.best_ranking_error is None else "action ranking"
-    return SelectedCheckpoint(path, f"the best by {measure}" if is_best else "as asked for", by, state)
+    return SelectedCheckpoint(path, f"the best by {measure}" if is_best else "as requested", by, state)

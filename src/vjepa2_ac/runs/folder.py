@@ -91,13 +91,13 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
     if (folder / CONFIG).exists():
         changed = [] if allow_config_change else changed_keys(read_run_config(folder), config)
         if differing := [key for key in changed if Affects.RUN in get_effect(key, Config)]:
-            found = f"a run of another config; it differs in {', '.join(differing)}"
+            found = f"a run with another config; it differs in {', '.join(differing)}"
             same = f"Set another run_dir for a new run, or resume with `{shell_command('train', folder, '--resume')}`"
-            fix = f"{same}; where the change is meant, add --allow-config-change"
-            raise InputError(where=str(folder), found=found, needed="the same config, to go on with it", fix=fix)
+            fix = f"{same}. To resume with the changed config, add --allow-config-change"
+            raise InputError(where=str(folder), found=found, needed="the same config, to resume the run", fix=fix)
     elif folder.exists() and not all(_is_without_config(path) for path in folder.iterdir()):
-        found = "a folder with other things in it, and no config.yaml"
-        needed = "an empty or new folder, or one of a run"
+        found = "a folder with other files and without config.yaml"
+        needed = "a new or empty folder, or the folder of a run"
         raise InputError(where=str(folder), found=found, needed=needed, fix="Set another run_dir")
     with translate_write_errors(folder):
         check_local_writable(folder)
@@ -139,7 +139,7 @@ def run_id(folder: Path) -> str:
         return secrets.token_hex(8)
     name = read_small_file(path, _MOST_BYTES_OF_ID).decode(errors="replace").strip()
     if not _ID.fullmatch(name):
-        raise InputError(where=str(path), found=short_repr(name), needed="the name of a run, letters and digits")
+        raise InputError(where=str(path), found=short_repr(name), needed="the name of a run: letters, digits and . _ -")
     return name
 
 
@@ -195,7 +195,7 @@ def read_run_config(folder: Path, overrides: Iterable[str] = ()) -> Config:
     """
     if not (folder / CONFIG).is_file():
         found = "no config.yaml" if folder.is_dir() else "no such folder"
-        needed = "the folder of a run, which `vjepa2-ac train CONFIG` makes"
+        needed = "the folder of a run, which `vjepa2-ac train CONFIG` creates"
         raise InputError(where=str(folder), found=found, needed=needed)
     overrides = [*overrides, f"run_dir={json.dumps(to_config_value(folder))}"]
     config = load_config_of_run(folder / CONFIG, overrides)
@@ -306,15 +306,15 @@ class RunLock:
             try:
                 self._lock.acquire(blocking=False)
             except Timeout:
-                found = f"a run that is being trained right now, by {describe_last_start(self._folder / ENVIRONMENT)}"
+                found = f"a run that is in use by {describe_last_start(self._folder / ENVIRONMENT)}"
                 needed = "a folder that no other process writes to"
-                fix = "Wait until it ends, stop it, or set another run_dir"
+                fix = "Wait until that process exits, stop it, or set another run_dir"
                 raise InputError(where=str(self._folder), found=found, needed=needed, fix=fix) from None
             except OSError as error:
                 if error.errno not in _NO_LOCKS:
                     raise
-                advice = "see that no other process trains in this folder"
-                logger.warning("%s: no locks here (%s): %s", self._folder, error.strerror, advice)
+                advice = "Make sure that no other process trains in this folder"
+                logger.warning("%s: no file locks (%s). %s", self._folder, error.strerror, advice)
 
     def __enter__(self) -> RunLock:
         """Return the lock, not yet acquired."""

@@ -98,8 +98,8 @@ class MetricsLog:
             error = self._write(sync=True)
         if error:  # after a failed fsync the system may have discarded the data
             found = f"the latest metrics cannot be written ({error.strerror or error}), and are lost"
-            fix = "Make room on the disk of the run, then resume: the same command goes on"
-            raise InputError(where=str(self.path), found=found, fix=f"The checkpoint of this step is written. {fix}")
+            fix = "Free disk space, then run the same command again to resume"
+            raise InputError(where=str(self.path), found=found, fix=f"The checkpoint of this step is saved. {fix}")
 
     def _write(self, *, sync: bool = False) -> OSError | None:
         """Write the waiting rows, and with `sync` flush them to the disk; return the error if this fails."""
@@ -142,7 +142,7 @@ def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
         if type(row.get("step")) is int and isinstance(row.get("kind"), str):
             yield row
         else:
-            logger.warning("%s: a line is not a row of metrics, or was left by halves; it is dropped", path)
+            logger.warning("%s: a line is incomplete or not a row of metrics; it is skipped", path)
 
 
 def read_warnings(path: Path) -> list[str]:
@@ -157,7 +157,7 @@ def warn_if_stalled(path: Path) -> Iterator[None]:
 
     A network disk may block for minutes. Without a warning, training would seem to hang.
     """
-    text = "%s: the disk has not taken it for %g s; training waits for it"
+    text = "%s: writing this file takes more than %g s; training waits for the disk"
     timer = threading.Timer(STALLED_S, logger.warning, (text, path, STALLED_S))
     timer.daemon = True
     timer.start()
@@ -231,7 +231,7 @@ def require_installed(tracking: TrackingConfig) -> None:
     }
     for library, (is_requested, install, off) in requested.items():
         if is_requested and importlib.util.find_spec(library) is None:
-            found, fix = f"asked for, but {library} is not installed", f"Run {install}, or set tracking.{library}={off}"
+            found, fix = f"enabled, but {library} is not installed", f"Run {install}, or set tracking.{library}={off}"
             raise InputError(where=f"tracking.{library}", found=found, fix=fix)
 
 
@@ -248,7 +248,8 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
     openings: dict[str, Opening] = {}
     if tracking.tensorboard and importlib.util.find_spec("tensorboard") is None:
         message = (
-            "TensorBoard is not installed: no event files, but metrics.jsonl has every number. To install it, run %s"
+            "TensorBoard is not installed, so no event files are written. metrics.jsonl contains all metrics. To"
+            " install TensorBoard, run %s"
         )
         logger.warning(message, pip_install("tensorboard"))
     elif tracking.tensorboard:

@@ -100,10 +100,10 @@ class RemoteCheckpoints:
                 continue
             run_id = owner if run_id is None else run_id
             if owner != run_id:
-                found = f"{self.place} holds a checkpoint of another run, {name}"
-                fix = "Set another checkpoint.remote; nothing was written there"
+                found = f"{self.place} contains a checkpoint of another run, {name}"
+                fix = "Set another checkpoint.remote; nothing was written to this folder"
                 raise RemoteFolderTakenError(
-                    where=REMOTE_KEY, found=found, needed="an empty place, or that of this run", fix=fix
+                    where=REMOTE_KEY, found=found, needed="an empty folder, or that of this run", fix=fix
                 )
         return run_id
 
@@ -219,9 +219,13 @@ class Mirror:
         in_time, self._has_ended = not self.is_uploading, True
         if not self._is_lost and not (in_time and self._sent == self._newest_here()):
             text = (
-                "%s has checkpoints up to %s; what %s has after that is on this machine only%s. A next start sends it"
+                "%s contains checkpoints up to %s. Later ones in %s are only on this machine%s. The next start uploads"
             )
-            sent, late = self._sent or "those of earlier starts", "" if in_time else ": there was no more time"
+            text += " them"
+            sent, late = (
+                self._sent or "those of earlier starts",
+                "" if in_time else ", because the time for uploads was over",
+            )
             logger.warning(text, self._remote.place, sent, self._folder / CHECKPOINTS, late)
 
     def __enter__(self) -> Mirror:
@@ -281,7 +285,7 @@ class Mirror:
         with suppress(FileNotFoundError):  # two uploaders would overwrite each other's files
             if self._starts is not None and storage.read_small_file(path, MAX_BYTES) != self._starts:
                 found = f"{remote.place} is used by a later start of this run, {describe_last_start(path)}"
-                fix = "This one continues without it; stop one of the two"
+                fix = "This start continues without uploads. Stop one of the two"
                 raise RemoteFolderTakenError(where=REMOTE_KEY, found=found, fix=fix)
         names = [path.name for path in reversed(list_checkpoints(self._folder / CHECKPOINTS))]
         newest = next(filter(None, map(self._hold, names)), None)

@@ -63,9 +63,10 @@ class OpenRun:
             path for path in list_checkpoints(Path(config.run_dir, CHECKPOINTS)) if step_number(path.name) > state.step
         ]
         if newest := next((path for path in reversed(later) if find_damage(path) is None), None):
-            there = f"a checkpoint of step {step_number(newest.name)}"
-            found = f"{there}, which another start wrote while this one stood at {state.step}"
-            raise InputError(where=str(newest), found=found, fix="Start again: the run continues from there")
+            found = (
+                f"a checkpoint of step {step_number(newest.name)} from another start; this one is at step {state.step}"
+            )
+            raise InputError(where=str(newest), found=found, fix="Run the same command again to resume from it")
         open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
 
     def mirror(self, run_id: str) -> Mirror | None:
@@ -137,7 +138,7 @@ def open_remote(
         return config
     place, run_dir = storage.canonical_path(config.checkpoint.remote), Path(config.run_dir).resolve()
     if not storage.is_url(place) and Path(place).is_relative_to(run_dir):
-        found, needed = f"{place}, and run_dir is {run_dir}", "a place outside the run's folder"
+        found, needed = f"{place}, and run_dir is {run_dir}", "a folder outside run_dir"
         fix = "Set checkpoint.remote to a folder on another disk, or a URL such as gs://bucket/run"
         raise InputError(where=REMOTE_KEY, found=found, needed=needed, fix=fix)
     state = None
@@ -152,7 +153,7 @@ def open_remote(
             listing = remote.list_files()
             owner = remote.find_owner(listing, None if state is None else state.run_id)
         minutes = config.checkpoint.remote_every_minutes
-        reporter.note(f"{place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
+        reporter.note(f"{place} is writable. It is updated every {minutes:g} minutes, and at the end of the run.")
         newer = [name for name in list_complete(listing) if state is None or step_number(name) > state.step]
         if not newer and (state is not None or owner is None):
             return config
@@ -163,19 +164,19 @@ def open_remote(
             lock.take()
         is_fetched = _fetch_newest(remote, newer, Path(target.run_dir), reporter, removes_damaged=into is None)
     except RefusedError as error:
-        fix = f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out"
+        fix = f"{error.fix.rstrip('.')}. Or set another checkpoint.remote, or remove it"
         raise InputError(where=REMOTE_KEY, found=f"{error.where}: {error.found}", fix=fix) from error
     except UnreachableError as error:
         if state is None and (newer or owner is not None):  # a new run could not use the remote folder of another one
             raise
-        stand = f"after step {state.step}" if state else "without a checkpoint"
-        there = f", though {newer[0]} is there" if newer else ""
-        text = "%s: %s. Training begins with what is on this machine, %s%s, and tries again later"
-        logger.warning(text, REMOTE_KEY, describe_upload_error(error), stand, there)
+        local_state = f"step {state.step}" if state else "no checkpoint"
+        newer_remote = f"; {newer[0]} is newer" if newer else ""
+        text = "%s: %s. Training starts from the state on this machine (%s%s). Uploads are tried again later"
+        logger.warning(text, REMOTE_KEY, describe_upload_error(error), local_state, newer_remote)
         return config
     if is_fetched or state is not None:
         return target if is_fetched else config
-    found = f"{place}: none of {counted(len(newer), 'checkpoint')} is whole"
+    found = f"{place}: none of {counted(len(newer), 'checkpoint')} is complete"
     fix = "To start the run again from step 0, remove them, or set another checkpoint.remote"
     raise InputError(where=REMOTE_KEY, found=found, fix=fix)
 
@@ -189,7 +190,8 @@ def _require_this_config(config: Config, place: str, *, allow_config_change: boo
             there = with_values_of_run(config.model_copy(update={"run_dir": folder}))
             check_run_folder(there, allow_config_change=allow_config_change)
         except InputError as error:
-            fix = "Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change"
+            fix = "Set another checkpoint.remote for a new run. To resume with the changed"
+            fix += " config, add --allow-config-change"
             raise InputError(where=f"{REMOTE_KEY} {place}", found=error.found, needed=error.needed, fix=fix) from None
 
 
@@ -206,7 +208,7 @@ def _fetch_newest(
     remove_incomplete(folder / CHECKPOINTS)
     for number, name in enumerate(names):
         if _fetch(remote, name, folder / CHECKPOINTS):
-            reporter.note(f"Fetched {name} from {remote.place}.")
+            reporter.note(f"Downloaded {name} from {remote.place}.")
             with suppress(UnreachableError):
                 for damaged in names[:number] if removes_damaged else ():
                     remote.remove(damaged)

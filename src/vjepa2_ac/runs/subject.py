@@ -82,7 +82,7 @@ def load_subject(
     name = str(name)
     if not is_run(name):
         if checkpoint != SELECTED:
-            found, needed = f"{name}, which is not the folder of a run", "a run: a model has no checkpoints"
+            found, needed = f"{name}, which is not the folder of a run", "a run, because a model has no checkpoints"
             raise InputError(where=f"--checkpoint {checkpoint}", found=found, needed=needed)
         config = config_of_model(name, overrides) if config is None else config
         return Subject(name, config, load_base(config.model.with_base(name), seed=config.seed))
@@ -161,6 +161,8 @@ def read_config_of_moved_run(folder: Path, overrides: Iterable[str]) -> Config:
     """
     for override in overrides:
         if not sets_movable_path(override):
-            needed = f"the new path of what was moved: {' or '.join(f'{key}=PATH' for key in MOVABLE_PATHS)}"
-            raise InputError(where=f"override {override}", found="a setting that loading does not use", needed=needed)
+            needed = f"the new path of the base model or encoder: {' or '.join(f'{key}=PATH' for key in MOVABLE_PATHS)}"
+            raise InputError(
+                where=f"override {override}", found="a key that cannot be changed when a run is loaded", needed=needed
+            )
     return read_run_config(folder, overrides)

@@ -379,7 +379,7 @@ def _total(config: Config, sizes: ModelSizes) -> int:
 def _memory_savings(config: Config) -> Iterator[tuple[str, dict[str, dict[str, Any]]]]:
     """Yield the changes that save memory, preferred ones first: the text to print, and the new values by section."""
     yield "training.gradient_checkpointing=true", {"training": {"gradient_checkpointing": True}}
-    yield "training.batch_size=1 (and as much more accumulation)", {"training": {"batch_size": 1}}
+    yield "training.batch_size=1 (and raise training.accumulation by the same factor)", {"training": {"batch_size": 1}}
     bf16 = {"model": {"dtype": "bfloat16"}, "training": {"precision": "bf16"}}
     yield "model.dtype=bfloat16 with training.precision=bf16", bf16
     if not (config.data.transforms or config.data.uses_cached_latents):

@@ -25,7 +25,7 @@ from vjepa2_ac.training.setup import set_up
 from vjepa2_ac.training.step import Run, batches_from, gradients, training_step
 from vjepa2_ac.training.validation import record, validate_base, validate_if_due
 
-_IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."
+_IN_PLACE = "All checks passed: data, model, validation and gradients. Nothing was written."
 
 
 def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
@@ -46,7 +46,9 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
     """
     changes = {"check_only": check_only, "allow_config_change": allow_config_change}
     with contextlib.ExitStack() as exit_stack, join_processes(config) as accelerator:
-        require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
+        require_same(
+            accelerator, config_as_dict(config), what="the config", fix="Start all processes with the same config"
+        )
         require_optimizer(config.training)
         reporter = reporter if accelerator.is_main_process else SILENT
         outputs = RunOutputs(config, reporter, accelerator, exit_stack, **changes)

@@ -97,7 +97,7 @@ class DivergenceDetector:
         self._reported |= set(new)
         training = self._config.training
         fix = (
-            f"If it stays so, lower training.learning_rate ({training.learning_rate:g}) or adapter.alpha, or raise"
+            f"If this persists, lower training.learning_rate ({training.learning_rate:g}) or adapter.alpha, or raise"
             f" training.warmup_steps ({training.warmup_steps:,})"
         )
         return f"at step {step:,} {'; '.join(new.values())}. {fix}" if new else ""
@@ -111,13 +111,13 @@ class DivergenceDetector:
                 yield "not finite", "an error of the validation is not a finite number"
             elif now > _NOISE * before:
                 copying = "; copying the last frame would be better" if now > 1.0 > before else ""
-                text = f"the {name} is {now:.3f} of persistence's in the validation (before training {before:.3f})"
+                text = f"the {name} in validation is {now:.3f} of persistence's (before training {before:.3f})"
                 yield name + copying, text + copying
         error = "action_ranking_error"
         if _number(metrics, f"{error}_low") > _number(self._at_start, f"{error}_high"):  # intervals are apart
             now, before = (100 * _number(row, error) for row in (metrics, self._at_start))
             text = f"the action-ranking error is {now:.1f} % (before training {before:.1f} %, chance 50 %)"
-            text += ", although predictions are better than the base's" if better else ""
+            text += ", although predictions are better than the base model's" if better else ""
             yield "rank", f"{text}. `vjepa2-ac data check` measures how diverse the motions of the data are"
 
     def _of_loss(self, loss: float) -> Iterator[tuple[str, str]]:
@@ -128,7 +128,7 @@ class DivergenceDetector:
         if len(self._losses) >= _FEWEST_LOSSES:
             self._lowest = min(self._lowest, typical)
         if typical > _FAR_ABOVE * self._lowest:
-            yield "loss", f"the loss is {typical:.4g}, and was {self._lowest:.4g} (medians of {_LOSSES} rows)"
+            yield "loss", f"the loss is {typical:.4g}, its minimum was {self._lowest:.4g} (medians of {_LOSSES} rows)"
 
 
 class TimedBatches(Iterator[Batch]):

@@ -72,7 +72,7 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
     """
     is_adamw = isinstance(optimizer, torch.optim.AdamW)  # bitsandbytes uses other names for the moments
     if any(("exp_avg" in moments) != is_adamw for moments in state["state"].values()):
-        raise ValueError("its moments are of another training.optimizer")
+        raise ValueError("the moments belong to another training.optimizer")
     current_settings = [
         {name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups
     ]

@@ -99,7 +99,7 @@ class RunOutputs:
             return
         changes = config_changes(run.config)
         for line in changes:
-            self._reporter.note(f"The config changes: {line}")
+            self._reporter.note(f"Config change: {line}")
         before = read_run_config(run.folder) if changes else run.config
         if rate := describe_changed_rate(run.state.step, before.training, run.config.training):
             self._reporter.note(rate)
@@ -203,6 +203,6 @@ def _why_ended(config: Config, state: RunState) -> str:
     if state.step >= config.training.steps:
         return f"Training is finished after {counted(config.training.steps, 'step')} (training.steps)."
     return (
-        f"Training ends at step {state.step:,}: step {state.best_step:,} is the best, and"
-        f" no better one followed in {counted(config.training.patience or 0, 'validation')} (training.patience)."
+        f"Training stops at step {state.step:,}: no improvement since step {state.best_step:,}, in"
+        f" {counted(config.training.patience or 0, 'validation')} (training.patience)."
     )

@@ -39,6 +39,8 @@ from vjepa2_ac.runs.metrics_log import warn_if_stalled
 from vjepa2_ac.training.optim import load_moments
 from vjepa2_ac.training.step import Run
 
+_CLIPS = "its clips"  # key of the hash of the validation clips, in state.json
+
 
 def save_checkpoint(run: Run, folder: Path) -> None:
     """Save a checkpoint into the run folder (see `runs.checkpoint`). All processes call this; only the first writes.
@@ -81,8 +83,8 @@ def restore(run: Run, reporter: Reporter) -> Run:
         dataset.broken.restore(before.broken)
         if (windows := len(dataset.windows("train"))) != before.windows:
             reporter.note(
-                f"The data has changed: {counted(windows, 'training clip')} instead of {before.windows:,}."
-                " From here on their order is another, and some may be seen twice in this epoch or not at all."
+                f"The data has changed: {counted(windows, 'training clip')} instead of {before.windows:,}. The order of"
+                " the next clips changes, and some clips may occur twice or not at all in this epoch."
             )
     run.state = keep_comparable_best(state, validation_settings(run.config, run.dataset), reporter)
     run.micro_batches = count_micro_batches(run.config, state, run.accelerator.num_processes, reporter)
@@ -112,7 +114,7 @@ def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any]
         load_moments(run.optimizer, moments)
         state = read_state(checkpoint)
     except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
-        fix = "Set back what was changed in the config; or delete this checkpoint, to use an older one"
+        fix = "Undo the changes of the config, or delete this checkpoint to resume from an older one"
         raise InputError(where=str(checkpoint), found=f"not the state of this run ({error})", fix=fix) from None
     reporter.note(f"Resuming from {checkpoint} (step {state.step:,} of {run.config.training.steps:,}).")
     return replace(state, run_id=state.run_id or run_id(run.folder)), moments
@@ -123,7 +125,7 @@ def validation_settings(config: Config, dataset: Dataset) -> Mapping[str, str]:
     settings = {key: json.dumps(value) for key, value in flatten(values_that_affect(Affects.MEASURED, config)).items()}
     windows = validation_windows(dataset, "validation", clips=config.validation.clips)
     clips = [(dataset.table.identity(episode), int(start)) for episode, start in windows]
-    return {**settings, "its clips": hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}
+    return {**settings, _CLIPS: hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}
 
 
 def keep_comparable_best(state: RunState, now: Mapping[str, str], reporter: Reporter) -> RunState:
@@ -135,11 +137,12 @@ def keep_comparable_best(state: RunState, now: Mapping[str, str], reporter: Repo
     before = state.validation_settings or {}
     differing = sorted(key for key in before.keys() & now if before[key] != now[key])
     state = replace(state, validation_settings=dict(now))
+    names = ["validation clips" if key == _CLIPS else key for key in differing]
     if not differing or state.best_error is None:
         return state
     reporter.note(
-        f"Validation measures something else than before (other: {', '.join(differing)}): the error"
-        f" {state.best_error:.4g} of step {state.best_step}, the best so far, does not compare and no longer counts."
+        f"The validation has changed ({', '.join(names)}): the best error so far, {state.best_error:.4g} at step"
+        f" {state.best_step}, is not comparable and is discarded."
     )
     return replace(
         state,
@@ -167,15 +170,16 @@ def count_micro_batches(config: Config, state: RunState, processes: int, reporte
         return configured
     micro_batches = state.clips_per_step // batch_size
     if micro_batches < processes:
-        found = f"{counted(processes, 'process')}, of which each computes {counted(batch_size, 'clip')} at once"
-        needed = f"{micro_batches} at most, for the {counted(state.clips_per_step, 'clip')} of a step of this run"
-        fix = "Start fewer; or set training.batch_size and training.accumulation to what each is to do, with"
+        found = f"{counted(processes, 'process')}, each with micro-batches of {counted(batch_size, 'clip')}"
+        clips = counted(state.clips_per_step, "clip")
+        needed = f"at most {counted(micro_batches, 'process')}, because a step of this run has {clips}"
+        fix = "Start fewer processes, or change training.batch_size and training.accumulation with"
         raise InputError(where="training.batch_size", found=found, needed=needed, fix=f"{fix} --allow-config-change")
     if micro_batches != configured:
         fewest, remainder = divmod(micro_batches, processes)
         each = f"{fewest} or {fewest + 1}" if remainder else f"{fewest}"
         reporter.note(
-            f"{counted(processes, 'process')}, before {state.processes}: {each} micro-batches of {batch_size} in each."
-            f" A step has {counted(state.clips_per_step, 'clip')}, as before."
+            f"{counted(processes, 'process')} instead of {state.processes}: each computes {each} micro-batches of"
+            f" {counted(batch_size, 'clip')}. A step still has {counted(state.clips_per_step, 'clip')}."
         )
     return micro_batches

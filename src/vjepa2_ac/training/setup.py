@@ -152,7 +152,7 @@ def _check_heads(config: Config, dataset: Dataset) -> None:
     heads, widths = find_heads_to_replace(base_sizes(config.model), dataset.widths), dataset.widths
     if heads and config.data.stride == "auto":
         found = f"auto, for states of {widths.state} and actions of {widths.action} numbers"
-        needed = "widths that the base was trained with: it is measured at each candidate stride"
+        needed = "the widths with which the base model was trained, because it is evaluated at each candidate stride"
         raise InputError(where="data.stride", found=found, needed=needed, fix="Set it to a number of control steps")
     require_trained_heads(heads, config.adapter)
 
@@ -167,8 +167,9 @@ def _fit_heads(world_model: WorldModel, config: Config, dataset: Dataset, report
     for name in ("state_encoder", "action_encoder") if world_model.sizes.predictor.use_states else ("action_encoder",):
         if name not in {*heads, *config.adapter.modules_to_save}:
             reporter.note(
-                f"{name.replace('_', ' ')}: the base's own, as wide as the data. If its numbers mean something else"
-                f" than those the base was trained on, add {name} to adapter.modules_to_save"
+                f"The {name.replace('_', ' ')} of the base model is kept, because its width fits the data. If the"
+                f" numbers have another meaning than in the base model's training data, add {name} to"
+                " adapter.modules_to_save."
             )
 
 
@@ -194,22 +195,26 @@ def _open_replay(replay: ReplayConfig, dataset: Dataset, reporter: Reporter) -> 
             f"states of {opened.widths.state} and actions of {opened.widths.action} numbers ({opened.config.states})"
             for opened in (replayed, dataset)
         )
-        where, fix = f"replay.data.path: {replayed.config.path}", "Replay a data set of the same kind of robot"
-        raise InputError(where=where, found=found, needed=f"{needed}, as data have them", fix=fix)
+        where, fix = (
+            f"replay.data.path: {replayed.config.path}",
+            "Use a replay data set with the same format of states and actions",
+        )
+        raise InputError(where=where, found=found, needed=f"{needed}, as in data", fix=fix)
     found_s, needed_s = (opened.config.model_stride / opened.control_rate_hz for opened in (replayed, dataset))
     if not math.isclose(found_s, needed_s, rel_tol=_STEP_TOLERANCE):  # data sets have different control rates
         found = f"{replayed.config.stride}: model steps of {found_s:.3g} s"
-        needed = f"{needed_s:.3g} s, as those of data (stride {dataset.config.stride})"
-        fix = f"Set replay.data.stride={needed_s * replayed.control_rate_hz:.3g}, or the other one"
+        needed = f"model steps of {needed_s:.3g} s, as in data (stride {dataset.config.stride})"
+        fix = f"Set replay.data.stride={needed_s * replayed.control_rate_hz:.3g}, or change data.stride"
         raise InputError(where="replay.data.stride", found=found, needed=needed, fix=fix)
     windows = replayed.windows("train")
-    reporter.note(f"Replay: {replay.share:.0%} of the clips are from {replay.data.path}, which has {len(windows):,}.")
+    available = counted(len(windows), "clip")
+    reporter.note(f"Replay: {replay.share:.0%} of the training clips are drawn from {replay.data.path} ({available}).")
     hashes = dataset.table.id_hash[dataset.is_selected & ~dataset.split_mask("train")]
     indices = np.flatnonzero(replayed.split_mask("train") & np.isin(replayed.table.id_hash, hashes))
     if held_out := sorted(replayed.table.identity(int(index)) for index in indices):
         reporter.note(
-            f"Warning: {counted(len(held_out), 'episode')} that the first data set holds out are replayed in training:"
-            f" {format_identities(held_out)}. Add them to replay.data.exclude."
+            f"Warning: the replay data set would train on {counted(len(held_out), 'held-out episode')} of the first"
+            f" data set: {format_identities(held_out)}. Add them to replay.data.exclude."
         )
     return replayed
 
@@ -232,8 +237,8 @@ def require_fitting_clips(first: Dataset, others: Sequence[Dataset]) -> None:
             continue  # not encoded yet
         found, needed = (_form(first_clip(dataset)) for dataset in (replayed, first))
         if found != needed:
-            needed = f"{needed}, as data have them: clips of both are in one micro-batch"
-            fix = "Take latents instead: set data.cache and replay.data.cache to auto, with the same cache_dtype"
+            needed = f"{needed}, as in data, because a micro-batch has clips of both data sets"
+            fix = "Set data.cache and replay.data.cache to auto, with the same cache_dtype"
             raise InputError(where="replay.data", found=f"clips of {found}", needed=needed, fix=fix)
 
 
@@ -256,10 +261,10 @@ def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
     ):
         if old_config.path != new_config.path and state.fingerprint != compute_fingerprint(dataset.table):
             found, needed = (
-                "other episodes or files than the run has seen",
+                "episodes or files that differ from those of the run",
                 f"the data set that was at {old_config.path}",
             )
-            fix = f"Set {key} to where that is now; where the change is meant, add --allow-config-change"
+            fix = f"Set {key} to its new path. To resume with the other data, add --allow-config-change"
             raise InputError(where=f"{key}: {new_config.path}", found=found, needed=needed, fix=fix)
 
 

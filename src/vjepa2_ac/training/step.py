@@ -305,7 +305,7 @@ def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> 
         return
     fp16 = ", or set training.precision to bf16 or fp32" if run.scaler.is_enabled() else ""
     found = f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}"
-    fix = f"The weights have not moved. Look at these clips, or lower training.learning_rate{fp16}"
+    fix = f"The weights are unchanged. Inspect these clips, or lower training.learning_rate{fp16}"
     raise InputError(where="training", found=found, fix=fix)
 
 

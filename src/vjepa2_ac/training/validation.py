@@ -28,8 +28,8 @@ USED = 0.02  # relative increase of the one-step error with shuffled actions, be
 RANKING_REACH_CM = 7.5  # half the width of the box of alternative actions: the motion of a plan in one model step
 _AT_ONCE = 64  # alternative actions per batch, about as many tokens as in a small micro-batch
 _BASE_NOT_CHECKED = (
-    "Base compared with persistence: skipped; needs trained input layers, found new ones (the data have other widths"
-    " than the base)."
+    "skipped: the check that the base model is better than persistence. It needs trained input layers, and those for"
+    " this data are new."
 )
 
 
@@ -174,6 +174,6 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
         return validation
     description = f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame"
     needed = "a base model that is better than persistence (below 1)"
-    fix = "Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction;"
-    fix += " to adapt it anyway, set training.allow_weak_base=true"
+    fix = "Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction."
+    fix += " To train anyway, set training.allow_weak_base=true"
     raise InputError(where="model.base", found=description, needed=needed, fix=fix)

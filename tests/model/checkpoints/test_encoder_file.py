@@ -216,9 +216,9 @@ def test_a_file_that_is_not_a_whole_encoder_is_refused(tmp_path: Path, change: A
 @pytest.mark.parametrize(
     ("path", "encoder", "message"),
     [
-        (V21, {"heads": None}, "width 64, .*the tensors do not show its heads.*Set model.encoder.heads"),
+        (V21, {"heads": None}, "width 64, .*its number of heads is not known.*Set model.encoder.heads"),
         (V21, {"heads": 5}, "64 is not a multiple of encoder.heads 5"),
-        (V2, {"frame": "image"}, "V-JEPA 2 has no path for images"),
+        (V2, {"frame": "image"}, "image needs V-JEPA 2.1"),
         (V2, {"key": "ema_encoder"}, r"no ema_encoder .*Set model.encoder.key"),
     ],
 )
@@ -249,7 +249,7 @@ def test_a_transformers_folder_that_says_something_else_is_refused(
 
 
 def test_pretrainings_masked_predictor_is_not_taken_for_one_of_actions() -> None:
-    with pytest.raises(InputError, match=r"takes no actions.*set model\.encoder\.path to this file"):
+    with pytest.raises(InputError, match=r"no action input.*set model\.encoder\.path to this file"):
         load_base(ModelConfig(base=str(V21)), seed=0)
 
 

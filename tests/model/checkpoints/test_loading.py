@@ -48,7 +48,7 @@ def test_sizes_that_a_folder_does_not_have_are_refused_by_name(model: WorldModel
     model.save_pretrained(tmp_path / "model")
     sizes = {"image_size": 64, "encoder": {"depth": 2, "heads": 4}, "predictor": {"width": 36, "heads": 3}}
     given = SizesConfig.model_validate(sizes)
-    with pytest.raises(InputError, match=r"image_size 48, and model\.sizes says 64, encoder\.heads 2, and .* 4"):
+    with pytest.raises(InputError, match=r"image_size 48, and model\.sizes has 64, encoder\.heads 2, and .* 4"):
         load_with(tmp_path / "model", given)
 
 
@@ -102,7 +102,7 @@ def test_it_predicts_as_the_model_that_was_written_and_its_licence_is_told_once(
     licence, unknown = (record.getMessage() for record in caplog.records)
     assert licence.startswith(f"{file}: a predictor without states and without an encoder. ")
     assert "CC-BY-NC 4.0: for non-commercial use only" in licence
-    assert f"{file} does not say which encoder its predictor was trained on" in unknown
+    assert f"{file} does not record the encoder of its predictor" in unknown
 
 
 def test_what_does_not_fit_is_refused(file: Path, encoder: Path, tmp_path: Path) -> None:
@@ -121,9 +121,9 @@ def test_what_does_not_fit_is_refused(file: Path, encoder: Path, tmp_path: Path)
     wider.save_pretrained(tmp_path / "wider")
     with pytest.raises(InputError, match=r"predictor_embed.weight has shape \[36, 24\], not \[36, 48\].*model.encoder"):
         loaded(file, tmp_path / "wider")
-    with pytest.raises(InputError, match=r"an encoder of its own, and model.encoder names another"):
+    with pytest.raises(InputError, match=r"a model with an encoder, and model.encoder sets another one"):
         loaded(tmp_path / "wider", encoder)
-    with pytest.raises(InputError, match=r"an encoder of its own, and model.encoder names another"):
+    with pytest.raises(InputError, match=r"a model with an encoder, and model.encoder sets another one"):
         loaded(GOLDEN / "model" / "tiny.pt", encoder)
     whole = torch.load(file, weights_only=True)
     whole["predictor"]["module.predictor_proj.bias"][0] = float("nan")

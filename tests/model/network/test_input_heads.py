@@ -62,8 +62,8 @@ def test_only_heads_that_do_not_fit_are_replaced_and_each_is_told(widths: Widths
     model, before = base(), base().predictor.state_dict()
     lines = fit_heads(model, widths, seed=0)
     replaced = {name: width for name, width in zip(PUBLISHED_HEADS, widths[::-1], strict=True) if width != 7}
-    expected = [f"{name.replace('_', ' ')}: {width} numbers instead" for name, width in replaced.items()]
-    assert [line.partition(" of")[0] for line in lines] == expected
+    expected = [f"New {name.replace('_', ' ')} for {width} numbers" for name, width in replaced.items()]
+    assert [line.partition(",")[0] for line in lines] == expected
     assert find_heads_to_replace(TINY, widths) == tuple(replaced)
     for name, value in model.predictor.state_dict().items():
         if name.split(".")[0] not in find_heads_to_replace(TINY, widths):
@@ -78,7 +78,7 @@ def test_a_fresh_head_that_would_not_be_trained_is_refused_with_the_line_to_add(
     with pytest.raises(InputError, match=r"modules_to_save=\[action_encoder, state_encoder\]"):
         add_adapter(fitted(Widths(14, 14)), plain, seed=0)
     one = LORA.model_copy(update={"modules_to_save": ("action_encoder",)})
-    with pytest.raises(InputError, match=r"trains the state encoder.*=\[action_encoder, state_encoder\]"):
+    with pytest.raises(InputError, match=r"new state encoder would not be trained.*=\[action_encoder, state_encoder\]"):
         add_adapter(fitted(Widths(8, 7)), one, seed=0)
     add_adapter(fitted(Widths(7, 8)), one, seed=0)  # the only fresh one
 
