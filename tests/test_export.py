@@ -144,7 +144,7 @@ def test_the_card_describes_base_data_and_training(
     for words in (
         str(base_folder), base.predictor_fingerprint(), base.encoder_fingerprint(), f"rlds, `{data_folder}`",
         "`exterior_1_left`", "4 frames, one every 2 control steps", "2 of 2 planned", "rank 4, alpha 8",
-        "batch 2 x accumulation 1", "0.05", "rollout of 2 steps", "Trained parameters: ",
+        "batch 2 x accumulation 1", "0.05", "rollout of 2 steps", "parameters are trained",
         "**Not measured**: the run had no",
     ):  # fmt: skip
         assert words in card, words

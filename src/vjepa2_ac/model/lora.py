@@ -91,7 +91,7 @@ class TrainableReport(NamedTuple):
 
     def __str__(self) -> str:
         share = f"{self.trained / self.predictor:.2%} of the predictor's {self.predictor:,}"
-        return f"Trained parameters: {self.trained:,} ({share}); the model has {self.total:,}."
+        return f"{self.trained:,} parameters are trained ({share}); the model has {self.total:,}"
 
 
 def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
