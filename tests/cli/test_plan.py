@@ -66,7 +66,7 @@ def test_a_plan_its_image_a_table_and_words_come_out(workshop: Path, capsys: pyt
     assert "planning 16/16" in reported
     assert "energy maps 27/27" in reported
     assert "Plan of 1 model step\n" in reported
-    assert "Goes" in reported
+    assert "Moves" in reported
     assert str(workshop / "out" / "plan.png") in reported
     assert (workshop / "out" / "plan.png").is_file()
     assert (file["seed"], file["goals"], len(file["slices"])) == (9, [str(workshop / "goal.png")], 3)
@@ -192,4 +192,4 @@ def test_a_decoder_that_will_not_do_is_told_before_the_plan(
     assert plan(workshop, *QUICK, "--decoder", str(tmp_path / "decoder"))[0] == 2
     said = capsys.readouterr().err
     assert f"--decoder {tmp_path}/decoder" in said.replace("\n", "")
-    assert "Train one" in said
+    assert "Train a decoder" in said

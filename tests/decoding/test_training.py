@@ -171,4 +171,4 @@ def test_settings_that_change_no_number_are_no_other_decoder(
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")
     train_decoder(make_decoder(data__workers=1, training__steps=9), reporter)
-    assert any("there already" in note for note in reporter.notes)
+    assert any("nothing to do" in note for note in reporter.notes)

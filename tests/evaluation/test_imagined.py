@@ -177,7 +177,10 @@ def test_where_nothing_was_simulated_no_outcome_is_known(whole_run: Path, whole_
 @pytest.mark.parametrize(
     ("asked", "found"),
     [
-        ({"actions": ("sideways",)}, r"actions: 'sideways'. Expected true \(of a recorded clip\), none, up"),
+        (
+            {"actions": ("sideways",)},
+            r"actions: 'sideways'. Expected true \(the actions of a recorded clip\), none, up",
+        ),
         ({"actions": ("nowhere.npy",)}, "nowhere.npy: cannot be read"),
         ({"size_m": 0.0}, "--size"),
         ({"episode": "nobody"}, "--episode nobody: 0 episodes with this name"),

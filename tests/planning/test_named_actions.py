@@ -42,7 +42,7 @@ def test_steps_are_as_long_as_asked_and_never_beyond_the_limits() -> None:
     for size in (0.0, -0.01, float("nan"), float("inf")):
         with pytest.raises(InputError, match=r"--size: .* cm per step"):
             make_named_actions("up", 1, size_m=size)
-    with pytest.raises(InputError, match=r"true \(of a recorded clip\), none, up, down"):
+    with pytest.raises(InputError, match=r"true \(the actions of a recorded clip\), none, up, down"):
         make_named_actions("sideways", 1)
     with pytest.raises(ValueError, match="0 steps"):
         make_named_actions("up", 0)

@@ -44,11 +44,11 @@ def test_every_frame_is_predicted_from_the_one_before_it(whole_run: Path, datase
     assert found.steps.tolist() == list(range(STRIDE, len(episode.states), STRIDE))
     assert found.errors.shape == (len(found.steps), model.num_tokens)
     usual = found.errors.mean(axis=0)
-    scores = found.scores(usual)
+    scores = found.compute_scores(usual)
     np.testing.assert_allclose(scores, np.maximum(found.errors - usual, 0).mean(axis=1), rtol=1e-6)
     by = calibrate_monitor(model, dataset, 0.3)
     for threshold, expected in ((scores.max(), None), (scores.max() - 1e-9, int(scores.argmax()))):
-        assert found.first_alarm(replace(by, expected=tuple(usual), threshold=threshold)) == expected
+        assert found.find_first_alarm(replace(by, expected=tuple(usual), threshold=threshold)) == expected
 
 
 def test_the_threshold_is_of_the_held_out_episodes_alone(whole_run: Path, dataset: Dataset) -> None:
@@ -58,7 +58,7 @@ def test_the_threshold_is_of_the_held_out_episodes_alone(whole_run: Path, datase
     watched = list(measure_episodes(model, dataset, held_out.tolist()))
     np.testing.assert_allclose(monitor.expected, np.concatenate([one.errors for one in watched]).mean(axis=0))
     others = np.concatenate([one.errors for one in watched[1:]]).mean(axis=0)
-    assert monitor.scores[0] == pytest.approx(watched[0].scores(others).max())
+    assert monitor.scores[0] == pytest.approx(watched[0].compute_scores(others).max())
     assert monitor.threshold in monitor.scores
 
 

@@ -98,7 +98,7 @@ def test_a_plan_of_several_steps_follows_what_the_model_predicts(tmp_path: Path)
 def test_it_is_refused_for_another_encoder_and_where_a_file_is_damaged(folder: Path) -> None:
     card = json.loads((folder / CARD).read_text())
     (folder / CARD).write_text(json.dumps(card | {"encoder": "0" * 64}))
-    with pytest.raises(InputError, match=r"prior of another encoder"):
+    with pytest.raises(InputError, match=r"a prior for encoder"):
         acting(folder)
     (folder / CARD).write_text(json.dumps(card | {"sizes": {**card["sizes"], "dim": -1}}))
     with pytest.raises(InputError, match="dim"):

@@ -101,7 +101,7 @@ class Noting(Knowing):
 def test_other_actions_are_of_other_episodes(dataset: Dataset) -> None:
     run, one = Noting(tiny_model(), PlanningConfig()), policy(dataset, "one", 0.1)
     score_policies(run, dataset, [one])
-    episodes = [name for name, step in sorted(one.places) if step < STEPS - 1]
+    episodes = [name for name, step in sorted(one.points) if step < STEPS - 1]
     true = np.stack([chunks[0] for chunks in run.chunks])
     assert len(true) == len(episodes) == 2 * EPISODES
     for name, chunks in zip(episodes, run.chunks, strict=True):
@@ -130,11 +130,11 @@ def test_views_are_read_side_by_side_as_the_planner_sees_them(tmp_path: Path) ->
 
 def test_places_that_not_all_have_are_left_out_and_unknown_episodes_refused(dataset: Dataset) -> None:
     one, other = policy(dataset, "one", 0.1), policy(dataset, "other", 0.1)
-    fewer = PolicyChunks("other", other.places[:2], other.chunks[:2])
+    fewer = PolicyChunks("other", other.points[:2], other.chunks[:2])
     assert score_policies(knowing(), dataset, [one, fewer]).places == 2
-    with pytest.raises(InputError, match="no frame that all"):
+    with pytest.raises(InputError, match="no common evaluation point"):
         score_policies(knowing(), dataset, [one, PolicyChunks("none", (("x", 0),), other.chunks[:1])])
-    with pytest.raises(InputError, match="no such episode"):
+    with pytest.raises(InputError, match="has no such episode"):
         score_policies(knowing(), dataset, [PolicyChunks("none", (("x", 0),), other.chunks[:1])])
 
 
@@ -142,7 +142,7 @@ def test_files_are_read_and_nothing_in_them_runs(tmp_path: Path) -> None:
     good = {"episodes": np.array(["a", "b"]), "frames": np.array([0, 3]), "chunks": np.zeros((2, 1, 4, 7))}
     np.savez(tmp_path / "good.npz", **good)
     found = read_policy_chunks(tmp_path / "good.npz")
-    assert (found.name, found.places) == ("good", (("a", 0), ("b", 3)))
+    assert (found.name, found.points) == ("good", (("a", 0), ("b", 3)))
     for name, change in {
         "pickled": {"episodes": np.array(["a", None], dtype=object)},
         "short": {"frames": np.array([0])},

@@ -87,7 +87,7 @@ def test_a_decoder_that_will_not_do_is_told_before_what_is_expensive(
     other = write_decoder(tmp_path / "other", load_base(make_config().model, seed=0), encoder="other")
     monkeypatch.setattr("vjepa2_ac.training.setup.use_latent_cache", lambda *_, **__: pytest.fail("encodes"))
     for check_only in (False, True):
-        with pytest.raises(InputError, match=r"validation\.decoder: .*other: the decoder of another encoder"):
+        with pytest.raises(InputError, match=r"validation\.decoder: .*other: the decoder does not fit the encoder"):
             train(make_config(validation__decoder=str(other)), reporter, check_only=check_only)
     monkeypatch.setattr("vjepa2_ac.training.setup.open_dataset", lambda *_, **__: pytest.fail("opens the data"))
     with pytest.raises(InputError, match=r"validation\.decoder: nowhere: no decoder\.json"):

@@ -75,7 +75,7 @@ def _score(options: argparse.Namespace) -> int:
     share = f"{scores.others_below_true:.0%} of the actions of other places"
     notes = [f"{share} have a lower energy than the true ones (chance {CHANCE:.0%})."]
     if scores.is_blind:
-        notes.append("No order: the model cannot tell actions apart on these data, and these energies mean nothing.")
+        notes.append("Not ranked: the model ranks the true actions no better than chance on these data.")
     if scores.left_out:
         notes.append(f"Left out: {counted(scores.left_out, 'frame')} whose episode ends before the goal.")
     about = session.as_dict() | {"policies": [str(file) for file in options.policies], "form": options.form}
@@ -124,7 +124,7 @@ def _monitor(options: argparse.Namespace) -> int:
     note = f"An alarm is a surprise above {monitor.threshold:.4g}, calibrated on {source}. At most"
     note += f" {monitor.false_alarms:.1%} of undisturbed episodes have an alarm."
     cli.show(*([watched_table(watched, monitor)] if watched else []), note, files=files)
-    return int(any(episode.first_alarm(monitor) is not None for episode in watched))
+    return int(any(episode.find_first_alarm(monitor) is not None for episode in watched))
 
 
 def _prior(options: argparse.Namespace) -> None:

@@ -182,7 +182,10 @@ def watched_table(watched: Sequence[EpisodeErrors], monitor: Monitor) -> Table:
     """Return a table of the highest surprise and the first alarm of each monitored episode."""
     table = MetricsTable("Surprise, over the threshold", ["episode", "highest", "first alarm at control step"])
     for episode in watched:
-        first, highest = episode.first_alarm(monitor), episode.scores(monitor.expected).max() / monitor.threshold
+        first, highest = (
+            episode.find_first_alarm(monitor),
+            episode.compute_scores(monitor.expected).max() / monitor.threshold,
+        )
         table.add_row(episode.name, f"{highest:.2f}", "no alarm" if first is None else str(episode.steps[first]))
     return table
 

@@ -129,7 +129,10 @@ def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservat
 def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None:
     """Refuse states for which named actions are undefined: vectors, and poses in the camera's frame."""
     if not space.is_base_pose:
-        found, needed = "states that are no poses in the robot base frame", "poses: names are directions in that frame"
+        found, needed = (
+            "states that are not poses in the robot base frame",
+            "poses, because names are directions in that frame",
+        )
         raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 

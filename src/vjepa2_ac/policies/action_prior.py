@@ -105,21 +105,21 @@ class ActionPrior(nn.Module):
 
     def forward(
         self,
-        seen: Float[Tensor, "batch tokens dim"],
-        wanted: Float[Tensor, "batch tokens dim"],
+        frame: Float[Tensor, "batch tokens dim"],
+        goal: Float[Tensor, "batch tokens dim"],
         remaining: Int[Tensor, " batch"],
         state: Float[Tensor, "batch state_dim"],
     ) -> tuple[Float[Tensor, "batch action_dim"], Float[Tensor, "batch action_dim"]]:
         """Return mean and mean absolute deviation of the next action, in units of `scale`."""
-        now, then = self._described(seen), self._described(wanted)
-        x = self.inner(torch.cat([now, then, then - now, state], dim=1))
+        frame_features, goal_features = self._extract_features(frame), self._extract_features(goal)
+        x = self.inner(torch.cat([frame_features, goal_features, goal_features - frame_features, state], dim=1))
         parts = self.remaining(remaining.clamp(0, self.sizes.ahead)).unflatten(1, (BLOCKS, 2, WIDTH))
         for number, block in enumerate(self.blocks):
             x = x + gelu(block(self.norm(x) * (1 + parts[:, number, 0]) + parts[:, number, 1]))
         mean, log_deviation = self.outer(self.norm(x)).chunk(2, dim=1)
         return mean, log_deviation.clamp(-5.0, 3.0).exp()
 
-    def _described(self, latents: Float[Tensor, "batch tokens dim"]) -> Float[Tensor, "batch numbers"]:
+    def _extract_features(self, latents: Float[Tensor, "batch tokens dim"]) -> Float[Tensor, "batch numbers"]:
         """Return the positions of `POINTS` points in an image (spatial softmax), and features at these points."""
         features = gelu(self.features(latents))
         shares = self.places(features).softmax(dim=1)
@@ -128,7 +128,7 @@ class ActionPrior(nn.Module):
         return torch.cat([points, values], dim=2).flatten(1)
 
     @torch.no_grad()
-    def next_action(
+    def predict_action(
         self,
         frame: Float[Tensor, "tokens dim"],
         state: Float[Tensor, " state_dim"],
@@ -149,8 +149,8 @@ class ActionPrior(nn.Module):
         return (mean * self.scale)[0].float().cpu(), (std * self.scale)[0].float().cpu()
 
     @torch.no_grad()
-    def start(
-        self, cost: WorldModelCost, wanted: Float[Tensor, "tokens dim"], remaining: int, space: SearchSpace
+    def make_start(
+        self, cost: WorldModelCost, goal: Float[Tensor, "tokens dim"], remaining: int, space: SearchSpace
     ) -> PlanStart:
         """Return the start of a search: the prior's actions along its own rollout in the world model.
 
@@ -158,18 +158,18 @@ class ActionPrior(nn.Module):
 
         Args:
             cost: The cost of the current scene, whose model predicts the frames.
-            wanted: Latents of the goal.
+            goal: Latents of the goal.
             remaining: Estimated number of model steps to the goal.
             space: The allowed actions.
         """
-        seen, state = cost.current
+        frame, state = cost.current
         decisions, spread = torch.zeros_like(space.lower), torch.zeros_like(space.lower)
         for number in range(space.decisions):
             done = number * space.repeat
             if done:
                 predicted, states = cost.rollout(space.repeat_over_steps(space.clip(decisions))[None])
-                seen, state = predicted[0, done - 1], states[0, done]
-            decisions[number], spread[number] = self.next_action(seen, state, wanted, remaining - done)
+                frame, state = predicted[0, done - 1], states[0, done]
+            decisions[number], spread[number] = self.predict_action(frame, state, goal, remaining - done)
         return PlanStart(decisions, decisions[None], spread)
 
 
@@ -179,9 +179,9 @@ def save_prior(folder: Path, card: PriorCard, prior: ActionPrior) -> None:
     Raises:
         InputError: The folder cannot be written.
     """
-    with folder_writer(folder, CARD) as fresh:
-        save_tensors(prior.state_dict(), fresh / WEIGHTS)
-        (fresh / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
+    with folder_writer(folder, CARD) as temporary_folder:
+        save_tensors(prior.state_dict(), temporary_folder / WEIGHTS)
+        (temporary_folder / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
 
 
 def load_prior(folder: str | Path, *, where: str) -> tuple[PriorCard, ActionPrior]:
@@ -207,9 +207,9 @@ def load_prior_for_planning(path: str, known: Fingerprints, cameras: Cameras) ->
     card, prior = load_prior(path, where="planning.prior")
     for name, trained, model in (("encoder", card.encoder, known.encoder), ("data.crop", card.crop, cameras.crop)):
         if trained != model:
-            found, needed = f"the prior of another {name} {trained}, not {model}", "one trained for this model"
+            found, needed = f"a prior for {name} {trained}; this model has {model}", "a prior trained for this model"
             raise InputError(where=f"planning.prior: {path}", found=found, needed=needed, fix=_FIX)
-    return prior.to(cameras.model.device).start
+    return prior.to(cameras.model.device).make_start
 
 
 _NUM_SCALE_BATCHES = 8  # number of batches from which the scale of the actions is computed
@@ -230,8 +230,8 @@ class PriorOptions:
 class _Pairs:
     """Frames, each with a later frame of the same clip as its goal."""
 
-    seen: Float[Tensor, "batch tokens dim"]
-    wanted: Float[Tensor, "batch tokens dim"]
+    frame: Float[Tensor, "batch tokens dim"]
+    goal: Float[Tensor, "batch tokens dim"]
     remaining: Int[Tensor, " batch"]
     states: Float[Tensor, "batch state_dim"]
     changes: Float[Tensor, "batch action_dim"]  # change of the state in the next model step
@@ -256,14 +256,15 @@ def train_prior(
         InputError: The data or the model cannot be used, or the loss is not finite.
     """
     options = options or PriorOptions()
-    require_stride(config.data, to="know how long a model step is")
+    require_stride(config.data, to="train a prior")
     device = select_device(config.training)
     data, frames = config.data, open_dataset(config.data, progress=reporter.task(INDEXING))
     reporter.task(LOADING)
     model, spaces = load_base(config.model, seed=config.seed).to(device), frames.spaces  # only the encoder is used
     if spaces.action.follows == "unknown":
-        found = "commands of which nobody knows what they do to the state"
-        raise InputError(where="data.actions: recorded", found=found, needed="actions that a planner can search among")
+        found = "actions whose effect on the state is unknown, so that a planner cannot use them"
+        needed = "data.actions: difference, or data.join_actions: sum or last"
+        raise InputError(where="data.actions: recorded", found=found, needed=needed)
     dataset = use_finished_cache(config, frames, model)
     if options.ahead is not None:
         dataset = dataset.with_frames(options.ahead + 1)
@@ -285,11 +286,11 @@ def train_prior(
 def _train(
     dataset: Dataset, model: WorldModel, config: Config, options: PriorOptions, reporter: Reporter
 ) -> ActionPrior:
-    drawn, spaces = torch.Generator().manual_seed(config.seed), dataset.spaces
+    generator, spaces = torch.Generator().manual_seed(config.seed), dataset.spaces
     progress, steps = reporter.task("training the prior", "steps"), options.steps
     with closing(training_loader(dataset, seed=config.seed, batch_size=options.batch_size)) as batches:
         first = [
-            _draw_pairs(clips, spaces, drawn)
+            _draw_pairs(clips, spaces, generator)
             for clips in itertools.islice(_encode_batches(batches, model), _NUM_SCALE_BATCHES)
         ]
         with torch.random.fork_rng(devices=[]):
@@ -300,19 +301,21 @@ def _train(
             prior = ActionPrior(sizes).to(model.device)
         prior.scale.copy_(torch.cat([batch.changes for batch in first]).std(dim=0).clamp(min=1e-6))
         optimizer = torch.optim.AdamW(prior.parameters(), lr=options.learning_rate, weight_decay=0.01)
-        pairs = (_draw_pairs(clips, spaces, drawn) for clips in _encode_batches(batches, model))
+        pairs = (_draw_pairs(clips, spaces, generator) for clips in _encode_batches(batches, model))
         for step, batch in enumerate(itertools.islice(itertools.chain(first, pairs), steps), start=1):
             for group in optimizer.param_groups:
                 share = min(1.0, step / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * (step - 1) / steps))
                 group["lr"] = share * options.learning_rate
-            mean, deviation = prior(batch.seen, batch.wanted, batch.remaining, batch.states)
+            mean, deviation = prior(batch.frame, batch.goal, batch.remaining, batch.states)
             loss = prior_loss(mean, deviation, batch.changes / prior.scale)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]  # torch
             norm = torch.nn.utils.clip_grad_norm_(prior.parameters(), _CLIP)
             if not math.isfinite(float(norm)):
-                found = f"a loss of step {step} that is not finite"
-                raise InputError(where="vjepa2-ac prior", found=found, fix="`vjepa2-ac data check` finds broken states")
+                found = f"the loss of step {step} is not finite"
+                raise InputError(
+                    where="vjepa2-ac prior", found=found, fix="Check the states with `vjepa2-ac data check`"
+                )
             optimizer.step()
             progress(step, steps)
     return prior.eval().requires_grad_(False)
@@ -323,8 +326,8 @@ def prior_loss(mean: Tensor, deviation: Tensor, changes: Tensor) -> Tensor:
 
     The error is detached in the second part: a large predicted deviation does not weaken the gradient of the mean.
     """
-    off = (mean - changes).abs()
-    return (off + off.detach() / deviation + deviation.log()).mean()
+    error = (mean - changes).abs()
+    return (error + error.detach() / deviation + deviation.log()).mean()
 
 
 def _encode_batches(batches: Iterator[Batch], model: WorldModel) -> Iterator[LatentBatch]:
@@ -334,16 +337,16 @@ def _encode_batches(batches: Iterator[Batch], model: WorldModel) -> Iterator[Lat
             yield encode_batch(model, batch, device=model.device)
 
 
-def _draw_pairs(clips: LatentBatch, spaces: Spaces, drawn: torch.Generator) -> _Pairs:
+def _draw_pairs(clips: LatentBatch, spaces: Spaces, generator: torch.Generator) -> _Pairs:
     """Draw a frame of each clip, and a later frame as its goal."""
     count, steps = clips.actions.shape[:2]
-    rows, at = torch.arange(count), torch.randint(steps, (count,), generator=drawn)
-    gap = 1 + (torch.rand(count, generator=drawn) * (steps - at)).long()
-    states, changes = clips.states[rows, at], clips.actions[rows, at]
+    rows, positions = torch.arange(count), torch.randint(steps, (count,), generator=generator)
+    gap = 1 + (torch.rand(count, generator=generator) * (steps - positions)).long()
+    states, changes = clips.states[rows, positions], clips.actions[rows, positions]
     if spaces.action.follows == "target":
         changes = changes - states
-    wanted = clips.latents[rows, at + gap]
-    return _Pairs(clips.latents[rows, at], wanted, gap.to(wanted.device), states, changes)
+    goal = clips.latents[rows, positions + gap]
+    return _Pairs(clips.latents[rows, positions], goal, gap.to(goal.device), states, changes)
 
 
 @torch.no_grad()
@@ -352,21 +355,21 @@ def _measure(dataset: Dataset, model: WorldModel, prior: ActionPrior, spaces: Sp
 
     It is measured with true goals and with goals of other clips. Empty: there are no held-out clips.
     """
-    drawn, size = torch.Generator().manual_seed(0), spaces.action.sized
-    errors: dict[str, list[Tensor]] = {"true_goals": [], "goals_of_others": [], "nothing": []}
+    generator, size = torch.Generator().manual_seed(0), spaces.action.sized
+    errors: dict[str, list[Tensor]] = {"true_goals": [], "goals_of_others": [], "zero_action": []}
     ids: list[str] = []
     if dataset.split_mask("test").any():
         for clips in _encode_batches(validation_batches(dataset, "test", clips=_NUM_HELD_OUT, batch_size=32), model):
-            pairs = _draw_pairs(clips, spaces, drawn)
-            for name, goals in (("true_goals", pairs.wanted), ("goals_of_others", pairs.wanted.roll(1, dims=0))):
-                mean, _ = prior(pairs.seen, goals, pairs.remaining, pairs.states)
+            pairs = _draw_pairs(clips, spaces, generator)
+            for name, goals in (("true_goals", pairs.goal), ("goals_of_others", pairs.goal.roll(1, dims=0))):
+                mean, _ = prior(pairs.frame, goals, pairs.remaining, pairs.states)
                 errors[name].append((mean * prior.scale - pairs.changes)[:, size].norm(dim=1))
-            errors["nothing"].append(pairs.changes[:, size].norm(dim=1))
+            errors["zero_action"].append(pairs.changes[:, size].norm(dim=1))
             ids += clips.episode_ids
     if not ids:
         return {}
     joined = {name: torch.cat(parts).double().cpu().numpy() for name, parts in errors.items()}
     ratios: dict[str, Estimate] = {
-        name: ratio(joined[name], joined["nothing"], ids) for name in ("true_goals", "goals_of_others")
+        name: ratio(joined[name], joined["zero_action"], ids) for name in ("true_goals", "goals_of_others")
     }
     return {"clips": len(ids), **{name: estimate.as_dict() for name, estimate in ratios.items()}}

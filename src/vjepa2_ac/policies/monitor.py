@@ -26,7 +26,7 @@ from vjepa2_ac.planning.energy import mean_difference
 from vjepa2_ac.storage.structured import parse_record, read_json_object
 
 MONITOR = "monitor.json"
-_FIX = "Make it with `vjepa2-ac monitor RUN`"
+_FIX = "Calibrate a monitor with `vjepa2-ac monitor RUN`"
 Number = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 MAX_EPISODES = 200  # largest number of episodes for a calibration
 _BATCH_SIZE = 16
@@ -52,9 +52,9 @@ class Monitor:
     encoder: str
     predictor: str
 
-    def compare(self, predicted: Float[Tensor, "tokens dim"], seen: Float[Tensor, "tokens dim"]) -> Surprise:
+    def compare(self, predicted: Float[Tensor, "tokens dim"], observed: Float[Tensor, "tokens dim"]) -> Surprise:
         """Return the surprise of a frame, given its prediction."""
-        errors = mean_difference(predicted, seen).float().cpu()
+        errors = mean_difference(predicted, observed).float().cpu()
         score = float(compute_surprise(errors, torch.tensor(self.expected)))
         return Surprise(score, errors, not score <= self.threshold)  # NaN is an alarm, too
 
@@ -72,11 +72,13 @@ class Monitor:
             InputError: There is no such file, or it was calibrated for another model.
         """
         file = Path(path) / MONITOR if Path(path).is_dir() else Path(path)
-        values = read_json_object(file, needed="a monitor.json", fix=_FIX)
-        monitor = parse_record(cls, values, where=f"{where}: {file}", needed="a monitor.json", fix=_FIX)
+        values = read_json_object(file, needed="a valid monitor.json", fix=_FIX)
+        monitor = parse_record(cls, values, where=f"{where}: {file}", needed="a valid monitor.json", fix=_FIX)
         is_same_model = (monitor.encoder, monitor.predictor) == (known.encoder, known.predictor)
         if not is_same_model or len(monitor.expected) != tokens:
-            raise InputError(where=f"{where}: {file}", found="the threshold of another model", fix=_FIX)
+            raise InputError(
+                where=f"{where}: {file}", found="a monitor that was calibrated for another model", fix=_FIX
+            )
         return monitor
 
 
@@ -101,9 +103,9 @@ def compute_conformal_threshold(scores: Float[Tensor, " episodes"], false_alarms
     count = len(scores)
     rank = -int(-(count + 1) * (1.0 - false_alarms) // 1)
     if not 1 <= rank <= count:
-        needed = f"{int(-(-1 // false_alarms)) - 1} at least" if false_alarms > 0 else "a share above 0"
-        found = f"{counted(count, 'held-out episode')} for false alarms in {false_alarms:.1%}"
-        fix = "Record more, raise data.test_share, or --false-alarms"
+        needed = f"at least {int(-(-1 // false_alarms)) - 1} episodes" if false_alarms > 0 else "a share above 0"
+        found = f"{counted(count, 'held-out episode')} for a false alarm rate of {false_alarms:.1%}"
+        fix = "Record more episodes, or raise data.test_share or --false-alarms"
         raise InputError(where="--false-alarms", found=found, needed=needed, fix=fix)
     return float(torch.sort(scores).values[rank - 1])
 
@@ -116,13 +118,13 @@ class EpisodeErrors:
     steps: Int[np.ndarray, " time"]  # control step of each predicted frame
     errors: Float[np.ndarray, "time tokens"]
 
-    def scores(self, expected: Sequence[float] | np.ndarray) -> Float[np.ndarray, " time"]:
+    def compute_scores(self, expected: Sequence[float] | np.ndarray) -> Float[np.ndarray, " time"]:
         """Return the surprise of each step, given the usual error of each patch."""
         return compute_surprise(torch.from_numpy(self.errors), torch.tensor(np.asarray(expected))).numpy()
 
-    def first_alarm(self, by: Monitor) -> int | None:
+    def find_first_alarm(self, monitor: Monitor) -> int | None:
         """Return the index of the first step whose surprise is above the threshold; None: there is none."""
-        above = np.flatnonzero(~(self.scores(by.expected) <= by.threshold))
+        above = np.flatnonzero(~(self.compute_scores(monitor.expected) <= monitor.threshold))
         return int(above[0]) if len(above) else None
 
 
@@ -149,10 +151,10 @@ def measure_episodes(
         starts = range(0, length - stride, stride)
         errors = []
         for batch in read_batches(pairs, [(index, start) for start in starts], batch_size=_BATCH_SIZE):
-            seen = encode_batch(model, batch, device=model.device, chunk=_BATCH_SIZE)
-            camera = None if seen.extrinsics is None else seen.extrinsics[:, :1]
-            predicted = model.predict(seen.latents[:, :1], seen.actions, seen.states[:, :1], camera)
-            errors.append(mean_difference(predicted[:, 0].float(), seen.latents[:, 1]).cpu())
+            observed = encode_batch(model, batch, device=model.device, chunk=_BATCH_SIZE)
+            camera = None if observed.extrinsics is None else observed.extrinsics[:, :1]
+            predicted = model.predict(observed.latents[:, :1], observed.actions, observed.states[:, :1], camera)
+            errors.append(mean_difference(predicted[:, 0].float(), observed.latents[:, 1]).cpu())
         if errors:
             all_errors = torch.cat(errors).double().numpy()
             yield EpisodeErrors(dataset.table.identity(index), np.array(starts) + stride, all_errors)
@@ -173,22 +175,22 @@ def calibrate_monitor(
     Raises:
         InputError: There are too few episodes, or an episode cannot be read.
     """
-    require_frames(dataset.config, to="watch")
-    require_stride(dataset.config, to="know how long a model step is")
+    require_frames(dataset.config, to="calibrate a monitor")
+    require_stride(dataset.config, to="calibrate a monitor")
     held_out = np.flatnonzero(dataset.split_mask("validation") | dataset.split_mask("test"))
     chosen = held_out[np.linspace(0, len(held_out), min(MAX_EPISODES, len(held_out)), endpoint=False).astype(int)]
     if not len(chosen):
-        needed = "validation or test episodes, which the threshold is of"
+        needed = "validation or test episodes, on which the threshold is calibrated"
         raise InputError(where=f"data.path: {dataset.config.path}", found="no held-out episodes", needed=needed)
-    watched = list(measure_episodes(model, dataset, chosen.tolist(), progress))
-    if len(watched) < 2:
-        raise InputError(where=f"data.path: {dataset.config.path}", found="one held-out episode", needed="two or more")
-    sums = np.stack([episode.errors.sum(axis=0) for episode in watched])
-    steps = np.array([len(episode.errors) for episode in watched])
+    episode_errors = list(measure_episodes(model, dataset, chosen.tolist(), progress))
+    if len(episode_errors) < 2:
+        raise InputError(where=f"data.path: {dataset.config.path}", found="one held-out episode", needed="at least two")
+    sums = np.stack([episode.errors.sum(axis=0) for episode in episode_errors])
+    steps = np.array([len(episode.errors) for episode in episode_errors])
     # Leave-one-out mean as the usual error, so that an episode does not lower its own scores.
     highest = [
-        episode.scores((sums.sum(axis=0) - sums[index]) / (steps.sum() - steps[index])).max()
-        for index, episode in enumerate(watched)
+        episode.compute_scores((sums.sum(axis=0) - sums[index]) / (steps.sum() - steps[index])).max()
+        for index, episode in enumerate(episode_errors)
     ]
     known = model.fingerprints()
     return Monitor(

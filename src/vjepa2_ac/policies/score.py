@@ -30,7 +30,7 @@ from vjepa2_ac.storage.structured import to_plain
 
 CHANCE = 0.5  # share of other actions with a lower energy than the true ones, if a model ignores the actions
 _NUM_ALTERNATIVES = 16  # number of actions from other evaluation points that the true actions are compared with
-_NEEDED = "arrays `episodes` (names), `frames` (control steps) and `chunks` (places x chunks x control steps x numbers)"
+_NEEDED = "arrays `episodes` (names), `frames` (control steps) and `chunks` (points x chunks x control steps x numbers)"
 
 ChunkForm = Literal["targets", "deltas", "offsets"]
 """targets: absolute target states, one after another. deltas: the change from each target to the next. offsets: the
@@ -42,8 +42,8 @@ class PolicyChunks:
     """The action chunks that a policy proposes at frames of episodes."""
 
     name: str
-    places: tuple[tuple[str, int], ...]  # evaluation points: name of the episode, control step
-    chunks: Float[np.ndarray, "places chunks steps dim"]
+    points: tuple[tuple[str, int], ...]  # evaluation points: name of the episode, control step
+    chunks: Float[np.ndarray, "points chunks steps dim"]
 
 
 @dataclass(frozen=True)
@@ -89,12 +89,12 @@ def read_policy_chunks(path: Path) -> PolicyChunks:
             episodes, frames, chunks = (arrays[name] for name in ("episodes", "frames", "chunks"))
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED) from None
-    fits = episodes.shape == frames.shape == chunks.shape[:1] and chunks.ndim == 4 and len(episodes) > 0
-    if not fits or frames.dtype.kind not in "iu" or chunks.dtype.kind != "f":
+    is_valid = episodes.shape == frames.shape == chunks.shape[:1] and chunks.ndim == 4 and len(episodes) > 0
+    if not is_valid or frames.dtype.kind not in "iu" or chunks.dtype.kind != "f":
         shapes = ", ".join(f"{array.dtype} {array.shape}" for array in (episodes, frames, chunks))
         raise InputError(where=str(path), found=f"arrays {shapes}", needed=_NEEDED)
-    places = tuple(zip(map(str, episodes.tolist()), map(int, frames.tolist()), strict=True))
-    return PolicyChunks(path.stem, places, chunks.astype(np.float64))
+    points = tuple(zip(map(str, episodes.tolist()), map(int, frames.tolist()), strict=True))
+    return PolicyChunks(path.stem, points, chunks.astype(np.float64))
 
 
 def changes_of_chunks(
@@ -129,7 +129,7 @@ def changes_of_chunks(
         needed = f"finite numbers, chunks x control steps x {len(space)}: {', '.join(space.names)}"
         raise InputError(where="chunks", found=f"an array of the shape {values.shape}", needed=needed)
     if values.shape[1] < control_steps:
-        needed = f"{control_steps} at least, which are one model step"
+        needed = f"at least {control_steps}, the control steps of one model step"
         raise InputError(where="chunks", found=counted(values.shape[1], "control step"), needed=needed)
     current, changes = torch.from_numpy(state), torch.from_numpy(values)
     if form == "deltas":
@@ -162,11 +162,11 @@ def read_run_ranking_error(subject: str, checkpoint: str) -> Estimate | None:
     step = parse_step(checkpoint.split(maxsplit=1)[0]) or 0
     log = [row for row in read_metrics_log(Path(subject) / METRICS) if row["step"] <= step]
     keys = ("action_ranking_error", "action_rank")  # the second key was used before 2026-11-29
-    key, rows = max(((key, [row for row in log if key in row]) for key in keys), key=lambda one: len(one[1]))
+    key, rows = max(((key, [row for row in log if key in row]) for key in keys), key=lambda item: len(item[1]))
     if not rows:
         return None
     numbers = (rows[-1][name] for name in (key, f"{key}_low", f"{key}_high"))
-    return Estimate(*(math.nan if one is None else float(one) for one in numbers))
+    return Estimate(*(math.nan if number is None else float(number) for number in numbers))
 
 
 def score_policies(
@@ -194,84 +194,108 @@ def score_policies(
     """
     views, stride, space = controller.config.views, dataset.config.model_stride, controller.spaces.state
     require_views(dataset.config, views, to="score policies")
-    places = sorted(set.intersection(*(set(one.places) for one in policies)))
-    if not places:
-        raise InputError(where="--policy", found="no frame that all of them have", needed="the same places in all")
+    common_points = sorted(set.intersection(*(set(policy.points) for policy in policies)))
+    if not common_points:
+        needed = "at least one evaluation point (episode and frame) that all files contain"
+        raise InputError(where="--policy", found="no common evaluation point", needed=needed)
     control_steps = control_steps or stride
-    ahead = max(1, min(one.chunks.shape[2] for one in policies) // control_steps) * stride
-    known = (_read_point(dataset, place, ahead, space) for place in places)
-    kept = [one for one in known if one is not None]
-    if not kept:
-        needed = f"{counted(ahead, 'control step')} after it in the episode"
-        raise InputError(where="--policy", found="no place with a goal", needed=needed)
-    rng, energies, ids = np.random.default_rng(0), list[np.ndarray](), [name for (name, _), *_ in kept]
-    rows = [{place: row for row, place in reversed([*enumerate(one.places)])} for one in policies]
-    for number, (place, episode, state, changes) in enumerate(kept):
-        others = [kept[other].changes for other in _draw_alternatives(rng, number, ids)]
+    goal_distance = max(1, min(policy.chunks.shape[2] for policy in policies) // control_steps) * stride
+    read_points = (_read_point(dataset, point, goal_distance, space) for point in common_points)
+    points = [point for point in read_points if point is not None]
+    if not points:
+        needed = f"{counted(goal_distance, 'control step')} after the frame in the same episode"
+        raise InputError(where="--policy", found="no evaluation point whose episode is long enough", needed=needed)
+    rng, ids = np.random.default_rng(0), [point.point[0] for point in points]
+    rows = [{point: row for row, point in reversed([*enumerate(policy.points)])} for policy in policies]
+    energies: list[np.ndarray] = []
+    for number, point in enumerate(points):
+        alternatives = [points[index].changes for index in _draw_alternatives(rng, number, ids)]
         chunks = [
-            changes_of_chunks(one.chunks[row[place]], state, form=form, control_steps=control_steps, space=space)
-            for one, row in zip(policies, rows, strict=True)
+            changes_of_chunks(
+                policy.chunks[row[point.point]], point.state, form=form, control_steps=control_steps, space=space
+            )[:, : len(point.changes)]
+            for policy, row in zip(policies, rows, strict=True)
         ]
-        chunks = [one[:, : len(changes)] for one in chunks]
-        frame, goal = read_views(dataset, episode, views, [place[1], place[1] + ahead])
+        step = point.point[1]
+        frame, goal = read_views(dataset, point.episode, views, [step, step + goal_distance])
         controller.reset(goal)
-        scored = controller.score(frame, state, np.concatenate([changes[None], others, *chunks]))
-        true, worse, rest = np.split(scored.energies, [1, 1 + len(others)])
-        by_policy = np.split(rest, np.cumsum([len(one) for one in chunks])[:-1])
-        of_chunks = [float(take(one)) for take in (np.mean, np.min) for one in by_policy]
-        energies.append(np.array([scored.zero_action_energy, true[0], float((worse < true).mean()), *of_chunks]))
-        progress(number + 1, len(kept))
-    nothing, demonstrated, better, *of_policies = np.stack(energies).T
-    means, bests = of_policies[: len(policies)], of_policies[len(policies) :]
-    order = sorted(range(len(policies)), key=lambda number: float(means[number].mean()))
-    scores = []
-    for before, number in zip([None, *order], order, strict=False):
-        pair = None if before is None else ((means[number], nothing), (means[before], nothing))
-        scores.append(
-            PolicyScore(
-                name=policies[number].name,
-                mean=ratio(means[number], nothing, ids),
-                best=ratio(bests[number], nothing, ids),
-                behind=None if pair is None else ratio_difference(*pair, ids),
-            )
-        )
+        scores = controller.score(frame, point.state, np.concatenate([point.changes[None], alternatives, *chunks]))
+        true, alternative, proposed = np.split(scores.energies, [1, 1 + len(alternatives)])
+        by_policy = np.split(proposed, np.cumsum([len(policy_chunks) for policy_chunks in chunks])[:-1])
+        means = [float(chunk_energies.mean()) for chunk_energies in by_policy]
+        lowest = [float(chunk_energies.min()) for chunk_energies in by_policy]
+        below_true = float((alternative < true).mean())
+        energies.append(np.array([scores.zero_action_energy, true[0], below_true, *means, *lowest]))
+        progress(number + 1, len(points))
+    zero_action, demonstrated, below, *of_policies = np.stack(energies).T
     return PolicyScores(
-        policies=tuple(scores),
-        demonstrated=ratio(demonstrated, nothing, ids),
-        others_below_true=mean_of(better, ids),
+        policies=_rank_policies(policies, of_policies[: len(policies)], of_policies[len(policies) :], zero_action, ids),
+        demonstrated=ratio(demonstrated, zero_action, ids),
+        others_below_true=mean_of(below, ids),
         places=len(ids),
         episodes=len(set(ids)),
-        left_out=len(places) - len(kept),
+        left_out=len(common_points) - len(points),
     )
+
+
+def _rank_policies(
+    policies: Sequence[PolicyChunks],
+    means: Sequence[Float[np.ndarray, " points"]],
+    lowest: Sequence[Float[np.ndarray, " points"]],
+    zero_action: Float[np.ndarray, " points"],
+    ids: Sequence[str],
+) -> tuple[PolicyScore, ...]:
+    """Return the scores of the policies, best first.
+
+    Args:
+        policies: The policies.
+        means: Mean energy of each policy's chunks, at each evaluation point.
+        lowest: Lowest energy of each policy's chunks, at each evaluation point.
+        zero_action: Energy of the zero action at each evaluation point.
+        ids: Episode of each evaluation point.
+    """
+    order = sorted(range(len(policies)), key=lambda index: float(means[index].mean()))
+    scores = []
+    for better, index in zip([None, *order], order, strict=False):
+        difference = None
+        if better is not None:
+            difference = ratio_difference((means[index], zero_action), (means[better], zero_action), ids)
+        mean, best = ratio(means[index], zero_action, ids), ratio(lowest[index], zero_action, ids)
+        scores.append(PolicyScore(policies[index].name, mean, best, difference))
+    return tuple(scores)
 
 
 class _EvaluationPoint(NamedTuple):
     """An evaluation point: a frame of an episode, its state, and the demonstrated changes after it."""
 
-    place: tuple[str, int]  # name of the episode, control step
+    point: tuple[str, int]  # name of the episode, control step
     episode: int  # index in the data set
     state: Float[np.ndarray, " dim"]
     changes: Float[np.ndarray, "steps dim"]
 
 
-def _read_point(dataset: Dataset, place: tuple[str, int], ahead: int, space: StateSpace) -> _EvaluationPoint | None:
-    """Read an evaluation point with a goal `ahead` control steps later; None: the episode ends before the goal.
+def _read_point(
+    dataset: Dataset, point: tuple[str, int], goal_distance: int, space: StateSpace
+) -> _EvaluationPoint | None:
+    """Read an evaluation point with a goal `goal_distance` control steps later; None: the episode ends before the goal.
 
     Raises:
         InputError: There is no such episode, or it cannot be read.
     """
-    name, step = place
+    name, step = point
     index = dataset.table.find(name)
     if index is None:
-        raise InputError(where=f"--policy: episode {name}", found=f"no such episode in {dataset.config.path}")
+        raise InputError(where=f"--policy: episode {name}", found=f"{dataset.config.path} has no such episode")
     states = dataset.source.read(index).states
-    if not 0 <= step < len(states) - ahead:
+    if not 0 <= step < len(states) - goal_distance:
         return None
-    path = states[step : step + ahead + 1 : dataset.config.model_stride]
-    return _EvaluationPoint(place, index, states[step], space.differences(path))
+    path = states[step : step + goal_distance + 1 : dataset.config.model_stride]
+    return _EvaluationPoint(point, index, states[step], space.differences(path))
 
 
-def _draw_alternatives(rng: np.random.Generator, number: int, episodes: Sequence[str]) -> Int[np.ndarray, " others"]:
+def _draw_alternatives(
+    rng: np.random.Generator, number: int, episodes: Sequence[str]
+) -> Int[np.ndarray, " alternatives"]:
     """Draw evaluation points from other episodes; from the same episode if there is only one.
 
     Args:
@@ -279,6 +303,6 @@ def _draw_alternatives(rng: np.random.Generator, number: int, episodes: Sequence
         number: Index of the evaluation point.
         episodes: Episode of each evaluation point.
     """
-    apart = [other for other, name in enumerate(episodes) if name != episodes[number]]
-    choices = apart or [other for other in range(len(episodes)) if other != number] or [number]
+    other_episodes = [index for index, name in enumerate(episodes) if name != episodes[number]]
+    choices = other_episodes or [index for index in range(len(episodes)) if index != number] or [number]
     return rng.choice(np.array(choices), size=_NUM_ALTERNATIVES)
