@@ -37,7 +37,7 @@ def test_steps_are_as_long_as_asked_and_never_beyond_the_limits() -> None:
     with pytest.raises(InputError, match=r"planning\.limits\.gripper: 0"):
         make_named_actions("close", 1, limits=LimitsConfig(gripper=0.0))
     for name in ("close", "open"):
-        with pytest.raises(InputError, match=rf"planning\.limits\.gripper_mode: held, so that nothing can move {name}"):
+        with pytest.raises(InputError, match=rf"planning\.limits\.gripper_mode: held, so that no action can move {name}"):
             make_named_actions(name, 1, limits=LimitsConfig(gripper_mode="held"))
     for size in (0.0, -0.01, float("nan"), float("inf")):
         with pytest.raises(InputError, match=r"--size: .* cm per step"):
