@@ -30,7 +30,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.evaluation.action_use import rollout_start
-from vjepa2_ac.intervals import bootstrapped
+from vjepa2_ac.intervals import bootstrap
 from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.model.world_model import WorldModel
@@ -38,7 +38,7 @@ from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.search_space import GRIPPER, make_pose_search_space
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.subject import load_subject
-from vjepa2_ac.spaces import states_along
+from vjepa2_ac.spaces import integrate_changes
 
 STEPS = 3
 AT_ONCE = 64  # samples
@@ -70,7 +70,7 @@ def energies(
     if len(actions) > AT_ONCE:
         return torch.cat([energies(model, frame, state, goal, part) for part in actions.split(AT_ONCE)])  # type: ignore[no-untyped-call]  # torch
     actions = actions.to(state)
-    states = states_along(state, actions)[:, :-1]
+    states = integrate_changes(state, actions)[:, :-1]
     first = slice(0, FRAMES_SEEN)
     frames = model.rollout(frame.expand(len(actions), 1, *frame.shape), actions[:, first], states[:, first])
     for end in range(FRAMES_SEEN + 1, STEPS + 1):
@@ -118,7 +118,7 @@ def main(words: Sequence[str] | None = None) -> None:
                 errors.append([float((planned - ends).abs().sum()), float(ends.abs().sum())])
                 ids.append(batch.episode_ids[row])
     columns = np.stack([np.array(errors), np.ones((len(errors), 2))])
-    for what, score in zip(("plans", "zero action"), bootstrapped(_score, columns, ids), strict=True):
+    for what, score in zip(("plans", "zero action"), bootstrap(_score, columns, ids), strict=True):
         print(f"{what}: Action Score {score:.1f} (best 80; 95 % interval over episodes)")
     plans_cm, zero_cm = 100 * columns[0].mean(axis=0)
     print(f"mean error of the end, cm: plans {plans_cm:.1f}, zero action {zero_cm:.1f}")

@@ -13,7 +13,7 @@ from typing import Any
 
 from methods import METHODS, Cell
 
-from vjepa2_ac.intervals import Estimate, share_of
+from vjepa2_ac.intervals import Estimate, estimate_share
 from vjepa2_ac.storage import write_atomically
 
 KEPT = Path(__file__).with_name("results")
@@ -138,4 +138,4 @@ def reached(one: Figures) -> list[bool]:
 def share_reached(results: Sequence[Figures]) -> Estimate:
     """Return the share of all goals that were reached, with Wilson's interval."""
     flags = [flag for one in results for flag in reached(one)]
-    return share_of(sum(flags), len(flags))
+    return estimate_share(sum(flags), len(flags))

@@ -12,7 +12,7 @@ from offline import correlations
 from results import Figures
 from selection import cells_of, run_of
 
-from vjepa2_ac.intervals import share_of
+from vjepa2_ac.intervals import estimate_share
 from vjepa2_ac.runs.checkpoint import RunState
 
 TITLES = {
@@ -69,7 +69,7 @@ def _rules(runs: Sequence[list[Figures]]) -> Iterator[str]:
         for rule, choose in RULES.items():
             chosen = [choose(run) for run in of_kind]
             goals, left = sum(one["goals"] for one in chosen), [one["left_cm"] for one in chosen]
-            share = share_of(sum(one["reached"] for one in chosen), goals)
+            share = estimate_share(sum(one["reached"] for one in chosen), goals)
             row = [
                 *(*kind, rule, ", ".join(str(one["cell"]["step"]) for one in chosen)),
                 *(_list([one[key] for one in chosen], 3) for key in ("error", "action_ranking_error")),

@@ -14,7 +14,7 @@ from offline import correlations
 from results import BASE_MODELS, CHANGES, Figures, label, main_cells, of_policy, pick, reached, share_reached
 from scipy.stats import binomtest
 
-from vjepa2_ac.intervals import mean_of, share_of
+from vjepa2_ac.intervals import estimate_mean, estimate_share
 
 FEWEST = 20  # cells of a correlation
 SHORT = ("zero-shot", AXES, BEST, LONGER, "full", "scratch", "scratch, 3x steps")  # rows of the short table
@@ -152,14 +152,14 @@ def _row(name: str, demonstrations: str, cells: Sequence[Figures]) -> str:
 def _reach(cells: Sequence[Figures]) -> str:
     """Return the share of all goals with Wilson's interval, and how many each seed reached."""
     by_seed = [reached(one) for one in cells]
-    share = share_of(sum(map(sum, by_seed)), sum(map(len, by_seed)))
+    share = estimate_share(sum(map(sum, by_seed)), sum(map(len, by_seed)))
     seeds = ", ".join(str(sum(flags)) for flags in by_seed)
     return f"{share.value:.0%} ({share.low:.0%} to {share.high:.0%}) of {sum(map(len, by_seed))}: {seeds}"
 
 
 def _distance(cells: Sequence[Figures]) -> str:
     ends = np.array([end for one in cells for end in one["reach"]["l1"]["ends_cm"]])
-    mean = mean_of(ends, [str(place) for place in range(len(ends))])
+    mean = estimate_mean(ends, [str(place) for place in range(len(ends))])
     return f"{mean.value:.1f} ({mean.low:.1f} to {mean.high:.1f})" if mean.has_interval else f"{mean.value:.1f}"
 
 

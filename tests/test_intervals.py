@@ -8,17 +8,17 @@ from scipy import stats
 
 from vjepa2_ac.intervals import (
     Estimate,
-    bootstrapped,
-    bootstrapped_by_weights,
-    mean_of,
-    ratio,
-    ratio_difference,
-    share_of,
+    bootstrap,
+    bootstrap_by_weights,
+    estimate_mean,
+    estimate_ratio,
+    estimate_ratio_difference,
+    estimate_share,
 )
 
 
 def test_a_ratio_weighs_clips_by_their_motion() -> None:
-    assert ratio(np.array([1.0, 0.0]), np.array([1.0, 3.0]), ("a", "b")).value == 0.25
+    assert estimate_ratio(np.array([1.0, 0.0]), np.array([1.0, 3.0]), ("a", "b")).value == 0.25
 
 
 @pytest.mark.parametrize("episodes", [6, 30])
@@ -31,7 +31,7 @@ def test_intervals_cover_the_truth_at_the_stated_rate(episodes: int) -> None:
         levels = rng.normal(0.7, 0.1, size=episodes)  # episodes differ; clips within one are alike
         errors = np.repeat(levels, 4) + rng.normal(0, 0.02, size=4 * episodes)
         columns = np.stack([errors, np.ones(4 * episodes)])[:, :, None]
-        (found,) = bootstrapped(lambda sums: sums[0] / sums[1], columns, ids)
+        (found,) = bootstrap(lambda sums: sums[0] / sums[1], columns, ids)
         covered += found.low <= 0.7 <= found.high
     assert covered / 400 == pytest.approx(0.95, abs=0.035)
 
@@ -40,55 +40,55 @@ def test_what_makes_an_episode_hard_for_both_does_not_widen_their_difference() -
     rng = np.random.default_rng(0)
     hard = rng.normal(1.0, 0.3, size=20)
     ones, ids = np.ones(20), tuple(map(str, range(20)))
-    apart = ratio_difference((hard - 0.1, ones), (hard, ones), ids)
+    apart = estimate_ratio_difference((hard - 0.1, ones), (hard, ones), ids)
     assert (apart.low, apart.value, apart.high) == pytest.approx((-0.1, -0.1, -0.1))
-    assert ratio(hard, ones, ids).high - ratio(hard, ones, ids).low > 0.2
+    assert estimate_ratio(hard, ones, ids).high - estimate_ratio(hard, ones, ids).low > 0.2
 
 
 def test_the_level_of_an_interval_is_that_of_few_episodes() -> None:
     """Quantiles of a uniform distribution are their levels: here Phi(-sqrt(n / (n - 1)) t), with Student's t, n - 1."""
     for episodes, student in ((2, 12.7062), (5, 2.77645), (30, 2.04523)):
-        (found,) = bootstrapped_by_weights(lambda weights: np.linspace(0, 1, len(weights))[:, None], episodes)
+        (found,) = bootstrap_by_weights(lambda weights: np.linspace(0, 1, len(weights))[:, None], episodes)
         level = stats.norm.cdf(-math.sqrt(episodes / (episodes - 1)) * student)
         assert (found.low, found.high) == pytest.approx((level, 1 - level), rel=1e-3)
 
 
 def test_an_episode_is_drawn_with_all_of_its_clips() -> None:
     """Two episodes: each alone or both are all that can be drawn, and the interval reaches from end to end."""
-    found = mean_of(np.array([1.0, 1.0, 5.0]), ("a", "a", "b"))
+    found = estimate_mean(np.array([1.0, 1.0, 5.0]), ("a", "a", "b"))
     assert (found.low, found.value, found.high) == pytest.approx((1.0, 7 / 3, 5.0), abs=0.01)
 
 
 def test_one_episode_has_no_interval_and_what_is_not_a_number_is_none_in_json() -> None:
-    alone = mean_of(np.array([1.0, 2.0]), ("a", "a"))
+    alone = estimate_mean(np.array([1.0, 2.0]), ("a", "a"))
     assert alone.as_dict() == {"value": 1.5, "low": None, "high": None}
     assert str(alone) == "1.500"
-    assert alone.side(of=0.0) == 0, "nothing is sure"
-    assert ratio(np.zeros(2), np.zeros(2), ("a", "b")).as_dict() == {"value": None, "low": None, "high": None}
+    assert alone.compare_to(0.0) == 0, "nothing is sure"
+    assert estimate_ratio(np.zeros(2), np.zeros(2), ("a", "b")).as_dict() == {"value": None, "low": None, "high": None}
 
 
 def test_the_side_of_an_interval_needs_all_of_it() -> None:
-    assert Estimate(1.0, 0.5, 1.5).side(of=1.4) == 0
-    assert Estimate(1.0, 0.5, 1.5).side(of=1.6) == -1
-    assert Estimate(1.0, 0.5, 1.5).side(of=0.4) == 1
-    assert Estimate(1.0, math.nan, math.nan).side(of=0.0) == 0
+    assert Estimate(1.0, 0.5, 1.5).compare_to(1.4) == 0
+    assert Estimate(1.0, 0.5, 1.5).compare_to(1.6) == -1
+    assert Estimate(1.0, 0.5, 1.5).compare_to(0.4) == 1
+    assert Estimate(1.0, math.nan, math.nan).compare_to(0.0) == 0
 
 
 def test_weights_of_episodes_give_the_interval_of_their_sums() -> None:
     rng = np.random.default_rng(3)
     values, ids = rng.random(12), [f"episode {clip % 4}" for clip in range(12)]
     sums = values.reshape(3, 4).sum(axis=0)
-    (found,) = bootstrapped_by_weights(lambda weights: (weights @ sums / (3 * weights.sum(axis=1)))[:, None], 4)
-    expected = mean_of(values, ids)
+    (found,) = bootstrap_by_weights(lambda weights: (weights @ sums / (3 * weights.sum(axis=1)))[:, None], 4)
+    expected = estimate_mean(values, ids)
     assert (found.value, found.low, found.high) == pytest.approx((expected.value, expected.low, expected.high))
-    (alone,) = bootstrapped_by_weights(lambda weights: weights, 1)
+    (alone,) = bootstrap_by_weights(lambda weights: weights, 1)
     assert alone.value == 1
     assert not alone.has_interval
 
 
 def test_published_intervals_come_out() -> None:
     # Brown, Cai, DasGupta (2001) and any table: Wilson's 95 % intervals.
-    middle, none, all_of_it = share_of(10, 20), share_of(0, 20), share_of(50, 50)
+    middle, none, all_of_it = estimate_share(10, 20), estimate_share(0, 20), estimate_share(50, 50)
     assert middle.value == 0.5
     assert (middle.low, middle.high) == pytest.approx((0.2993, 0.7007), abs=1e-4)
     assert (none.value, none.low, none.high) == pytest.approx((0.0, 0.0, 0.1611), abs=1e-4)

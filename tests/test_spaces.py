@@ -16,16 +16,16 @@ from vjepa2_ac.spaces import (
     POSE_CHANGE,
     POSES,
     Spaces,
+    make_vector_states,
     require_finite,
-    vector_states,
 )
 
 STATES = np.array([[0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2], [0.5, 0.1, 0.3, -3.1, 0.0, 0.2, 0.3]])
 
 
 def test_rotations_are_composed_and_vectors_subtract() -> None:
-    assert abs(POSE.differences(STATES)[0, 3]) < 0.1, "angles jump at pi"
-    np.testing.assert_array_equal(vector_states(7).differences(STATES), np.diff(STATES, axis=0))
+    assert abs(POSE.compute_differences(STATES)[0, 3]) < 0.1, "angles jump at pi"
+    np.testing.assert_array_equal(make_vector_states(7).compute_differences(STATES), np.diff(STATES, axis=0))
 
 
 def test_what_no_robot_measures_is_named_with_its_step_and_the_fix() -> None:
@@ -131,12 +131,12 @@ def test_what_a_robot_may_measure_is_taken() -> None:
 
 
 def test_a_pose_has_its_numbers_and_a_vector_any_that_are_finite() -> None:
-    vector_states(2).require_state(np.array([300.0, -90.0]), "state")
+    make_vector_states(2).require_state(np.array([300.0, -90.0]), "state")
     for numbers, space, complaint in (
         (np.zeros(5), EXTRINSICS, "5 numbers"),
         (np.zeros(7), EXTRINSICS, "7 numbers"),
-        (np.zeros(3), vector_states(2), r"3 numbers .* Expected 2: state 0, state 1"),
-        (np.array([0.0, math.nan]), vector_states(2), "Expected finite numbers"),
+        (np.zeros(3), make_vector_states(2), r"3 numbers .* Expected 2: state 0, state 1"),
+        (np.array([0.0, math.nan]), make_vector_states(2), "Expected finite numbers"),
     ):
         with pytest.raises(InputError, match=complaint):
             space.require_state(numbers, "state")

@@ -7,7 +7,13 @@ from scipy.spatial.transform import Rotation
 
 from paths import GOLDEN
 from synthetic import synthetic_states
-from vjepa2_ac.spaces import actions_from_states, apply_actions, euler_from_matrices, matrices_from_euler, states_along
+from vjepa2_ac.spaces import (
+    actions_from_states,
+    apply_actions,
+    euler_from_matrices,
+    integrate_changes,
+    matrices_from_euler,
+)
 
 
 def assert_same_poses(found: torch.Tensor, expected: np.ndarray, tolerance: float) -> None:
@@ -29,7 +35,7 @@ def test_composed_poses_are_the_official_ones(which: int, dtype: torch.dtype, to
 def test_a_trajectorys_actions_lead_along_it() -> None:
     states = synthetic_states(30)
     actions = torch.from_numpy(actions_from_states(states))
-    found = states_along(torch.from_numpy(states[0]), torch.stack([actions, actions * 0]))
+    found = integrate_changes(torch.from_numpy(states[0]), torch.stack([actions, actions * 0]))
     assert_same_poses(found[0], states, 1e-6)
     assert_same_poses(found[1], np.repeat(states[:1], 30, axis=0), 1e-6)
 
@@ -52,7 +58,7 @@ def test_at_gimbal_lock_the_yaw_is_zero_and_gradients_are_finite() -> None:
 def test_gradients_are_those_of_finite_differences() -> None:
     state = torch.tensor([0.4, 0.0, 0.3, 3.0, 0.3, 0.2, 0.5], dtype=torch.float64)
     actions = 0.1 * torch.randn(2, 3, 7, generator=torch.Generator().manual_seed(0)).double()
-    assert torch.autograd.gradcheck(lambda given: states_along(state, given), (actions.requires_grad_(),))
+    assert torch.autograd.gradcheck(lambda given: integrate_changes(state, given), (actions.requires_grad_(),))
 
 
 def test_autocast_does_not_coarsen_poses() -> None:

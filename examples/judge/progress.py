@@ -18,7 +18,7 @@ from scipy.stats import spearmanr
 from vjepa2_ac import load_run
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.encoding.batch import encode_frames
-from vjepa2_ac.intervals import mean_of
+from vjepa2_ac.intervals import estimate_mean
 from vjepa2_ac.planning.energy import distance
 
 AT_ONCE = 64  # frames
@@ -51,7 +51,7 @@ def main(run: str, out: str, every: str = "1") -> None:
             monotony[name] = spearmanr(steps, progress).statistic
     pyarrow.parquet.write_table(pa.Table.from_pylist(rows), out)
     if monotony:
-        found = mean_of(np.array(list(monotony.values())), list(monotony))
+        found = estimate_mean(np.array(list(monotony.values())), list(monotony))
         print(f"It grows with time by Spearman's {found} on {len(monotony)} held-out episodes (1: always).")
 
 

@@ -1,4 +1,4 @@
-"""Data records: Episode -> Clip -> Batch -> LatentBatch, and the legend of axes, units and coordinate frames.
+"""Data records: Episode -> Clip -> Batch -> LatentBatch, and the conventions of axes, units and coordinate frames.
 
 Axes
     batch    clips that are computed together
@@ -10,8 +10,8 @@ Axes
 
 State (7 numbers, a pose): x, y, z in metres; roll, pitch, yaw in radians, as extrinsic xyz Euler angles; gripper
     closedness, 0 open .. 1 closed. All in the robot base frame (x to the robot's front, y to its left, z up); the point
-    is the flange, not the finger tip. States are *measured*. With `data.states: vector` a state is whatever numbers the
-    source has, state_dim of them.
+    is the flange, not the finger tip. States are *measured*. With `data.states: vector` a state is a
+    vector of state_dim numbers from the source.
 
 Action (7 numbers, of poses): the change from a state to the state of the next *model* step: metres, extrinsic xyz Euler
     angles of R[t+1] @ R[t].T, and the change of closedness. See `spaces.actions_from_states`. Of vectors:
@@ -42,10 +42,10 @@ def no_progress(done: int, total: int) -> None:
     """Show nothing."""
 
 
-def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return for each name of an episode the end by which it differs from the others; of a single one all of it.
+def shorten_names(names: Sequence[str]) -> dict[str, str]:
+    """Return the shortest end of each episode name that distinguishes it from the other names.
 
-    Folders and files that all have at their end, such as trajectory.h5, are left out.
+    Common endings of all names, such as trajectory.h5, are removed. A single name is returned unchanged.
     """
     parts, short, count = {name: name.split("/") for name in names}, dict.fromkeys(names, ""), 0
     while len({part[-1] for part in parts.values()}) == 1 < min(map(len, parts.values())):
@@ -62,7 +62,7 @@ EXTRINSICS_DIM = 6
 
 
 class Widths(NamedTuple):
-    """How many numbers a state and an action have."""
+    """The widths (number of components) of a state and an action."""
 
     state: int
     action: int
@@ -82,8 +82,8 @@ class StoredLatents:
     values: Num[Tensor, "*batch time tokens dim"]  # bfloat16, float32 or int8
     scales: Float32[Tensor, "*batch time tokens"] | None = None  # of int8: the value of 1, for each token
 
-    def mapped(self, change: Callable[[Tensor], Tensor]) -> StoredLatents:
-        """Return the same with each tensor replaced."""
+    def map_tensors(self, change: Callable[[Tensor], Tensor]) -> StoredLatents:
+        """Return the latents with each tensor replaced."""
         return StoredLatents(change(self.values), None if self.scales is None else change(self.scales))
 
 
@@ -97,7 +97,7 @@ class EpisodeInfo:
 
     id: str  # independent of the order of episodes and the number of shards
     num_steps: int
-    success: bool | None = None  # None: the data set does not say
+    success: bool | None = None  # None: not recorded
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Skipped:
+class SkippedClip:
     """A clip of a batch that could not be read (`data.broken_episodes: skip`)."""
 
     episode_id: str
@@ -142,7 +142,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Batch:
-    """Clips stacked for the device; pixels stay uint8 until they are there, and cached latents in the cache's type."""
+    """Clips stacked for the device: pixels as uint8, and cached latents in the dtype of the cache."""
 
     frames: UInt8[Tensor, "batch time height width 3"] | None  # None: there are latents
     states: Float32[Tensor, "batch time state_dim"]
@@ -153,9 +153,9 @@ class Batch:
     bytes_fetched: int = 0  # over the network, for these clips
     latents: StoredLatents | None = None
     cameras: tuple[str | None, ...] = ()  # one per clip; None: the config's first
-    skipped: tuple[Skipped, ...] = ()  # clips that could not be read
+    skipped: tuple[SkippedClip, ...] = ()  # clips that could not be read
 
-    def mapped(self, change: Callable[[Tensor], Tensor]) -> Batch:
+    def map_tensors(self, change: Callable[[Tensor], Tensor]) -> Batch:
         """Return the batch with each tensor replaced."""
         return replace(
             self,
@@ -163,31 +163,31 @@ class Batch:
             states=change(self.states),
             actions=change(self.actions),
             extrinsics=None if self.extrinsics is None else change(self.extrinsics),
-            latents=None if self.latents is None else self.latents.mapped(change),
+            latents=None if self.latents is None else self.latents.map_tensors(change),
         )
 
     def to(self, device: torch.device | str, *, non_blocking: bool = False) -> Batch:
         """Return the batch with its tensors on a device."""
-        return self.mapped(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+        return self.map_tensors(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> Batch:
         """Return the batch in pinned memory, from which copies to the device do not block the host.
 
         DataLoader calls a method of this name to pin.
         """
-        return self.mapped(lambda tensor: tensor.pin_memory())
+        return self.map_tensors(lambda tensor: tensor.pin_memory())
 
     @property
     def nbytes(self) -> int:
-        """The bytes of all its tensors."""
+        """Size of all tensors in bytes."""
         latents = () if self.latents is None else (self.latents.values, self.latents.scales)
         tensors = (self.frames, self.states, self.actions, self.extrinsics, *latents)
-        return sum(one.nbytes for one in tensors if one is not None)
+        return sum(tensor.nbytes for tensor in tensors if tensor is not None)
 
 
 @dataclass(frozen=True)
 class LatentBatch:
-    """What training, evaluation and planning see: layer-normalised latents in place of pixels."""
+    """The input of training, evaluation and planning: layer-normalised latents in place of pixels."""
 
     latents: Float[Tensor, "batch time tokens dim"]
     states: Float[Tensor, "batch time state_dim"]
@@ -196,12 +196,12 @@ class LatentBatch:
     episode_ids: tuple[str, ...]
     starts: tuple[int, ...]
 
-    def clip(self, row: int) -> LatentBatch:
+    def select_clip(self, row: int) -> LatentBatch:
         """Return one clip, as a batch."""
-        one = slice(row, row + 1)
-        extrinsics = None if self.extrinsics is None else self.extrinsics[one]
-        tensors = self.latents[one], self.states[one], self.actions[one], extrinsics
-        return LatentBatch(*tensors, self.episode_ids[one], self.starts[one])
+        rows = slice(row, row + 1)
+        extrinsics = None if self.extrinsics is None else self.extrinsics[rows]
+        tensors = self.latents[rows], self.states[rows], self.actions[rows], extrinsics
+        return LatentBatch(*tensors, self.episode_ids[rows], self.starts[rows])
 
 
 StepRanges = Sequence[tuple[int, int]]  # [start, end) of control steps, ascending and apart
@@ -228,8 +228,8 @@ class EpisodeSource(Protocol):
         """Return one episode; no frame is read or decoded before `Episode.read_frames` requests it.
 
         Args:
-            index: Place in `infos`.
-            camera: Whose frames; None: the config's (first) camera.
+            index: Index in `infos`.
+            camera: Name of the camera; None: the first camera of the config.
             needed: Steps that clips may come from, None: all. A remote source caches no others.
 
         Raises:

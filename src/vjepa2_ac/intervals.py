@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Float
 
 RESAMPLES = 2000
-ENOUGH_EPISODES = 5  # with fewer, an interval over episodes means little
-_SHARE = 0.95  # probability that an interval covers the true value
+MIN_EPISODES = 5  # with fewer, an interval over episodes means little
+_CONFIDENCE = 0.95  # probability that an interval covers the true value
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ class Estimate:
         """Whether there were enough episodes for an interval."""
         return not math.isnan(self.low)
 
-    def side(self, of: float) -> int:
+    def compare_to(self, value: float) -> int:
         """Return -1 or 1 if the whole interval is below or above a number, else 0: uncertain."""
-        return -1 if self.high < of else 1 if self.low > of else 0
+        return -1 if self.high < value else 1 if self.low > value else 0
 
-    def below(self, level: float) -> Estimate:
-        """Return how far the number is below a level, with its interval."""
+    def subtract_from(self, level: float) -> Estimate:
+        """Return `level` minus the estimate, with its interval."""
         return Estimate(level - self.value, level - self.high, level - self.low)
 
     def as_dict(self) -> dict[str, float | None]:
@@ -60,7 +60,7 @@ class Estimate:
         return f"{self:.3f}"
 
 
-def bootstrapped(
+def bootstrap(
     of_sums: Callable[[np.ndarray], np.ndarray],
     columns: Float[np.ndarray, "columns clips metrics"],
     episode_ids: Sequence[str],
@@ -79,11 +79,11 @@ def bootstrapped(
         if count < 2:
             return tuple(Estimate(float(value), math.nan, math.nan) for value in values)
         sums = np.einsum("cnf,ne->cef", columns, np.eye(count)[episode_of], optimize=True)
-        drawn = of_sums(np.einsum("re,cef->crf", _draws(count), sums, optimize=True))
-    return _estimates(values, drawn, count)
+        drawn = of_sums(np.einsum("re,cef->crf", _draw_episode_counts(count), sums, optimize=True))
+    return _make_estimates(values, drawn, count)
 
 
-def bootstrapped_by_weights(
+def bootstrap_by_weights(
     of_weights: Callable[[Float[np.ndarray, "draws episodes"]], Float[np.ndarray, "draws metrics"]],
     episodes: int,
 ) -> tuple[Estimate, ...]:
@@ -91,75 +91,82 @@ def bootstrapped_by_weights(
 
     Args:
         of_weights: Turns weights of the episodes into values; all weights 1 give the estimate itself.
-        episodes: Their number; an interval needs two. The samples are those of `bootstrapped`.
+        episodes: Their number; an interval needs two. The samples are those of `bootstrap`.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         values = of_weights(np.ones((1, episodes)))[0]
         if episodes < 2:
             return tuple(Estimate(float(value), math.nan, math.nan) for value in values)
-        return _estimates(values, of_weights(_draws(episodes)), episodes)
+        return _make_estimates(values, of_weights(_draw_episode_counts(episodes)), episodes)
 
 
-def mean_of(values: Float[np.ndarray, " clips"], episode_ids: Sequence[str]) -> Estimate:
+def estimate_mean(values: Float[np.ndarray, " clips"], episode_ids: Sequence[str]) -> Estimate:
     """Return the mean over clips."""
-    return ratio(values, np.ones_like(values), episode_ids)
+    return estimate_ratio(values, np.ones_like(values), episode_ids)
 
 
-def ratio(
-    errors: Float[np.ndarray, " clips"], others: Float[np.ndarray, " clips"], episode_ids: Sequence[str]
+def estimate_ratio(
+    errors: Float[np.ndarray, " clips"], references: Float[np.ndarray, " clips"], episode_ids: Sequence[str]
 ) -> Estimate:
-    """Return mean error over mean other error, most often persistence: clips are weighted by the denominator."""
-    return ratios(errors[:, None], others[:, None], episode_ids)[0]
+    """Return the mean error divided by the mean reference error, such as that of persistence.
+
+    Clips are weighted by the denominator.
+    """
+    return estimate_ratios(errors[:, None], references[:, None], episode_ids)[0]
 
 
-def ratios(
-    errors: Float[np.ndarray, "clips metrics"], others: Float[np.ndarray, "clips metrics"], episode_ids: Sequence[str]
+def estimate_ratios(
+    errors: Float[np.ndarray, "clips metrics"],
+    references: Float[np.ndarray, "clips metrics"],
+    episode_ids: Sequence[str],
 ) -> tuple[Estimate, ...]:
-    """Return the `ratio` of each metric."""
-    return bootstrapped(lambda sums: sums[0] / sums[1], np.stack([errors, others]), episode_ids)
+    """Return the `estimate_ratio` of each metric."""
+    return bootstrap(lambda sums: sums[0] / sums[1], np.stack([errors, references]), episode_ids)
 
 
-def ratio_difference(
-    one: tuple[Float[np.ndarray, " clips"], Float[np.ndarray, " clips"]],
-    other: tuple[Float[np.ndarray, " clips"], Float[np.ndarray, " clips"]],
+def estimate_ratio_difference(
+    first: tuple[Float[np.ndarray, " clips"], Float[np.ndarray, " clips"]],
+    second: tuple[Float[np.ndarray, " clips"], Float[np.ndarray, " clips"]],
     episode_ids: Sequence[str],
 ) -> Estimate:
-    """Return the `ratio` of one pair of (errors, persistence) minus that of another on the same clips.
+    """Return the ratio of the first pair (errors, persistence) minus that of the second, on the same clips.
 
     Both are resampled together, so what makes an episode hard for both does not widen the interval.
     """
-    columns = np.stack([*one, *other])[:, :, None]
-    return bootstrapped(lambda sums: sums[0] / sums[1] - sums[2] / sums[3], columns, episode_ids)[0]
+    columns = np.stack([*first, *second])[:, :, None]
+    return bootstrap(lambda sums: sums[0] / sums[1] - sums[2] / sums[3], columns, episode_ids)[0]
 
 
 @lru_cache(maxsize=4)
-def _draws(episodes: int) -> Float[np.ndarray, "resamples episodes"]:
+def _draw_episode_counts(episodes: int) -> Float[np.ndarray, "resamples episodes"]:
     """Return how often each episode was drawn, with replacement, in each bootstrap sample."""
     drawn = np.random.default_rng(0).integers(episodes, size=(RESAMPLES, episodes))
-    places = drawn + episodes * np.arange(RESAMPLES)[:, None]
-    return np.bincount(places.ravel(), minlength=RESAMPLES * episodes).reshape(RESAMPLES, episodes).astype(np.float64)
+    positions = drawn + episodes * np.arange(RESAMPLES)[:, None]
+    return (
+        np.bincount(positions.ravel(), minlength=RESAMPLES * episodes).reshape(RESAMPLES, episodes).astype(np.float64)
+    )
 
 
-def _estimates(
+def _make_estimates(
     values: Float[np.ndarray, " metrics"], drawn: Float[np.ndarray, "draws metrics"], episodes: int
 ) -> tuple[Estimate, ...]:
-    from scipy import stats  # takes half a second, which wrong words on a command line do not wait for
+    from scipy import stats  # imported here because it takes half a second
 
-    tail = stats.norm.cdf(-math.sqrt(episodes / (episodes - 1)) * stats.t.ppf((1 + _SHARE) / 2, episodes - 1))
+    tail = stats.norm.cdf(-math.sqrt(episodes / (episodes - 1)) * stats.t.ppf((1 + _CONFIDENCE) / 2, episodes - 1))
     return tuple(
-        _with_interval(float(value), column[np.isfinite(column)], float(tail))
+        _make_estimate(float(value), column[np.isfinite(column)], float(tail))
         for value, column in zip(values, drawn.T, strict=True)
     )
 
 
-def _with_interval(value: float, drawn: np.ndarray, tail: float) -> Estimate:
+def _make_estimate(value: float, drawn: np.ndarray, tail: float) -> Estimate:
     if not len(drawn) or math.isnan(value):
         return Estimate(value, math.nan, math.nan)
     low, high = np.quantile(drawn, [tail, 1 - tail])
     return Estimate(value, float(low), float(high))
 
 
-def share_of(successes: int, tries: int) -> Estimate:
+def estimate_share(successes: int, trials: int) -> Estimate:
     """Return the share of successes with Wilson's 95 % interval, which stays within 0 .. 1.
 
     Raises:
@@ -167,6 +174,6 @@ def share_of(successes: int, tries: int) -> Estimate:
     """
     from scipy import stats
 
-    found = stats.binomtest(successes, tries)
-    low, high = found.proportion_ci(_SHARE, method="wilson")
-    return Estimate(float(found.statistic), float(low), float(high))
+    test = stats.binomtest(successes, trials)
+    low, high = test.proportion_ci(_CONFIDENCE, method="wilson")
+    return Estimate(float(test.statistic), float(low), float(high))

@@ -22,8 +22,8 @@ from vjepa2_ac.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-REACH_M = 5.0  # larger positions are not in metres
-ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
+MAX_POSITION_M = 5.0  # larger positions are not in metres
+MAX_ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
 _LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
 GRIPPER_SLACK = 0.1  # a measured closedness may exceed 0 .. 1 by this
 CONVERSIONS = {  # how to bring numbers in other units to metres and radians
@@ -31,12 +31,12 @@ CONVERSIONS = {  # how to bring numbers in other units to metres and radians
     "centimetres": "divide them by 100",
     "degrees": "multiply them by pi / 180",
 }
-_MOST_CM, _MOST_MM, _MOST_DEGREES = 100.0, 5000.0, 360.5  # of positions and angles that look like these units
+_MAX_CM, _MAX_MM, _MAX_DEGREES = 100.0, 5000.0, 360.5  # of positions and angles that look like these units
 
 Follows = Literal["change", "target", "unknown"]
 
 
-# ---- poses, as NumPy arrays or tensors; Euler angles wrap at pi, so differences are those of rotation matrices ----
+# ---- poses, as NumPy arrays or tensors; rotations are subtracted as matrices, because Euler angles wrap at pi ----
 
 
 def matrices_from_euler(angles: Any) -> Any:
@@ -88,7 +88,7 @@ def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray
 
     Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/droid.py, poses_to_diffs.
     """
-    return POSE.differences(states)
+    return POSE.compute_differences(states)
 
 
 def rotation_differences(angles: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time-1 3"]:
@@ -102,7 +102,7 @@ def rotation_angles(rotations: Float[np.ndarray, "count 3"]) -> Float[np.ndarray
     return np.asarray(Rotation.from_euler("xyz", rotations).magnitude())
 
 
-def step_sizes(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time-1 2"]:
+def compute_step_sizes(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time-1 2"]:
     """Return the distance, in metres, and the angle of the rotation, in radians, from each pose to the next."""
     rotations = Rotation.from_euler("xyz", states[:, 3:6])
     moved, turned = np.diff(states[:, :3], axis=0), (rotations[1:] * rotations[:-1].inv()).magnitude()
@@ -150,27 +150,27 @@ class Space:
 
     @property
     def is_pose(self) -> bool:
-        """Whether it has the parts of a pose, position, rotation and gripper, where a pose has them."""
+        """Whether position, rotation and gripper have the indices of a pose."""
         return (self.position, self.rotation, self.gripper) == (slice(0, 3), slice(3, 6), 6)
 
     @property
-    def sized(self) -> slice:
-        """The numbers whose norm is the size of a motion: the position, or all."""
+    def size_axes(self) -> slice:
+        """Indices of the components whose norm is the size of a motion: the position, or all components."""
         return slice(None) if self.position is None else self.position
 
     @property
-    def shown_unit(self) -> str:
-        """The unit in which people read such sizes: cm, or none."""
+    def display_unit(self) -> str:
+        """Unit in which sizes of motions are displayed: cm for a position, else empty."""
         return "" if self.position is None else "cm"
 
     @property
-    def shown_factor(self) -> float:
-        """How many of that unit one is."""
+    def display_factor(self) -> float:
+        """Factor from metres to the displayed unit."""
         return 1.0 if self.position is None else 100.0
 
-    def shown_size(self, numbers: Float[np.ndarray, "*batch dim"]) -> Float[np.ndarray, "*batch"]:
-        """Return the size of motions in the unit in which people read it."""
-        return np.asarray(np.linalg.norm(numbers[..., self.sized], axis=-1) * self.shown_factor)
+    def compute_display_size(self, numbers: Float[np.ndarray, "*batch dim"]) -> Float[np.ndarray, "*batch"]:
+        """Return the sizes of motions in the displayed unit."""
+        return np.asarray(np.linalg.norm(numbers[..., self.size_axes], axis=-1) * self.display_factor)
 
 
 @dataclass(frozen=True)
@@ -181,26 +181,26 @@ class StateSpace(Space):
 
     @property
     def is_base_pose(self) -> bool:
-        """Whether it is a pose in the robot base frame, along whose axes directions have names."""
+        """Whether states are poses in the robot base frame, in which directions have names."""
         return self.is_pose and self.frame == "base"
 
-    def path_length(self, states: Float[np.ndarray, "time dim"]) -> float:
-        """Return the sizes of the motions from state to state, added up: of poses in metres."""
-        return float(np.linalg.norm(np.diff(states[:, self.sized], axis=0), axis=1).sum())
+    def compute_path_length(self, states: Float[np.ndarray, "time dim"]) -> float:
+        """Return the sum of the sizes of all motions between consecutive states: in metres for poses."""
+        return float(np.linalg.norm(np.diff(states[:, self.size_axes], axis=0), axis=1).sum())
 
     @property
     def change_names(self) -> tuple[str, ...]:
-        """The names of the numbers' changes: dx, dy, ...; of a vector those of its numbers."""
+        """Names of the changes: dx, dy, ... for a pose, the names of the components for a vector."""
         return self.names if self.position is None else tuple(f"d{name}" for name in self.names)
 
-    def differences(self, states: Float[np.ndarray, "time dim"]) -> Float[np.ndarray, "time-1 dim"]:
-        """Return the change from each state to the next; of rotations R[t+1] @ R[t].T, as of poses.
+    def compute_differences(self, states: Float[np.ndarray, "time dim"]) -> Float[np.ndarray, "time-1 dim"]:
+        """Return the change from each state to the next: R[t+1] @ R[t].T for rotations, else the difference.
 
         Raises:
             ValueError: Fewer than two states.
         """
         if len(states) < 2:
-            raise ValueError(f"a difference needs two states; got {len(states)}")
+            raise ValueError(f"expected at least two states, got {len(states)}")
         changes = np.diff(states, axis=0)
         if self.rotation is not None:
             changes[:, self.rotation] = rotation_differences(states[:, self.rotation])
@@ -219,36 +219,36 @@ class StateSpace(Space):
         Args:
             states: One for each control step.
             where: File and episode, for messages.
-            fix: Which settings to check.
-            conversions: By the name of a unit that the numbers may look like, how to convert from it.
+            fix: The settings to check, for messages.
+            conversions: Name of a unit that the numbers may have, and how to convert from it.
 
         Raises:
-            InputError: There are no states; or names the first implausible state, its numbers, and the units that the
-                states seem to have.
+            InputError: There are no states, or a state is implausible. The message has its step, its numbers, and the
+                units that the states seem to have.
         """
         if len(states) == 0:
-            raise zero_steps(where)
-        for wrong, needed in self._checks(states):
-            if wrong.any():
-                step = int(wrong.argmax())
-                place = f"{where}: step {step}" if len(states) > 1 else where
+            raise no_steps_error(where)
+        for is_wrong, needed in self._checks(states):
+            if is_wrong.any():
+                step = int(is_wrong.argmax())
+                position = f"{where}: step {step}" if len(states) > 1 else where
                 found = f"the numbers {np.array2string(states[step], precision=4, max_line_width=200)}"
                 looks = [
                     f"The {part} look like {unit}: {conversions[unit]}"
                     for part, unit in self._likely_units(states)
                     if unit in conversions
                 ]
-                raise InputError(where=place, found=found, needed=needed, fix=". ".join(filter(None, [*looks, fix])))
+                raise InputError(where=position, found=found, needed=needed, fix=". ".join(filter(None, [*looks, fix])))
 
     def require_state(self, numbers: np.ndarray, where: str) -> None:
         """Refuse an array that is not a state, or an implausible state.
 
         Raises:
-            InputError: Says what was found.
+            InputError: The array is not a plausible state.
         """
         if numbers.shape != (len(self),):
             names = (f"{name} ({unit})" if unit else name for name, unit in zip(self.names, self.units, strict=True))
-            found = f"{numbers.size} numbers in the shape {numbers.shape}"
+            found = f"{numbers.size} numbers with shape {numbers.shape}"
             raise InputError(where=where, found=found, needed=f"{len(self)}: {', '.join(names)}")
         self.require_plausible(numbers[None], where)
 
@@ -256,10 +256,10 @@ class StateSpace(Space):
         """Return, for each rule, a mask of the steps that break it, and what is needed."""
         checks = [(~np.isfinite(states).all(axis=1), "finite numbers")]
         if self.position is not None:
-            far = abs(states[:, self.position]).max(axis=1) > REACH_M
-            checks.append((far, f"a position within {REACH_M:g} m of the base, in metres"))
+            far = abs(states[:, self.position]).max(axis=1) > MAX_POSITION_M
+            checks.append((far, f"a position within {MAX_POSITION_M:g} m of the base, in metres"))
         if self.rotation is not None:
-            checks.append((abs(states[:, self.rotation]).max(axis=1) > ANGLE_RAD, "angles in radians"))
+            checks.append((abs(states[:, self.rotation]).max(axis=1) > MAX_ANGLE_RAD, "angles in radians"))
         if self.gripper is not None:
             closed = states[:, self.gripper]
             beyond = (closed < -GRIPPER_SLACK) | (closed > 1 + GRIPPER_SLACK)
@@ -269,18 +269,18 @@ class StateSpace(Space):
     def _likely_units(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[str, str]]:
         """Return the parts of a pose that look like another unit than metres and radians, each with that unit.
 
-        Most steps must be too large: a few wrong steps are outliers, and say nothing about the unit.
+        Most steps must be too large, because a few wrong steps are outliers that do not show the unit.
         """
-        found = []
+        units = []
         if self.position is not None:
             usual = float(np.median(abs(states[:, self.position]).max(axis=1)))
-            if REACH_M < usual <= _MOST_MM:
-                found.append(("positions", "centimetres" if usual < _MOST_CM else "millimetres"))
+            if MAX_POSITION_M < usual <= _MAX_MM:
+                units.append(("positions", "centimetres" if usual < _MAX_CM else "millimetres"))
         if self.rotation is not None:
             angles = abs(states[:, self.rotation]).max(axis=1)
-            if np.median(angles) > ANGLE_RAD and angles.max() <= _MOST_DEGREES:
-                found.append(("angles", "degrees"))
-        return found
+            if np.median(angles) > MAX_ANGLE_RAD and angles.max() <= _MAX_DEGREES:
+                units.append(("angles", "degrees"))
+        return units
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ class ActionSpace(Space):
     follows: Follows = "change"  # change: added to the state. target: becomes the state. unknown: neither is known
 
 
-def zero_steps(where: str) -> InputError:
+def no_steps_error(where: str) -> InputError:
     """Return the error of an episode without steps."""
     return InputError(where=where, found="no steps", needed="one or more")
 
@@ -303,7 +303,7 @@ EXTRINSICS = StateSpace(_AXES[:6], _UNITS[:6], slice(0, 3), slice(3, 6))
 POSE_CHANGE = ActionSpace(tuple(f"d{axis}" for axis in _AXES), _UNITS, slice(0, 3), slice(3, 6), 6)
 
 
-def vector_states(width: int) -> StateSpace:
+def make_vector_states(width: int) -> StateSpace:
     """Return the space of states whose numbers have no known meaning."""
     return StateSpace(tuple(f"state {number}" for number in range(width)), ("",) * width)
 
@@ -314,10 +314,10 @@ def require_finite(numbers: Float[np.ndarray, "steps dim"], where: str, *, fix: 
     Raises:
         InputError: As `StateSpace.require_plausible`.
     """
-    vector_states(numbers.shape[1]).require_plausible(numbers, where, fix=fix)
+    make_vector_states(numbers.shape[1]).require_plausible(numbers, where, fix=fix)
 
 
-def vector_actions(width: int, follows: Follows) -> ActionSpace:
+def make_vector_actions(width: int, follows: Follows) -> ActionSpace:
     """Return the space of actions whose numbers have no known meaning."""
     return ActionSpace(tuple(f"action {number}" for number in range(width)), ("",) * width, follows=follows)
 
@@ -331,21 +331,21 @@ class Spaces:
 
     @property
     def widths(self) -> Widths:
-        """How many numbers they have."""
+        """Widths of state and action."""
         return Widths(len(self.state), len(self.action))
 
     @classmethod
-    def of_vectors(cls, widths: Widths, joined: str | None) -> Spaces:
+    def from_widths(cls, widths: Widths, joined: str | None) -> Spaces:
         """Return the spaces of vectors.
 
         Args:
-            widths: Of both.
-            joined: difference, of states; or how recorded commands were joined to one (`data.join_actions`), which says
-                what they are: a sum of deltas changes the state by itself, the last target becomes it.
+            widths: Widths of state and action.
+            joined: "difference" for differences of states; else how recorded actions were joined (`data.join_actions`):
+                "sum" of changes, or the "last" target state.
         """
-        known: dict[str | None, Follows] = {"difference": "change", "sum": "change", "last": "target"}
-        follows: Follows = known.get(joined, "unknown") if widths.state == widths.action else "unknown"
-        return cls(vector_states(widths.state), vector_actions(widths.action, follows))
+        meanings: dict[str | None, Follows] = {"difference": "change", "sum": "change", "last": "target"}
+        follows: Follows = meanings.get(joined, "unknown") if widths.state == widths.action else "unknown"
+        return cls(make_vector_states(widths.state), make_vector_actions(widths.action, follows))
 
 
 POSES = Spaces(POSE, POSE_CHANGE)
@@ -359,8 +359,8 @@ def apply_actions(
 ) -> Float[Tensor, "*batch dim"]:
     """Return the states after changes, on any device and differentiable: a gripper is clipped to 0 .. 1.
 
-    Of poses the same as `apply_action`, except for the gripper; numbers of vectors add. Autocast is disabled here:
-    bfloat16 has too few digits for rotations.
+    For poses this is `apply_action` with a clipped gripper; for vectors it is addition. Autocast is disabled because
+    bfloat16 is too imprecise for rotations.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.
     """
@@ -373,7 +373,7 @@ def apply_actions(
     return torch.cat([after[..., : space.gripper], closed], dim=-1)  # type: ignore[no-any-return]  # untyped
 
 
-def states_along(
+def integrate_changes(
     state: Float[Tensor, " dim"], changes: Float[Tensor, "samples steps dim"], space: StateSpace = POSE
 ) -> Float[Tensor, "samples steps+1 dim"]:
     """Return the states before and after every change, starting from one state."""
@@ -383,28 +383,28 @@ def states_along(
     return sys.modules["torch"].stack(states, dim=1)  # type: ignore[no-any-return]  # untyped
 
 
-def counterfactual_states(
+def integrate_states(
     state: Float[np.ndarray, " state_dim"], actions: Float[np.ndarray, "steps state_dim"], space: StateSpace = POSE
 ) -> Float[np.ndarray, "steps+1 state_dim"]:
-    """Return the states before and after actions that were not taken: integrated from the first, in double precision.
+    """Return the states before and after actions that were not executed, integrated from the first in double precision.
 
-    Never take them from a recording: later states of what did happen would give the model the truth. The gripper stays
-    within 0 .. 1. Of poses without the lag of a real arm, which covers some 95 % of a commanded step.
+    Recorded states must not be used instead, because they would reveal the recorded motion to the model. The gripper is
+    clipped to 0 .. 1. The lag of a real arm, which covers about 95 % of a commanded step, is not modelled.
     """
-    import torch  # `spaces` is imported by commands that need none
+    import torch  # imported here because some commands that import `spaces` do not need it
 
-    first, changes = (torch.from_numpy(np.array(one, dtype=np.float64)) for one in (state, actions))
-    return states_along(first, changes[None], space)[0].numpy()
+    first, changes = (torch.from_numpy(np.array(values, dtype=np.float64)) for values in (state, actions))
+    return integrate_changes(first, changes[None], space)[0].numpy()
 
 
-def feasible_actions(
+def clip_gripper_changes(
     state: Float[np.ndarray, " state_dim"], actions: Float[np.ndarray, "steps state_dim"], space: StateSpace = POSE
 ) -> Float[np.ndarray, "steps state_dim"]:
-    """Return actions whose gripper changes only as far as it can: those of `counterfactual_states`, as data would have.
+    """Return actions whose gripper changes stay within the range 0 .. 1 of closedness, as in `integrate_states`.
 
-    A measured closedness does not change any more at its end, so a model has never seen further changes there.
+    A measured closedness does not exceed its range, so the training data contain no changes beyond it.
     """
     feasible = np.array(actions, dtype=np.float64)
     if space.gripper is not None:
-        feasible[:, space.gripper] = np.diff(counterfactual_states(state, actions, space)[:, space.gripper])
+        feasible[:, space.gripper] = np.diff(integrate_states(state, actions, space)[:, space.gripper])
     return feasible

@@ -135,7 +135,7 @@ WRONG = {
     "an image that is not there": (["--goal", "{here}/nowhere.png"], "nowhere.png: cannot be read: No such file"),
     "a black mask": (["--mask", "{here}/black.png"], "no pixel inside the cropped image"),
     "degrees": (["--state", "0.4,0,0.3,180,0,5,0"], "multiply them by pi / 180"),
-    "too few numbers": (["--state", "0.4,0,0.3"], "3 numbers in the shape (3,)"),
+    "too few numbers": (["--state", "0.4,0,0.3"], "3 numbers with shape (3,)"),
     "limits below zero": (["planning.limits.xyz=[-0.05,0.05,0.05]"], "planning.limits.xyz.0"),
     "a knob of training": (["training.steps=2"], "a setting that planning does not use"),
     "a camera that is not used": (["--extrinsics", "0,0,0,0,0,0"], "a camera pose if and only if the model uses it"),

@@ -20,7 +20,7 @@ from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions, ClosedLoopBenchmark
 from vjepa2_ac.simulation.rollout import ClosedLoopResult
-from vjepa2_ac.spaces import POSE, vector_states
+from vjepa2_ac.spaces import POSE, make_vector_states
 from worlds import Copier, Halfway, about, again, clips_batch
 
 SURE = Estimate(-0.123, -0.145, -0.101)
@@ -60,7 +60,7 @@ def plans() -> list[Table]:
             spec=PlanResult, actions=actions, states=states, decision=Mock(why="planned"), state_space=space,
             space=Mock(free=torch.arange(7)),
         )
-        for space in (POSE, vector_states(7))
+        for space in (POSE, make_vector_states(7))
     ]  # fmt: skip
     return [plan_table(answer) for answer in answers]
 

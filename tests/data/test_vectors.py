@@ -145,7 +145,7 @@ def test_vector_config_that_needs_poses_or_is_incomplete_raises(changes: dict[st
         parse_config({"run_dir": "r", "model": {"base": "b"}, "data": values}, where="here")
 
 
-FIVE = Spaces.of_vectors(Widths(5, 5), "difference")
+FIVE = Spaces.from_widths(Widths(5, 5), "difference")
 
 
 def batch(states: np.ndarray, actions: np.ndarray | None = None) -> Batch:

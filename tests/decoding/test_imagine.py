@@ -13,7 +13,7 @@ from vjepa2_ac.decoding.decoder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import Start, compute_rollout, decode_views
 from vjepa2_ac.evaluation.imagined import imagine_plan
 from vjepa2_ac.planning.counterfactual import make_named_actions
-from vjepa2_ac.spaces import POSE, counterfactual_states
+from vjepa2_ac.spaces import POSE, integrate_states
 
 STEPS, TOKENS, DIM = 4, 4, 12
 STATE = np.array([0.4, 0.1, 0.3, 3.1, 0.0, -3.1, 0.9])
@@ -62,7 +62,7 @@ def test_the_camera_of_the_first_frame_holds_for_all_steps() -> None:
 
 def test_known_states_are_given_as_they_are() -> None:
     model, actions = Remembering(), make_named_actions("up", STEPS)
-    states = counterfactual_states(STATE, actions)[:-1] + 0.5
+    states = integrate_states(STATE, actions)[:-1] + 0.5
     compute_rollout(model.rollout, start_of(truth()), actions, states)
     np.testing.assert_allclose(model.given[2][0].numpy(), states, atol=1e-6)
 

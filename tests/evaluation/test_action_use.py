@@ -20,7 +20,7 @@ from vjepa2_ac.evaluation.action_use import (
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import ActionRanking, Landscapes, rank_difference
-from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, vector_actions
+from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, make_vector_actions
 from worlds import DIM, Copier, Halfway, Oracle, clips_batch, moved
 
 CLIPS, REACH, FEW, SAMPLES = 12, 0.075, 8, 40
@@ -73,7 +73,7 @@ def test_a_move_is_the_longest_within_reach_there_and_back() -> None:
 def test_commands_that_are_no_changes_are_taken_as_they_are() -> None:
     batch = line()
     batch.actions[:, 2] *= 3
-    found = moves(batch, vector_actions(7, "target"))
+    found = moves(batch, make_vector_actions(7, "target"))
     assert len(found) == CLIPS
     assert all(torch.equal(one.action, batch.actions[clip, 2]) for clip, one in enumerate(found))
 
@@ -147,7 +147,7 @@ def test_actions_on_the_shell_are_as_long_as_the_true_one_and_go_everywhere() ->
 
 
 def test_numbers_of_vectors_are_lengths_in_their_largest_change() -> None:
-    space = vector_actions(3, "change")
+    space = make_vector_actions(3, "change")
     move = replace(moves(line())[0], action=torch.tensor([0.1, 0.0, 0.0]))
     others = replace(move, action=torch.tensor([0.0, 5.0, 0.0]))
     _, drawn = drawn_for(move, [move, others], space, 500, np.random.default_rng(0))
@@ -212,7 +212,7 @@ def test_the_box_moves_only_the_hand() -> None:
     assert np.array_equal(boxed[:, 3:], np.tile(start.action[3:].double().numpy(), (500, 1)))
     assert 0.07 < np.abs(boxed[:, :3]).max() <= 0.075
     assert abs(boxed[:, :3].mean()) < 0.005
-    drawn, _ = drawn_for(start, begun, vector_actions(7, "change"), 500, np.random.default_rng(0))
+    drawn, _ = drawn_for(start, begun, make_vector_actions(7, "change"), 500, np.random.default_rng(0))
     assert (np.abs(drawn).max(axis=0) <= np.abs([one.true for one in begun]).max(axis=0)).all()
     assert np.abs(drawn[:, 3:]).max() > 0.05
 

@@ -39,7 +39,7 @@ from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
-from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, vector_actions
+from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, make_vector_actions
 from worlds import DIM, TIME, Copier, Halfway, Oracle, about, again, clips_batch, in_batches, rows
 
 PROBES = ProbeOptions(ranking_clips=6, samples=20, landscape_clips=3, nodes=5, examples=3, at_once=7)
@@ -154,7 +154,7 @@ def test_vectors_have_no_centimetres_and_too_few_numbers_no_landscape() -> None:
     vectors, narrow = (
         evaluate(
             evaluated_models,
-            again(clips_batch(width=width), space=vector_actions(width, "change")),
+            again(clips_batch(width=width), space=make_vector_actions(width, "change")),
             about(),
             probes=PROBES,
         )
@@ -221,9 +221,9 @@ def test_a_step_moves_if_the_hand_goes_turns_or_grips(action: list[float], moves
 
 
 def test_vectors_move_beside_their_largest_ones() -> None:
-    clips = of([1.0, 0.0], [0.05, 0.0], [0.0, 0.2], [0.0, 0.0], space=vector_actions(2, "change"))
+    clips = of([1.0, 0.0], [0.05, 0.0], [0.0, 0.2], [0.0, 0.0], space=make_vector_actions(2, "change"))
     assert clips.moving.tolist() == [[True, False, True, False]]
-    assert not of([0.0, 0.0], space=vector_actions(2, "change")).moving.any(), "nothing at all is no motion"
+    assert not of([0.0, 0.0], space=make_vector_actions(2, "change")).moving.any(), "nothing at all is no motion"
 
 
 # ---- errors, and actions of other clips ----

@@ -36,7 +36,7 @@ from vjepa2_ac.evaluation.summary import (
     summarize,
     with_closed_loop,
 )
-from vjepa2_ac.intervals import Estimate, share_of
+from vjepa2_ac.intervals import Estimate, estimate_share
 from vjepa2_ac.spaces import POSE_CHANGE
 from worlds import about
 
@@ -158,7 +158,7 @@ def test_better_action_ranking_needs_a_lower_error_than_chance_and_the_base_mode
 def test_the_third_line_is_action_ranking_until_a_closed_loop_was_measured(tmp_path: Path) -> None:
     bare, measured = summary_of(model("model", 0.5)), summary_of(ranked("model", 0.5, 0.02, shuffled=0.9))
     assert bare.ranks_actions == not_measured_verdict(RANKING, "`vjepa2-ac evaluate --ranking-clips 32`")
-    shares = {name: share_of(count, 50) for name, count in {"m": 45, "random": 2, "oracle": 50}.items()}
+    shares = {name: estimate_share(count, 50) for name, count in {"m": 45, "random": 2, "oracle": 50}.items()}
     plans = closed_loop_verdict(shares, "m", "oracle", 50, "reach")
     (tmp_path / "closed_loop" / "reach-B").mkdir(parents=True)
     file = tmp_path / "closed_loop" / "reach-B" / "closed_loop.json"
@@ -232,7 +232,7 @@ def test_blur_is_named_exactly_where_error_and_spread_both_fell(with_base: bool,
     assert not weak.predicts.reference, "there is no spread with one clip"
 
 
-def mapped(result: ModelResult, distance: float, sharpness: float, episodes: int = 8) -> ModelResult:
+def map_tensors(result: ModelResult, distance: float, sharpness: float, episodes: int = 8) -> ModelResult:
     """Return a model with landscapes of a mean distance and sharpness, which differ a little by clip."""
     rng, ids = np.random.default_rng(0), [f"episode {number}" for number in range(episodes)]
     distances = distance + rng.uniform(-0.5, 0.5, episodes)
@@ -328,7 +328,7 @@ def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
     solved: int, problems: int, oracle: int, conclusion: str, needs: str
 ) -> None:
     counts = {"adapter": solved, "zero action": 0, "random": min(2, problems - 1), "oracle": oracle}
-    shares = {name: share_of(count, problems) for name, count in counts.items()}
+    shares = {name: estimate_share(count, problems) for name, count in counts.items()}
     plans = closed_loop_verdict(shares, "adapter", "oracle", problems, "reach")
     assert plans.conclusion == conclusion
     assert plans.needs.startswith(needs)
@@ -339,7 +339,7 @@ def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
 def test_a_measured_plan_is_not_denied_by_the_use_of_the_actions() -> None:
     summary = summary_of(model("adapter", 0.5))
     assert summary.sentence.endswith("ignores the actions, so the model cannot be used for planning.")
-    shares = {"adapter": share_of(45, 50), "random": share_of(0, 50), "oracle": share_of(50, 50)}
+    shares = {"adapter": estimate_share(45, 50), "random": estimate_share(0, 50), "oracle": estimate_share(50, 50)}
     measured = replace(summary, plans=closed_loop_verdict(shares, "adapter", "oracle", 50, "reach"))
     assert measured.sentence == "The model predicts typical motion and ignores the actions."
 

@@ -10,7 +10,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.inspection.coverage import PLAY, Coverage, ReadEpisode, coverage_findings, coverage_in, coverage_of
 from vjepa2_ac.inspection.statistics import inspect_dataset
-from vjepa2_ac.spaces import POSE, matrices_from_euler, rotation_differences, states_in_camera_frame, vector_states
+from vjepa2_ac.spaces import POSE, make_vector_states, matrices_from_euler, rotation_differences, states_in_camera_frame
 
 DIVERSE = "motions are diverse enough to plan with"
 
@@ -95,7 +95,7 @@ def test_changes_are_those_over_a_stride_within_kept_ranges_in_the_frame_of_the_
 
 def test_vectors_are_narrow_where_most_numbers_hardly_move_or_go_one_way() -> None:
     def vectors(changes: np.ndarray, stride: int = 1) -> Coverage:
-        return coverage_of(changes, vector_states(6), stride)
+        return coverage_of(changes, make_vector_states(6), stride)
 
     free = np.random.default_rng(0).normal(size=(300, 6)) * 0.1
     assert vectors(free).verdict == DIVERSE

@@ -16,7 +16,7 @@ from vjepa2_ac.data.index import StepSelection
 from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.inspection.excerpts import excerpt_findings, excerpts_of
 from vjepa2_ac.inspection.findings import Finding
-from vjepa2_ac.spaces import POSE, StateSpace, vector_states
+from vjepa2_ac.spaces import POSE, StateSpace, make_vector_states
 
 Pair = tuple[np.ndarray, np.ndarray]
 Spoil = Callable[[list[Pair]], list[Pair]]
@@ -77,7 +77,7 @@ def alarms_in(pairs: list[Pair], **about: object) -> list[Finding]:
 
 
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("space", [POSE, vector_states(7)], ids=["poses", "vectors"])
+@pytest.mark.parametrize("space", [POSE, make_vector_states(7)], ids=["poses", "vectors"])
 def test_what_belongs_together_gives_no_alarm(seed: int, space: StateSpace) -> None:
     findings = found_in(recorded(seed), space=space)
     assert not [finding for finding in findings if finding.level != "ok"]

@@ -60,7 +60,7 @@ def test_vectors_add_and_a_model_of_targets_is_given_the_states_that_changes_lea
     model = vector_model(3)
     model.base_predictor.action_encoder.weight.mul_(40)
     start, tried = Scene(draw(TOKENS, DIM), draw(3)), actions(2, 4)[..., :3]
-    spaces = Spaces.of_vectors(Widths(3, 3), joined)
+    spaces = Spaces.from_widths(Widths(3, 3), joined)
     found, states = WorldModelCost(model, start, goal(), EnergyConfig(), spaces=spaces).rollout(tried)
     after = start.state + torch.cat([torch.zeros(2, 1, 3), tried.cumsum(dim=1)], dim=1)
     torch.testing.assert_close(states, after)

@@ -8,7 +8,7 @@ import pytest
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.counterfactual import make_named_actions, read_actions
-from vjepa2_ac.spaces import counterfactual_states
+from vjepa2_ac.spaces import integrate_states
 
 START = np.array([0.4, 0.1, 0.3, np.pi - 0.01, 0.02, -0.7, 0.4])
 ROWS = np.array([[0.05, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0], [0.0, -0.02, 0.01, 0.0, 0.0, 0.0, -0.75]])
@@ -19,7 +19,7 @@ def test_opposites_sum_to_zero_and_lead_apart_along_one_axis(one: str, other: st
     there, back = make_named_actions(one, 3), make_named_actions(other, 3)
     assert there.any()
     assert not (there + back).any()
-    ends = [counterfactual_states(START, actions)[-1] for actions in (there, back)]
+    ends = [integrate_states(START, actions)[-1] for actions in (there, back)]
     axis = {"up": 2, "left": 1, "forward": 0, "close": 6}[one]
     assert ends[0][axis] > START[axis] > ends[1][axis]
     same = np.arange(7) != axis
@@ -37,7 +37,9 @@ def test_steps_are_as_long_as_asked_and_never_beyond_the_limits() -> None:
     with pytest.raises(InputError, match=r"planning\.limits\.gripper: 0"):
         make_named_actions("close", 1, limits=LimitsConfig(gripper=0.0))
     for name in ("close", "open"):
-        with pytest.raises(InputError, match=rf"planning\.limits\.gripper_mode: held, so that no action can move {name}"):
+        with pytest.raises(
+            InputError, match=rf"planning\.limits\.gripper_mode: held, so that no action can move {name}"
+        ):
             make_named_actions(name, 1, limits=LimitsConfig(gripper_mode="held"))
     for size in (0.0, -0.01, float("nan"), float("inf")):
         with pytest.raises(InputError, match=r"--size: .* cm per step"):

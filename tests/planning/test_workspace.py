@@ -14,7 +14,7 @@ from decisions import controller, image
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_within_limits, make_pose_search_space
-from vjepa2_ac.spaces import CAMERA_POSE, POSE, vector_states
+from vjepa2_ac.spaces import CAMERA_POSE, POSE, make_vector_states
 
 CORNERS = ((0.3, -0.2, 0.1), (0.6, 0.2, 0.5))
 SLACK = 2e-8  # metres
@@ -75,7 +75,7 @@ def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -
     assert run.decision.plan is None
 
 
-@pytest.mark.parametrize("space", [CAMERA_POSE, vector_states(8)])
+@pytest.mark.parametrize("space", [CAMERA_POSE, make_vector_states(8)])
 def test_a_box_is_of_poses_in_the_base_frame(space) -> None:
     with pytest.raises(InputError, match="workspace: a model whose states are not poses"):
         Workspace.from_limits(limits_of(), space)

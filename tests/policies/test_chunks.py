@@ -11,7 +11,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.policies.score import changes_of_chunks
-from vjepa2_ac.spaces import actions_from_states, apply_action, vector_states
+from vjepa2_ac.spaces import actions_from_states, apply_action, make_vector_states
 
 
 def walks(seed: int, steps: int = 12) -> np.ndarray:
@@ -43,7 +43,7 @@ def test_the_same_motion_in_every_form_is_the_same_change(seed: int, control_ste
 
 def test_control_steps_that_fill_no_model_step_are_left_out_and_vectors_add() -> None:
     chunks = np.arange(30.0).reshape(1, 10, 3)
-    found = changes_of_chunks(chunks, np.zeros(3), form="deltas", control_steps=4, space=vector_states(3))
+    found = changes_of_chunks(chunks, np.zeros(3), form="deltas", control_steps=4, space=make_vector_states(3))
     np.testing.assert_allclose(found, [[chunks[0, :4].sum(0), chunks[0, 4:8].sum(0)]])
 
 

@@ -27,7 +27,7 @@ from vjepa2_ac.serving.session import (
     interpolate_waypoints,
 )
 from vjepa2_ac.serving.wire import pack, unpack
-from vjepa2_ac.spaces import POSE, actions_from_states, apply_action, vector_states
+from vjepa2_ac.spaces import POSE, actions_from_states, apply_action, make_vector_states
 
 CUP = {"cup": (SubGoal(image(50), "cup"),), "two": (SubGoal(image(51), "a", at_most=1), SubGoal(image(52), "b"))}
 
@@ -232,7 +232,7 @@ def test_sent_action_is_within_the_limits_for_any_plan(
     steps = sent
     if form == "pose":
         assert ((sent[:, 6] >= 0) & (sent[:, 6] <= 1)).all()
-        steps = POSE.differences(np.stack([state, sent[-1]]))
+        steps = POSE.compute_differences(np.stack([state, sent[-1]]))
     assert (abs(steps) <= LARGEST + 1e-5).all()
     targets = state[:3] + np.cumsum(steps[:, :3], axis=0)
     is_inside = (targets >= np.array(BOX[0]) - 1e-5).all() and (targets <= np.array(BOX[1]) + 1e-5).all()
@@ -297,7 +297,7 @@ def test_rotation_outside_the_workspace_is_allowed() -> None:
 
 
 def test_vector_changes_must_be_within_the_axis_limits() -> None:
-    space, limits = vector_states(3), LimitsConfig(axes=(0.1, 0.2, 0.0))
+    space, limits = make_vector_states(3), LimitsConfig(axes=(0.1, 0.2, 0.0))
     changes = np.array([[0.1, -0.2, 0.0], [-0.1, 0.2, 0.0]])
     assert find_limit_violation(np.zeros(3), changes, limits, space) == ""
     for axis, value in ((0, 0.11), (1, -0.21), (2, 0.01)):

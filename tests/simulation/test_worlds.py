@@ -247,7 +247,7 @@ def test_a_world_that_does_not_read_its_requests_is_refused(program: Program) ->
             "ended with status 1\n(.*\n)*RuntimeError: the cube fell off",
         ),
         (HELLO, "print(json.dumps({'error': 'the arm is asleep'}), flush=True)", "the arm is asleep"),
-        (HELLO, "say(state=answer['state'][:6])", "state: 6 numbers in the shape \\(6,\\). Expected 7: x"),
+        (HELLO, "say(state=answer['state'][:6])", "state: 6 numbers with shape \\(6,\\). Expected 7: x"),
         ("print('Welcome!', flush=True)", "say()", "wrote 'Welcome!'. Expected a JSON object"),
         ("print(json.dumps(about | {'rate_hz': 0}), flush=True)", "say()", "rate_hz: "),
         (HELLO, "say(distance_m=float('nan'))", "distance_m nan"),

@@ -29,7 +29,7 @@ def controller(model: WorldModel | None = None, seed: int = 0, **changes: object
 def vector_controller(joined: str, *, states: bool = True) -> Controller:
     """Return a controller of eight joints, whose recorded commands were joined so."""
     config = QUICK.model_copy(update={"iterations": 2, "limits": LimitsConfig(axes=(0.1,))})
-    return Controller(vector_model(8, states=states), config, spaces=Spaces.of_vectors(Widths(8, 8), joined))
+    return Controller(vector_model(8, states=states), config, spaces=Spaces.from_widths(Widths(8, 8), joined))
 
 
 def asked(*goals: int, nodes: int | None = 3, broken: bool = False, start: int = 0, **changes: object) -> PlanResult:

@@ -29,7 +29,7 @@ from vjepa2_ac.evaluation.result import (
 )
 from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.evaluation.summary import summarize
-from vjepa2_ac.intervals import mean_of
+from vjepa2_ac.intervals import estimate_mean
 from vjepa2_ac.reports.write import report_page
 
 ABOUT = About(
@@ -66,8 +66,8 @@ def _predicted(
 
 def ranking_of(ranks: np.ndarray, ids: tuple[str, ...]) -> ActionRanking:
     """Return a ranking of these moves, the same in the box and on the shell."""
-    rank = mean_of(ranks, ids)
-    change = mean_of(0.2 - 0.3 * ranks, ids)
+    rank = estimate_mean(ranks, ids)
+    change = estimate_mean(0.2 - 0.3 * ranks, ids)
     return ActionRanking(64, 0.075, ids, ranks, rank, rank, rank, change, change)
 
 
@@ -90,8 +90,8 @@ def _landscapes(rng: np.random.Generator, ids: tuple[str, ...], off: float) -> L
 
 def _distribution(rng: np.random.Generator, ids: tuple[str, ...], spread: float, horizon: int) -> LatentDistribution:
     levels = [spread ** (h / horizon) + 0.1 * rng.standard_normal(len(ids)) for h in range(1, horizon + 1)]
-    spreads = tuple(mean_of(level, ids) for level in levels)
-    mmd, variance = tuple(mean_of(1 - level, ids) for level in levels), tuple(2 * one.value for one in spreads)
+    spreads = tuple(estimate_mean(level, ids) for level in levels)
+    mmd, variance = tuple(estimate_mean(1 - level, ids) for level in levels), tuple(2 * one.value for one in spreads)
     return LatentDistribution(spreads, mmd, 1.5 - spread, variance, (2.0,) * horizon)
 
 
@@ -125,7 +125,7 @@ def decoded_strips(one: Evaluation, size: int = 64) -> Evaluation:
     rows = dict.fromkeys(("truth", *names), true)
     both = (rows, rows | {names[1]: true[:1].repeat(len(true), axis=0)})
     strips = tuple(DecodedStrip("median", one.clips.episode_ids[0], 0, shown) for shown in both)
-    psnr = (mean_of(np.linspace(20, 24, len(one.clips)), one.clips.episode_ids),) * one.horizon
+    psnr = (estimate_mean(np.linspace(20, 24, len(one.clips)), one.clips.episode_ids),) * one.horizon
     curves = {(name, "psnr_db.whole.truth"): psnr for name in names}
     return replace(
         one, decoded=DecodedRollouts({"folder": "decoder"}, names, curves, strips, fvd=dict.fromkeys(names, 0.4))

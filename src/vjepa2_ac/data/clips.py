@@ -107,7 +107,7 @@ def compute_actions(
         ValueError: Commands are required and the episode has none.
     """
     if config.actions == "difference":
-        return get_state_space(config, states.shape[1]).differences(states)
+        return get_state_space(config, states.shape[1]).compute_differences(states)
     if commands is None:
         raise ValueError("the episode has no recorded commands")
     return join_commands(commands[steps[0] : steps[-1]], config.model_stride, config.join_actions)

@@ -103,7 +103,7 @@ def _actions(recording: Episode, dataset: Dataset) -> Float32[np.ndarray, "steps
         return recording.commands.astype(np.float32)
     actions = np.zeros(recording.states.shape, np.float32)
     if len(actions) > 1:
-        actions[:-1] = dataset.spaces.state.differences(recording.states)
+        actions[:-1] = dataset.spaces.state.compute_differences(recording.states)
     return actions
 
 

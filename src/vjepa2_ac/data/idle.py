@@ -144,7 +144,7 @@ def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> 
     """Return a mask of the steps at which the measured pose changes less than the thresholds; False at the first."""
     if len(states) < 2:
         return np.zeros(len(states), bool)
-    motion = POSE.differences(states.astype(np.float64))
+    motion = POSE.compute_differences(states.astype(np.float64))
     still = (
         (np.linalg.norm(motion[:, POSE.position], axis=1) < config.translation_m)
         & (rotation_angles(motion[:, POSE.rotation]) < config.rotation_rad)

@@ -24,7 +24,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.episode import STATE_DIM, EpisodeInfo, StepRanges
 from vjepa2_ac.errors import InputError, MissingFileError
-from vjepa2_ac.spaces import step_sizes
+from vjepa2_ac.spaces import compute_step_sizes
 from vjepa2_ac.storage import paths
 
 logger = logging.getLogger(__name__)
@@ -337,7 +337,7 @@ STATES_NOT_READ = StatesSummary()
 def summarize_states(states: Float[np.ndarray, "steps state_dim"]) -> StatesSummary:
     """Summarise the states of an episode with one or more steps."""
     width = states.shape[1]
-    fastest = step_sizes(states).max(axis=0, initial=0.0) if width == STATE_DIM else np.zeros(2)
+    fastest = compute_step_sizes(states).max(axis=0, initial=0.0) if width == STATE_DIM else np.zeros(2)
     positions = states[:, np.arange(3) % width]
     return StatesSummary(hash_states(states), [*fastest, *positions.mean(axis=0), *positions.std(axis=0)])
 

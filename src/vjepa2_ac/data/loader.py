@@ -40,7 +40,7 @@ from vjepa2_ac.data.files import map_in_threads, num_connections
 from vjepa2_ac.data.selection import BrokenEpisodes, format_identities
 from vjepa2_ac.data.transforms import ClipTransforms
 from vjepa2_ac.data.windows import ClipOrder, interleave_halves, spread_indices
-from vjepa2_ac.episode import Batch, Clip, Skipped
+from vjepa2_ac.episode import Batch, Clip, SkippedClip
 from vjepa2_ac.errors import InputError, UnreachableError, UserError, counted
 from vjepa2_ac.process import safe_imports, stop_request
 
@@ -209,24 +209,24 @@ class _MicroBatches(TorchDataset[Batch]):
         try:
             results = self._read(positions)
             clips = [result for result in results if isinstance(result, Clip)]
-            skipped = tuple(result for result in results if isinstance(result, Skipped))
+            skipped = tuple(result for result in results if isinstance(result, SkippedClip))
             batch = collate(clips) if clips else empty_batch(self.dataset.config.frames, self.dataset.widths)
             batch = replace(batch, bytes_fetched=storage.bytes_fetched() - before, skipped=skipped)
             return batch if get_worker_info() is None else _in_shared_memory(batch)
         except UserError as error:
             return error
 
-    def _read(self, positions: list[int]) -> list[Clip | Skipped]:
+    def _read(self, positions: list[int]) -> list[Clip | SkippedClip]:
         datasets = [clips.dataset for clips in (self, self.replayed) if clips is not None]
         connections = max(num_connections(dataset.config) for dataset in datasets)
         return list(map_in_threads(self._clip, positions, connections))
 
-    def _clip(self, position: int) -> Clip | Skipped:
+    def _clip(self, position: int) -> Clip | SkippedClip:
         if self.replayed is not None:
             before, after = (int(number * self.share) for number in (position, position + 1))
             if after > before:
                 clip = self.replayed._clip(before)
-                return replace(clip, replayed=True) if isinstance(clip, Skipped) else clip
+                return replace(clip, replayed=True) if isinstance(clip, SkippedClip) else clip
             position -= before
         request = self.request_at(position)
         try:
@@ -235,7 +235,7 @@ class _MicroBatches(TorchDataset[Batch]):
             name = self.dataset.table.identity(request.episode)
             if self.dataset.config.broken_episodes == "error":
                 raise self.dataset.broken.add_fix(error, [name]) from None
-            return Skipped(name, str(error))
+            return SkippedClip(name, str(error))
         return clip if self.changes is None else self.changes.apply(clip, position)
 
 
@@ -428,7 +428,7 @@ def _in_shared_memory(batch: Batch) -> Batch:
         UnreachableError: There is too little shared memory.
     """
     try:
-        return batch.mapped(Tensor.share_memory_)
+        return batch.map_tensors(Tensor.share_memory_)
     except RuntimeError as error:
         found = f"not enough space for a batch of {_megabytes(batch.nbytes)} from a loader worker ({error})"
         raise UnreachableError(where=str(SHARED_MEMORY), found=found, fix=_MORE_SHARED_MEMORY) from None

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.data import PoseFields, RotationFormat
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.spaces import ANGLE_RAD, POSE
+from vjepa2_ac.spaces import MAX_ANGLE_RAD, POSE
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _UNIT_TOLERANCE = 1e-2
@@ -181,7 +181,7 @@ def measure_rotation_speeds(
     jumps = [_find_jumps(episode) for episode in numbers]
     speeds: dict[RotationFormat, RotationSpeeds] = {}
     for written_as in FORMATS:
-        if written_as != "euler_xyz_degrees" and largest > ANGLE_RAD:
+        if written_as != "euler_xyz_degrees" and largest > MAX_ANGLE_RAD:
             continue
         angles = [_step_angles(episode, written_as) for episode in numbers]
         ratios = [

@@ -24,7 +24,7 @@ from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.decoding.decoder import Decoder, DecoderShape, to_images
 from vjepa2_ac.encoding.latent_cache import FramesToEncode, needed_frames
 from vjepa2_ac.episode import Progress
-from vjepa2_ac.intervals import mean_of
+from vjepa2_ac.intervals import estimate_mean
 from vjepa2_ac.media.image_similarity import psnr, ssim
 
 
@@ -177,8 +177,8 @@ def measure_decoders(
         decibels, similar = np.concatenate(parts, axis=1)
         finite = np.isfinite(decibels)
         means[name] = {
-            "psnr_db": mean_of(decibels[finite], np.array(ids)[finite].tolist()).as_dict(),
-            "ssim": mean_of(similar, ids).as_dict(),
+            "psnr_db": estimate_mean(decibels[finite], np.array(ids)[finite].tolist()).as_dict(),
+            "ssim": estimate_mean(similar, ids).as_dict(),
             "exact_frames": int((~finite).sum()),
         }
     return means

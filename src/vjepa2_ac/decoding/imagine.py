@@ -31,7 +31,7 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import checkpoint_name
 from vjepa2_ac.runs.folder import IMAGINED
-from vjepa2_ac.spaces import StateSpace, counterfactual_states, feasible_actions
+from vjepa2_ac.spaces import StateSpace, clip_gripper_changes, integrate_states
 from vjepa2_ac.storage import translate_write_errors, write_atomically
 
 logger = logging.getLogger(__name__)
@@ -109,11 +109,11 @@ def compute_rollout(
         start: The first frame and its state.
         actions: One action for each step.
         states: The recorded states, for recorded actions. None: states are integrated from the first one, and gripper
-            commands are clipped to the possible range (`feasible_actions`), as in the training data.
+            commands are clipped to the possible range (`clip_gripper_changes`), as in the training data.
     """
     if states is None:
-        states = counterfactual_states(start.state, actions, start.space)[:-1]
-        actions = feasible_actions(start.state, actions, start.space)
+        states = integrate_states(start.state, actions, start.space)[:-1]
+        actions = clip_gripper_changes(start.state, actions, start.space)
     device = start.latents.device
     action_inputs, state_inputs = (
         torch.as_tensor(values, dtype=torch.float32, device=device)[None] for values in (actions, states)
@@ -260,9 +260,9 @@ class ValidationStrip:
         """Update the clip with the most motion from a batch of validation clips and its latents."""
         self._dataset = dataset
         for row, states in enumerate(encoded.states.double().cpu().numpy()):
-            motion = dataset.spaces.state.path_length(states)
+            motion = dataset.spaces.state.compute_path_length(states)
             if motion > self._max_motion:
-                clip = encoded.clip(row)
+                clip = encoded.select_clip(row)
                 copied = replace(clip, latents=clip.latents.detach().float().cpu().clone())  # frees the other clips
                 self._max_motion, self._clip = motion, (replace(batch, latents=None), row, copied)
 

@@ -374,7 +374,7 @@ def _encode(
         recording, frames = part.result()
         pixels = frames.to(encoder.device, non_blocking=True)
         inputs = pixels_to_input(pixels[None], encoder.world_model.image_size)[0]
-        latents.append(pack_latents(encoder.latents(inputs), kind).mapped(_to_host))
+        latents.append(pack_latents(encoder.latents(inputs), kind).map_tensors(_to_host))
         pictures.append(_to_host(input_to_pixels(inputs)))
 
     def finish() -> EncodedEpisode:

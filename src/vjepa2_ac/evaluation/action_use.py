@@ -17,9 +17,9 @@ from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import SAME_ENERGY, ActionRanking, Landscape, Landscapes
-from vjepa2_ac.intervals import mean_of, ratio
+from vjepa2_ac.intervals import estimate_mean, estimate_ratio
 from vjepa2_ac.model.distances import absolute_difference
-from vjepa2_ac.spaces import POSE, ActionSpace, vector_states
+from vjepa2_ac.spaces import POSE, ActionSpace, make_vector_states
 
 _MARGIN = 1.25  # half-width of a landscape's grid relative to the largest true action
 _AXES = slice(0, 3)  # components of an action that span the grid; the position for poses
@@ -104,15 +104,15 @@ def select_moves(batch: LatentBatch, row: int, space: ActionSpace, reach: float)
     if space.follows != "change":
         return (rollout_start(batch, row, int(batch.actions[row].norm(dim=-1).argmax())),)
     states = batch.states[row].cpu().numpy().astype(np.float64)
-    state_space = vector_states(states.shape[1]) if space.position is None else POSE
+    state_space = make_vector_states(states.shape[1]) if space.position is None else POSE
     pairs = [(first, last) for first in range(len(states)) for last in range(first + 1, len(states))]
-    changes = np.concatenate([state_space.differences(states[[first, last]]) for first, last in pairs])
-    lengths = np.linalg.norm(changes[:, state_space.sized], axis=1)
+    changes = np.concatenate([state_space.compute_differences(states[[first, last]]) for first, last in pairs])
+    lengths = np.linalg.norm(changes[:, state_space.size_axes], axis=1)
     within = lengths <= (np.inf if space.position is None else reach)
     ends = pairs[int(np.where(within, lengths, -1.0).argmax() if within.any() else lengths.argmin())]
     moves = []
     for first, last in (ends, ends[::-1]):
-        change = torch.from_numpy(state_space.differences(states[[first, last]])[0]).to(batch.actions)
+        change = torch.from_numpy(state_space.compute_differences(states[[first, last]])[0]).to(batch.actions)
         moves.append(rollout_start(batch, row, first, end=last, action=change))
     return tuple(moves)
 
@@ -177,13 +177,13 @@ def draw_alternatives(
     box, shell = (np.tile(true, (probes.samples, 1)) for _ in range(2))
     drawn = generator.uniform(-1.0, 1.0, size=box.shape)
     if space.position is None:
-        box, unit = drawn * largest, largest[space.sized]
+        box, unit = drawn * largest, largest[space.size_axes]
     else:
         box[:, space.position] = drawn[:, space.position] * (probes.reach_cm / 100)
-        unit = np.ones(len(true))[space.sized]
+        unit = np.ones(len(true))[space.size_axes]
     drawn = generator.normal(size=(probes.samples, len(unit))) * (unit > 0)
-    length = np.linalg.norm(true[space.sized] / np.where(unit > 0, unit, 1.0))
-    shell[:, space.sized] = drawn * unit * length / np.maximum(np.linalg.norm(drawn, axis=1), 1e-12)[:, None]
+    length = np.linalg.norm(true[space.size_axes] / np.where(unit > 0, unit, 1.0))
+    shell[:, space.size_axes] = drawn * unit * length / np.maximum(np.linalg.norm(drawn, axis=1), 1e-12)[:, None]
     return np.concatenate([box, shell])
 
 
@@ -227,11 +227,11 @@ def rank_actions(
         reach=probes.reach_cm / 100,
         episode_ids=ids,
         ranks=ranks,
-        rank=mean_of(ranks, ids),
-        box=mean_of(in_box, ids),
-        shell=mean_of(on_shell, ids),
-        spread=ratio(spread, now, ids),
-        change=ratio(change, now, ids),
+        rank=estimate_mean(ranks, ids),
+        box=estimate_mean(in_box, ids),
+        shell=estimate_mean(on_shell, ids),
+        spread=estimate_ratio(spread, now, ids),
+        change=estimate_ratio(change, now, ids),
     )
 
 
@@ -258,13 +258,13 @@ def measure_landscapes(
 
     def landscape(start: RolloutStart) -> Landscape:
         true = start.true[_AXES]
-        return _landscape(model, start, grid_axes(true, half, nodes), true, space.shown_factor, probes.at_once)
+        return _landscape(model, start, grid_axes(true, half, nodes), true, space.display_factor, probes.at_once)
 
     maps = map_shared(starts, landscape, progress)
     chance = np.mean([np.linalg.norm(_nodes_of(each.axes) - each.true, axis=1).mean() for each in maps])
     return Landscapes(
         axis_names=space.names[_AXES],
-        unit=space.shown_unit,
+        unit=space.display_unit,
         maps=tuple(maps),
         chance_distance=float(chance),
     )

@@ -29,7 +29,7 @@ from vjepa2_ac.evaluation.distribution import frechet_distance
 from vjepa2_ac.evaluation.evaluate import ClipName, EvaluatedModel, FramesOfRow, RepeatableClips
 from vjepa2_ac.evaluation.measure import predict_frames
 from vjepa2_ac.evaluation.result import DecodedRollouts, DecodedStrip, Example
-from vjepa2_ac.intervals import Estimate, ratios
+from vjepa2_ac.intervals import Estimate, estimate_ratios
 from vjepa2_ac.media.image_similarity import masked_mean, moving_region, psnr, ssim_map
 from vjepa2_ac.reporter import SILENT, Reporter
 
@@ -172,4 +172,4 @@ def _joined(parts: Sequence[Mapping[_Key, Sequence[np.ndarray]]]) -> dict[_Key, 
 def _means(values: Float[np.ndarray, "clips horizon"], ids: Sequence[str]) -> tuple[Estimate, ...]:
     """Return the mean at each horizon, over the clips whose value is finite."""
     finite = np.isfinite(values)
-    return ratios(np.where(finite, values, 0.0), finite.astype(np.float64), ids)
+    return estimate_ratios(np.where(finite, values, 0.0), finite.astype(np.float64), ids)

@@ -29,7 +29,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vjepa2_ac.evaluation.result import LatentDistribution
-from vjepa2_ac.intervals import Estimate, bootstrapped_by_weights
+from vjepa2_ac.intervals import Estimate, bootstrap_by_weights
 
 _SCALE = 100.0  # factor of the reported MMD
 
@@ -157,7 +157,7 @@ def mmd(
     def of_weights(weights: np.ndarray) -> np.ndarray:
         return np.asarray(_SCALE * _quadratic(weights, pairs) / _quadratic(weights, counts))[:, None]
 
-    return bootstrapped_by_weights(of_weights, len(pairs))[0]
+    return bootstrap_by_weights(of_weights, len(pairs))[0]
 
 
 def _summed(

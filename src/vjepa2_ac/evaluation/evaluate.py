@@ -190,7 +190,7 @@ def _collect(
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             names.append(name)
             if name in probed:
-                largest = int(batch.actions[row][:, clips.space.sized].norm(dim=-1).argmax())
+                largest = int(batch.actions[row][:, clips.space.size_axes].norm(dim=-1).argmax())
                 starts.append(rollout_start(batch, row, largest))
                 moves += select_moves(batch, row, clips.space, probes.reach_cm / 100)
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
@@ -229,7 +229,7 @@ def _examples(
             for evaluated_model in evaluated_models:
                 with evaluated_model.prediction_context():
                     predicted[evaluated_model.name] = (
-                        predict_frames(evaluated_model.model, batch.clip(row))[0].float().cpu()
+                        predict_frames(evaluated_model.model, batch.select_clip(row))[0].float().cpu()
                     )
             errors_of = {
                 source: rearrange(
@@ -267,7 +267,7 @@ def describe_clips(
         space: Meaning of the actions.
         seconds_per_step: Duration of a model step.
     """
-    size, (episode_ids, starts) = space.shown_size(actions), zip(*names, strict=True)
+    size, (episode_ids, starts) = space.compute_display_size(actions), zip(*names, strict=True)
     if space.position is None or space.rotation is None or space.gripper is None:
         least = _IDLE_SHARE * float(np.percentile(size, 95))
         words = f"the norm of the action is {least:.3g} or more, a tenth of its 95th percentile"

@@ -248,7 +248,7 @@ def _motion(dataset: Dataset, episode: int, start: int) -> float:
     """Return the length of the robot's path in a clip, added up over its model steps."""
     steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
     states = dataset.source.read(episode, None, dataset.needed_steps(episode)).states[list(steps)]
-    return dataset.spaces.state.path_length(states)
+    return dataset.spaces.state.compute_path_length(states)
 
 
 def _as_seen(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio, ratios
+from vjepa2_ac.intervals import Estimate, bootstrap, estimate_mean, estimate_ratio, estimate_ratios
 from vjepa2_ac.model.distances import absolute_difference, squared_difference
 from vjepa2_ac.registry import METRICS
 
@@ -202,11 +202,11 @@ class Landscapes:
 
     def mean(self, measure: LandscapeMeasure) -> Estimate:
         """Return the mean of a measure over the clips."""
-        return mean_of(self._values(measure), self.episode_ids)
+        return estimate_mean(self._values(measure), self.episode_ids)
 
     def difference(self, other: Landscapes, measure: LandscapeMeasure) -> Estimate:
         """Return the mean of a measure minus that of another model on the same clips, paired."""
-        return mean_of(self._values(measure) - other._values(measure), self.episode_ids)
+        return estimate_mean(self._values(measure) - other._values(measure), self.episode_ids)
 
     def _values(self, measure: LandscapeMeasure) -> Float[np.ndarray, " clips"]:
         return np.array([getattr(landscape, measure) for landscape in self.maps])
@@ -342,38 +342,40 @@ Steps = Bool[np.ndarray, "clips horizon"]  # True for steps to include
 
 def over_persistence(errors: PredictionErrors, mode: Mode, metric: Metric = L1, actions: ActionMode = "true") -> Curve:
     """Return the mean error relative to persistence's at each horizon: 1 is as good as persistence; 0 is perfect."""
-    return ratios(errors.of(mode, metric, actions), errors.of(mode, metric, "persistence"), errors.episode_ids)
+    return estimate_ratios(errors.of(mode, metric, actions), errors.of(mode, metric, "persistence"), errors.episode_ids)
 
 
 def one_step_over_persistence(
     errors: PredictionErrors, actions: Actions = "true", steps: Steps | None = None
 ) -> Estimate:
     """Return the teacher-forced error relative to persistence, over all or the selected steps; NaN without steps."""
-    return ratio(_one_step(errors, actions, steps), _one_step(errors, "persistence", steps), errors.episode_ids)
+    return estimate_ratio(
+        _one_step(errors, actions, steps), _one_step(errors, "persistence", steps), errors.episode_ids
+    )
 
 
 def gain_over(errors: PredictionErrors, others: PredictionErrors, mode: Mode = "rollout", metric: Metric = L1) -> Curve:
     """Return the relative gain over another model at each horizon, paired by clip: 0.18 is 18 % better."""
     pair = [each.of(mode, metric) for each in (errors, others)]
     better = 1 if metric.smaller_is_better else -1
-    return bootstrapped(lambda sums: better * (1 - sums[0] / sums[1]), np.stack(pair), errors.episode_ids)
+    return bootstrap(lambda sums: better * (1 - sums[0] / sums[1]), np.stack(pair), errors.episode_ids)
 
 
 def cost_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
     """Return the relative increase of the teacher-forced error with zero or shuffled actions, paired by clip."""
-    grown = ratio(_one_step(errors, actions), _one_step(errors, "true"), errors.episode_ids)
+    grown = estimate_ratio(_one_step(errors, actions), _one_step(errors, "true"), errors.episode_ids)
     return Estimate(grown.value - 1, grown.low - 1, grown.high - 1)
 
 
 def gap_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
     """Return the increase of the teacher-forced error with zero or shuffled actions, relative to persistence."""
     changed, true = (errors.of("teacher_forced", L1, each) for each in (actions, "true"))
-    return ratio((changed - true).mean(axis=1), _one_step(errors, "persistence"), errors.episode_ids)
+    return estimate_ratio((changed - true).mean(axis=1), _one_step(errors, "persistence"), errors.episode_ids)
 
 
 def rank_difference(one: ActionRanking, other: ActionRanking) -> Estimate:
     """Return the action-ranking error minus that of another model on the same moves, paired: below 0 is better."""
-    return mean_of(one.ranks - other.ranks, one.episode_ids)
+    return estimate_mean(one.ranks - other.ranks, one.episode_ids)
 
 
 def _one_step(errors: PredictionErrors, actions: ActionMode, steps: Steps | None = None) -> np.ndarray:

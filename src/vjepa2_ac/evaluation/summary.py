@@ -21,7 +21,7 @@ from pydantic import BeforeValidator, TypeAdapter
 from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import L1, Evaluation
 from vjepa2_ac.evaluation.rows import Row
-from vjepa2_ac.intervals import ENOUGH_EPISODES, Estimate
+from vjepa2_ac.intervals import MIN_EPISODES, Estimate
 from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 
 Conclusion = Literal["yes", "no", "inconclusive", "not measured"]
@@ -176,13 +176,13 @@ def summarize(evaluation: Evaluation, rows: Sequence[Row]) -> Summary:
         ranks_actions=ranks_actions,
         landscape=None if landscape is None else _of_enough(landscape, mapped),
     )
-    return summary if clips.episodes >= ENOUGH_EPISODES else _too_few(summary, clips.episodes)
+    return summary if clips.episodes >= MIN_EPISODES else _too_few(summary, clips.episodes)
 
 
 def _too_few(summary: Summary, episodes: int) -> Summary:
     """Return a summary without conclusions: it states that there are too few episodes, and the numbers so far."""
     needs = (
-        f"{_are_too_few(episodes, 'held-out episode')}; at least {ENOUGH_EPISODES} are needed."
+        f"{_are_too_few(episodes, 'held-out episode')}; at least {MIN_EPISODES} are needed."
         f" So far: {summary.predicts.statement}; {summary.uses_actions.statement}."
     )
     return replace(
@@ -197,7 +197,7 @@ def _too_few(summary: Summary, episodes: int) -> Summary:
 def _of_enough(verdict: Verdict, episode_ids: Sequence[str]) -> Verdict:
     """Return a verdict on clips of these episodes, without a conclusion if there are too few episodes."""
     episodes = len(set(episode_ids))
-    if not 0 < episodes < ENOUGH_EPISODES:
+    if not 0 < episodes < MIN_EPISODES:
         return verdict
     few = f"{verdict.reference[:-1]}; {_are_too_few(episodes, 'episode')})"
     return replace(_without_conclusion(verdict), reference=few)
@@ -245,7 +245,7 @@ def draw_conclusion(gain: Estimate, same: float) -> Conclusion:
     if max(abs(gain.low), abs(gain.high)) < same:
         return "no"
     conclusions: dict[int, Conclusion] = {-1: "no", 0: "inconclusive", 1: "yes"}
-    return conclusions[gain.side(of=0.0)]
+    return conclusions[gain.compare_to(0.0)]
 
 
 def _verdict(name: str, conclusion: Conclusion, statement: str, estimate: Estimate, compared_with: str) -> Verdict:
@@ -263,7 +263,7 @@ def _predicts(evaluation: Evaluation, rows: Mapping[str, Row], base_rows: Mappin
     """
     horizon, ahead = evaluation.horizon, f"{evaluation.seconds_ahead:.1f} s ahead"
     error = rows[f"rollout.{L1.name}.over_persistence.{horizon}"].estimate
-    verdict = against_persistence = _verdict_on_gain(error.below(1.0), _PERSISTENCE, ahead)
+    verdict = against_persistence = _verdict_on_gain(error.subtract_from(1.0), _PERSISTENCE, ahead)
     gain, remarks = rows.get(f"rollout.{L1.name}.gain_over_base.{horizon}"), []
     if gain is not None:
         verdict = _verdict_on_gain(gain.estimate, _BASE, ahead)
@@ -271,7 +271,7 @@ def _predicts(evaluation: Evaluation, rows: Mapping[str, Row], base_rows: Mappin
             f"by {metric.label} {_amount(other.estimate, 'better', 'worse')} {format_interval(other.estimate)}".rstrip()
             for metric in evaluation.metrics
             if (other := rows.get(f"rollout.{metric.name}.gain_over_base.{horizon}"))
-            and other.estimate.side(of=0.0) != gain.estimate.side(of=0.0)
+            and other.estimate.compare_to(0.0) != gain.estimate.compare_to(0.0)
         ]
     error_fell = verdict.value is not None and verdict.value > SAME_ERROR
     if error_fell and (blur := _blur(rows, base_rows, horizon)):
@@ -325,13 +325,16 @@ def _ranks_actions(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Ver
     rank = rows[key].estimate
     statement = f"action-ranking error {format_percent(rank.value)} %"
     conclusion, reference, compared_with = (
-        draw_conclusion(rank.below(CHANCE), RANKING_TOLERANCE),
+        draw_conclusion(rank.subtract_from(CHANCE), RANKING_TOLERANCE),
         "chance 50 %",
         _CHANCE,
     )
     if (difference := rows.get("ranking.difference_to_base")) is not None:
         if conclusion == "yes":
-            conclusion, compared_with = draw_conclusion(difference.estimate.below(0.0), RANKING_TOLERANCE), _BASE
+            conclusion, compared_with = (
+                draw_conclusion(difference.estimate.subtract_from(0.0), RANKING_TOLERANCE),
+                _BASE,
+            )
         reference = f"base model {format_percent(base_rows[key].value)} %, {reference}"
     verdict = _verdict(RANKING, conclusion, statement, rank, compared_with)
     return replace(verdict, reference=f"({reference})", baseline=CHANCE)
@@ -346,11 +349,11 @@ def _landscape(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict
     if key not in rows:
         return None
     distance, chance, unit = rows[key].estimate, rows[key].chance or 0.0, rows[key].unit
-    conclusion, compared_with = draw_conclusion(distance.below(chance), 0.0), _CHANCE
+    conclusion, compared_with = draw_conclusion(distance.subtract_from(chance), 0.0), _CHANCE
     references = [f"random point {_with_unit(chance, unit)}", f"sharpness {rows[sharpness].value:#.2g}"]
     if (difference := rows.get("landscapes.distance.difference_to_base")) is not None:
         if conclusion == "yes":
-            conclusion, compared_with = draw_conclusion(difference.estimate.below(0.0), 0.0), _BASE
+            conclusion, compared_with = draw_conclusion(difference.estimate.subtract_from(0.0), 0.0), _BASE
         references.insert(0, f"base model {_with_unit(base_rows[key].value, unit)}")
         references[-1] += f", base model {base_rows[sharpness].value:#.2g}"
     statement = f"energy minimum {_with_unit(distance.value, unit)} from the true action"
@@ -385,7 +388,7 @@ def closed_loop_verdict(
     if reference.value < CHANCE:
         solved = f"The oracle solves only {format_percent(reference.value)} % of these problems"
         needs = f"{solved}, so they cannot be used for comparison; raise --steps."
-    elif problems < ENOUGH_EPISODES:
+    elif problems < MIN_EPISODES:
         needs = f"{_are_too_few(problems, 'problem')}; use --episodes 50."
     others = ", ".join(f"{name} {format_percent(rate.value)} %" for name, rate in shares.items() if name != model)
     statement = (

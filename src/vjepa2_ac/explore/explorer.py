@@ -33,7 +33,7 @@ from vjepa2_ac.planning.energy import EnergySlice, Goal, Scene, WorldModelCost, 
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, raise_if_cancelled
 from vjepa2_ac.planning.search_space import SearchSpace, make_search_space
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
-from vjepa2_ac.spaces import Spaces, counterfactual_states, feasible_actions
+from vjepa2_ac.spaces import Spaces, clip_gripper_changes, integrate_states
 
 MAX_STEPS = 16  # longest path in model steps, as in the training of the released model
 _MAX_CACHED_STEPS = 128  # cached predictions per model, for undo and for other branches
@@ -208,7 +208,7 @@ class Explorer:
         states = batch.states[0].double().numpy()
         action = batch.actions[0, 0].double().numpy()
         if self.spaces.action.follows == "target":
-            action = self.spaces.state.differences(np.stack([states[0], action]))[0]
+            action = self.spaces.state.compute_differences(np.stack([states[0], action]))[0]
         camera, latents = None if encoded.extrinsics is None else encoded.extrinsics[0, 0], encoded.latents[0]
         first = Observation(pixels[0], latents[0], states[0], tuple(action.tolist()), camera)
         return first, Observation(pixels[1], latents[1], states[1])
@@ -238,7 +238,7 @@ class Explorer:
         """Return the states along a path: recorded while the actions are the recorded ones, then integrated."""
         states = [self.get_observation(position.episode, position.start).state]
         for action, recorded in zip(position.actions, self.get_recorded_observations(position)[1:], strict=True):
-            following = counterfactual_states(states[-1], np.array([action]), self.spaces.state)[1]
+            following = integrate_states(states[-1], np.array([action]), self.spaces.state)[1]
             states.append(following if recorded is None else recorded.state)
         return np.stack(states)
 
@@ -266,7 +266,7 @@ class Explorer:
         if self.spaces.action.follows != "target":
             values = np.array(position.actions[-1])
             if self.get_recorded_observation(position) is None:  # the gripper cannot open or close beyond its range
-                values = feasible_actions(states[-2], values[None], self.spaces.state)[0]
+                values = clip_gripper_changes(states[-2], values[None], self.spaces.state)[0]
         cache, camera = cache.copy(), self.get_extrinsics(position)
         action, state = (torch.as_tensor(x, dtype=torch.float32, device=self.device) for x in (values, states[-2]))
         inputs = latents[None, None], action[None, None], state[None, None]

@@ -18,7 +18,7 @@ from torch import Tensor
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.windows import spread_indices_with_ends
-from vjepa2_ac.episode import Progress, short_names
+from vjepa2_ac.episode import Progress, shorten_names
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.explore.explorer import (
     MAX_STEPS,
@@ -121,7 +121,7 @@ class Views:
     def episode_names(self) -> list[str]:
         """The names of the episodes, shortened to the parts in which they differ."""
         names = [self.explorer.get_episode_name(index) for index in range(len(self.explorer.episodes))]
-        short = short_names(names)
+        short = shorten_names(names)
         return [short[name] for name in names]
 
     # ---- actions and moves ----
@@ -162,7 +162,7 @@ class Views:
         explorer, changes = self.explorer, []
         for episode in explorer.episodes[:_MAX_SAMPLED_EPISODES]:
             states = np.asarray(explorer.dataset.source.read(episode).states, dtype=np.float64)
-            changes.append(explorer.spaces.state.differences(states[:: explorer.stride]))
+            changes.append(explorer.spaces.state.compute_differences(states[:: explorer.stride]))
         return changes
 
     @property
@@ -173,7 +173,7 @@ class Views:
     @property
     def _initial_episode_and_goal(self) -> tuple[int, int]:
         """The proposed start and goal: the episode with the most motion, and its last control step."""
-        size = self.explorer.spaces.state.sized
+        size = self.explorer.spaces.state.size_axes
         lengths = [float(np.linalg.norm(changes[:, size], axis=1).sum()) for changes in self._recorded_changes]
         episode = int(np.argmax(lengths))
         return episode, self.explorer.get_num_steps(episode) - 1
@@ -378,4 +378,4 @@ def make_displayed_units(space: Space) -> list[dict[str, Any]]:
     """Return the name, unit, displayed unit and conversion factor of each number of a state or an action."""
     shown = {"m": ("cm", 100.0), "rad": ("°", 180 / math.pi)}
     units = [(name, unit, *shown.get(unit, (unit, 1.0))) for name, unit in zip(space.names, space.units, strict=True)]
-    return [dict(zip(("name", "unit", "shown_unit", "factor"), values, strict=True)) for values in units]
+    return [dict(zip(("name", "unit", "display_unit", "factor"), values, strict=True)) for values in units]

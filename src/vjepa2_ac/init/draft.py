@@ -16,7 +16,7 @@ from vjepa2_ac.config.model import RANDOM, ModelSizes
 from vjepa2_ac.errors import counted
 from vjepa2_ac.init.dataset_properties import DatasetProperties
 from vjepa2_ac.init.draft_values import DraftValue, DraftValues, format_yaml, list_guesses, plain_values
-from vjepa2_ac.intervals import ENOUGH_EPISODES
+from vjepa2_ac.intervals import MIN_EPISODES
 from vjepa2_ac.model.checkpoints import base_sizes
 from vjepa2_ac.model.model_files import OFFICIAL, PUBLISHED
 from vjepa2_ac.storage.paths import BUILTIN
@@ -341,7 +341,7 @@ def _choose_shares(data: DatasetProperties) -> dict[Split, DraftValue]:
     if data.episodes is not None:
         share = next(share for least, share in _SHARES if data.episodes > least or least == 0)
         count = max(1, round(share * data.episodes))
-        required = min(_MAX_TEST_SHARE, math.ceil(100 * (ENOUGH_EPISODES + 1) / data.episodes) / 100)
+        required = min(_MAX_TEST_SHARE, math.ceil(100 * (MIN_EPISODES + 1) / data.episodes) / 100)
         test_share = max(share, required)
         reason = f"about {count:,} of {counted(data.episodes, 'episode')}, selected by a hash"
     return {

@@ -13,7 +13,7 @@ from vjepa2_ac.data.poses import FORMATS, find_smoother_format, measure_rotation
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft_values import DraftValue
 from vjepa2_ac.inspection.motion import FASTEST_RAD_S
-from vjepa2_ac.spaces import ANGLE_RAD, REACH_M
+from vjepa2_ac.spaces import MAX_ANGLE_RAD, MAX_POSITION_M
 
 Numbers = Float[np.ndarray, "steps _"]
 Samples = Mapping[str, Sequence[Numbers]]  # values of some episodes, by column; columns that were not read are missing
@@ -352,12 +352,12 @@ def _choose_rotation_format(rotation: _Numbers, samples: Samples, control_rate_h
     if is_guess and not values:
         reason += ". The values were not read"
     largest = _measure_magnitude(values)
-    if proposed != "euler_xyz_degrees" and largest > ANGLE_RAD:
+    if proposed != "euler_xyz_degrees" and largest > MAX_ANGLE_RAD:
         reason = f"the values reach {largest:.0f}, which is too large for radians"
         if proposed == "rotation_vector":
             reason += ". Rotation vectors in degrees are not supported"
         return DraftValue("euler_xyz_degrees", reason, is_guess or proposed == "rotation_vector")
-    values = [episode[abs(episode).max(axis=1) <= max(largest, ANGLE_RAD)] for episode in values]
+    values = [episode[abs(episode).max(axis=1) <= max(largest, MAX_ANGLE_RAD)] for episode in values]
     smoother = (
         find_smoother_format(measure_rotation_speeds(values, control_rate_hz), proposed, FASTEST_RAD_S)
         if values
@@ -374,9 +374,9 @@ def _choose_position_unit(position: _Numbers, samples: Samples) -> DraftValue:
     if position[0].unit in {"m", "cm", "mm"}:
         return DraftValue(position[0].unit)
     largest = _measure_magnitude(_get_finite_values(position, samples))
-    if largest <= REACH_M:
+    if largest <= MAX_POSITION_M:
         return DraftValue("m")
-    unit = "mm" if largest > 100 * REACH_M / 2 else "cm"
+    unit = "mm" if largest > 100 * MAX_POSITION_M / 2 else "cm"
     return DraftValue(unit, f"the values reach {largest:.0f}, which is too large for metres", is_guess=True)
 
 

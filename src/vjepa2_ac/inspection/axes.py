@@ -28,7 +28,7 @@ from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.action_use import RolloutStart, rollout_start
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.inspection.variants import load_named
-from vjepa2_ac.intervals import Estimate, bootstrapped, ratio
+from vjepa2_ac.intervals import Estimate, bootstrap, estimate_ratio
 from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.planning.energy import Axes
@@ -103,10 +103,10 @@ def fit_axes(
     def of_sums(sums: Float[np.ndarray, "1 *batch angles"]) -> Float[np.ndarray, "*batch 1"]:
         return np.asarray((nearby + _wrapped(_least(sums[0]) - nearby))[..., None])
 
-    (yaw,) = bootstrapped(of_sums, errors[None], episode_ids)
+    (yaw,) = bootstrap(of_sums, errors[None], episode_ids)
     return AxisFit(
         yaw_degrees=yaw,
-        error=ratio(errors[:, _nearest_tried(yaw.value)], errors[:, _UNTURNED], episode_ids),
+        error=estimate_ratio(errors[:, _nearest_tried(yaw.value)], errors[:, _UNTURNED], episode_ids),
         by_angle=tuple((errors.sum(axis=0) / errors[:, _UNTURNED].sum()).tolist()),
         pairs=len(errors),
         episodes=len(set(episode_ids)),

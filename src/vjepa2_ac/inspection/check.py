@@ -24,7 +24,7 @@ from vjepa2_ac.inspection.excerpts import check_excerpts
 from vjepa2_ac.inspection.findings import Finding, Level, duplicates_finding, first_case
 from vjepa2_ac.inspection.motion import check_motion
 from vjepa2_ac.inspection.statistics import PERCENTILES, at_some_stride
-from vjepa2_ac.intervals import ENOUGH_EPISODES
+from vjepa2_ac.intervals import MIN_EPISODES
 from vjepa2_ac.spaces import POSE, POSES, Spaces, rotation_angles
 
 _DARK = 8  # mean (0 to 255) below which frames are nearly black
@@ -104,9 +104,9 @@ def _check_test_split(dataset: Dataset) -> Iterator[Finding]:
     """Yield a warning if the test split is too small for intervals, with a share that suffices."""
     config, is_long_enough = dataset.config, dataset.table.num_steps >= dataset.config.clip_steps
     count = int((dataset.split_mask("test") & is_long_enough).sum())
-    if not 0 < count < ENOUGH_EPISODES:
+    if not 0 < count < MIN_EPISODES:
         return
-    text = f"{counted(count, 'test episode')} cannot show whether training helped; {ENOUGH_EPISODES} are needed"
+    text = f"{counted(count, 'test episode')} cannot show whether training helped; {MIN_EPISODES} are needed"
     if "test" in held_out_splits(dataset.table, config):
         yield Finding("warning", "test", f"{text}. data.splits=hash draws the test split from all episodes")
         return
@@ -114,7 +114,7 @@ def _check_test_split(dataset: Dataset) -> Iterator[Finding]:
     for percent in range(5, 55, 5):  # tried, because a hash draws the split: its size is not exactly its share
         other = replace(dataset, config=config.model_copy(update={"test_share": percent / 100}))
         test, train = (int((other.split_mask(split) & is_long_enough).sum()) for split in ("test", "train"))
-        if test >= ENOUGH_EPISODES and train > test:
+        if test >= MIN_EPISODES and train > test:
             fix = f"Set data.test_share={percent / 100:g}: the split then has {test}"
             break
     yield Finding("warning", "test", f"{text}. {fix}")
@@ -221,7 +221,7 @@ def _pose_findings(
         (np.ptp(closed) == 0, "warning", f"it never moves in {counted(clips, 'clip')}. Check that the state has it"),
         (closed.max() < _OPEN, "warning", "the gripper never closes. Check that it is 0 to 1, not a width in metres"),
     )
-    moved = POSE.shown_size(actions)
+    moved = POSE.compute_display_size(actions)
     yield first_case(
         "actions",
         f"cm per model step: {_percentiles(moved, '.2f')}",

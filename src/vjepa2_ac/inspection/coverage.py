@@ -63,7 +63,7 @@ class ReadEpisode:
         states = self.states if self.extrinsics is None else states_in_camera_frame(self.states, self.extrinsics)
         for start, end in self.kept:
             for first in range(start, min(start + stride, end - stride)):
-                yield space.differences(states[first:end:stride])
+                yield space.compute_differences(states[first:end:stride])
 
 
 def sample_of(dataset: Dataset, count: int) -> list[int]:
@@ -188,7 +188,7 @@ def _needed(moving_steps: int) -> str:
 
 
 def _of_poses(changes: Float[np.ndarray, "pairs 7"], usual: Float[np.ndarray, " 7"], stride: int) -> Coverage:
-    moves_cm, lengths_cm = 100 * changes[:, POSE.position], POSE.shown_size(changes)
+    moves_cm, lengths_cm = 100 * changes[:, POSE.position], POSE.compute_display_size(changes)
     directions = (moves_cm / np.maximum(lengths_cm, 1e-12)[:, None])[lengths_cm >= _SHORT_CM]
     moving_steps = len(directions) // stride
     is_known = moving_steps >= _FEWEST_STEPS

@@ -135,7 +135,7 @@ def excerpt_findings(
 
 def _motion_in(excerpts: Sequence[Excerpt], space: StateSpace) -> list[Float[np.ndarray, " _"]]:
     """Return the motion of each episode at each step: the sum over its numbers, each relative to its usual change."""
-    changes = [space.differences(one.states) for one in excerpts]
+    changes = [space.compute_differences(one.states) for one in excerpts]
     for change in changes if space.rotation is not None else ():
         change[:, space.rotation] = Rotation.from_euler("xyz", change[:, space.rotation]).as_rotvec()
     scale = np.sqrt((np.concatenate(changes) ** 2).mean(axis=0))

@@ -18,7 +18,7 @@ from vjepa2_ac.errors import counted
 from vjepa2_ac.inspection.coverage import PERCENTILE, ReadEpisode, read_each, read_sample, sample_of
 from vjepa2_ac.inspection.excerpts import BLANK, affordable, is_still, small_grey
 from vjepa2_ac.inspection.findings import Finding, duplicates_finding, first_case
-from vjepa2_ac.spaces import POSE, step_sizes
+from vjepa2_ac.spaces import POSE, compute_step_sizes
 
 _EPISODES = 200
 _MIDDLES = 64  # episodes whose middle frame is read
@@ -132,7 +132,7 @@ def speed_finding(stretches: Sequence[Stretch], control_rate_hz: float, checked:
     """
     if not stretches:
         return Finding("skipped", "speed", "needs episodes of two or more steps, found none")
-    speeds, turns = control_rate_hz * np.concatenate([step_sizes(one.states) for one in stretches]).T
+    speeds, turns = control_rate_hz * np.concatenate([compute_step_sizes(one.states) for one in stretches]).T
     excess = np.maximum(speeds / FASTEST_M_S, turns / FASTEST_RAD_S)
     if excess.max() <= 1:
         text = f"at most {speeds.max():.2f} m/s and {turns.max():.2f} rad/s between control steps ({checked})"

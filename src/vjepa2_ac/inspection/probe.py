@@ -34,7 +34,7 @@ from vjepa2_ac.inspection.variants import (
     measure_variants,
     result_of,
 )
-from vjepa2_ac.intervals import ENOUGH_EPISODES
+from vjepa2_ac.intervals import MIN_EPISODES
 from vjepa2_ac.spaces import POSE, euler_from_matrices, matrices_from_euler
 
 SHIFTS = (1, 2, 4, 8)  # control steps
@@ -53,7 +53,7 @@ class VariantProbe:
     @property
     def better(self) -> VariantResult | None:
         """The best variant, if it is certainly better than the unchanged data and better than persistence."""
-        certain = [result for result in self.results if result.is_certainly_better(needed=ENOUGH_EPISODES)]
+        certain = [result for result in self.results if result.is_certainly_better(needed=MIN_EPISODES)]
         gains = {result: -result.difference.value for result in certain if result.difference and result.ratio.high < 1}
         better = [result for result, gain in gains.items() if gain > _GAIN]
         return max(better, key=lambda result: gains[result], default=None)
@@ -61,7 +61,7 @@ class VariantProbe:
     @property
     def is_decided(self) -> bool:
         """Whether there is a verdict: a variant is better, or the model beats persistence on enough episodes."""
-        return self.better is not None or (self.plain.episodes >= ENOUGH_EPISODES and self.plain.ratio.value < 1)
+        return self.better is not None or (self.plain.episodes >= MIN_EPISODES and self.plain.ratio.value < 1)
 
     def verdict(self) -> str:
         """Return a sentence that states whether the unchanged data fit the model best."""
@@ -71,8 +71,8 @@ class VariantProbe:
         if better is not None and (difference := better.difference) is not None:
             less = f"{-difference.value:.3f} [{-difference.high:.3f}, {-difference.low:.3f}]"
             return f"{text}, lower by {less} with {better.name}: {better.repair}"
-        if plain.episodes < ENOUGH_EPISODES:
-            return f"needs at least {ENOUGH_EPISODES} episodes, found {plain.episodes} ({text})"
+        if plain.episodes < MIN_EPISODES:
+            return f"needs at least {MIN_EPISODES} episodes, found {plain.episodes} ({text})"
         if plain.ratio.value >= 1:
             return f"needs a model that predicts these data better than persistence ({text})"
         return f"{text}; no variant fits better with certainty"

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from vjepa2_ac.data.idle import find_runs
 from vjepa2_ac.data.transforms import CropBox, crop_box
-from vjepa2_ac.episode import Progress, no_progress, short_names
+from vjepa2_ac.episode import Progress, no_progress, shorten_names
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.inspection.coverage import ENOUGH_NEAR, ReadEpisode
 from vjepa2_ac.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, Inspection, largest_change
@@ -53,7 +53,7 @@ def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress:
     """
     dataset, shown = inspection.dataset, inspection.sample[:rows]
     identities = [dataset.table.identity(one.index) for one in shown]
-    names = short_names(identities)
+    names = shorten_names(identities)
     strips = []
     for done, (one, name) in enumerate(zip(shown, identities, strict=True), start=1):
         try:
@@ -77,7 +77,7 @@ def _strip_of(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
     left_out = np.ones(steps, bool)
     for start, end in one.kept:
         left_out[start:end] = False
-    changed = space.shown_size(changes) if is_pose else largest_change(changes, inspection.ranges)
+    changed = space.compute_display_size(changes) if is_pose else largest_change(changes, inspection.ranges)
     return Strip(
         name=name,
         success=episode.info.success,
@@ -127,7 +127,7 @@ def _panels(part: Any, inspection: Inspection) -> None:
     lengths.locator_params(axis="y", nbins=4, integer=True)
     _motion(part.add_subplot(grid[1]), inspection)
     if has_poses:
-        places = np.concatenate([one.states[:, dataset.spaces.state.sized] for one in inspection.sample])
+        places = np.concatenate([one.states[:, dataset.spaces.state.size_axes] for one in inspection.sample])
         places = places[:: -(-len(places) // _PLACES)]
         axes = part.add_subplot(grid[2])
         shown = axes.scatter(-places[:, 1], places[:, 0], c=places[:, 2], s=2, cmap="viridis", linewidths=0)

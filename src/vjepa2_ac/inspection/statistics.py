@@ -62,7 +62,7 @@ class Inspection:
         if not self.has_poses:
             return {CHANGED: largest_change(changes, self.ranges)}
         turned_deg = np.rad2deg(rotation_angles(changes[:, space.rotation]))
-        return {MOVED: space.shown_size(changes), TURNED: turned_deg}
+        return {MOVED: space.compute_display_size(changes), TURNED: turned_deg}
 
     @cached_property
     def values(self) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, EpisodeSource, Latent
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.evaluation.measure import ONE_STEP_PREDICTIONS, ClipSample, Predictor, measure_errors
 from vjepa2_ac.evaluation.result import L1
-from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
+from vjepa2_ac.intervals import Estimate, estimate_ratio, estimate_ratio_difference
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
@@ -92,10 +92,12 @@ def result_of(
     if reference is not None:
         common = [clip for clip in errors if clip in reference]
         variant, other = (np.array([part[clip] for clip in common]).T.copy() for part in (errors, reference))
-        difference = ratio_difference((variant[0], variant[1]), (other[0], other[1]), [name for name, _ in common])
+        difference = estimate_ratio_difference(
+            (variant[0], variant[1]), (other[0], other[1]), [name for name, _ in common]
+        )
     of_model, of_persistence = np.array(list(errors.values())).T.copy()
     means, counts = (float(of_model.mean()), float(of_persistence.mean())), (len(ids), len(set(ids)))
-    return VariantResult(name, ratio(of_model, of_persistence, ids), *means, *counts, difference, repair)
+    return VariantResult(name, estimate_ratio(of_model, of_persistence, ids), *means, *counts, difference, repair)
 
 
 @dataclass(frozen=True)

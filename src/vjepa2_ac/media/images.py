@@ -262,7 +262,7 @@ def has_moved(
         space: The space of the states.
         largest: The largest change of each number in a model step; used for vectors, whose units are unknown.
     """
-    (change,) = space.differences(np.stack([before, now]))
+    (change,) = space.compute_differences(np.stack([before, now]))
     if not space.is_pose:
         return bool(((largest > 0) & (abs(change) > _STILL_SHARE * largest)).any())
     return float(np.linalg.norm(change[:3])) > _STILL_M or float(rotation_angles(change[None, 3:6])[0]) > _STILL_RAD

@@ -36,7 +36,7 @@ from vjepa2_ac.planning.settings import read_axes, require_base_frame, resolve_d
 from vjepa2_ac.planning.solvers import PlanStart
 from vjepa2_ac.registry import PLANNING_FILES
 from vjepa2_ac.runs.subject import Subject
-from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces, states_along
+from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces, integrate_changes
 
 _PRIOR_STEPS = 3  # model steps left for the prior's input if a goal has no `at_most`; fewer give larger motions
 State = Float[np.ndarray, " numbers"]
@@ -204,7 +204,7 @@ class Controller:
         return self._model.device
 
     @property
-    def shown_axes(self) -> tuple[int, ...]:
+    def display_axes(self) -> tuple[int, ...]:
         """Indices of the numbers to show, at most three: the position of a pose, or the first free numbers."""
         return (0, 1, 2) if self.spaces.state.is_pose else tuple(self.space.free[:3].tolist())
 
@@ -426,7 +426,9 @@ class Controller:
             action=self._get_command(state, plan.actions[0].double().numpy()),
             why=why,
             plan=plan,
-            states=states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0].numpy(),
+            states=integrate_changes(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[
+                0
+            ].numpy(),
             cost=cost,
             from_samples=samples is not None,
         )

@@ -104,7 +104,7 @@ def decide(controller: Controller, request: PlanRequest, *, nodes: int = 0, repo
     if plan is not None and decision.cost is not None:
         with torch.no_grad():
             still = float(decision.cost(torch.zeros_like(plan.actions)[None])[0])
-        axes = controller.shown_axes
+        axes = controller.display_axes
         if decision.why != "no finite energy" and nodes >= 3 and len(axes) >= 2:
             task = reporter.task("energy maps", "action sequences")
             slices = compute_energy_slices(decision.cost, plan.actions, space, axes, nodes=nodes, progress=task)
@@ -218,8 +218,8 @@ def _relative_change(energy: float, reference: float) -> str:
 
 def _describe_motion(result: PlanResult) -> str:
     space, change, steps = result.state_space, result.states[-1] - result.states[0], len(result.actions)
-    shown = change[list(result.controller.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
-    names = [space.change_names[axis] for axis in result.controller.shown_axes]
+    shown = change[list(result.controller.display_axes)] * (space.display_factor if space.is_pose else 1.0)
+    names = [space.change_names[axis] for axis in result.controller.display_axes]
     duration = f"in {counted(steps, 'model step')}"
     if not space.is_pose:
         parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, shown, strict=True))
@@ -228,15 +228,14 @@ def _describe_motion(result: PlanResult) -> str:
     parts = ", ".join(f"{name} {value:+.1f}" for name, value in zip(names, shown, strict=True))
     gripper = 0.0 if space.gripper is None else change[space.gripper]
     gripper_text = f", gripper {gripper:+.2f}" if gripper else ""
-    return (
-        f"Moves {np.linalg.norm(shown):.1f} {space.shown_unit} {duration} ({parts} {space.shown_unit}{gripper_text})."
-    )
+    unit = space.display_unit
+    return f"Moves {np.linalg.norm(shown):.1f} {unit} {duration} ({parts} {unit}{gripper_text})."
 
 
 def find_axes_at_limit(result: PlanResult) -> list[str]:
     """Return the names of the components of the first action that are at their limits (position or vector)."""
     upper, space = result.space.upper[0].numpy(), result.state_space
-    numbers = result.controller.shown_axes if space.is_pose else range(len(space))
+    numbers = result.controller.display_axes if space.is_pose else range(len(space))
     return [
         space.change_names[number] for number in numbers
         if upper[number] > 0 and abs(result.actions[0, number]) >= _AT_LIMIT * upper[number]

@@ -22,7 +22,7 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.planner import Cost, report_progress
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.registry import ENERGIES
-from vjepa2_ac.spaces import POSES, Spaces, euler_from_matrices, matrices_from_euler, states_along
+from vjepa2_ac.spaces import POSES, Spaces, euler_from_matrices, integrate_changes, matrices_from_euler
 
 Latents = Float[Tensor, "*batch tokens dim"]
 Target = Float[Tensor, "*target tokens dim"]
@@ -226,7 +226,7 @@ class WorldModelCost:
         """Return the predicted latents after each action, and the states before and after it, in one batch."""
         samples, steps = actions.shape[:2]
         actions = actions.to(self._state)
-        states = states_along(self._state, actions, self._spaces.state)
+        states = integrate_changes(self._state, actions, self._spaces.state)
         inputs = states[:, 1:] if self._spaces.action.follows == "target" else actions
         camera = None if self._camera is None else self._camera.expand(samples, steps, -1)
         dim = self._frame.shape[-1]

@@ -18,7 +18,7 @@ from vjepa2_ac.config.section import Affects, get_effect
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import CHANGES, MOVABLE_PATHS, is_run, read_run_config, sets_movable_path
-from vjepa2_ac.spaces import POSE, REACH_M, vector_states
+from vjepa2_ac.spaces import MAX_POSITION_M, POSE, make_vector_states
 from vjepa2_ac.storage.structured import parse_record, read_json_object
 
 logger = logging.getLogger(__name__)
@@ -181,7 +181,7 @@ def read_data_limits(folder: Path, *, is_pose: bool) -> DataLimits | None:
     data_limits = parse_record(
         DataLimits, values, where=str(path), needed="one number of 0 or more per component of a state"
     )
-    if is_pose and (len(data_limits.changes) != len(POSE) or max(data_limits.changes[:3]) > REACH_M):
+    if is_pose and (len(data_limits.changes) != len(POSE) or max(data_limits.changes[:3]) > MAX_POSITION_M):
         needed = f"{len(POSE)} numbers: {', '.join(POSE.change_names)}, positions in metres"
         raise InputError(where=str(path), found=str(data_limits.changes), needed=needed)
     return data_limits
@@ -225,7 +225,7 @@ def warn_if_limits_exceed_data(config: Config, folder: Path) -> tuple[str, ...]:
         if data_limits.low_diversity
         else []
     )
-    names = POSE.change_names if is_pose else vector_states(len(data_limits.changes)).names
+    names = POSE.change_names if is_pose else make_vector_states(len(data_limits.changes)).names
     reach = _largest_changes(config.planning.limits, data_limits, is_pose=is_pose)
     for key, (unit, factor, numbers) in (_POSE_LIMITS if is_pose else _VECTOR_LIMITS).items():
         beyond = [

@@ -33,7 +33,7 @@ from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.encode_dataset import use_finished_cache
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.intervals import Estimate, ratio
+from vjepa2_ac.intervals import Estimate, estimate_ratio
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.world_model import Fingerprints, WorldModel
 from vjepa2_ac.planning.cameras import Cameras
@@ -355,7 +355,7 @@ def _measure(dataset: Dataset, model: WorldModel, prior: ActionPrior, spaces: Sp
 
     It is measured with true goals and with goals of other clips. Empty: there are no held-out clips.
     """
-    generator, size = torch.Generator().manual_seed(0), spaces.action.sized
+    generator, size = torch.Generator().manual_seed(0), spaces.action.size_axes
     errors: dict[str, list[Tensor]] = {"true_goals": [], "goals_of_others": [], "zero_action": []}
     ids: list[str] = []
     if dataset.split_mask("test").any():
@@ -370,6 +370,6 @@ def _measure(dataset: Dataset, model: WorldModel, prior: ActionPrior, spaces: Sp
         return {}
     joined = {name: torch.cat(parts).double().cpu().numpy() for name, parts in errors.items()}
     ratios: dict[str, Estimate] = {
-        name: ratio(joined[name], joined["zero_action"], ids) for name in ("true_goals", "goals_of_others")
+        name: estimate_ratio(joined[name], joined["zero_action"], ids) for name in ("true_goals", "goals_of_others")
     }
     return {"clips": len(ids), **{name: estimate.as_dict() for name, estimate in ratios.items()}}

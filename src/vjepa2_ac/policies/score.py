@@ -19,13 +19,13 @@ from jaxtyping import Float, Int
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.intervals import Estimate, mean_of, ratio, ratio_difference
+from vjepa2_ac.intervals import Estimate, estimate_mean, estimate_ratio, estimate_ratio_difference
 from vjepa2_ac.planning.cameras import read_views, require_views
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.runs.checkpoint import parse_step
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log
-from vjepa2_ac.spaces import POSE, StateSpace, apply_actions, states_along
+from vjepa2_ac.spaces import POSE, StateSpace, apply_actions, integrate_changes
 from vjepa2_ac.storage.structured import to_plain
 
 CHANCE = 0.5  # share of other actions with a lower energy than the true ones, if a model ignores the actions
@@ -133,12 +133,12 @@ def changes_of_chunks(
         raise InputError(where="chunks", found=counted(values.shape[1], "control step"), needed=needed)
     current, changes = torch.from_numpy(state), torch.from_numpy(values)
     if form == "deltas":
-        targets = states_along(current, changes, space)[:, 1:].numpy()
+        targets = integrate_changes(current, changes, space)[:, 1:].numpy()
     else:
         targets = values if form == "targets" else apply_actions(current.expand_as(changes), changes, space).numpy()
     space.require_plausible(targets.reshape(-1, len(space)), "chunks")
     ends = targets[:, control_steps - 1 :: control_steps]
-    return np.stack([space.differences(np.concatenate([state[None], chunk_ends])) for chunk_ends in ends])
+    return np.stack([space.compute_differences(np.concatenate([state[None], chunk_ends])) for chunk_ends in ends])
 
 
 def is_blind(error: Estimate | None) -> bool:
@@ -230,8 +230,8 @@ def score_policies(
     zero_action, demonstrated, below, *of_policies = np.stack(energies).T
     return PolicyScores(
         policies=_rank_policies(policies, of_policies[: len(policies)], of_policies[len(policies) :], zero_action, ids),
-        demonstrated=ratio(demonstrated, zero_action, ids),
-        others_below_true=mean_of(below, ids),
+        demonstrated=estimate_ratio(demonstrated, zero_action, ids),
+        others_below_true=estimate_mean(below, ids),
         places=len(ids),
         episodes=len(set(ids)),
         left_out=len(common_points) - len(points),
@@ -259,8 +259,8 @@ def _rank_policies(
     for better, index in zip([None, *order], order, strict=False):
         difference = None
         if better is not None:
-            difference = ratio_difference((means[index], zero_action), (means[better], zero_action), ids)
-        mean, best = ratio(means[index], zero_action, ids), ratio(lowest[index], zero_action, ids)
+            difference = estimate_ratio_difference((means[index], zero_action), (means[better], zero_action), ids)
+        mean, best = estimate_ratio(means[index], zero_action, ids), estimate_ratio(lowest[index], zero_action, ids)
         scores.append(PolicyScore(policies[index].name, mean, best, difference))
     return tuple(scores)
 
@@ -290,7 +290,7 @@ def _read_point(
     if not 0 <= step < len(states) - goal_distance:
         return None
     path = states[step : step + goal_distance + 1 : dataset.config.model_stride]
-    return _EvaluationPoint(point, index, states[step], space.differences(path))
+    return _EvaluationPoint(point, index, states[step], space.compute_differences(path))
 
 
 def _draw_alternatives(

@@ -18,7 +18,7 @@ from vjepa2_ac.errors import InputError, counted, shell_command
 from vjepa2_ac.evaluation.result import L1
 from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.evaluation.summary import Verdict, format_percent
-from vjepa2_ac.intervals import Estimate, bootstrapped
+from vjepa2_ac.intervals import Estimate, bootstrap
 from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
 from vjepa2_ac.runs.checkpoint import RANKING_TOLERANCE, parse_step
 
@@ -65,7 +65,7 @@ class Comparison:
         (first, measured), best = next(iter(self.measured.items())), max(gains, key=lambda name: gains[name].value)
         if not gains[best].has_interval:
             return f"Whether the errors differ is not measured: {self._too_few}"
-        if not (side := gains[best].side(of=0.0)):
+        if not (side := gains[best].compare_to(0.0)):
             return f"The errors of {best} and {first} do not differ significantly."
         low, value, high = (format_percent(one) for one in sorted(map(abs, astuple(gains[best]))))
         change = f"{value} % {'lower' if side > 0 else 'higher'}"
@@ -170,7 +170,7 @@ def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
     found = []
     for other, metrics in others:
         columns = np.stack([*_last(metrics), *_last(first)])[:, :, None]
-        (gain,) = bootstrapped(lambda sums: 1 - (sums[0] / sums[1]) / (sums[2] / sums[3]), columns, ids)
+        (gain,) = bootstrap(lambda sums: 1 - (sums[0] / sums[1]) / (sums[2] / sums[3]), columns, ids)
         group, line = f"Gain over {name}", f"{(first.about.frames - 1) * first.about.seconds_per_step:.2f} s ahead"
         numbers = (gain.value, gain.low, gain.high)
         found.append(Row(group, line, "gain_over_first", other, *numbers, form=".1%", better="higher", chance=0.0))

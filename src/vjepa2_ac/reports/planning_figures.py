@@ -102,9 +102,9 @@ def _imagined(part: Any, answer: PlanResult, imagined: ImaginedPlan) -> None:
 def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     elites, heights, energies, path = part.subplots(1, 4)
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
-    factor = answer.state_space.shown_factor
+    factor = answer.state_space.display_factor
     first, upper = answer.actions[0] * factor, answer.space.upper[0].double().numpy() * factor
-    shown = answer.controller.shown_axes  # with fewer than three components one is shown twice
+    shown = answer.controller.display_axes  # with fewer than three components one is shown twice
     across, up, third = shown[0], shown[min(1, len(shown) - 1)], shown[-1]
     for number, (one, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
         tried = one.elites[:, 0].double().numpy() * factor
@@ -124,7 +124,7 @@ def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
 
 def _plane(axes: Any, answer: PlanResult, across: int, up: int) -> None:
     """Draw the limits of two components of the first action, and the chosen action."""
-    factor = answer.state_space.shown_factor
+    factor = answer.state_space.display_factor
     width, height = (answer.space.upper[0, axis].item() * factor for axis in (across, up))
     corner = -width, -height
     axes.add_patch(Rectangle(corner, 2 * width, 2 * height, fill=False, color=GREY, linewidth=1))
@@ -135,7 +135,7 @@ def _plane(axes: Any, answer: PlanResult, across: int, up: int) -> None:
 
 def _label(answer: PlanResult, axis: int) -> str:
     name = answer.state_space.change_names[axis]
-    return f"{name} ({unit})" if (unit := answer.state_space.shown_unit) else name
+    return f"{name} ({unit})" if (unit := answer.state_space.display_unit) else name
 
 
 def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
@@ -157,7 +157,7 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
 
 def _path(axes: Any, answer: PlanResult) -> None:
     space = answer.state_space
-    way = (answer.states - answer.states[0]) * answer.state_space.shown_factor
+    way = (answer.states - answer.states[0]) * answer.state_space.display_factor
     if not space.is_pose:
         for number in answer.space.free[:_MOST_NUMBERS].tolist():
             axes.plot(way[:, number], "o-", markersize=4, label=space.names[number])
@@ -175,7 +175,7 @@ def _path(axes: Any, answer: PlanResult) -> None:
 def _slices(part: Any, answer: PlanResult) -> None:
     lowest = min(np.nanmin(one.energy) for one in answer.slices)
     highest = max(np.nanmax(one.energy) for one in answer.slices)
-    factor, all_axes = answer.state_space.shown_factor, part.subplots(1, len(answer.slices))
+    factor, all_axes = answer.state_space.display_factor, part.subplots(1, len(answer.slices))
     for axes, one in zip(all_axes, answer.slices, strict=True):
         colours = {"shading": "nearest", "cmap": "viridis", "vmin": lowest, "vmax": highest}
         image = axes.pcolormesh(one.across * factor, one.up * factor, one.energy, **colours)

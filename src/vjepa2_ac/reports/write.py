@@ -21,7 +21,7 @@ from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from vjepa2_ac.episode import short_names
+from vjepa2_ac.episode import shorten_names
 from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import L1, Curve, DecodedStrip, Evaluation, Example, over_persistence
 from vjepa2_ac.evaluation.rows import Row, RowTable, arrange_tables, make_rows
@@ -111,7 +111,7 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
         video=make_video(evaluation),
         parts=_parts(evaluation, rows),
         missing=missing_parts(evaluation),
-        short=short_names(evaluation.clips.episode_ids),
+        short=shorten_names(evaluation.clips.episode_ids),
         style=Markup(resources.files("vjepa2_ac").joinpath("assets/report.css").read_text("utf-8")),  # noqa: S704
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.intervals import Estimate, mean_of, share_of
+from vjepa2_ac.intervals import Estimate, estimate_mean, estimate_share
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.arm import Block, Mark, SimulatedArm, State
 from vjepa2_ac.simulation.motion import HIGH, LOW, OutOfReachError, rest_joints
@@ -347,7 +347,7 @@ class ClosedLoopResult:
     @property
     def success_rate(self) -> Estimate:
         """Fraction of episodes in which the task is done at the end."""
-        return share_of(int(self.successes.sum()), len(self.episodes))
+        return estimate_share(int(self.successes.sum()), len(self.episodes))
 
     @property
     def why_counts(self) -> dict[str, int]:
@@ -364,7 +364,7 @@ class ClosedLoopResult:
         needed = [episode.steps_needed for episode in self.episodes if episode.steps_needed is not None]
         return {
             "success": self.success_rate,
-            "success_ever": share_of(sum(episode.success_ever for episode in self.episodes), len(self.episodes)),
+            "success_ever": estimate_share(sum(episode.success_ever for episode in self.episodes), len(self.episodes)),
             "final_distance_cm": _mean(self.distance_cm[:, -1]),
             "steps_needed": _mean(np.array(needed, dtype=np.float64)) if needed else None,
             "seconds_per_decision": _mean(self.seconds.mean(axis=1)),
@@ -372,7 +372,7 @@ class ClosedLoopResult:
 
 
 def _mean(values: Float[np.ndarray, " episodes"]) -> Estimate:
-    return mean_of(values, [f"{number:06d}" for number in range(len(values))])
+    return estimate_mean(values, [f"{number:06d}" for number in range(len(values))])
 
 
 def run_trials(

@@ -19,7 +19,7 @@ from vjepa2_ac.data.files import EpisodeFiles, map_in_threads, num_connections
 from vjepa2_ac.data.index import STATES_NOT_READ, EpisodeProblem, EpisodeTable, StatesSummary, build_labels, nul_error
 from vjepa2_ac.episode import EpisodeInfo, EpisodeSource, FrameReader, Progress, Widths, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.spaces import CAMERA_POSE, POSE, POSE_CHANGE, Spaces, StateSpace, vector_states
+from vjepa2_ac.spaces import CAMERA_POSE, POSE, POSE_CHANGE, Spaces, StateSpace, make_vector_states
 
 logger = logging.getLogger(__name__)
 
@@ -33,14 +33,14 @@ def open_source(config: DataConfig) -> EpisodeSource:
 
 def get_state_space(config: DataConfig, width: int) -> StateSpace:
     """Return the space of measured states: poses in the base frame, or vectors of the given width."""
-    return POSE if config.states == "pose" else vector_states(width)
+    return POSE if config.states == "pose" else make_vector_states(width)
 
 
 def get_spaces(config: DataConfig, widths: Widths) -> Spaces:
     """Return the spaces of the states and actions of clips."""
     if config.states == "pose":
         return Spaces(POSE if config.pose_frame == "base" else CAMERA_POSE, POSE_CHANGE)
-    return Spaces.of_vectors(widths, "difference" if config.actions == "difference" else config.join_actions)
+    return Spaces.from_widths(widths, "difference" if config.actions == "difference" else config.join_actions)
 
 
 @dataclass(frozen=True)

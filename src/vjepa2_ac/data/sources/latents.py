@@ -22,7 +22,7 @@ from vjepa2_ac.data.sources.indexed_source import IndexedSource, get_state_space
 from vjepa2_ac.data.sources.latent_files import FIX, OPTIONAL, LatentFiles
 from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, MissingFileError, counted
-from vjepa2_ac.spaces import vector_states
+from vjepa2_ac.spaces import make_vector_states
 from vjepa2_ac.storage.structured import read_json_object
 
 FORMAT = 2  # of the files of a cache
@@ -248,7 +248,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
             if values.shape != (info.num_steps, width):
                 needed = f"{info.num_steps} x {width}, as the other files of the cache say"
                 raise InputError(where=f"{where}: {name}", found=f"shape {values.shape}", needed=needed, fix=FIX)
-            space = get_state_space(self._config, width) if name == "states" else vector_states(width)
+            space = get_state_space(self._config, width) if name == "states" else make_vector_states(width)
             if name != "joint_velocities":  # only the idle filter reads them, and checks them
                 space.require_plausible(values, f"{where}: {name}", fix=FIX)
 

@@ -19,7 +19,7 @@ from vjepa2_ac.data.poses import require_selection
 from vjepa2_ac.data.sources.parquet import read_table
 from vjepa2_ac.errors import InputError, MissingFileError, counted, did_you_mean
 from vjepa2_ac.media.video import VideoHeader, is_depth_format
-from vjepa2_ac.spaces import zero_steps
+from vjepa2_ac.spaces import no_steps_error
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.block_file import BlockCachedFile
 from vjepa2_ac.storage.structured import parse_json_object, read_json_object
@@ -386,7 +386,7 @@ def require_files(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Seq
         InputError: The episode has no steps, or its rows or frames are missing or too few.
     """
     if row.length == 0:
-        raise zero_steps(f"{info.root}: {row.id}")
+        raise no_steps_error(f"{info.root}: {row.id}")
     rows_in = row.data_file(info)
     if rows_in not in files:
         where, needed = f"{storage.join(info.root, rows_in)}: {row.id}", f"the {row.length} rows of the episode"

@@ -36,7 +36,7 @@ from vjepa2_ac.data.sources.tfrecord import (
 )
 from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress
 from vjepa2_ac.errors import InputError, counted, did_you_mean
-from vjepa2_ac.spaces import require_finite, zero_steps
+from vjepa2_ac.spaces import no_steps_error, require_finite
 
 IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
 STEP_FLAG = "steps/is_first"
@@ -198,7 +198,7 @@ def read_states(record: Record, config: RldsData, steps: int, where: str) -> Flo
         InputError: A feature is missing, does not have equally many numbers per step, or has implausible states.
     """
     if steps == 0:
-        raise zero_steps(where)
+        raise no_steps_error(where)
     fields = config.fields
     columns = [_read_per_step(record, name, steps, where) for name in fields.state]
     widths = {name: column.shape[1] for name, column in zip(fields.state, columns, strict=True)}
@@ -314,7 +314,7 @@ def _scan_record(
         states = None if is_far else _read_checked_states(record, config, cameras, f"{span} ({name})")
         steps = read_num_steps(record, config) if states is None else len(states)
         if steps == 0:
-            raise zero_steps(f"{span} ({name})")
+            raise no_steps_error(f"{span} ({name})")
     except InputError as error:
         return EpisodeProblem.from_error(error if is_far else _prefer_crc_error(error, read, span), name)
     place = dict(zip(_LOCATOR_COLUMNS, (shard, span.number, span.offset, span.length), strict=True))
