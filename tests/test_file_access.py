@@ -1,4 +1,4 @@
-"""Files that other users write or read: modes follow the umask, and a refused, special or odd file is named."""
+"""Files that other users write or read: modes follow the umask, and errors name refused, special or invalid files."""
 
 import os
 import re
@@ -199,7 +199,7 @@ def umask(request: pytest.FixtureRequest) -> Iterator[int]:
 
 
 def other_modes(root: Path, umask: int) -> dict[str, str]:
-    """Return the files whose mode is not that of a new file under a umask."""
+    """Return the files whose mode differs from that of a new file under a umask."""
     modes = {path: stat.S_IMODE(path.stat().st_mode) for path in root.rglob("*") if path.is_file()}
     assert modes
     return {str(path.relative_to(root)): oct(mode) for path, mode in modes.items() if mode != 0o666 & ~umask}

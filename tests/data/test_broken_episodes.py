@@ -82,7 +82,7 @@ def parse_fixes(error: InputError) -> dict[str, Mapping[str, Any]]:
 
 
 def follow_exclusions(use: Use, **values: Any) -> None:
-    """Exclude what each error names until there is none; fail where one names no new episode."""
+    """Exclude the episodes that each error names until no error remains; fail if an error names no new episode."""
     excluded: tuple[str, ...] = ()
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Transforms of training clips: registered, a pure function of the seed and the position, checked, never cached."""
+"""Transforms of training clips: pure functions of seed and position whose results are checked and never cached."""
 
 import itertools
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Any data set becomes a LeRobot data set v3.0, whole or not at all, that reads back with the same values."""
+"""Conversion to LeRobot v3.0: complete or absent, with the same values when read back."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Selection of episodes and steps: once, counted, and the same for every source."""
+"""Selection of episodes and steps: counted, and the same for every source."""
 
 import hashlib
 import sys
@@ -68,7 +68,7 @@ def test_excluding_an_unknown_episode_raises() -> None:
 
 
 def droid_sized() -> EpisodeTable:
-    """Return a table of as many episodes as DROID 1.0.1 has, with identities as long as its own."""
+    """Return a table with the number of episodes and the identity lengths of DROID 1.0.1."""
     count, generator = 95_658, np.random.default_rng(0)
     names = np.array([f"{number:06d}".encode() * 38 for number in generator.permutation(count)])
     return EpisodeTable(
@@ -82,7 +82,7 @@ def droid_sized() -> EpisodeTable:
 
 
 def two_ranges_each(table: EpisodeTable) -> StepSelection:
-    """Return ranges with rests between them: a quarter of the steps, as in DROID."""
+    """Return two ranges per episode; a quarter of the steps is idle, as in DROID."""
     count, steps = len(table), table.num_steps
     start, end = (np.zeros(2 * count, np.int32) for _ in range(2))
     start[1::2], end[0::2], end[1::2] = steps * 0.4, steps * 0.3, steps * 0.85

@@ -1,4 +1,4 @@
-"""Groups stay in one split; unknown groups are refused, and so is an episode without one."""
+"""Each group is in one split; unknown fields and episodes without a group raise an error."""
 
 from collections import defaultdict
 from pathlib import Path

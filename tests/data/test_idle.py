@@ -1,4 +1,4 @@
-"""Idle steps: the same as in openpi, and never where the robot moves."""
+"""Idle steps: the same as in openpi; moving steps are never idle."""
 
 import json
 from functools import partial

@@ -39,7 +39,7 @@ def ids(table: EpisodeTable) -> list[str]:
 def cached_table(
     tmp_path: Path, key: str = KEY, place: str = "/data/set", table: EpisodeTable | None = None
 ) -> EpisodeTable:
-    """Return the cached table; without one to build it must be there."""
+    """Return the cached table, built from `table`; without `table` it must be in the cache."""
     return get_or_build_index(
         DiskCacheConfig(dir=str(tmp_path)), key, place, lambda: table or pytest.fail("built again")
     )

@@ -1,4 +1,4 @@
-"""Formats of rotation numbers: a wrong format is named where the numbers jump, and the right one is never doubted."""
+"""Formats of rotation numbers: a wrong format is detected at jumps, the right one is never rejected."""
 
 from collections.abc import Callable
 

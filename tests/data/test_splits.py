@@ -1,4 +1,4 @@
-"""The splits that a data set has itself are used as such; what is missing is drawn, and what is pooled is said."""
+"""The data set's own splits are used; a missing split is drawn by hash, and pooled splits are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Positions and angles in other units: the error names the config key, and with that key they are read."""
+"""Positions and angles in other units: the error names the config key, and the data can be read with that key."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Robots without poses: vectors of any width arrive unchanged from every source that supports them."""
+"""Robots without poses: every source that supports vectors returns them unchanged, at any width."""
 
 import json
 from collections.abc import Callable

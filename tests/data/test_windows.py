@@ -38,7 +38,7 @@ def episodes(*lengths: int) -> list[EpisodeInfo]:
 
 
 def select_split_windows(infos: list[EpisodeInfo], config: DataConfig, split: Split) -> Windows:
-    """Return the windows of episodes of which every step is kept."""
+    """Return the windows of episodes whose steps are all kept."""
     table = EpisodeTable.from_infos(infos)
     is_selected = select_included(table, config)
     starts = find_clip_windows(table, StepSelection.all_steps(table, is_selected), config)
@@ -143,7 +143,7 @@ def test_larger_held_out_share_only_takes_episodes_from_train() -> None:
 
 
 def splits_of(source: MemorySource, **options: object) -> dict[str, Split]:
-    """Return the split of every episode that takes part."""
+    """Return the split of each used episode."""
     dataset = open_in_memory(source, **({"validation_share": 0.02, "test_share": 0.02} | options))
     return {
         dataset.table.identity(int(place)): split
@@ -155,7 +155,7 @@ def splits_of(source: MemorySource, **options: object) -> dict[str, Split]:
 @pytest.mark.parametrize("split_by", [None, r"episode (\d)"])
 @pytest.mark.parametrize("left_out", [0, 2, 6, 7])
 def test_excluding_an_episode_moves_no_other_between_splits(left_out: int, split_by: str | None) -> None:
-    """Neither `data.exclude` nor an episode that breaks: what a run has trained on stays out of its validation."""
+    """Excluded or broken episodes do not move training episodes into validation."""
     options = {"split_by": split_by, "idle": {"rule": "motion"}, "broken_episodes": "skip"}
     before = splits_of(MemorySource([60] * 8), **options)
     assert set(before.values()) == set(SPLITS)

@@ -1,4 +1,4 @@
-"""Loader workers: none makes its run wait for ever, shared memory is checked, and imports are safe."""
+"""Loader workers: a run never waits forever, shared memory is checked, and imports are safe."""
 
 import contextlib
 import signal
@@ -91,7 +91,7 @@ def test_dead_or_blocked_worker_raises() -> None:
 
 
 class Slow(Iterator[int]):
-    """Times out twice, then has a result; or raises something else."""
+    """An iterator that times out twice before its result, or raises another error."""
 
     def __init__(self, error: str = "DataLoader timed out after 1.0 seconds") -> None:
         self.errors = [RuntimeError(error)] * 2

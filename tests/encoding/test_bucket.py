@@ -1,4 +1,4 @@
-"""A latent cache in a bucket: written whole, found by one listing, read in ranges, over networks that fail."""
+"""A latent cache in a bucket: written completely, found by one listing, read in ranges, with network failures."""
 
 import os
 import time
@@ -31,7 +31,7 @@ ALWAYS = 10_000  # times
 
 @pytest.fixture(autouse=True)
 def _small_heads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """These episodes are so small that the head of a file would be most of it."""
+    """Read smaller file heads, because the files of these episodes are small."""
     monkeypatch.setattr("vjepa2_ac.data.sources.latent_files._HEAD_BYTES", 512)
 
 
@@ -186,7 +186,7 @@ def test_damaged_bucket_file_is_reported_and_encoded_again(
 
 
 def start(nursery: Nursery, config: Config, folder: Path, name: str, **environment: str) -> object:
-    """Start `vjepa2-ac encode` in a process of its own."""
+    """Start `vjepa2-ac encode` in a separate process."""
     path = folder / f"{name}.yaml"
     path.write_text(as_yaml(config))
     words = ("-m", "vjepa2_ac.cli", "encode", str(path))

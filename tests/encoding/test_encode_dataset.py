@@ -1,4 +1,4 @@
-"""Encoding: done once, also after interruptions; a run on cached latents equals the run on frames."""
+"""Encoding: each frame once, also after interruptions; a run on cached latents equals the run on frames."""
 
 import errno
 import shutil

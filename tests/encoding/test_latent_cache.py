@@ -43,7 +43,7 @@ STEPS, FRAMES, TOKENS, DIM = 12, (0, 2, 5, 11), 4, 24
 
 
 def episode(steps: int = STEPS) -> Episode:
-    """Return an episode with everything that one can have; its frames must not be read."""
+    """Return an episode with all optional values; its frames must not be read."""
 
     def no_pictures(steps: Sequence[int]) -> np.ndarray:
         raise AssertionError(f"pictures of {steps}")
@@ -212,14 +212,14 @@ def config_of(data: Path, tmp_path: Path, **options: Any) -> DataConfig:
 
 
 def cached(path: Path, tmp_path: Path, **options: Any) -> tuple[Dataset, Dataset]:
-    """Return a data set, and the same through its cache."""
+    """Return a data set of frames, and the same data set read from its cache."""
     original = open_dataset(config_of(path, tmp_path, **options))
     write_cache(original)
     return original, LatentCache.for_dataset(original, NUMBERS).open_dataset()
 
 
 def open_cache_only(through: Dataset, **options: Any) -> Dataset:
-    """Return what a cache is without its data set, as a config that was changed in two places opens it."""
+    """Open a cache without its data set and with another disk cache."""
     changes = {
         "source": "latents",
         "cache": "off",
@@ -276,7 +276,7 @@ def test_cached_clips_equal_those_of_the_data_set(
 
 @pytest.fixture
 def cached_set_with_broken_episode(tmp_path: Path) -> Dataset:
-    """A hundred episodes; the frames of one cannot be read."""
+    """A cached data set of 100 episodes; the frames of one episode cannot be read."""
     unreadable = frozenset({5})
     source = MemorySource([6] * 100, pictureless=unreadable)
     config = config_of(tmp_path, tmp_path, broken_episodes="skip", validation_share=0.1, test_share=0.1)
@@ -329,7 +329,7 @@ def test_damaged_cache_file_follows_the_broken_episode_policy(cached_set_with_br
 
 @pytest.fixture(scope="module")
 def shared_cache(droid_with_rests: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Dataset, Path]:
-    """A data set, the same through its cache, and the folder of `cache_dir`; read only."""
+    """A data set, the same data set read from its cache, and the folder of `cache_dir`; tests must not change them."""
     folder = tmp_path_factory.mktemp("cache")
     original, through = cached(droid_with_rests, folder, idle=IDLE, outcome="success")
     return original, through, folder

@@ -21,7 +21,7 @@ Run = Callable[..., LatentFiles]
 
 
 def colours(inputs: torch.Tensor, chunk: int) -> torch.Tensor:
-    """Return latents of one token that hold the colour of a frame, which is episode and step."""
+    """Return latents of one token: the frame's colour, which encodes episode and step."""
     del chunk
     return inputs[..., 2, 2][..., None, :]
 

@@ -1,4 +1,4 @@
-"""Encoding by Ray: the same files as by one process, whatever dies, and the same errors."""
+"""Encoding with Ray: same files and errors as with one process, also if actors die."""
 
 import os
 import re

@@ -21,7 +21,7 @@ def encoded(config: Config) -> Path:
 
 
 def cache_config(folder: Path, **changes: Any) -> dict[str, Any]:
-    """Return the changes that make a config of a cache without its data set."""
+    """Return the config values that read a cache without its data set."""
     return {"data__source": "latents", "data__path": str(folder)} | changes
 
 

@@ -1,4 +1,4 @@
-"""Similarity of images equals torchmetrics' (recorded values), can be differentiated and keeps to its region."""
+"""Image similarity: equal to recorded values of torchmetrics, differentiable, and limited to the mask."""
 
 import math
 
@@ -22,7 +22,7 @@ RECORDED = [
 
 
 def pair(case: int, size: tuple[int, int]) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "3 height width"]]:
-    """Return an image and another one, by formula: paler and brighter, shifted, unrelated, or its negative."""
+    """Return an image and a second image: paler and brighter, shifted, unrelated, or the negative."""
     rows = torch.arange(size[0], dtype=torch.float64)[:, None]
     columns = torch.arange(size[1], dtype=torch.float64)[None]
     waves = [rows * (0.11 + 0.03 * c) + columns * (0.07 + 0.02 * case) + c for c in range(3)]

@@ -60,14 +60,14 @@ def test_invalid_image_raises(data: bytes, complaint: str, tmp_path: Path) -> No
 
 
 def claimed_png(height: int, width: int) -> bytes:
-    """Return a PNG of a few hundred bytes that says to be of a size."""
+    """Return a PNG of a few hundred bytes whose header claims a size."""
     data = png(Image.fromarray(PIXELS))
     header = data[12:16] + struct.pack(">II", width, height) + data[24:29]
     return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
 
 
 def claimed_jpeg(height: int, width: int) -> bytes:
-    """Return a JPEG likewise."""
+    """Return a JPEG of a few hundred bytes whose header claims a size."""
     data = simplejpeg.encode_jpeg(PIXELS)
     place = data.index(b"\xff\xc0") + 5
     return data[:place] + struct.pack(">HH", height, width) + data[place + 4 :]

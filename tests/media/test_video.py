@@ -1,4 +1,4 @@
-"""Video frames: independent of which other frames are decoded; and films."""
+"""Video frames: independent of the other decoded frames; writing of videos."""
 
 import io
 import sys
@@ -197,7 +197,7 @@ def test_libav_does_not_allocate_images_above_the_limit(tmp_path: Path, monkeypa
 
 
 class FailingFile(io.BytesIO):
-    """Reads that fail after a while, as a network's do."""
+    """A file whose reads fail after a while, like those of a network."""
 
     def __init__(self, data: bytes, reads: int) -> None:
         super().__init__(data)
@@ -262,7 +262,7 @@ def test_frame_past_the_end_raises(tmp_path: Path, clock: Clock | None) -> None:
 
 
 def test_reordered_frames_without_header_information_are_found_by_time(tmp_path: Path) -> None:
-    """A file of key frames alone needs no reordering to be decoded, yet may be shown in another order."""
+    """Frames of a file with key frames only may be displayed in another order than they are stored."""
     shown = [1, 3, 2, 5, 4, 7, 6, 8]  # when each stored picture is shown
     whole = every_frame(write_mp4(tmp_path / "whole.mp4", FRAMES[:8], gop=1))
     with av.open(str(tmp_path / "whole.mp4")) as source, av.open(str(tmp_path / "moved.mp4"), "w") as target:
@@ -275,7 +275,7 @@ def test_reordered_frames_without_header_information_are_found_by_time(tmp_path:
 
 
 def test_time_unit_too_coarse_for_the_rate_raises(tmp_path: Path) -> None:
-    """Of a time scale of 0 libav makes whole seconds: all frames of one would be taken for the same."""
+    """A time scale of 0 is read by libav as whole seconds, so that all frames of a second have the same time."""
     path = write_mp4(tmp_path / "a.mp4", FRAMES)
     data = bytearray(path.read_bytes())
     scale = data.index(b"mdhd") + 16

@@ -1,4 +1,4 @@
-"""The block file: reads like a file, fetches little more than is read, and that once per machine, up to a limit."""
+"""Block files and the disk cache: few extra bytes are fetched, once per machine, within a size limit."""
 
 import errno
 import io
@@ -24,7 +24,7 @@ DATA = bytes(i * 7 % 251 for i in range(3000))
 
 
 class Served:
-    """Bytes that count what is fetched of them."""
+    """Bytes with a counter of fetches."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.fetches = data, []
@@ -214,7 +214,7 @@ def test_unwritable_disk_logs_one_warning(
 
 
 def fill(folder: Path, entries: int) -> None:
-    """Write entries of 100 bytes under the keys 0, 1, ..., the first of them used longest ago."""
+    """Write entries of 100 bytes under the keys 0, 1, ..., in this order of use."""
     for key in range(entries):
         before = set(folder.rglob("*"))
         DiskCache(folder, 10_000).write(str(key), bytes(96))

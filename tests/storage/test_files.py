@@ -1,4 +1,4 @@
-"""Files: complete or absent, and URLs read like local paths. With real processes that are killed."""
+"""Files: complete or absent, also after a kill; URLs are read like local paths."""
 
 import errno
 import os
@@ -190,7 +190,7 @@ def test_partial_file_of_another_machine_survives_a_clock_jump(
 
 @pytest.fixture(params=["local", "memory"])
 def folder(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """A folder with two files, on this machine and behind a URL."""
+    """A folder with two files, local or behind a URL."""
     place = str(tmp_path) if request.param == "local" else f"memory://{tmp_path.name}"
     filesystem = fsspec.filesystem("file" if request.param == "local" else "memory")
     for name, data in (("b", b"0123456789"), ("a", b"")):

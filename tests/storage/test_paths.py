@@ -1,4 +1,4 @@
-"""Paths: each has one meaning everywhere, and none is mistaken for another kind."""
+"""Paths from the user are resolved by the same rules in config keys, options and environment variables."""
 
 from pathlib import Path
 from typing import Any

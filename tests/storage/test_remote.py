@@ -1,4 +1,4 @@
-"""Remote reads: network failures are retried, or reported in time; with a real server that fails. And who logs in."""
+"""Remote reads: retries, errors and logins, tested with a real server that fails on request."""
 
 import importlib
 import json
@@ -218,7 +218,7 @@ class StatusError(Exception):
 
 
 class NoCredentialsError(Exception):
-    """As botocore says it."""
+    """The error of botocore for missing credentials."""
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""JSON and YAML: read as people mean it, or refused with the place; nothing is executed, nothing grows."""
+"""JSON and YAML: parsed as intended or rejected with the position, without execution or unlimited growth."""
 
 import json
 import math

@@ -110,7 +110,7 @@ def test_missing_bucket_raises_with_its_name(tmp_path: Path) -> None:
 
 @pytest.fixture(params=["gs", "memory", "folder"])
 def target(request: pytest.FixtureRequest, bucket: Gcs, tmp_path: Path) -> str:
-    """A place of every kind: an object store, a file system of fsspec with folders, a folder of this machine."""
+    """A target of each kind: an object store, an fsspec file system with folders, a local folder."""
     assert bucket.names("bucket") == ["before"]
     return {"gs": "gs://bucket/run", "memory": f"memory://{tmp_path.name}/run", "folder": str(tmp_path / "at/run")}[
         request.param
