@@ -152,7 +152,7 @@ def raising(error: BaseException) -> Callable[..., int]:
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 9 bytes"), "too little memory"),
         (
             torch.OutOfMemoryError("CUDA out of memory. Tried\nto"),
-            r"GPU's .*\(CUDA out of memory. Tried\). Set training",
+            r"the GPU has too little memory \(CUDA out of memory. Tried\). Set training",
         ),
         (OSError(errno.ENOSPC, "No space left on device", "run"), r"No space left on device: 'run'"),
     ],

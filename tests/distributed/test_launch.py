@@ -41,7 +41,7 @@ def test_incomplete_variables_are_one_error(launched: Any, changes: dict[str, st
     variables = {name: value for name, value in (VARIABLES | changes).items() if value is not None}
     launched(variables)
     with pytest.raises(InputError, match="Unset RANK and WORLD_SIZE if you did not start several") as caught:
-        distributed._meet("gloo")
+        distributed._join_process_group("gloo")
     assert all(f"{name}={value}" in str(caught.value) for name, value in variables.items())
 
 
@@ -66,9 +66,9 @@ def test_who_is_waited_for_is_reported_while_it_is(
         yield Store(), 0, 2
 
     launched(VARIABLES | changes, meet)
-    monkeypatch.setattr(distributed, "_PATIENCE_S", 0.01)
+    monkeypatch.setattr(distributed, "_REPORT_AFTER_S", 0.01)
     monkeypatch.setattr(distributed._log, "warning", lambda *words: (logging.warning(*words), reported.set()))
-    distributed._meet("gloo")
+    distributed._join_process_group("gloo")
     (said,) = caplog.messages
     assert said.startswith(f"Waiting for {missing} at 127.0.0.1:29511. Unset RANK and WORLD_SIZE")
 
@@ -87,4 +87,4 @@ def test_processes_that_never_join_are_one_error(launched: Any, error: str, word
 
     launched(VARIABLES | {"WORLD_SIZE": "4"}, meet)
     with pytest.raises(UnreachableError, match=f"processes of this run: {words} within 10 minutes"):
-        distributed._meet("gloo")
+        distributed._join_process_group("gloo")

@@ -65,7 +65,7 @@ def test_a_process_killed_at_any_time_ends_all_and_fewer_resume(endless) -> None
         survivors = [rank for rank in ranks if rank is not ranks[victim]]
         for said in errors_of(survivors):
             assert "another process of this run" in said
-            assert "resumes from the newest checkpoint" in said
+            assert "to resume from the newest checkpoint" in said
         assert {rank.returncode for rank in survivors} == {2}
     again = started(endless, 3 + KILLS % 2)
     again[-1].send_signal(signal.SIGUSR1)
