@@ -27,7 +27,7 @@ def test_init_writes_a_config_checks_the_data_and_prints_the_next_commands(
     assert "$ vjepa2-ac data check my-robot.yaml" in printed
     assert printed.count("ok  ") > 10
     next_commands = printed.partition("Next:")[2]
-    for command in ("train my-robot.yaml --check", "training.steps=100", "evaluate runs/my-robot-trial", "real run"):
+    for command in ("train my-robot.yaml --check", "training.steps=100", "evaluate runs/my-robot-trial", "full run"):
         assert command in next_commands, command
     assert main(["train", "my-robot.yaml", "--check"]) == 0
 
@@ -73,6 +73,6 @@ def test_init_sim_prints_the_command_that_records_the_data(
 def test_init_prints_the_download_of_a_missing_model(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init", "data/my robot/v1.0", "--out", "sub/a.yaml"]) == 0
     printed = capsys.readouterr().out
-    assert "vjepa2-ac download   # the model, once: 11.7 GB" in printed
-    assert "# the real run, 200 times the trial's step time; repeat to resume" in printed
+    assert "vjepa2-ac download   # downloads the model (11.7 GB)" in printed
+    assert "# full run of 200 steps; run again to resume" in printed
     assert load_config("sub/a.yaml").model.base == "checkpoints/vjepa2-ac-vitg.pt"

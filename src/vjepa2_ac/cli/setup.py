@@ -122,9 +122,9 @@ def _init(options: argparse.Namespace) -> int:
         check, train = shell_command("data", "check", out), shell_command("train", out, "--check")
         cli.show(f"\nFix these errors and run `{check}` again. If it finds no errors, continue with\n`{train}`.")
         return status
-    first = [(f"vjepa2-ac {_RECORD.format(path=path)}", "the data; half a minute on a core of its own")] * is_missing
+    first = [(f"vjepa2-ac {_RECORD.format(path=path)}", "records the data in about half a minute")] * is_missing
     if not Path(model.path).exists() and (fetch := model.download):
-        first.append((fetch[0], f"the model, once: {fetch[1]}"))
+        first.append((fetch[0], f"downloads the model ({fetch[1]})"))
     cli.show("\nNext:", *(f"  {line}   # {about}" for line, about in [*first, *_next(draft, out, name)]))
     return 0
 
@@ -152,13 +152,13 @@ def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
     trial, steps = f"runs/{name}-trial", draft.config.training.steps
     short = (f"training.steps={_TRIAL_STEPS}", "validation.every=50", "checkpoint.every=50")
     return [
-        (shell_command("train", out, "--check"), "everything that can fail, before the first step"),
+        (shell_command("train", out, "--check"), "checks everything that can fail before the first step"),
         (
             shell_command("train", out, f"run_dir={trial}", *short),
-            f"{_TRIAL_STEPS} steps: does it learn, how long is a step?",
+            f"trial of {_TRIAL_STEPS} steps: check the loss and the time per step",
         ),
-        (shell_command("evaluate", trial), "against the base, on held-out episodes"),
-        (shell_command("train", out), f"the real run, {steps:,} times the trial's step time; repeat to resume"),
+        (shell_command("evaluate", trial), "compares the trial with the base model on held-out episodes"),
+        (shell_command("train", out), f"full run of {steps:,} steps; run again to resume"),
     ]
 
 
