@@ -236,7 +236,7 @@ class Dataset:
         """Return an episode; frames are read only on `Episode.read_frames`.
 
         Raises:
-            InputError: The episode cannot be read, or the widths of its states or actions differ from the others.
+            InputError: The episode cannot be read, or its states or actions have other widths than the data set.
         """
         recording = self.source.read(episode, camera, self.needed_steps(episode))
         require_widths(recording, self.widths)

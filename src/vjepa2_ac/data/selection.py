@@ -259,7 +259,7 @@ def describe_splits(table: EpisodeTable, config: DataConfig) -> str:
 def select_split(
     table: EpisodeTable, split_hash: UInt64[np.ndarray, " episodes"], config: DataConfig, split: Split, among: Members
 ) -> Members:
-    """Return a mask of the episodes of a split: the data set's own split, or drawn from the others by `draw_split`.
+    """Return a mask of the episodes of a split: the data set's own split, or drawn by `draw_split`.
 
     Args:
         table: The episodes, with the names of the data set's own splits.
@@ -291,8 +291,8 @@ def draw_split(
         split_hash: Hash of each episode's identity; with `data.split_by`, of the name of its group.
         config: The shares.
         split: The split.
-        among: Mask of the episodes to split; None: all. With few episodes the split of one depends on the others, so
-            the mask includes broken episodes and those in `data.exclude`, and stays the same throughout a run.
+        among: Mask of the episodes to split; None: all. With few episodes the split of an episode depends on the
+            other episodes, so the mask includes broken and excluded episodes, and stays the same throughout a run.
     """
     number = split_hash.astype(np.float64) / 2**64
     among = np.ones(len(number), bool) if among is None else among

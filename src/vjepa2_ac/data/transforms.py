@@ -33,7 +33,7 @@ NARROWEST, WIDEST = 0.75, 1.35  # aspects (width over height) between these are 
 
 _MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)  # of ImageNet, with which the encoder was trained
 _STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
-_STREAM = 0x7F  # separates the random numbers of transforms from others of the same seed and position
+_STREAM = 0x7F  # separates the random numbers of transforms from other uses of the same seed and position
 
 
 @dataclass(frozen=True)

@@ -217,9 +217,9 @@ def encode_webp(
         quality: Quality of the compression, from 0 to 100.
     """
     file = io.BytesIO()
-    first, *others = (Image.fromarray(frame) for frame in frames)
+    first, *remaining = (Image.fromarray(frame) for frame in frames)
     times = [int(1000 * duration_s) for duration_s in seconds]
-    first.save(file, "WEBP", save_all=True, append_images=others, duration=times, loop=0, quality=quality)
+    first.save(file, "WEBP", save_all=True, append_images=remaining, duration=times, loop=0, quality=quality)
     return file.getvalue()
 
 

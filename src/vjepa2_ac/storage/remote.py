@@ -93,7 +93,7 @@ def file_version(url: str) -> str:
 def list_folder(url: str) -> list[FileInfo]:
     """Return the entries of a folder, sorted by name; an empty list if there is no such folder.
 
-    The server is asked for one listing, with one request per page.
+    One listing is requested, with one request per page.
 
     Raises:
         UnreachableError: The URL cannot be reached.
