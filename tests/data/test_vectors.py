@@ -110,7 +110,7 @@ def test_lerobot_reads_the_configured_columns(tmp_path: Path, write: Callable[..
 def test_episode_of_another_width_is_broken(tmp_path: Path) -> None:
     write_vectors(tmp_path, width=14)
     write_vectors(tmp_path / "other", width=8, episodes=1)
-    with pytest.raises(InputError, match=r"other.*8 numbers a state.*14 numbers a state, as in most"):
+    with pytest.raises(InputError, match=r"other.*8 numbers per state.*14 numbers per state, as in most"):
         open_dataset(vector_config(tmp_path))
 
 

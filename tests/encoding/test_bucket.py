@@ -174,7 +174,7 @@ def test_damaged_bucket_file_is_reported_and_encoded_again(
         if name.endswith(".safetensors"):
             place = storage.join(folder, name)
             bucket.put(place.removeprefix("gs://"), storage.read_bytes(place)[:-10])
-    with pytest.raises(InputError, match=r"gs://.*safetensors: not a whole file of latents.*vjepa2-ac encode"):
+    with pytest.raises(InputError, match=r"gs://.*safetensors: not a complete file of latents.*vjepa2-ac encode"):
         batches(open_cache_only(bucket_config(), folder))
     encoded_frames.clear()
     encode_config(bucket_config())

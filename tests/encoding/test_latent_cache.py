@@ -142,7 +142,7 @@ def with_nan(tensors: dict[str, torch.Tensor], _: object) -> None:
         (lambda tensors, _: tensors.update(states=tensors["states"][:3]), r"states: shape \(3, 7\).*Expected 40 x 7"),
         (lambda tensors, _: tensors.update(states=tensors["states"] * 1000), r"states: step 0: .*like millimetres"),
         (lambda tensors, _: tensors.update(extrinsics=torch.zeros(3, 6)), r"extrinsics: shape \(3, 6\)"),
-        (lambda tensors, _: tensors.pop("states"), r"not a whole file of latents"),
+        (lambda tensors, _: tensors.pop("states"), r"not a complete file of latents"),
     ],
 )
 def test_states_of_a_third_party_cache_are_checked(tmp_path: Path, change: Callable[..., object], message: str) -> None:
@@ -295,9 +295,7 @@ def test_broken_episode_is_skipped_with_and_without_a_cache(cached_set_with_brok
     assert_same_clips(*batches)
     assert {len(batch.starts) for batch in batches[1]} > {2}
     assert list(through.broken.reasons) == list(original.broken.reasons) == ["episode 5"]
-    assert "could not be read when they were encoded (memory: pictures of episode 5: damaged)" in str(
-        through.broken.reasons
-    )
+    assert "encoding could not read the episode (memory: pictures of episode 5: damaged)" in str(through.broken.reasons)
 
 
 def test_damaged_cache_file_follows_the_broken_episode_policy(cached_set_with_broken_episode: Dataset) -> None:

@@ -170,7 +170,7 @@ BROKEN = {
     "no video": (lambda folder: (folder / MP4).unlink(), f"{LEFT}.mp4: no such file"),
     "no key": (put(GRIPPER, None), "gripper_position: no such array"),
     "text for numbers": (put(POSE, np.full((STEPS, 6), b"x")), "kind"),
-    "shorter gripper": (put(GRIPPER, STATES[:-1, 6]), "gripper: 23 of 24 steps"),
+    "shorter gripper": (put(GRIPPER, STATES[:-1, 6]), "gripper: values for 23 of 24 steps"),
     "no steps": (put(POSE, np.zeros((0, 6))), "no steps"),
     "not a number": (put(POSE, ONE_NAN), "step 3"),
     "out of reach": (put(POSE, STATES[:, :6] + [6, 0, 0, 0, 0, 0]), "5 m"),

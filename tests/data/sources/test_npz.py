@@ -79,7 +79,7 @@ def test_a_file_that_changed_after_indexing_is_named(tmp_path: Path) -> None:
     plain = source(tmp_path)
     plain.infos()
     write(path, states=STATES[:9], frames=FRAMES[:9])
-    with pytest.raises(InputError, match=r"one.npz: 9 steps. Expected the 20"):
+    with pytest.raises(InputError, match=r"one.npz: 9 steps. Expected 20"):
         plain.read(0)
 
 
@@ -98,7 +98,7 @@ NAN = np.where(np.arange(STEPS)[:, None] == 3, np.nan, STATES)
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "no states": (lambda path: write(path, without="states"), "states: no such array"),
     "no rate worth the name": (lambda path: write(path, fps_hz=0.0), "fps_hz: 0"),
-    "another rate": (lambda path: write(path, fps_hz=30.0), "30 steps a second.*Expected 15 steps a second"),
+    "another rate": (lambda path: write(path, fps_hz=30.0), "30 steps per second.*Expected 15 steps per second"),
     "no such camera": (lambda path: write(path, without="frames", wrist=WRIST), "frames: no such array"),
     "mistyped camera": (
         lambda path: write(path, without="frames", frame=FRAMES),

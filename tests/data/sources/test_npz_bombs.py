@@ -55,7 +55,7 @@ BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "a head without end": (
         lambda path: add(without(path, "states"), "states", described((STEPS, 7), "<f8", claimed=32 * _MB), 32 * _MB),
-        r"states: cannot be read \(an array in another format",
+        r"states: cannot be read \(an array in a format that numpy does not write",
     ),
     "a packing without a bound": (
         lambda path: add(
@@ -66,7 +66,7 @@ BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "frames that are not there": (
         lambda path: add(without(path, "frames"), "frames", described((STEPS, 4_000_000, 4_000_000, 3), "|u1"), 1000),
-        "frames: cannot be read .*in 1128 bytes",
+        "frames: cannot be read .*does not match 1128 bytes",
     ),
     "rows of nothing": (
         lambda path: add(without(path, "states"), "states", described((1 << 40, 0), "<f8"), 0),
@@ -114,4 +114,4 @@ def test_frames_that_unpack_to_far_more_bytes_than_the_file_has_are_refused(
     table = table_of(folder)
     (problem,) = table.problems
     assert ([info.id for info in table], problem.where) == (["noisy", "plain", "small"], f"{folder}/bomb.npz: frames")
-    assert "bytes that unpack to 1,350,128; above 1,048,576 bytes at most 100 times as many" in problem.found
+    assert "bytes that unpack to 1,350,128; above 1,048,576 bytes the largest compression ratio is 100" in problem.found

@@ -125,7 +125,7 @@ def test_real_robot_episodes_of_another_schema_are_read_by_mapped_names(shared: 
         ),
         (
             lambda f: f.pop("episode_metadata/file_path"),
-            "no feature episode_metadata/file_path; the record has .*steps/action",
+            "no feature episode_metadata/file_path; existing features: .*steps/action",
         ),
         (lambda f: f.update({"steps/is_first": ("float_list", [1.0] * 12)}), "a float_list.*Expected a int64_list"),
         (lambda f: f.update({"steps/is_first": ("int64_list", [])}), "no steps.*Expected one or more"),
@@ -188,7 +188,7 @@ def test_a_file_that_changes_while_it_is_in_use_is_an_error(droid: Path, tmp_pat
     shard = sorted(folder.glob("*.tfrecord-*"))[0]
     os.truncate(shard, shard.stat().st_size // 2)
     for use in (lambda: source.read(0), lambda: episode.read_frames([3])):
-        with pytest.raises(InputError, match=rf"{shard.name}: .*it has changed since the data set was opened"):
+        with pytest.raises(InputError, match=rf"{shard.name}: .*the file has changed since the data set was opened"):
             use()
     shard.unlink()
     with pytest.raises(InputError, match=rf"{shard.name}: cannot be read"):
@@ -234,7 +234,7 @@ def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Pa
     [
         ("{", "invalid JSON"),
         ('{"name": "a", "splits": []}', "no episodes"),
-        ('{"name": "a", "splits": [{"name": "train", "shardLengths": ["x"]}]}', "not a description"),
+        ('{"name": "a", "splits": [{"name": "train", "shardLengths": ["x"]}]}', "not a valid data set description"),
         (
             '{"name": "a", "splits": [{"name": "train", "shardLengths": [9999999999]}]}',
             "shard of 9,999,999,999 episodes",

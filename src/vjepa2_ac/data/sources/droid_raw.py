@@ -75,17 +75,15 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             OSError: Data behind a URL cannot be read.
         """
         table = self.infos()
-        info, place = (
-            table[index],
-            _EpisodeLocation(**parse_json_object(table.locators["place"][index].decode(), where="the index")),
-        )
-        serial = _select_serial(place.serials, camera or self._config.cameras[0], info.id)
-        numbers = self._read_arrays(place, (serial,))
+        info = table[index]
+        location = _EpisodeLocation(**parse_json_object(table.locators["place"][index].decode(), where="the index"))
+        serial = _select_serial(location.serials, camera or self._config.cameras[0], info.id)
+        numbers = self._read_arrays(location, (serial,))
         states = _join_states(numbers)
-        require_indexed_length(len(states), info, self._path(place.folder, TRAJECTORY))
-        video = self._path(place.folder, f"{VIDEOS}/{serial}.mp4")
+        require_indexed_length(len(states), info, self._path(location.folder, TRAJECTORY))
+        video = self._path(location.folder, f"{VIDEOS}/{serial}.mp4")
         task = table.label("task", index)
-        frames = partial(self._read_frames, video, place.version, numbers["frame"].tolist())
+        frames = partial(self._read_frames, video, location.version, numbers["frame"].tolist())
         return Episode(
             info=info,
             states=states,
@@ -99,10 +97,10 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
     def _read_frames(
         self, video: str, version: str, frames: Sequence[int], steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
-        opened = partial(self._files.open, video, version=version)
-        walk = lambda: {"times": np.array(read_frame_times(opened(), where=video), np.int64)}  # noqa: E731
-        times = self._files.read_parsed(f"times {video} {version}", walk)["times"].tolist()
-        return read_frames(opened(), [frames[step] for step in steps], where=video, times=times)
+        open_video = partial(self._files.open, video, version=version)
+        read_times = lambda: {"times": np.array(read_frame_times(open_video(), where=video), np.int64)}  # noqa: E731
+        times = self._files.read_parsed(f"times {video} {version}", read_times)["times"].tolist()
+        return read_frames(open_video(), [frames[step] for step in steps], where=video, times=times)
 
     def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, None]:
         """Return the cached table, or scan all episodes; a changed local file changes the key."""
@@ -110,7 +108,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         folders = find_episodes(root, CONNECTIONS)
         if not folders:
             needed = f"folders LAB/success|failure/DATE/TIME with a {TRAJECTORY}"
-            fix = "DROID's are in gs://gresearch/robotics/droid_raw/1.0.1"
+            fix = "The raw DROID recordings are in gs://gresearch/robotics/droid_raw/1.0.1"
             raise InputError(where="data.path", found=f"no episodes under {root}", needed=needed, fix=fix)
         listed: Sequence[EpisodeFolder | str] = folders
         if not storage.is_url(root):
@@ -132,58 +130,65 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         listed = list_episode(self._config.path, folder)
         has_trajectory = any(file.name == TRAJECTORY for file in listed.files)
         if not has_trajectory or listed.metadata is None:
-            found = f"episode {identity} has no {'metadata_*.json' if has_trajectory else TRAJECTORY}"
-            raise InputError(where=self._path(folder, ""), found=found, needed="one", fix=_FIX)
+            file = "metadata_*.json" if has_trajectory else TRAJECTORY
+            found, needed = f"episode {identity} has no {file}", f"a {file} in each episode"
+            raise InputError(where=self._path(folder, ""), found=found, needed=needed, fix=_FIX)
         version, path = hash_key({"files": listed}), self._path(folder, listed.metadata)
         metadata = parse_json_object(
             self._files.read(path, version=version), where=path, needed="the metadata of an episode"
         )
-        named = {camera: _parse_serial(metadata, camera) for camera in RAW_CAMERAS}
-        known = {camera: serial for camera, serial in named.items() if serial}
-        serials, counts = tuple(_select_serial(known, camera, path) for camera in self._config.cameras), {}
+        parsed = {camera: _parse_serial(metadata, camera) for camera in RAW_CAMERAS}
+        serial_by_camera = {camera: serial for camera, serial in parsed.items() if serial}
+        serials = tuple(_select_serial(serial_by_camera, camera, path) for camera in self._config.cameras)
+        counts = {}
         for serial in serials:
             video = self._path(folder, f"{VIDEOS}/{serial}.mp4")
-            if not any(one.name == f"{serial}.mp4" for one in listed.videos):
-                existing = ", ".join(file.name for file in listed.videos) or "none"
-                needed = f"the MP4 of a camera in {listed.metadata} or data.camera; the folder has {existing}"
-                fix = f"{did_you_mean(serial, [*RAW_CAMERAS, *known.values()])}{_FIX}"
-                raise InputError(where=video, found="no such file", needed=needed, fix=fix)
+            names = [file.name for file in listed.videos]
+            if f"{serial}.mp4" not in names:
+                found = f"no such file; existing MP4 files: {', '.join(names) or 'none'}"
+                needed = f"the MP4 of a camera in {listed.metadata} or data.camera"
+                fix = f"{did_you_mean(serial, [*RAW_CAMERAS, *serial_by_camera.values()])}{_FIX}"
+                raise InputError(where=video, found=found, needed=needed, fix=fix)
             counts[serial] = read_header(video, where=video).num_frames
-        place = _EpisodeLocation(folder, version, known, counts)
-        states = _join_states(self._read_arrays(place, serials))
+        location = _EpisodeLocation(folder, version, serial_by_camera, counts)
+        states = _join_states(self._read_arrays(location, serials))
         success = metadata.get("success")
         outcome = success if isinstance(success, bool) else parse_outcome(identity)
         return IndexEntry(
             EpisodeInfo(identity, len(states), outcome),
             self._path(folder, TRAJECTORY),
-            locator={"place": json.dumps(vars(place)).encode()},
+            locator={"place": json.dumps(vars(location)).encode()},
             states=summarize_states(states),
             labels=_parse_labels(metadata),
             rate_hz=RAW_RATE_HZ,
         )
 
-    def _read_arrays(self, place: _EpisodeLocation, serials: tuple[str, ...]) -> Arrays:
+    def _read_arrays(self, location: _EpisodeLocation, serials: tuple[str, ...]) -> Arrays:
         """Return the arrays of the used steps, with the poses of some cameras and the index of each frame.
 
         Raises:
             InputError: The trajectory is damaged, incomplete, implausible, or of another length than an MP4.
         """
-        path = self._path(place.folder, TRAJECTORY)
-        key = f"trajectory {path} {place.version} {serials}"
-        read = partial(self._files.read, path, version=place.version)
-        found = self._files.read_parsed(key, lambda: parse_trajectory(read(), path, serials))
-        steps = len(found["pose"])
-        for serial, count in place.frames.items():
+        path = self._path(location.folder, TRAJECTORY)
+        key = f"trajectory {path} {location.version} {serials}"
+        read = partial(self._files.read, path, version=location.version)
+        arrays = self._files.read_parsed(key, lambda: parse_trajectory(read(), path, serials))
+        steps = len(arrays["pose"])
+        for serial, count in location.frames.items():
             if abs(steps - count) > 1:
-                wrong, needed = f"{counted(steps, 'step')}, but {count} frames in {serial}.mp4", "one for each step"
-                raise InputError(where=path, found=wrong, needed=f"{needed}; the last one may be missing", fix=_FIX)
-        if self._config.pose_frame == "camera" and not found.keys() >= set(serials):
-            needed, fix = "observation/camera_extrinsics of the camera", "Set data.pose_frame: base"
-            raise InputError(where=path, found="no poses of the camera", needed=needed, fix=fix)
-        used = np.arange(min(steps, *place.frames.values()))
-        if "skipped" in found:
-            used = used[found["skipped"][used, 0] == 0]
-        numbers = {name: values[used] for name, values in found.items()} | {"frame": used}
+                found = f"{counted(steps, 'step')}, but {counted(count, 'frame')} in {serial}.mp4"
+                needed = "one frame for each step; only the last frame may be missing"
+                raise InputError(where=path, found=found, needed=needed, fix=_FIX)
+        if self._config.pose_frame == "camera" and not arrays.keys() >= set(serials):
+            needed, fix = (
+                "the array observation/camera_extrinsics for each camera of data.camera",
+                "Set data.pose_frame: base",
+            )
+            raise InputError(where=path, found="the camera poses are missing", needed=needed, fix=fix)
+        used = np.arange(min(steps, *location.frames.values()))
+        if "skipped" in arrays:
+            used = used[arrays["skipped"][used, 0] == 0]
+        numbers = {name: values[used] for name, values in arrays.items()} | {"frame": used}
         POSE.require_plausible(_join_states(numbers), path, fix=_FIX)
         return numbers
 
@@ -204,24 +209,26 @@ def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[st
     """
     h5py = require_library("h5py", where=where, called="h5py, which reads trajectory.h5", extra="raw")
     poses = {serial: (f"observation/camera_extrinsics/{serial}_left", 6) for serial in serials}
-    found: dict[str, Float[np.ndarray, "steps _"]] = {}
+    arrays: dict[str, Float[np.ndarray, "steps _"]] = {}
     try:
         # Read from memory, so that HDF5 never waits for a network or crashes on a file that is being truncated.
         with h5py.File(h5py.h5f.open_file_image(data)) as file:
-            for name, (place, width) in (_REQUIRED | _OPTIONAL | poses).items():
-                if place in file:
-                    found[name] = _read_array(file[place], width, f"{where}: {place}")
+            for name, (array_path, width) in (_REQUIRED | _OPTIONAL | poses).items():
+                if array_path in file:
+                    arrays[name] = _read_array(file[array_path], width, f"{where}: {array_path}")
                 elif name in _REQUIRED:
-                    there = ", ".join(sorted(file))[:200]
-                    raise InputError(where=f"{where}: {place}", found=f"no such array; there are {there}", fix=_FIX)
+                    found = f"no such array; existing groups: {', '.join(sorted(file))[:200]}"
+                    raise InputError(where=f"{where}: {array_path}", found=found, fix=_FIX)
     except (OSError, KeyError, ValueError, TypeError, RuntimeError, MemoryError, OverflowError) as error:
-        wrong = f"{len(data)} bytes that cannot be read as HDF5 ({str(error)[:200]})"
-        raise InputError(where=where, found=wrong, needed="an undamaged trajectory.h5", fix=_FIX) from None
-    steps = len(found["pose"])
-    for name, values in found.items():
+        found = f"{len(data)} bytes that cannot be read as HDF5 ({str(error)[:200]})"
+        raise InputError(where=where, found=found, needed="an undamaged trajectory.h5", fix=_FIX) from None
+    steps = len(arrays["pose"])
+    for name, values in arrays.items():
         if len(values) != steps:
-            raise InputError(where=f"{where}: {name}", found=f"{len(values)} of {counted(steps, 'step')}", fix=_FIX)
-    return found
+            raise InputError(
+                where=f"{where}: {name}", found=f"values for {len(values)} of {counted(steps, 'step')}", fix=_FIX
+            )
+    return arrays
 
 
 def _read_array(data: Any, width: int, where: str) -> Float[np.ndarray, "steps width"]:
@@ -229,7 +236,7 @@ def _read_array(data: Any, width: int, where: str) -> Float[np.ndarray, "steps w
     shape, kind = tuple(getattr(data, "shape", None) or ()), getattr(getattr(data, "dtype", None), "kind", "?")
     fits = shape[1:] == (width,) or (width == 1 and len(shape) == 1)
     if not fits or shape[0] > _MAX_STEPS or kind not in "fiub":
-        found, needed = f"shape {shape} of kind {kind!r}", f"{width} numbers for each step"
+        found, needed = f"shape {shape} of dtype kind {kind!r}", f"{width} numbers for each step"
         raise InputError(where=where, found=found, needed=needed, fix=_FIX)
     values = np.asarray(data[()], dtype=np.float64).reshape(-1, width)
     require_finite(values, where, fix=_FIX)
@@ -250,8 +257,8 @@ def _parse_serial(metadata: Mapping[str, Any], camera: str) -> str | None:
 def _select_serial(serials: Mapping[str, str], camera: str, where: str) -> str:
     """Return the serial number of a camera, given by a name (left, right, wrist, ext1, ext2) or a serial number."""
     if camera in RAW_CAMERAS and camera not in serials:
-        found, fix = f"no {camera}_mp4_path with an MP4", "Set data.camera to one that every episode has"
-        raise InputError(where=where, found=found, needed="the path of one in the metadata", fix=fix)
+        found, fix = f"{camera}_mp4_path is missing or not an MP4", "Set data.camera to a camera of every episode"
+        raise InputError(where=where, found=found, needed="the path of an MP4 in the metadata", fix=fix)
     return serials.get(camera, camera)
 
 
@@ -291,14 +298,14 @@ def find_episodes(root: str, connections: int) -> list[str]:
     """
     if _is_episode(root, ""):
         return [""]
-    found: list[str] = []
+    episodes: list[str] = []
     folders = [""]
     for _ in range(DEEPEST):
         children = map_in_threads(lambda folder: _list_children(root, folder), folders, connections)
-        together = [child for group in children for child in group]
-        found += [path for path, is_episode in together if is_episode]
-        folders = [path for path, is_episode in together if not is_episode]
-    return sorted(found)
+        flat = [child for group in children for child in group]
+        episodes += [path for path, is_episode in flat if is_episode]
+        folders = [path for path, is_episode in flat if not is_episode]
+    return sorted(episodes)
 
 
 def list_episode(root: str, folder: str) -> EpisodeFolder:

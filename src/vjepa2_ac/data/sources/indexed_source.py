@@ -60,7 +60,7 @@ ScanResult = IndexEntry | EpisodeProblem
 
 
 def build_table(
-    found: Iterable[ScanResult], config: DataConfig, total: int, progress: Progress = no_progress
+    results: Iterable[ScanResult], config: DataConfig, total: int, progress: Progress = no_progress
 ) -> EpisodeTable:
     """Build the table of all episodes from the results of a scan.
 
@@ -68,7 +68,7 @@ def build_table(
     one are problems, like those with a duplicate identity.
 
     Args:
-        found: The result of each episode, in the source's order.
+        results: The result of each episode, in the source's order.
         config: The data.
         total: Number of episodes.
         progress: Called with (done, total) after each episode.
@@ -78,37 +78,38 @@ def build_table(
     """
     usable: dict[str, IndexEntry] = {}
     problems: list[EpisodeProblem] = []
-    kinds: dict[str, int] = {}
-    for done, one in enumerate(found, start=1):
-        if isinstance(one, EpisodeProblem):
-            problems.append(one)
-        elif "\0" in one.info.id:
-            problems.append(EpisodeProblem.from_error(nul_error(one.info.id, one.where), one.info.id))
-        elif (first := usable.setdefault(one.info.id, one)) is one:
-            kinds[one.kind] = kinds.get(one.kind, 0) + 1
+    kinds: dict[str, int] = {}  # number of episodes of each kind
+    for num_done, result in enumerate(results, start=1):
+        if isinstance(result, EpisodeProblem):
+            problems.append(result)
+        elif "\0" in result.info.id:
+            problems.append(EpisodeProblem.from_error(nul_error(result.info.id, result.where), result.info.id))
+        elif (first := usable.setdefault(result.info.id, result)) is result:
+            kinds[result.kind] = kinds.get(result.kind, 0) + 1
         else:
-            wrong = f"the same identity as {first.where}: {one.info.id}"
-            needed = "episodes that can be told apart: the split is a hash of the identity"
-            problems.append(EpisodeProblem(one.info.id, one.where, wrong, needed, config.same_identity_fix))
-        progress(done, total)
+            problem = f"the identity {result.info.id} is also the identity of {first.where}"
+            needed = "a unique identity for each episode, because the split is a hash of the identity"
+            problems.append(EpisodeProblem(result.info.id, result.where, problem, needed, config.same_identity_fix))
+        progress(num_done, total)
     if not usable:
         raise problems[0].error
-    usual = max(kinds, key=lambda kind: kinds[kind])
-    fix = "Resample the episode, or keep the recordings of different robots in different folders"
-    for name, one in usable.items():
-        if one.kind != usual:
-            problems.append(EpisodeProblem(name, one.where, one.kind, f"{usual}, as in most episodes", fix))
-    rows = [one for one in usable.values() if one.kind == usual]
-    logger.info("%s: %d episodes, %d that cannot be used", config.path, len(rows), len(problems))
-    hashes, rate = [one.states.state_hash for one in rows], rows[0].rate_hz
+    main_kind = max(kinds, key=lambda kind: kinds[kind])
+    fix = "Resample the episode, or store the recordings of different robots in different folders"
+    for name, entry in usable.items():
+        if entry.kind != main_kind:
+            needed = f"{main_kind}, as in most episodes"
+            problems.append(EpisodeProblem(name, entry.where, entry.kind, needed, fix))
+    entries = [entry for entry in usable.values() if entry.kind == main_kind]
+    logger.info("%s: %d usable episodes, %d unusable episodes", config.path, len(entries), len(problems))
+    hashes, rate = [entry.states.state_hash for entry in entries], entries[0].rate_hz
     return replace(
-        EpisodeTable.from_infos([one.info for one in rows]),
+        EpisodeTable.from_infos([entry.info for entry in entries]),
         problems=tuple(problems),
-        locators={name: np.array([one.locator[name] for one in rows]) for name in rows[0].locator},
+        locators={name: np.array([entry.locator[name] for entry in entries]) for name in entries[0].locator},
         texts={} if rate is None else {"control_rate_hz": str(rate)},
         state_hash=np.array(hashes, np.uint64) if any(hashes) else None,
-        motion=np.array([one.states.motion for one in rows], np.float32),
-        labels=build_labels([one.labels for one in rows]),
+        motion=np.array([entry.states.motion for entry in entries], np.float32),
+        labels=build_labels([entry.labels for entry in entries]),
     )
 
 
@@ -142,9 +143,9 @@ class IndexedSource(ABC, Generic[Config, State]):
 
     def with_raw_states(self) -> Self:
         """Return a source of the same episodes that reads states as unconverted vectors; the index is shared."""
-        other = type(self)(self._config.model_copy(update={"states": "vector"}))
-        other._index_and_state = self._index_and_state
-        return other
+        source = type(self)(self._config.model_copy(update={"states": "vector"}))
+        source._index_and_state = self._index_and_state
+        return source
 
     @cached_property
     def _files(self) -> EpisodeFiles:
@@ -177,8 +178,8 @@ class IndexedSource(ABC, Generic[Config, State]):
             except InputError as error:
                 return EpisodeProblem.from_error(error, identities[key])
 
-        found = map_in_threads(scan_one, [*identities], num_connections(self._config))
-        return build_table(found, self._config, len(identities), progress)
+        results = map_in_threads(scan_one, [*identities], num_connections(self._config))
+        return build_table(results, self._config, len(identities), progress)
 
     @abstractmethod
     def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, State]:
@@ -196,18 +197,19 @@ def make_frame_reader(num_steps: int, where: str, decode: FrameReader) -> FrameR
 
     def read(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
         if not steps or min(steps) < 0 or max(steps) >= num_steps:
-            raise ValueError(f"{where}: steps {list(steps)} of {num_steps}")
+            raise ValueError(f"{where}: steps {list(steps)} requested. Expected steps from 0 to {num_steps - 1}.")
         return decode(steps)
 
     return read
 
 
-def require_indexed_length(found: int, info: EpisodeInfo, where: str) -> None:
+def require_indexed_length(num_steps: int, info: EpisodeInfo, where: str) -> None:
     """Refuse an episode whose length differs from its length in the index.
 
     Raises:
         InputError: The lengths differ.
     """
-    if found != info.num_steps:
-        needed, fix = f"the {info.num_steps} that were indexed", "Do not change files while a run reads them"
-        raise InputError(where=where, found=counted(found, "step"), needed=needed, fix=fix)
+    if num_steps != info.num_steps:
+        needed = f"{info.num_steps}, as when the data set was indexed"
+        fix = "Do not change files while a run reads them"
+        raise InputError(where=where, found=counted(num_steps, "step"), needed=needed, fix=fix)

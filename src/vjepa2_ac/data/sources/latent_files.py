@@ -60,7 +60,7 @@ _TENSOR_TYPES = {
     "U8": torch.uint8, "I8": torch.int8, "I16": torch.int16, "I32": torch.int32, "I64": torch.int64,
 }  # fmt: skip
 _LATENTS_SUFFIX, _BROKEN_SUFFIX = ".safetensors", ".broken"
-FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
+FIX = "Delete this file and run the `vjepa2-ac encode` command of this cache again, or copy the file again"
 
 
 def pack_latents(latents: Float[Tensor, "*batch tokens dim"], kind: CacheType) -> StoredLatents:
@@ -129,8 +129,8 @@ class LatentFiles:
 
     def get_file_size(self, number: int, camera: str) -> int:
         """Return the size of a file in bytes; 0 if the file is missing."""
-        found = self._find_file(_file_name(number, camera))
-        return 0 if found is None else found.size
+        file = self._find_file(_file_name(number, camera))
+        return 0 if file is None else file.size
 
     def find_missing(self, numbers: Sequence[int], cameras: Sequence[str]) -> list[int]:
         """Return the episodes that have neither a file of latents nor a `.broken` file for some camera.
@@ -146,10 +146,10 @@ class LatentFiles:
 
     def is_done(self, number: int, camera: str) -> bool:
         """Return whether a file of latents or a `.broken` file exists; behind a URL only the listing is checked."""
-        is_there = (
+        is_present = (
             self.get_file_size(number, camera) > 0 if storage.is_url(self.folder) else self.has_file(number, camera)
         )
-        return is_there or self._find_file(_file_name(number, camera, _BROKEN_SUFFIX)) is not None
+        return is_present or self._find_file(_file_name(number, camera, _BROKEN_SUFFIX)) is not None
 
     def open(self, number: int, camera: str) -> EpisodeFile:
         """Open the file of an episode and camera.
@@ -158,20 +158,17 @@ class LatentFiles:
             InputError: The file is missing, damaged, or belongs to another cache; or the episode could not be read.
             UnreachableError: The file cannot be read now.
         """
-        place, file, note = (
-            self.path(number, camera),
-            self._find_file(_file_name(number, camera)),
-            _file_name(number, camera, _BROKEN_SUFFIX),
-        )
+        path, file = self.path(number, camera), self._find_file(_file_name(number, camera))
+        note = _file_name(number, camera, _BROKEN_SUFFIX)
         if file is None and self._find_file(note) is not None:
-            found = f"no latents: it could not be read when they were encoded ({self._read_reason(note).rstrip('.')})"
-            raise InputError(where=place, found=found)
+            reason = self._read_reason(note).rstrip(".")
+            raise InputError(where=path, found=f"no latents, because encoding could not read the episode ({reason})")
         if file is None:
-            raise InputError(where=place, found="no such file", needed="latents of an episode", fix=FIX)
+            raise InputError(where=path, found="no such file", needed="latents of an episode", fix=FIX)
         if self.cache is None:
-            return EpisodeFile(place, self.key, file.size, partial(storage.read_ranges, place))
-        key = f"{place} {file.version} {file.size}"
-        return EpisodeFile(place, self.key, file.size, partial(cached_ranges, place, key=key, cache=self.cache))
+            return EpisodeFile(path, self.key, file.size, partial(storage.read_ranges, path))
+        key = f"{path} {file.version} {file.size}"
+        return EpisodeFile(path, self.key, file.size, partial(cached_ranges, path, key=key, cache=self.cache))
 
     def write(self, number: int, encoded: EncodedEpisode, *, lossless_images: bool = False) -> None:
         """Write the file of an episode and camera.
@@ -192,13 +189,15 @@ class LatentFiles:
             jpegs = [encode_jpeg(frame, quality=_JPEG_QUALITY) for frame in encoded.pictures]
             arrays["pictures"] = np.frombuffer(b"".join(jpegs), np.uint8)
             arrays["picture_ends"] = np.cumsum([len(jpeg) for jpeg in jpegs], dtype=np.int64)
-        tensors = {name: torch.from_numpy(np.array(one, order="C")) for name, one in arrays.items() if one is not None}
+        tensors = {
+            name: torch.from_numpy(np.array(array, order="C")) for name, array in arrays.items() if array is not None
+        }
         tensors["latents"] = latents.values.contiguous()
         if latents.scales is not None:
             tensors["scales"] = latents.scales.contiguous()
         metadata = json.dumps(dict(episode.metadata), sort_keys=True)
-        about = {"id": episode.info.id, "camera": encoded.camera, "metadata": metadata, "key": self.key}
-        storage.write(self.path(number, camera), save(tensors, metadata=about))
+        header = {"id": episode.info.id, "camera": encoded.camera, "metadata": metadata, "key": self.key}
+        storage.write(self.path(number, camera), save(tensors, metadata=header))
         if self._find_file(note := _file_name(number, camera, _BROKEN_SUFFIX)) is not None:
             storage.remove(storage.join(self.folder, note))
 
@@ -263,16 +262,18 @@ class EpisodeFile:
             self._head = self._read_pieces([(0, min(size, _HEAD_BYTES))])[0]
             begin = _LENGTH_BYTES + int.from_bytes(self._head[:_LENGTH_BYTES], "little")
             if not _LENGTH_BYTES < begin <= min(size, MAX_BYTES):
-                raise ValueError("no header")
+                raise ValueError("the header is missing")
             header = parse_json_object(self._read_pieces([(_LENGTH_BYTES, begin - _LENGTH_BYTES)])[0], where=path)
-            about = header.pop("__metadata__", {})
+            metadata = header.pop("__metadata__", {})
             self._tensors = {name: _Tensor.from_header(entry, begin) for name, entry in header.items()}
-            if (end := max([begin, *(one.end for one in self._tensors.values())])) != size:
-                raise ValueError(f"{size:,} bytes of {end:,}")
-            self.metadata = {name: str(text) for name, text in parse_json_object(about["metadata"], where=path).items()}
+            if (end := max([begin, *(tensor.end for tensor in self._tensors.values())])) != size:
+                raise ValueError(f"{size:,} bytes instead of {end:,}")
+            self.metadata = {
+                name: str(text) for name, text in parse_json_object(metadata["metadata"], where=path).items()
+            }
         self.names = self._tensors.keys()
-        if about.get("key") != key:
-            raise self._damage_error("a file of another cache", "a file that was made with this one's cache.json")
+        if metadata.get("key") != key:
+            raise self._damage_error("the file belongs to another cache", "a file with the key of this cache.json")
 
     @cached_property
     def frame_steps(self) -> Int[np.ndarray, " frames"]:
@@ -286,8 +287,9 @@ class EpisodeFile:
             InputError: There is no tensor of this name.
         """
         with self._translate_errors():
-            one = self._tensors[name]
-            return np.asarray(one.to_tensor(self._read_pieces([(one.start, one.end - one.start)]), one.shape).numpy())
+            tensor = self._tensors[name]
+            pieces = self._read_pieces([(tensor.start, tensor.end - tensor.start)])
+            return np.asarray(tensor.to_tensor(pieces, tensor.shape).numpy())
 
     def find_frames(self, steps: Sequence[int]) -> list[int]:
         """Return the indices of the frames at these control steps.
@@ -295,13 +297,15 @@ class EpisodeFile:
         Raises:
             InputError: The cache has no frame at one of the steps.
         """
-        there = {step: place for place, step in enumerate(self.frame_steps.tolist())}
-        if absent := [step for step in steps if step not in there]:
-            needed = f"one of the {len(there)} that clips of the cache's data.stride and data.frames need"
-            raise InputError(where=self.path, found=f"no frame of control step {absent[0]}", needed=needed)
-        return [there[step] for step in steps]
+        indices = {step: index for index, step in enumerate(self.frame_steps.tolist())}
+        if missing := [step for step in steps if step not in indices]:
+            needed = (
+                f"one of the {len(indices)} steps that clips with the data.stride and data.frames of the cache need"
+            )
+            raise InputError(where=self.path, found=f"no frame of control step {missing[0]}", needed=needed)
+        return [indices[step] for step in steps]
 
-    def read_latents(self, places: Sequence[int]) -> StoredLatents:
+    def read_latents(self, indices: Sequence[int]) -> StoredLatents:
         """Read the latents of frames, given by their indices.
 
         Raises:
@@ -309,9 +313,9 @@ class EpisodeFile:
         """
         names = [name for name in ("latents", "scales") if name == "latents" or name in self.names]
         with self._translate_errors():
-            return StoredLatents(*self._read_rows(names, places))
+            return StoredLatents(*self._read_rows(names, indices))
 
-    def read_images(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames size size 3"]:
+    def read_images(self, indices: Sequence[int]) -> UInt8[np.ndarray, "frames size size 3"]:
         """Read the encoder's input images of frames, given by their indices.
 
         Raises:
@@ -320,26 +324,26 @@ class EpisodeFile:
         with self._translate_errors():
             stored = self._tensors["pictures"]
             if len(stored.shape) > 1:
-                return np.asarray(self._read_rows(["pictures"], places)[0].numpy())
+                return np.asarray(self._read_rows(["pictures"], indices)[0].numpy())
             ends = [0, *self.read_array("picture_ends").tolist()]
-            jpegs = self._read_pieces([stored.get_row_range(ends[place], ends[place + 1]) for place in places])
-        return decode_images(jpegs, self.frame_steps[list(places)].tolist(), self.path)
+            jpegs = self._read_pieces([stored.get_row_range(ends[index], ends[index + 1]) for index in indices])
+        return decode_images(jpegs, self.frame_steps[list(indices)].tolist(), self.path)
 
-    def _read_rows(self, names: Sequence[str], places: Sequence[int]) -> list[Tensor]:
+    def _read_rows(self, names: Sequence[str], indices: Sequence[int]) -> list[Tensor]:
         """Read the same rows of several tensors together."""
-        tensors, count = [self._tensors[name] for name in names], len(places)
-        pieces = self._read_pieces([one.get_row_range(place, place + 1) for one in tensors for place in places])
+        tensors, count = [self._tensors[name] for name in names], len(indices)
+        pieces = self._read_pieces([tensor.get_row_range(i, i + 1) for tensor in tensors for i in indices])
         parts = (pieces[number * count : (number + 1) * count] for number in range(len(tensors)))
-        return [one.to_tensor(part, (count, *one.shape[1:])) for one, part in zip(tensors, parts, strict=True)]
+        return [tensor.to_tensor(part, (count, *tensor.shape[1:])) for tensor, part in zip(tensors, parts, strict=True)]
 
     def _read_pieces(self, ranges: Ranges) -> list[bytes]:
-        known, there = len(self._head), dict[tuple[int, int], bytes]()
+        pieces: dict[tuple[int, int], bytes] = {}
         for start, length in ranges:
-            if start + length <= known or not length:
-                there[start, length] = self._head[start : start + length]
-        lacking = [one for one in dict.fromkeys(ranges) if one not in there]
-        there |= zip(lacking, self._read(lacking), strict=True) if lacking else ()
-        return [there[one] for one in ranges]
+            if start + length <= len(self._head) or not length:
+                pieces[start, length] = self._head[start : start + length]
+        missing = [byte_range for byte_range in dict.fromkeys(ranges) if byte_range not in pieces]
+        pieces |= zip(missing, self._read(missing), strict=True) if missing else ()
+        return [pieces[byte_range] for byte_range in ranges]
 
     @contextmanager
     def _translate_errors(self) -> Iterator[None]:
@@ -348,7 +352,7 @@ class EpisodeFile:
             with storage.translate_read_errors(self.path, needed="latents of an episode", fix=FIX):
                 yield
         except (AttributeError, KeyError, IndexError, RuntimeError, ValueError, TypeError) as error:
-            raise self._damage_error(f"not a whole file of latents ({error})") from None
+            raise self._damage_error(f"not a complete file of latents ({error})") from None
 
     def _damage_error(self, found: str, needed: str = "") -> InputError:
         return InputError(where=self.path, found=found, needed=needed, fix=FIX)
@@ -363,13 +367,13 @@ class _Tensor:
     start: int  # position in the file
 
     @classmethod
-    def from_header(cls, about: Mapping[str, Any], begin: int) -> _Tensor:
+    def from_header(cls, entry: Mapping[str, Any], begin: int) -> _Tensor:
         """Create a tensor from its entry in the header; `begin` is the position after the header."""
-        start, end = about["data_offsets"]
-        one = cls(_TENSOR_TYPES[about["dtype"]], tuple(about["shape"]), begin + start)
-        if min(start, *one.shape) < 0 or one.end != begin + end:
-            raise ValueError(f"shape {one.shape} in bytes {start} to {end}")
-        return one
+        start, end = entry["data_offsets"]
+        tensor = cls(_TENSOR_TYPES[entry["dtype"]], tuple(entry["shape"]), begin + start)
+        if min(start, *tensor.shape) < 0 or tensor.end != begin + end:
+            raise ValueError(f"shape {tensor.shape} does not match bytes {start} to {end}")
+        return tensor
 
     @property
     def end(self) -> int:

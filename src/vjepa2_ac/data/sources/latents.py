@@ -31,7 +31,7 @@ CACHE_FILE, EPISODES_FILE, STEPS_FILE = "cache.json", "episodes.npz", "kept.npz"
 _FRAME_KEYS = {"source", "camera", "pose_frame", "cache_dtype"}  # config keys that affect frames, not clips
 _NON_ENCODING_PREFIXES = ("data", "format")  # prefixes of parts that are unrelated to the encoder
 _MAX_BYTES = 1 << 30  # size limit of a table
-_ENCODE = "Run `vjepa2-ac encode`, which resumes where it was stopped; or copy the cache again"
+_ENCODE = "Run `vjepa2-ac encode`, which resumes an unfinished cache, or copy the cache again"
 
 
 @dataclass(frozen=True)
@@ -64,17 +64,17 @@ class CacheKey:
         """The cameras of a cache."""
         return tuple(map(str, self.parts["data.camera"]))
 
-    def list_differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
+    def list_differences(self, parts: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
         """Return the differences from other parts, such as "data.stride: 8, not 4", for some names or for all."""
-        wanted = json.loads(json.dumps(dict(wanted)))  # types as in a file
-        names = sorted(self.parts.keys() | wanted) if names is None else names
-        return [text for name in names for text in _compare_values(name, self.parts.get(name), wanted.get(name))]
+        parts = json.loads(json.dumps(dict(parts)))  # converts tuples to lists, as in a file
+        names = sorted(self.parts.keys() | parts) if names is None else names
+        return [text for name in names for text in _compare_values(name, self.parts.get(name), parts.get(name))]
 
     def list_encoding_differences(self, encoding: Encoding) -> list[str]:
         """Return the differences in the settings by which frames became latents."""
         names = sorted(self.parts.keys() | encoding.parts)
         return self.list_differences(
-            encoding.parts, [one for one in names if not one.startswith(_NON_ENCODING_PREFIXES)]
+            encoding.parts, [name for name in names if not name.startswith(_NON_ENCODING_PREFIXES)]
         )
 
 
@@ -117,29 +117,29 @@ def require_matching_folder(folder: Path | str, name: str, key: CacheKey, *, whe
         InputError: Lists the differences.
         UnreachableError: The folder cannot be read now.
     """
-    fix = "Name another folder, or delete this one"
-    others = [
-        other for other in storage.list_names(folder) if other[0] != "."
-    ]  # listed first, because another process may begin now
+    fix = "Choose another folder, or delete this one"
+    # Listed before the key is read, because another process may start writing at any time.
+    other_names = [other for other in storage.list_names(folder) if other[0] != "."]
     try:
-        there = read_json_object(storage.join(folder, name), fix=fix)
+        stored = read_json_object(storage.join(folder, name), fix=fix)
     except MissingFileError:
-        if others:
-            found = f"a folder with other things in it, such as {others[0]}"
-            raise InputError(where=where, found=found, needed="a new or empty one", fix=fix) from None
+        if other_names:
+            found = f"the folder contains other files, such as {other_names[0]}"
+            raise InputError(where=where, found=found, needed="a new or empty folder", fix=fix) from None
         return
-    if differing := CacheKey(there.get("key") or {}).list_differences(key.parts):
-        found, needed = f"made otherwise: {'; '.join(differing)}", "a new folder, or one made with these settings"
+    if differing := CacheKey(stored.get("key") or {}).list_differences(key.parts):
+        found = f"the folder was created with different settings: {'; '.join(differing)}"
+        needed = "a new folder, or a folder that was created with these settings"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 
-def _compare_values(name: str, here: Any, there: Any) -> list[str]:
-    if here == there or (there is None and name in REMOVED and here in REMOVED[name].values):
-        return []  # equal, or a config key that was removed since and whose value equals today's behaviour
-    if isinstance(here, dict) and isinstance(there, dict):
-        inner = sorted(here.keys() | there)
-        return [text for key in inner for text in _compare_values(f"{name}.{key}", here.get(key), there.get(key))]
-    return [f"{name}: {_format_value(here)}, not {_format_value(there)}"]
+def _compare_values(name: str, stored: Any, current: Any) -> list[str]:
+    if stored == current or (current is None and name in REMOVED and stored in REMOVED[name].values):
+        return []  # equal, or the key of a removed option whose stored value equals today's behaviour
+    if isinstance(stored, dict) and isinstance(current, dict):
+        inner = sorted(stored.keys() | current)
+        return [text for key in inner for text in _compare_values(f"{name}.{key}", stored.get(key), current.get(key))]
+    return [f"{name}: {_format_value(stored)}, not {_format_value(current)}"]
 
 
 def _format_value(value: Any) -> str:
@@ -161,10 +161,12 @@ def read_cache_key(folder: Path | str) -> CacheKey:
         key = read_json_object(where, fix=_ENCODE).get("key")
     except MissingFileError:
         is_folder = storage.is_url(folder) or Path(folder).is_dir()
-        found = "no latent cache" if is_folder else f"no such folder, seen from {Path.cwd()}"
+        found = "no latent cache" if is_folder else f"no such folder (working directory: {Path.cwd()})"
         raise InputError(where=str(folder), found=found, needed=needed, fix=_ENCODE) from None
     if not isinstance(key, dict) or key.get("format") != FORMAT or not isinstance(key.get("data.camera"), list):
-        raise InputError(where=where, found="another file, or another format", needed=needed, fix=_ENCODE)
+        raise InputError(
+            where=where, found="not the key of a latent cache, or an unsupported format", needed=needed, fix=_ENCODE
+        )
     return CacheKey(key)
 
 
@@ -246,7 +248,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         for name, values in arrays.items():
             width = STATE_DIM if name == "states" and self._config.states == "pose" else np.atleast_2d(values).shape[1]
             if values.shape != (info.num_steps, width):
-                needed = f"{info.num_steps} x {width}, as the other files of the cache say"
+                needed = f"{info.num_steps} x {width}, as in the index of the cache"
                 raise InputError(where=f"{where}: {name}", found=f"shape {values.shape}", needed=needed, fix=FIX)
             space = get_state_space(self._config, width) if name == "states" else make_vector_states(width)
             if name != "joint_velocities":  # only the idle filter reads them, and checks them
@@ -262,10 +264,12 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         table, opened = self._open()
         numbers = np.unique(episodes).tolist()
         if missing := opened.files.find_missing(numbers, self.cameras):
-            such = f"{len(missing)} of {counted(len(numbers), 'episode')}, such as {table.identity(missing[0])}"
-            fix = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
-            fix += " episodes out (data.outcome, data.exclude)"
-            raise InputError(where=self._config.path, found=f"no latents of {such}", fix=fix)
+            count = f"{len(missing)} of {counted(len(numbers), 'episode')}"
+            found = f"no latents of {count}, such as {table.identity(missing[0])}"
+            fix = (
+                "Run the `vjepa2-ac encode` command of this cache again to encode the missing episodes, or exclude them"
+            )
+            raise InputError(where=self._config.path, found=found, fix=f"{fix} (data.outcome, data.exclude)")
         return self._config.model_copy(update={"camera": self.cameras})
 
     def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - opening a cache is fast
@@ -287,7 +291,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
 
 def cache_mismatch_error(folder: Path | str, differing: Sequence[str]) -> InputError:
     """Return the error of a cache with other settings than those in use."""
-    found = f"a latent cache that was made otherwise: {'; '.join(differing)}"
-    needed = "one that was made with this model and these settings"
-    fix = "Change the settings to those, or encode the data set again"
+    found = f"the latent cache was encoded with different settings: {'; '.join(differing)}"
+    needed = "a latent cache that was encoded with this model and these settings"
+    fix = "Change the settings to those of the cache, or encode the data set again"
     return InputError(where=str(folder), found=found, needed=needed, fix=fix)

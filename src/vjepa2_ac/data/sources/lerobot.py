@@ -52,7 +52,7 @@ FRAME_COLUMN, TIME_COLUMN = "frame_index", "timestamp"
 _DATA_BYTES = "data_bytes"  # total size of the Parquet files with rows
 _CHECKS = 2  # version of the checks during indexing and of the choice of frames; a new number rebuilds all indexes
 
-_FIX_VECTORS = "Leave the episode out, or check data.lerobot: state, action"
+_FIX_VECTORS = "Exclude the episode, or check data.lerobot.state and data.lerobot.action"
 
 EpisodeArrays = dict[str, Any]
 """The data of an episode except its frames, by the names of `Episode`: states, commands, joint_velocities."""
@@ -116,7 +116,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             if info.features[key].dtype == "video":
                 files |= listed(info.video_path or "", key)
         fields = config.format_values["lerobot"]
-        fields.pop("action")  # included in the columns if it matters
+        fields.pop("action")  # `select_columns` includes the columns of actions if they are read
         parts = {
             **({"vector": select_columns(config)} if config.states == "vector" else {}),
             "source": "lerobot",
@@ -135,18 +135,18 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
 
     def _build_table(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, config, fields = self._info, self._config, self._config.lerobot
-        is_far, connections = storage.is_url(config.path), num_connections(config)
-        of_config = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
-        videos = [key for key in of_config if info.features[key].dtype == "video"]
+        is_remote, connections = storage.is_url(config.path), num_connections(config)
+        camera_keys = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
+        videos = [key for key in camera_keys if info.features[key].dtype == "video"]
         rows = read_episode_rows(info, tables, videos, fields.success, self._open_file)
         if not rows:
-            raise InputError(where=info.where, found="no episodes", needed="a data set with episodes")
+            raise InputError(where=info.where, found="the data set has no episodes", needed="at least one episode")
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
-        reads_rows = not is_far or (config.outcome != "all" and outcome_unknown)
+        reads_rows = not is_remote or (config.outcome != "all" and outcome_unknown)
         overlaps = find_overlaps(info, rows, keys)
-        header_of = cache(lambda path: read_header(path, where=path))
+        read_cached_header = cache(lambda path: read_header(path, where=path))
 
-        def look(row: EpisodeRow) -> ScanResult:
+        def scan(row: EpisodeRow) -> ScanResult:
             success, summary = row.success, STATES_NOT_READ
             try:
                 require_files(info, row, files, keys)
@@ -156,22 +156,22 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
                     content, outcome = self._read_arrays(row)
                     success = success if outcome is None else outcome
                     summary = summarize_states(content["states"])
-                if not is_far:
-                    require_video_lengths(info, row, keys, header_of)
+                if not is_remote:
+                    require_video_lengths(info, row, keys, read_cached_header)
             except InputError as error:
                 return EpisodeProblem.from_error(error, row.id)
-            facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
-            return IndexEntry(facts, self._where(row), row.locator, summary, labels, self._info.fps)
+            episode_info, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
+            return IndexEntry(episode_info, self._where(row), row.locator, summary, labels, self._info.fps)
 
         by_file: dict[str, list[EpisodeRow]] = {}  # grouped, so that each row group is decoded once
         for row in rows:
             by_file.setdefault(row.data_file(info), []).append(row)
-        found: dict[str, ScanResult] = {}
-        seen = map_in_threads(lambda some: [(row.id, look(row)) for row in some], [*by_file.values()], connections)
-        for of_file in seen:
-            found.update(of_file)
-            progress(len(found), len(rows))
-        return build_table([found[row.id] for row in rows], config, len(rows))
+        results: dict[str, ScanResult] = {}
+        scan_file = lambda file_rows: [(row.id, scan(row)) for row in file_rows]  # noqa: E731
+        for file_results in map_in_threads(scan_file, [*by_file.values()], connections):
+            results.update(file_results)
+            progress(len(results), len(rows))
+        return build_table([results[row.id] for row in rows], config, len(rows))
 
     def _read_arrays(self, row: EpisodeRow) -> tuple[EpisodeArrays, bool | None]:
         """Return the data in the rows of an episode, and whether the episode succeeded (None: unknown).
@@ -189,11 +189,11 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
                 raise missing_error("data.lerobot", "column", name, where, rows)
             feature, width = info.features.get(name), rows[name].shape[1]
             if feature is not None and width != feature.width:
-                found, needed = f"{width} numbers a row", f"{feature.width}, says {info.where}"
+                found, needed = f"{width} numbers per row", f"{feature.width}, according to {info.where}"
                 raise InputError(where=f"{where}: {name}", found=found, needed=needed, fix=FIX_EPISODE)
             return rows[name].astype(np.float64)
 
-        def joined(names: Sequence[str]) -> Float[np.ndarray, "steps width"]:
+        def concatenate(names: Sequence[str]) -> Float[np.ndarray, "steps width"]:
             numbers = np.concatenate([column(name) for name in names], axis=1)
             require_finite(numbers, where, fix=_FIX_VECTORS)
             return numbers
@@ -202,15 +202,15 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             """Return an optional column; if the data set has it, every file must have it."""
             return None if name is None or (name not in rows and name not in info.features) else column(name)
 
-        states, success = joined(fields.state), optional(fields.success)
+        states, success = concatenate(fields.state), optional(fields.success)
         if fields.select is not None:
             states = states[:, list(fields.select)]
         content = {
             "states": convert_poses(states, fields, where, section="data.lerobot")
             if config.states == "pose"
             else states,
-            "commands": joined(fields.action) if config.actions == "recorded" else None,
-            "joint_velocities": None if optional(JOINT_VELOCITY) is None else joined([JOINT_VELOCITY]),
+            "commands": concatenate(fields.action) if config.actions == "recorded" else None,
+            "joint_velocities": None if optional(JOINT_VELOCITY) is None else concatenate([JOINT_VELOCITY]),
         }
         return content, None if success is None else bool(success.any())
 
@@ -241,7 +241,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         if images is None:
             all_images = read_all()
             if len(all_images) != row.length:
-                found, needed = f"{len(all_images)} images", f"one for each of {counted(row.length, 'step')}"
+                found, needed = f"{len(all_images)} images", f"one image for each of {counted(row.length, 'step')}"
                 raise InputError(where=where, found=found, needed=needed)
             if int(self.infos().texts[_DATA_BYTES]) <= self._config.disk_cache.limit_gb * 1e9:
                 self._files.cache.write_parts(entry, all_images)
@@ -265,16 +265,22 @@ def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
     """Check that the rows of an episode are complete, in order, and at the data set's rate."""
     count = len(rows[EPISODE_COLUMN]) if rows else 0
     if count != length:
-        raise InputError(where=where, found=f"{count} rows", needed=f"{length}, says the data set", fix=FIX_EPISODE)
+        raise InputError(
+            where=where,
+            found=counted(count, "row"),
+            needed=f"{length}, according to the files in meta",
+            fix=FIX_EPISODE,
+        )
     order = np.arange(length)
     if FRAME_COLUMN in rows and not np.array_equal(rows[FRAME_COLUMN][:, 0], order):
-        found = f"{FRAME_COLUMN} that is not 0 to {length - 1} in order"
-        raise InputError(where=where, found=found, needed="a row for each step", fix=FIX_EPISODE)
-    if (
-        TIME_COLUMN in rows and not (wrong := abs(rows[TIME_COLUMN][:, 0] - order / fps)).max() < 0.5 / fps
-    ):  # NaN is wrong, too
-        step = int(np.argmax(~(wrong < 0.5 / fps)))
-        found = f"the {TIME_COLUMN} {rows[TIME_COLUMN][step, 0]:.4g} s"
-        needed = f"{step / fps:.4g} s, at the {fps:g} rows per second that meta/info.json says"
-        fix = "Correct fps in meta/info.json, or leave the episode out"
+        found = f"{FRAME_COLUMN} does not count from 0 to {length - 1}"
+        raise InputError(where=where, found=found, needed="one row for each step, in order", fix=FIX_EPISODE)
+    if TIME_COLUMN not in rows:
+        return
+    errors_s = abs(rows[TIME_COLUMN][:, 0] - order / fps)
+    if not errors_s.max() < 0.5 / fps:  # written this way, because a NaN is an error, too
+        step = int(np.argmax(~(errors_s < 0.5 / fps)))
+        found = f"{TIME_COLUMN} {rows[TIME_COLUMN][step, 0]:.4g} s"
+        needed = f"{step / fps:.4g} s, at the {fps:g} rows per second of meta/info.json"
+        fix = "Correct fps in meta/info.json, or exclude the episode"
         raise InputError(where=f"{where}: step {step}", found=found, needed=needed, fix=fix)

@@ -28,23 +28,23 @@ INFO = "meta/info.json"
 VERSIONS = ("v2.1", "v3.0")
 
 _PLACEHOLDER = re.compile(r"\{(?:(video_key)|(?:chunk_index|file_index|episode_chunk|episode_index)(?::0\dd)?)\}")
-_FIX = "Get meta/info.json again"
+_FIX = "Download meta/info.json again"
 _FIX_VERSION = (
-    "lerobot 0.3.3's convert_dataset_v1_to_v2.py and convert_dataset_v20_to_v21.py make v2.1 of older ones; for newer "
-    "ones update vjepa2-ac"
+    "Convert older data sets to v2.1 with convert_dataset_v1_to_v2.py and convert_dataset_v20_to_v21.py of lerobot "
+    "0.3.3; for newer versions update vjepa2-ac"
 )
-_FIX_STORAGE = "`vjepa2-ac data converter lance_to_files` prints a script that writes the files a Lance table is of"
-_FIX_HUB = "Check the name in hf://datasets/owner/name; for a private data set, `hf auth login` or set HF_TOKEN"
+_FIX_STORAGE = "`vjepa2-ac data converter lance_to_files` prints a script that converts a Lance table to these files"
+_FIX_HUB = "Check the name in hf://datasets/owner/name; for a private data set, run `hf auth login` or set HF_TOKEN"
 TABLES = {  # path templates of the files that list the episodes
     "v2.1": "meta/episodes.jsonl",
     "v3.0": "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
 }
-FIX_EPISODE = "Copy the data set again, or leave the episode out"
+FIX_EPISODE = "Copy the data set again, or exclude the episode"
 _MAX_BYTES = 1 << 28  # size limit of meta/episodes.jsonl
-_FIX_TABLES = "Get the files in meta again"
+_FIX_TABLES = "Download the files in meta again"
 _FIX_RANGES = (
     "Correct file_index, from_timestamp and to_timestamp in meta/episodes (they may be wrong for other episodes of the "
-    "file, too), or leave both episodes out"
+    "file, too), or exclude both episodes"
 )
 _ROUNDING_STEPS = 0.25  # the ranges of two episodes in a video may overlap by this many steps
 
@@ -106,17 +106,17 @@ class DatasetInfo:
         """
         fields = config.lerobot
         columns = [name for name, feature in self.features.items() if feature.is_numbers]
-        wanted = {"state": fields.state, "action": fields.action if config.actions == "recorded" else ()}
-        for knob, names in wanted.items():
+        columns_by_key = {"state": fields.state, "action": fields.action if config.actions == "recorded" else ()}
+        for key, names in columns_by_key.items():
             for name in names:
                 if name not in columns:
-                    raise missing_error(f"data.lerobot.{knob}", "column of numbers", name, self.where, columns)
-        columns_of_state = {}
+                    raise missing_error(f"data.lerobot.{key}", "column of numbers", name, self.where, columns)
+        state_columns = {}
         for name in fields.state:
             feature = self.features[name]
             described = ", ".join(feature.names) if len(feature.names) == feature.width else feature.width
-            columns_of_state[f"{name} [{described}]"] = feature.width
-        require_selection(columns_of_state, fields, "data.lerobot", is_pose=config.states == "pose")
+            state_columns[f"{name} [{described}]"] = feature.width
+        require_selection(state_columns, fields, "data.lerobot", is_pose=config.states == "pose")
         for camera in config.cameras:
             self.get_camera_key(fields, camera)
 
@@ -133,15 +133,17 @@ class DatasetInfo:
         if key not in cameras:
             raise missing_error(f"data.lerobot.cameras.{camera}", "camera", key, self.where, cameras)
         if self.features[key].dtype == "video" and self.video_path is None:
-            raise InputError(where=self.where, found=f"no video_path, and {key} is a video", needed="one", fix=_FIX)
+            found = f"{key} is a video, but video_path is missing"
+            raise InputError(where=self.where, found=found, needed="the path template of the videos", fix=_FIX)
         return key
 
 
-def missing_error(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
+def missing_error(where: str, kind: str, name: str, container: str, existing: Iterable[str]) -> InputError:
     """Return an error about a missing name, with the existing names and a suggestion."""
-    known = list(known)
-    fix = f"{did_you_mean(name, known)}It has: {', '.join(known) or 'none'}"
-    return InputError(where=where, found=f"no {kind} {name} in {place}", needed="one that it has", fix=fix)
+    existing = list(existing)
+    needed = f"one of {', '.join(existing)}" if existing else ""
+    found = f"no {kind} {name} in {container}" + ("" if existing else f", which has no {kind}")
+    return InputError(where=where, found=found, needed=needed, fix=did_you_mean(name, existing).strip())
 
 
 def read_info(root: str) -> DatasetInfo:
@@ -167,8 +169,8 @@ def read_info(root: str) -> DatasetInfo:
     try:
         return _parse_info(root, content)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-        found = f"not a description of a data set ({error!r})"
-        raise InputError(where=where, found=found, needed="LeRobot's own", fix=_FIX) from None
+        found = f"not a valid data set description ({error!r})"
+        raise InputError(where=where, found=found, needed="meta/info.json as written by LeRobot", fix=_FIX) from None
 
 
 def _parse_info(root: str, content: Mapping[str, Any]) -> DatasetInfo:
@@ -205,15 +207,15 @@ def _parse_feature(content: Mapping[str, Any]) -> Feature:
     """
     dtype, shape, names = content["dtype"], tuple(content["shape"]), content.get("names")
     if not isinstance(dtype, str) or not all(type(size) is int and size > 0 for size in shape):
-        raise TypeError(f"a feature of dtype {dtype!r} and shape {shape!r}")
+        raise TypeError(f"invalid feature with dtype {dtype!r} and shape {shape!r}")
     if isinstance(names, dict) and all(type(index) is int for index in names.values()):  # {"x": 0, "y": 1, ...}
         names = sorted(names, key=names.__getitem__)
     elif isinstance(names, dict) and len(names) == 1:  # {"motors": ["x", "y", ...]}, as in older ports
         names = next(iter(names.values()))
-    marks = [one for one in (content.get("info"), content.get("video_info")) if isinstance(one, Mapping)]
+    video_infos = [info for info in (content.get("info"), content.get("video_info")) if isinstance(info, Mapping)]
     is_depth = any(
-        one.get("is_depth_map") or one.get("video.is_depth_map") or is_depth_format(str(one.get("video.pix_fmt")))
-        for one in marks
+        info.get("is_depth_map") or info.get("video.is_depth_map") or is_depth_format(str(info.get("video.pix_fmt")))
+        for info in video_infos
     )
     return Feature(dtype, shape, tuple(map(str, names)) if isinstance(names, list) else (), is_depth)
 
@@ -222,7 +224,7 @@ def _require_safe_template(template: str) -> str:
     """Check a path template such as `chunk-{chunk_index:03d}`, which must stay inside the data set, and return it."""
     rest = _PLACEHOLDER.sub("", template)
     if not template or template.startswith("/") or ".." in template.split("/") or "{" in rest or "}" in rest:
-        raise ValueError(f"the path template {template!r}")
+        raise ValueError(f"invalid path template {template!r}")
     return template
 
 
@@ -238,18 +240,22 @@ def list_by_template(root: str, template: str, key: str = "", *, connections: in
         InputError: A file is a git-lfs pointer.
         OSError: A folder cannot be listed.
     """
-    pattern = _PLACEHOLDER.sub(lambda place: glob.escape(key) if place[1] else "[0-9]*", template)
-    *folders, name = pattern.split("/")
-    found = [""]
+    pattern = _PLACEHOLDER.sub(lambda match: glob.escape(key) if match[1] else "[0-9]*", template)
+    *folders, file_pattern = pattern.split("/")
+    matches = [""]
     for part in folders:
-        names = {folder: storage.list_names(storage.join(root, folder)) if "[" in part else [part] for folder in found}
-        found = [f"{folder}{one}/" for folder in found for one in names[folder] if fnmatchcase(one, part)]
-    listings = map_in_threads(lambda folder: storage.list_files(storage.join(root, folder)), found, connections)
-    files = [(folder, file) for folder, inside in zip(found, listings, strict=True) for file in inside]
-    fitting = dict(sorted((f"{folder}{file.name}", file) for folder, file in files if fnmatchcase(file.name, name)))
-    for path, file in fitting.items():
+        names = {
+            folder: storage.list_names(storage.join(root, folder)) if "[" in part else [part] for folder in matches
+        }
+        matches = [f"{folder}{name}/" for folder in matches for name in names[folder] if fnmatchcase(name, part)]
+    listings = map_in_threads(lambda folder: storage.list_files(storage.join(root, folder)), matches, connections)
+    files = [(folder, file) for folder, listing in zip(matches, listings, strict=True) for file in listing]
+    matching_files = dict(
+        sorted((f"{folder}{file.name}", file) for folder, file in files if fnmatchcase(file.name, file_pattern))
+    )
+    for path, file in matching_files.items():
         storage.require_regular_file(storage.join(root, path), file.size)
-    return fitting
+    return matching_files
 
 
 # ---- the episodes ----
@@ -306,7 +312,7 @@ def read_episode_rows(
         OSError: A remote file cannot be read.
     """
     outcome = f"stats/{success}/max"
-    own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome}
+    columns_read = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome}
     prefixes = tuple(f"videos/{key}/" for key in videos)
     rows = []
     for table in tables:
@@ -314,20 +320,20 @@ def read_episode_rows(
         if info.version == "v2.1":
             values = list(_read_lines(path))
         else:
-            columns = read_table(open_file(path), path, lambda name: name in own or name.startswith(prefixes))
+            columns = read_table(open_file(path), path, lambda name: name in columns_read or name.startswith(prefixes))
             values = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         for number, row in enumerate(values):
             try:
                 rows.append(_parse_row(info, row, videos, row.get(outcome)))
             except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-                found, needed = f"not an episode ({error!r})", "LeRobot's own tables"
+                found, needed = f"not an entry of an episode ({error!r})", "a table as written by LeRobot"
                 raise InputError(where=f"{path}: row {number}", found=found, needed=needed, fix=_FIX_TABLES) from None
     rows.sort(key=lambda row: row.index)
     numbers = {row.index for row in rows}
     if len(numbers) != len(rows) or len(rows) != info.episodes:
         where = storage.join(info.root, tables[0] if tables else "meta")
-        found = f"{counted(len(rows), 'episode')}, of {len(numbers)} numbers"
-        needed = f"{info.episodes} of as many numbers, says {info.where}"
+        found = f"{counted(len(rows), 'episode')} with {len(numbers)} different values of episode_index"
+        needed = f"{counted(info.episodes, 'episode')} with different values, according to {info.where}"
         raise InputError(where=where, found=found, needed=needed, fix=_FIX_TABLES)
     return rows
 
@@ -337,19 +343,20 @@ def _read_lines(path: str) -> Iterator[dict[str, Any]]:
     for number, line in enumerate(storage.read_small_file(path, _MAX_BYTES).splitlines(), start=1):
         if line.strip():
             where = f"{path}: line {number}"
-            yield parse_json_object(line, where=where, needed="an episode", fix=_FIX_TABLES)
+            yield parse_json_object(line, where=where, needed="the entry of an episode", fix=_FIX_TABLES)
 
 
 def _parse_row(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], outcome: object) -> EpisodeRow:
     index = int(row["episode_index"])
     if info.version == "v2.1":  # one file per episode
-        places = ("data", *(f"videos/{key}" for key in videos))
-        row = {**row, **{f"{place}/chunk_index": index // info.chunk_episodes for place in places}}
-        row |= {f"{place}/file_index": index for place in places} | {f"{place}/from_timestamp": 0 for place in places}
+        prefixes = ("data", *(f"videos/{key}" for key in videos))
+        row = {**row, **{f"{prefix}/chunk_index": index // info.chunk_episodes for prefix in prefixes}}
+        row |= {f"{prefix}/file_index": index for prefix in prefixes}
+        row |= {f"{prefix}/from_timestamp": 0 for prefix in prefixes}
     while isinstance(outcome, list) and outcome:
         outcome = outcome[0]
     tasks = row.get("tasks") or ()
-    place: dict[str, float] = {
+    locator: dict[str, float] = {
         "index": index,
         "chunk": int(row["data/chunk_index"]),
         "file": int(row["data/file_index"]),
@@ -360,13 +367,13 @@ def _parse_row(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str],
         start, end = float(row[f"{name}/from_timestamp"]), row.get(f"{name}/to_timestamp")
         if not math.isfinite(start) or start < 0:
             raise ValueError(f"{name}/from_timestamp {start}")
-        place |= {f"{key}.{part}": int(row[f"{name}/{part}_index"]) for part in ("chunk", "file")}
-        place[f"{key}.start_s"] = start
+        locator |= {f"{key}.{part}": int(row[f"{name}/{part}_index"]) for part in ("chunk", "file")}
+        locator[f"{key}.start_s"] = start
         if end is not None:
             lengths_s[key] = float(end) - start
     return EpisodeRow(
         length=int(row["length"]),
-        locator=place,
+        locator=locator,
         task="; ".join(map(str, tasks)) if isinstance(tasks, list | tuple) else str(tasks),
         lengths_s=lengths_s,
         success=bool(outcome) if isinstance(outcome, bool | int | float) else None,
@@ -387,27 +394,28 @@ def require_files(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Seq
     """
     if row.length == 0:
         raise no_steps_error(f"{info.root}: {row.id}")
-    rows_in = row.data_file(info)
-    if rows_in not in files:
-        where, needed = f"{storage.join(info.root, rows_in)}: {row.id}", f"the {row.length} rows of the episode"
+    data_file = row.data_file(info)
+    if data_file not in files:
+        where, needed = f"{storage.join(info.root, data_file)}: {row.id}", f"the {row.length} rows of the episode"
         raise InputError(where=where, found="no such file", needed=needed, fix=FIX_EPISODE)
     for key in keys:
         if f"{key}.file" not in row.locator:
             continue
-        shown_in = row.video_file(info, key)
-        where, of_rows = f"{storage.join(info.root, shown_in)}: {row.id}", f"for {row.length} rows in {rows_in}"
-        if shown_in not in files:
+        video_file = row.video_file(info, key)
+        where = f"{storage.join(info.root, video_file)}: {row.id}"
+        rows = f"{counted(row.length, 'row')} in {data_file}"
+        if video_file not in files:
             raise InputError(
-                where=where, found=f"no such video, {of_rows}", needed=f"the frames of {key}", fix=FIX_EPISODE
+                where=where, found="no such video", needed=f"the frames of {key} for {rows}", fix=FIX_EPISODE
             )
         if not row.lengths_s.get(key, math.inf) > (row.length - 0.5) / info.fps:
-            found = f"{row.lengths_s[key]:.3f} s of video, says the data set, {of_rows}"
-            needed = f"{row.length / info.fps:.3f} s"
-            raise InputError(where=where, found=found, needed=needed, fix="Leave the episode out")
+            found = f"{row.lengths_s[key]:.3f} s of video according to the files in meta"
+            needed = f"{row.length / info.fps:.3f} s for {rows}"
+            raise InputError(where=where, found=found, needed=needed, fix="Exclude the episode")
 
 
 def require_video_lengths(
-    info: DatasetInfo, row: EpisodeRow, keys: Sequence[str], header_of: Callable[[str], VideoHeader]
+    info: DatasetInfo, row: EpisodeRow, keys: Sequence[str], read_header: Callable[[str], VideoHeader]
 ) -> None:
     """Refuse an episode whose video ends before its last step according to the header of the video.
 
@@ -415,7 +423,7 @@ def require_video_lengths(
         info: Description of the data set.
         row: The episode.
         keys: Features of the used cameras.
-        header_of: Returns the header of the video at a path.
+        read_header: Returns the header of the video at a path.
 
     Raises:
         InputError: A video is too short, or cannot be read.
@@ -423,10 +431,12 @@ def require_video_lengths(
     for key in keys:
         if f"{key}.file" in row.locator:
             path = storage.join(info.root, row.video_file(info, key))
-            header, last_s = header_of(path), row.locator[f"{key}.start_s"] + (row.length - 1) / info.fps
+            header, last_s = read_header(path), row.locator[f"{key}.start_s"] + (row.length - 1) / info.fps
             if header.num_frames < row.length or header.span_s < last_s - 0.5 / info.fps:
-                found = f"{header.num_frames} frames at {header.rate_hz:.4g} a second, up to {header.span_s:.3f} s"
-                needed = f"one for each of {row.length} rows at {info.fps:g} a second, up to {last_s:.3f} s"
+                found = (
+                    f"{header.num_frames} frames at {header.rate_hz:.4g} frames per second, up to {header.span_s:.3f} s"
+                )
+                needed = f"a frame for each of {row.length} rows at {info.fps:g} rows per second, up to {last_s:.3f} s"
                 raise InputError(where=f"{path}: {row.id}", found=found, needed=needed, fix=FIX_EPISODE)
 
 
@@ -440,23 +450,23 @@ def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[
     """
     errors: dict[str, InputError] = {}
     for key in keys:
-        claims = []
+        segments = []
         for row in rows:
             if f"{key}.file" in row.locator:
                 start_s = row.locator[f"{key}.start_s"]
                 end_s = start_s + row.lengths_s.get(key, row.length / info.fps)
-                claims.append((row.video_file(info, key), start_s, end_s, row.id))
+                segments.append((row.video_file(info, key), start_s, end_s, row.id))
         latest = ("", 0.0, 0.0, "")
-        for claim in sorted(claims):
-            path, start_s, end_s, identity = claim
+        for segment in sorted(segments):
+            path, start_s, end_s, identity = segment
             end_s = min(end_s, latest[2])
             if path == latest[0] and end_s - start_s > _ROUNDING_STEPS / info.fps:
                 seconds = f"{start_s:.6g} to {end_s:.6g} s of {PurePosixPath(path).name}"
-                found, needed = f"{latest[3]} and {identity} claim {seconds}", "seconds of one episode only"
+                found, needed = f"{latest[3]} and {identity} both contain {seconds}", "no overlap between episodes"
                 error = InputError(where=storage.join(info.root, path), found=found, needed=needed, fix=_FIX_RANGES)
                 errors.setdefault(latest[3], error)
                 errors.setdefault(identity, error)
-            latest = max(latest, claim, key=lambda one: (one[0], one[2]))
+            latest = max(latest, segment, key=lambda item: (item[0], item[2]))
     return errors
 
 

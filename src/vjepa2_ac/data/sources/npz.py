@@ -52,7 +52,7 @@ from vjepa2_ac.errors import InputError, UserError, did_you_mean
 from vjepa2_ac.media.images import require_decodable_size
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
-FORMAT_HELP = "docs/data.md says what an episode holds"
+FORMAT_HELP = "docs/data.md describes the arrays of an episode"
 
 _SUFFIX = ".npz"
 _MAX_NUMBERS = 1 << 25  # limit for arrays other than frames: 88 hours of 7 numbers at 15 Hz; 256 MB as float64
@@ -101,12 +101,13 @@ class NpzSource(IndexedSource[DataConfig, None]):
             for camera in cameras:
                 file.require_frames(camera, steps)
             extrinsics = [file.read_extrinsics(camera, steps) for camera in cameras]
-            if config.pose_frame == "camera" and any(one is None for one in extrinsics):
-                found, needed = "no poses of the camera", "extrinsics, or extrinsics_CAMERA for each of data.camera"
+            if config.pose_frame == "camera" and any(poses is None for poses in extrinsics):
+                found = "the camera poses are missing"
+                needed = "the array extrinsics, or extrinsics_CAMERA for each camera of data.camera"
                 raise InputError(where=path, found=found, needed=needed, fix="Set data.pose_frame: base")
             fps_hz = float(file.read_numbers("fps_hz", ()))
             if fps_hz <= 0:
-                raise file.array_error("fps_hz", f"{fps_hz:g}", "control steps per second")
+                raise file.array_error("fps_hz", f"{fps_hz:g}", "a positive number of control steps per second")
             joints = "joint_velocities"
             language = file.read_text("language") if "language" in names else None
             episode = Episode(
@@ -124,7 +125,7 @@ class NpzSource(IndexedSource[DataConfig, None]):
                 commands=file.read_numbers("actions", (steps, None)) if config.actions == "recorded" else None,
             )
             headers = {name: file.read_header(name) for name in _LABELS if name in names}  # a camera may have this name
-            is_text = {name: one.shape == () and one.dtype.kind == "U" for name, one in headers.items()}
+            is_text = {name: header.shape == () and header.dtype.kind == "U" for name, header in headers.items()}
             labels = {name: file.read_text(name) for name in headers if is_text[name]}
             return episode, {"task": language, **labels}
 
@@ -145,19 +146,20 @@ class NpzSource(IndexedSource[DataConfig, None]):
         )
         if not listed:
             found = f"no .npz files under {root}"
-            raise InputError(where="data.path", found=found, needed="one for each episode", fix=FORMAT_HELP)
-        knobs: dict[str, object] = {"cameras": config.cameras, "pose_frame": config.pose_frame}
+            raise InputError(where="data.path", found=found, needed="one .npz file for each episode", fix=FORMAT_HELP)
+        config_values: dict[str, object] = {"cameras": config.cameras, "pose_frame": config.pose_frame}
         if config.states == "vector":
-            knobs |= {"states": config.states, "actions": config.actions}
-        key = index_key({"source": "npz", **knobs, "listed": listed}, root)
+            config_values |= {"states": config.states, "actions": config.actions}
+        key = index_key({"source": "npz", **config_values, "listed": listed}, root)
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
         build = partial(self._scan_all, partial(self._scan, key), dict(zip(ids, ids, strict=True)), progress)
         return get_or_build_index(config.disk_cache, key, root, build), None
 
     def _scan(self, version: str, identity: str) -> IndexEntry:
         episode, labels = self._read_episode(identity, version, self._config.cameras)
-        action = "" if episode.commands is None else f", {episode.commands.shape[1]} an action"
-        kind = f"{episode.control_rate_hz:g} steps a second (fps_hz), {episode.states.shape[1]} numbers a state{action}"
+        kind = f"{episode.control_rate_hz:g} steps per second (fps_hz), {episode.states.shape[1]} numbers per state"
+        if episode.commands is not None:
+            kind += f", {episode.commands.shape[1]} numbers per action"
         where, states = self._path(identity), summarize_states(episode.states)
         return IndexEntry(episode.info, where, {}, states, labels, episode.control_rate_hz, kind)
 
@@ -166,15 +168,15 @@ class NpzSource(IndexedSource[DataConfig, None]):
 
 
 @contextmanager
-def open_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
+def open_npz(file_or_path: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
     """Open an .npz file, given by its path or as an open remote file, for reading.
 
     Raises:
         InputError: The file is missing, or not an .npz file. An UnreachableError if it cannot be read.
     """
     with (
-        storage.translate_read_errors(path, fix="Put it back, or leave the episode out"),
-        closing(storage.open_for_reading(opened) if isinstance(opened, str) else opened) as file,
+        storage.translate_read_errors(path, fix="Restore the file, or exclude the episode"),
+        closing(storage.open_for_reading(file_or_path) if isinstance(file_or_path, str) else file_or_path) as file,
     ):
         yield NpzFile(file, path)
 
@@ -227,16 +229,17 @@ class NpzFile:
         with self._translate_errors(name), self._archive.open(member) as file:
             # Version 1.0 limits the length of a header. Numpy writes other versions only for records of many fields.
             if np.lib.format.read_magic(file) != (1, 0):
-                raise ValueError("an array in another format than numpy writes")
+                raise ValueError("an array in a format that numpy does not write")
             shape, by_columns, dtype = np.lib.format.read_array_header_1_0(file)
             header = ArrayHeader(shape, dtype, file.tell(), by_columns and len(shape) > 1)
             if dtype.hasobject:
-                raise ValueError("an array of Python objects, which would have to be executed")
+                raise ValueError("an array of Python objects, which are not loaded because unpickling can execute code")
             if header.start + header.nbytes != member.file_size:
-                raise ValueError(f"shape {header.shape} of {header.dtype} in {member.file_size} bytes")
+                raise ValueError(f"shape {header.shape} of {header.dtype} does not match {member.file_size} bytes")
             if member.file_size > max(_MAX_UNPACKED_BYTES, _MAX_RATIO * member.compress_size):
                 unpacked = f"{member.compress_size:,} bytes that unpack to {member.file_size:,}"
-                raise ValueError(f"{unpacked}; above {_MAX_UNPACKED_BYTES:,} bytes at most {_MAX_RATIO} times as many")
+                limit = f"above {_MAX_UNPACKED_BYTES:,} bytes the largest compression ratio is {_MAX_RATIO}"
+                raise ValueError(f"{unpacked}; {limit}")
             return header
 
     def read_array(self, name: str) -> Shaped[np.ndarray, ...]:
@@ -244,7 +247,7 @@ class NpzFile:
         header = self.read_header(name)
         with self._translate_errors(name), self._archive.open(self._members[name]) as member:
             if header.nbytes > _MAX_BYTES:
-                raise ValueError(f"shape {header.shape}, more than is ever read at once")
+                raise ValueError(f"shape {header.shape} exceeds the limit of {_MAX_BYTES:,} bytes per array")
             values = np.frombuffer(member.read(), header.dtype, offset=header.start)
             return values.reshape(header.shape, order="F" if header.by_columns else "C")
 
@@ -258,12 +261,12 @@ class NpzFile:
         with self._translate_errors(name), self._archive.open(member) as unpacked:
             stored = member.compress_type == zipfile.ZIP_STORED
             file, start = (self._file, self._find_content(member)) if stored else (unpacked, 0)
-            ordered, places = np.unique(rows, return_inverse=True)
-            found = np.empty((len(ordered), *header.shape[1:]), header.dtype)
-            for place, row in enumerate(ordered.tolist()):
+            unique_rows, indices = np.unique(rows, return_inverse=True)
+            values = np.empty((len(unique_rows), *header.shape[1:]), header.dtype)
+            for index, row in enumerate(unique_rows.tolist()):
                 file.seek(start + header.start + row * header.row_bytes)
-                found[place] = np.frombuffer(file.read(header.row_bytes), header.dtype).reshape(header.shape[1:])
-            return found if (places == np.arange(len(rows))).all() else found[places]
+                values[index] = np.frombuffer(file.read(header.row_bytes), header.dtype).reshape(header.shape[1:])
+            return values if (indices == np.arange(len(rows))).all() else values[indices]
 
     def array_error(self, name: str, found: str, needed: str) -> InputError:
         """Return an error about an array."""
@@ -277,14 +280,14 @@ class NpzFile:
         values = self.read_array(name).astype(np.float64)
         if not np.isfinite(values).all():
             step = np.argwhere(~np.isfinite(values))[0][:1].tolist()
-            raise self.array_error(name, f"NaN or infinity{f' at step {step[0]}' if step else ''}", "numbers")
+            raise self.array_error(name, f"NaN or infinity{f' at step {step[0]}' if step else ''}", "finite numbers")
         return values
 
     def read_text(self, name: str) -> str:
         """Read a text."""
-        self._require(name, (), "U", "one text")
+        self._require(name, (), "U", "a text")
         if (size := self.read_header(name).nbytes) > _MAX_TEXT_BYTES:
-            raise self.array_error(name, f"a text of {size:,} bytes", f"at most {_MAX_TEXT_BYTES:,}")
+            raise self.array_error(name, f"a text of {size:,} bytes", f"at most {_MAX_TEXT_BYTES:,} bytes")
         return str(self.read_array(name))
 
     def read_extrinsics(self, camera: str, steps: int) -> Float64[np.ndarray, "steps 6"] | None:
@@ -310,16 +313,18 @@ class NpzFile:
         """Refuse an array that is missing or has another shape or type."""
         if name not in self.names:
             existing = ", ".join(self.names)[:200] or "none"
-            error = self.array_error(name, "no such array", f"{meaning}; the file has {existing}")
+            error = self.array_error(name, f"no such array; existing arrays: {existing}", meaning)
             fix = f"{did_you_mean(name, self.names)}{error.fix}"
             raise InputError(where=error.where, found=error.found, needed=error.needed, fix=fix)
         header = self.read_header(name)
-        alike = len(header.shape) == len(shape) and all(
-            b in {a, None} for a, b in zip(header.shape, shape, strict=True)
+        has_shape = len(header.shape) == len(shape) and all(
+            expected in {size, None} for size, expected in zip(header.shape, shape, strict=True)
         )
-        if not alike or header.dtype.kind not in kinds or (0 in header.shape[1:]):
-            wanted = " x ".join("any" if size is None else str(size) for size in shape) or "a single one"
-            raise self.array_error(name, f"shape {header.shape} of {header.dtype}", f"{meaning}: {wanted}")
+        if not has_shape or header.dtype.kind not in kinds or (0 in header.shape[1:]):
+            expected_shape = " x ".join("any" if size is None else str(size) for size in shape) or "a scalar"
+            raise self.array_error(
+                name, f"shape {header.shape} of {header.dtype}", f"{meaning} of shape {expected_shape}"
+            )
 
     def _find_content(self, member: zipfile.ZipInfo) -> int:
         """Return the offset in the file of the content of an uncompressed member."""
@@ -337,6 +342,6 @@ class NpzFile:
         except Exception as error:  # zipfile, zlib and numpy raise many types of errors for damaged files
             if storage.is_os_read_error(error):
                 raise
-            place = f"{self._where}: {name}" if name else self._where
+            where = f"{self._where}: {name}" if name else self._where
             found = f"cannot be read ({str(error)[:200] or type(error).__name__})"
-            raise InputError(where=place, found=found, needed="an undamaged .npz file", fix=_FIX) from None
+            raise InputError(where=where, found=found, needed="an undamaged .npz file", fix=_FIX) from None

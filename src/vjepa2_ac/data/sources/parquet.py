@@ -34,7 +34,7 @@ MAX_TABLE_BYTES = 1 << 28  # size of a table of episodes or tasks
 MAX_IMAGE_BYTES = 1 << 32  # size of the images in one row group
 _ROWS_AT_ONCE = 64  # rows per read if a value may be as large as an image
 _BUFFER_BYTES = 4096  # buffer of a column whose values are not read
-_FIX = "Copy the file again, or leave its episodes out"
+_FIX = "Copy the file again, or exclude its episodes"
 
 
 class ParquetRows:
@@ -66,8 +66,8 @@ class ParquetRows:
             with self._open_groups(path, episode) as (file, groups):
                 for number in groups:
                     group = self._read_group(path, file, number)
-                    of_episode = group[EPISODE_COLUMN][:, 0] == episode
-                    parts.append({name: column[of_episode] for name, column in group.items()})
+                    is_in_episode = group[EPISODE_COLUMN][:, 0] == episode
+                    parts.append({name: column[is_in_episode] for name, column in group.items()})
             return {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
 
         return self._files.read_parsed(f"rows {self._version} {path} {episode}", read)
@@ -79,45 +79,46 @@ class ParquetRows:
             InputError: The file is missing or damaged, or the column does not contain images.
             OSError: A remote file cannot be read.
         """
-        found: list[Any] = []
+        images: list[Any] = []
         with self._open_groups(path, episode) as (file, groups):
             for number in groups:
                 for part in _read_parts(file, path, [EPISODE_COLUMN, column], MAX_IMAGE_BYTES, row_groups=[number]):
                     rows = zip(part[column], part[EPISODE_COLUMN], strict=True)
-                    found += [row.get("bytes") if isinstance(row, dict) else row for row, its in rows if its == episode]
-        if not all(isinstance(image, bytes) for image in found):
-            wrong, needed = "no images, or names of files in their place", "PNG or JPEG bytes in the column"
-            raise InputError(where=f"{path}: {column}", found=wrong, needed=needed)
-        return found
+                    selected = [row for row, row_episode in rows if row_episode == episode]
+                    images += [row.get("bytes") if isinstance(row, dict) else row for row in selected]
+        if not all(isinstance(image, bytes) for image in images):
+            found, needed = "values that are not encoded images, such as file names", "PNG or JPEG bytes in the column"
+            raise InputError(where=f"{path}: {column}", found=found, needed=needed)
+        return images
 
     @contextmanager
     def _open_groups(self, path: str, episode: int) -> Iterator[tuple[parquet.ParquetFile, list[int]]]:
         """Open a file; yield it and the row groups that may have rows of an episode, by its statistics."""
-        opened = self._files.open(path, version=self._version)
-        with _opened(opened, path) as file:
+        source = self._files.open(path, version=self._version)
+        with _open_parquet(source, path) as file:
             if path not in self._ranges:
-                self._ranges[path] = _read_episode_ranges(file, path, opened, self._columns)
+                self._ranges[path] = _read_episode_ranges(file, path, source, self._columns)
             yield file, [n for n, (first, last) in enumerate(self._ranges[path]) if first <= episode <= last]
 
     def _read_group(self, path: str, file: parquet.ParquetFile, number: int) -> Columns:
-        if getattr(self._last, "place", None) != (path, number):
+        if getattr(self._last, "path_and_group", None) != (path, number):
             present = [name for name in self._columns if name in file.schema_arrow.names]
             table = file.read_row_group(number, columns=present, use_threads=False)
             self._last.group = {name: to_numbers(table.column(name), f"{path}: {name}") for name in present}
-            self._last.place = path, number
+            self._last.path_and_group = path, number
         group: Columns = self._last.group
         return group
 
 
-def read_table(opened: str | BlockCachedFile, path: str, wanted: Callable[[str], bool]) -> dict[str, list[Any]]:
+def read_table(source: str | BlockCachedFile, path: str, is_selected: Callable[[str], bool]) -> dict[str, list[Any]]:
     """Read selected columns of a small Parquet file as lists of Python values.
 
     Raises:
         InputError: The file is missing or damaged.
         OSError: A remote file cannot be read.
     """
-    with _opened(opened, path) as file:
-        present = [name for name in file.schema_arrow.names if wanted(name)]
+    with _open_parquet(source, path) as file:
+        present = [name for name in file.schema_arrow.names if is_selected(name)]
         values: dict[str, list[Any]] = {name: [] for name in present}
         for part in _read_parts(file, path, present, MAX_TABLE_BYTES):
             for name in part:
@@ -142,8 +143,8 @@ def to_numbers(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
             raise _not_numeric_error(where, str(column.type), array.null_count)
         lengths = np.unique(array.value_lengths().to_numpy(zero_copy_only=False))
         if len(lengths) > 1:
-            found = f"{lengths[0]} numbers in one row and {lengths[-1]} in another"
-            raise InputError(where=where, found=found, needed="as many")
+            found = f"{lengths[0]} numbers in one row and {lengths[-1]} in another row"
+            raise InputError(where=where, found=found, needed="the same count of numbers in each row")
         width *= int(lengths[0]) if len(lengths) else 0
         array = array.flatten()
     kind = array.type
@@ -152,31 +153,31 @@ def to_numbers(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
     return np.asarray(array.to_numpy(zero_copy_only=False)).reshape(rows, width)
 
 
-def _not_numeric_error(where: str, kind: str, gaps: int) -> InputError:
-    found = f"{gaps} rows without a value" if gaps else f"values of type {kind}"
-    return InputError(where=where, found=found, needed="numbers, as many in each row", fix=_FIX)
+def _not_numeric_error(where: str, kind: str, num_nulls: int) -> InputError:
+    found = f"{num_nulls} rows without a value" if num_nulls else f"values of type {kind}"
+    return InputError(where=where, found=found, needed="the same count of numbers in each row", fix=_FIX)
 
 
 @contextmanager
-def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.ParquetFile]:
+def _open_parquet(source: str | BlockCachedFile, path: str) -> Iterator[parquet.ParquetFile]:
     """Open a Parquet file with verified page checksums, and convert its errors to errors for the user."""
     pa = import_pyarrow(path)
     try:
         with pa.parquet.ParquetFile(
-            opened, page_checksum_verification=True, pre_buffer=not isinstance(opened, str), memory_map=False
+            source, page_checksum_verification=True, pre_buffer=not isinstance(source, str), memory_map=False
         ) as file:
             yield file
     except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError) as error:
-        if isinstance(opened, BlockCachedFile) and opened.failure is not None:
-            raise opened.failure from None
+        if isinstance(source, BlockCachedFile) and source.failure is not None:
+            raise source.failure from None
         if isinstance(error, OSError) and error.errno is not None:  # an error of the operating system
             raise storage.read_error(path, error, fix=_FIX) from None
-        found = f"damaged: {' '.join(str(error).strip().splitlines()[:1])[:200]}"
-        raise InputError(where=path, found=found, needed="a whole Parquet file", fix=_FIX) from None
+        found = f"the file is damaged: {' '.join(str(error).strip().splitlines()[:1])[:200]}"
+        raise InputError(where=path, found=found, needed="a complete Parquet file", fix=_FIX) from None
 
 
 def _read_episode_ranges(
-    file: parquet.ParquetFile, path: str, opened: str | BlockCachedFile, columns: Sequence[str]
+    file: parquet.ParquetFile, path: str, source: str | BlockCachedFile, columns: Sequence[str]
 ) -> list[tuple[float, float]]:
     """Return the least and the greatest episode number of each row group; infinite if the file has no statistics.
 
@@ -184,47 +185,52 @@ def _read_episode_ranges(
         InputError: There is no column of episode numbers, or a column has too many numbers.
         pyarrow.ArrowException, OSError: The footer contradicts itself.
     """
-    paths = [file.metadata.schema.column(place).path for place in range(file.metadata.num_columns)]
-    places = [n for n, one in enumerate(paths) if any(f"{one}.".startswith(f"{name}.") for name in columns)]
-    _require_consistent(file, opened, places)
+    paths = [file.metadata.schema.column(index).path for index in range(file.metadata.num_columns)]
+    indices = [index for index, path in enumerate(paths) if any(f"{path}.".startswith(f"{name}.") for name in columns)]
+    _require_consistent(file, source, indices)
     if EPISODE_COLUMN not in paths:
-        raise InputError(where=path, found=f"no column {EPISODE_COLUMN}", needed="one", fix=_FIX)
+        raise InputError(where=path, found=f"the column {EPISODE_COLUMN} is missing", fix=_FIX)
     ranges: list[tuple[float, float]] = []
     for number in range(file.num_row_groups):
         group = file.metadata.row_group(number)
-        for place in places:
-            if (count := group.column(place).num_values) > MAX_NUMBERS:
+        for index in indices:
+            if (count := group.column(index).num_values) > MAX_NUMBERS:
                 found, needed = f"{count:,} numbers in a row group", f"at most {MAX_NUMBERS:,}"
-                raise InputError(where=f"{path}: {paths[place]}", found=found, needed=needed, fix=_FIX)
-        known = group.column(paths.index(EPISODE_COLUMN)).statistics
-        is_known = known is not None and known.has_min_max and isinstance(known.min, int)
-        ranges.append((known.min, known.max) if is_known else (-inf, inf))
+                raise InputError(where=f"{path}: {paths[index]}", found=found, needed=needed, fix=_FIX)
+        statistics = group.column(paths.index(EPISODE_COLUMN)).statistics
+        has_range = statistics is not None and statistics.has_min_max and isinstance(statistics.min, int)
+        ranges.append((statistics.min, statistics.max) if has_range else (-inf, inf))
     return ranges
 
 
-def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile, places: list[int]) -> None:
+def _require_consistent(file: parquet.ParquetFile, source: str | BlockCachedFile, indices: list[int]) -> None:
     """Refuse a file whose footer has inconsistent entries of some columns, in any row group.
 
     Reading such an entry with pyarrow (`row_group(n).column(p)`) aborts the process with an unhandled C++ exception.
     Reading one row makes the same checks and raises a Python error. For a remote file no row is read, which finds fewer
     errors, because the blocks of every row group would be fetched.
     """
-    parquet = import_pyarrow(str(opened)).parquet
-    rows = 1 if isinstance(opened, str) else 0
-    with parquet.ParquetFile(opened, metadata=file.metadata, buffer_size=_BUFFER_BYTES, pre_buffer=False) as light:
+    parquet = import_pyarrow(str(source)).parquet
+    rows = 1 if isinstance(source, str) else 0
+    with parquet.ParquetFile(
+        source, metadata=file.metadata, buffer_size=_BUFFER_BYTES, pre_buffer=False
+    ) as footer_check:
         for group in range(file.num_row_groups):
-            next(light.reader.iter_batches(rows, row_groups=[group], column_indices=places, use_threads=False), None)
+            next(
+                footer_check.reader.iter_batches(rows, row_groups=[group], column_indices=indices, use_threads=False),
+                None,
+            )
 
 
 def _read_parts(
-    file: parquet.ParquetFile, path: str, columns: list[str], max_bytes: int, **which: list[int]
+    file: parquet.ParquetFile, path: str, columns: list[str], max_bytes: int, **selection: list[int]
 ) -> Iterator[dict[str, list[Any]]]:
     """Yield some columns as Python values, a few rows at a time, up to a limit of their total size.
 
     Sizes are counted as Python values, because the table stores equal values once, but Python a copy of each.
     """
     total = 0
-    for part in file.iter_batches(_ROWS_AT_ONCE, columns=columns, use_threads=False, **which):
+    for part in file.iter_batches(_ROWS_AT_ONCE, columns=columns, use_threads=False, **selection):
         values = part.to_pydict()
         total += _estimate_bytes(values)
         if total > max_bytes:

@@ -69,13 +69,13 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
         feature, info = fields.cameras[camera], table[index]
         shard, span = locate_record(table, shards, index)
         where = f"{span} ({info.id})"
-        of_images = f"{where}: {feature}"
+        images_where = f"{where}: {feature}"
         if storage.is_url(shard.path):
             remote = RemoteEpisode(shard, span, config.disk_cache)
             names = [STEP_FLAG, *list_step_features(config), fields.joint_velocity, fields.language]
             record = remote.fetch_record([name for name in names if name])
-            place = record.find_feature(feature)
-            images = remote.make_image_reader(feature, place, info.num_steps, needed, of_images)
+            byte_range = record.find_feature(feature)
+            images = remote.make_image_reader(feature, byte_range, info.num_steps, needed, images_where)
             return read_episode(record, config, info, images, where)
         with open_shard(shard) as read:
             checked = cache_folder(config.disk_cache) / "index" / f"{table.texts['index']}.checked"
@@ -83,7 +83,7 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
                 verify_crc(read, span)
                 _mark_checked(checked, index)
             record = Record(read, span)
-            images = make_local_image_reader(shard, record.find_feature(feature), info.num_steps, of_images)
+            images = make_local_image_reader(shard, record.find_feature(feature), info.num_steps, images_where)
             return read_episode(record, config, info, images, where)
 
     def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, tuple[Shard, ...]]:
@@ -115,7 +115,7 @@ def _is_checked(file: Path, number: int) -> bool:
 
 
 def _mark_checked(file: Path, number: int) -> None:
-    """Mark a record as checked; where that cannot be written, it is checked again next time."""
+    """Mark a record as checked; if the mark cannot be written, the record is checked again next time."""
     with suppress(OSError):
         handle = os.open(file, os.O_WRONLY | os.O_CREAT, 0o666)
         try:
@@ -129,8 +129,8 @@ def make_local_image_reader(shard: Shard, feature: ByteRange, num_steps: int, wh
 
     def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
         with open_shard(shard) as read:
-            places = _find_images(read, feature, num_steps, where)
-            return decode_images([read(*places[step]) for step in steps], steps, where)
+            ranges = _find_images(read, feature, num_steps, where)
+            return decode_images([read(*ranges[step]) for step in steps], steps, where)
 
     return make_frame_reader(num_steps, where, decode)
 
@@ -185,8 +185,8 @@ class RemoteEpisode:
                 if stored is None:
                     images = self._fetch_all(key, feature, num_steps, needed, where)
                 else:
-                    places = np.frombuffer(stored, np.uint32).reshape(-1, 2) + np.array([feature[0], 0])
-                    images = self._read_images(key, list(map(tuple, places.tolist())), steps)
+                    ranges = np.frombuffer(stored, np.uint32).reshape(-1, 2) + np.array([feature[0], 0])
+                    images = self._read_images(key, list(map(tuple, ranges.tolist())), steps)
             return decode_images([images[step] for step in steps], steps, where)
 
         return make_frame_reader(num_steps, where, decode)
@@ -204,25 +204,25 @@ class RemoteEpisode:
     ) -> dict[int, bytes]:
         """Fetch all images of a camera; cache their positions and the images of the needed steps."""
         start, end = feature[0], sum(feature)
-        chunks = [(place, min(_CHUNK_BYTES, end - place)) for place in range(start, end, _CHUNK_BYTES)]
+        chunks = [(offset, min(_CHUNK_BYTES, end - offset)) for offset in range(start, end, _CHUNK_BYTES)]
         data = b"".join(storage.read_ranges(self._shard.path, chunks))
 
         def read(offset: int, length: int) -> bytes:
             return data[offset - start : offset - start + length]
 
-        places = _find_images(read, feature, num_steps, where)
-        self._positions.write(key, (np.array(places) - (start, 0)).astype(np.uint32).tobytes())
-        images = {step: read(*place) for step, place in enumerate(places)}
+        ranges = _find_images(read, feature, num_steps, where)
+        self._positions.write(key, (np.array(ranges) - (start, 0)).astype(np.uint32).tobytes())
+        images = {step: read(*byte_range) for step, byte_range in enumerate(ranges)}
         steps = {step for first, stop in needed or [(0, num_steps)] for step in range(first, stop)}
         self._contents.write_parts(key, [image if step in steps else b"" for step, image in images.items()])
         return images
 
-    def _read_images(self, key: str, places: list[ByteRange], steps: Sequence[int]) -> dict[int, bytes]:
+    def _read_images(self, key: str, ranges: list[ByteRange], steps: Sequence[int]) -> dict[int, bytes]:
         """Return images whose positions are known, from the cache or fetched, neighbouring images with one request."""
-        images = dict(zip(steps, self._contents.read_parts(key, len(places), steps) or [b""] * len(steps), strict=True))
-        lacking = sorted(step for step, image in images.items() if not image)
-        fetched = read_adjacent_ranges(self._shard.path, [places[step] for step in lacking], _GAP_BYTES)
-        return images | dict(zip(lacking, fetched, strict=True))
+        images = dict(zip(steps, self._contents.read_parts(key, len(ranges), steps) or [b""] * len(steps), strict=True))
+        missing_steps = sorted(step for step, image in images.items() if not image)
+        fetched = read_adjacent_ranges(self._shard.path, [ranges[step] for step in missing_steps], _GAP_BYTES)
+        return images | dict(zip(missing_steps, fetched, strict=True))
 
 
 def _find_images(read: ReadBytes, feature: ByteRange, num_steps: int, where: str) -> list[ByteRange]:
@@ -232,11 +232,11 @@ def _find_images(read: ReadBytes, feature: ByteRange, num_steps: int, where: str
         InputError: The feature is not a list of images, or does not have one image per step.
     """
     try:
-        places = find_items(read, feature, num_steps + 1)
+        ranges = find_items(read, feature, num_steps + 1)
     except NotAnExampleError as error:
         raise InputError(where=where, found=str(error), needed="a list of images") from None
-    if len(places) != num_steps:
-        found = f"{len(places)} images" if len(places) < num_steps else "more images"
-        needed = f"one for each of the {counted(num_steps, 'step')}"
+    if len(ranges) != num_steps:
+        found = f"{len(ranges)} images" if len(ranges) < num_steps else f"more than {counted(num_steps, 'image')}"
+        needed = f"one image for each of the {counted(num_steps, 'step')}"
         raise InputError(where=where, found=found, needed=needed)
-    return places
+    return ranges

@@ -64,7 +64,7 @@ class Record:
 
     @property
     def position(self) -> str:
-        """The name of the record's file (with split and number of the shard), and the record's number in the file."""
+        """The record's file name, which contains split and shard number, and the record's number in the file."""
         return f"{self._span.path.rsplit('/', 1)[-1]}: record {self._span.number}"
 
     @cached_property
@@ -72,22 +72,22 @@ class Record:
         """The position of each feature."""
         return self.locate()
 
-    def locate(self, enough: Sequence[set[str]] = ()) -> dict[str, ByteRange]:
-        """Return the positions of the features, reading until all features of one of the sets `enough` are found.
+    def locate(self, sufficient: Sequence[set[str]] = ()) -> dict[str, ByteRange]:
+        """Return the positions of the features, reading until all features of one of the sets `sufficient` are found.
 
         Raises:
             InputError: The record is not an Example.
         """
-        found: dict[str, ByteRange] = {}
+        ranges: dict[str, ByteRange] = {}
         try:
-            for name, place in iterate_features(self._read, self._span.data_offset, self._span.length):
-                found[name] = place
-                if any(found.keys() >= names for names in enough):
+            for name, byte_range in iterate_features(self._read, self._span.data_offset, self._span.length):
+                ranges[name] = byte_range
+                if any(ranges.keys() >= names for names in sufficient):
                     break
         except NotAnExampleError as error:
-            found_text = f"not a tf.train.Example ({error})"
-            raise InputError(where=str(self._span), found=found_text, needed="an RLDS data set") from None
-        return found
+            found = f"not a tf.train.Example ({error})"
+            raise InputError(where=str(self._span), found=found, needed="an RLDS data set") from None
+        return ranges
 
     def find_feature(self, name: str) -> ByteRange:
         """Return the position of a feature.
@@ -96,9 +96,9 @@ class Record:
             InputError: The record lacks the feature; names the existing ones.
         """
         if name not in self.feature_ranges:
-            known = sorted(self.feature_ranges)
-            found = f"no feature {name}; the record has {', '.join(known) or 'none'}"
-            raise InputError(where=str(self._span), found=found, fix=f"{did_you_mean(name, known)}Set data.fields")
+            names = sorted(self.feature_ranges)
+            found = f"no feature {name}; existing features: {', '.join(names) or 'none'}"
+            raise InputError(where=str(self._span), found=found, fix=f"{did_you_mean(name, names)}Set data.fields")
         return self.feature_ranges[name]
 
     def read_values(self, name: str, *kinds: Kind) -> Sequence[Any] | np.ndarray:
@@ -113,13 +113,15 @@ class Record:
             raise InputError(where=where, found=f"{length:,} bytes", needed=f"at most {_MAX_BYTES:,}")
         data = self._read(offset, length)
         if len(data) < length:
-            raise InputError(where=where, found=f"{len(data)} bytes at {offset}", needed=f"{length} bytes")
+            raise InputError(where=where, found=f"{len(data)} bytes at offset {offset}", needed=f"{length} bytes")
         try:
-            found, values = decode_feature(data)
+            kind, values = decode_feature(data)
         except NotAnExampleError as error:
-            raise InputError(where=where, found=f"not a feature ({error})", needed="an RLDS data set") from None
-        if found is not None and found not in kinds:
-            raise InputError(where=where, found=f"a {found}", needed=f"a {' or '.join(kinds)}", fix="Check data.fields")
+            raise InputError(
+                where=where, found=f"not a tf.train.Feature ({error})", needed="an RLDS data set"
+            ) from None
+        if kind is not None and kind not in kinds:
+            raise InputError(where=where, found=f"a {kind}", needed=f"a {' or '.join(kinds)}", fix="Check data.fields")
         return values
 
 
@@ -139,8 +141,8 @@ def read_identity(record: Record, fields: RldsFields) -> str:
             raise InputError(where=error.where, found=error.found, needed=error.needed, fix=_FIX_IDENTITY) from None
         parts += [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
     if not any(parts):
-        found = f"empty: {', '.join(fields.identity)}"
-        raise InputError(where=record.position, found=found, needed="the identity of the episode", fix=_FIX_IDENTITY)
+        found = f"the identity is empty ({', '.join(fields.identity)})"
+        raise InputError(where=record.position, found=found, needed="a text or a number", fix=_FIX_IDENTITY)
     return IDENTITY_SEPARATOR.join(parts)
 
 
@@ -208,7 +210,7 @@ def read_states(record: Record, config: RldsData, steps: int, where: str) -> Flo
     if fields.select is not None:
         numbers = numbers[:, list(fields.select)]
     if config.states == "vector":
-        require_finite(numbers, where, fix="Check data.fields.state, or leave the episode out")
+        require_finite(numbers, where, fix="Check data.fields.state, or exclude the episode")
         return numbers
     return convert_poses(numbers, fields, where, section="data.fields")
 
@@ -232,7 +234,7 @@ def read_commands(
 def _read_per_step(record: Record, name: str, steps: int, where: str) -> Float[np.ndarray, "steps width"]:
     values = np.asarray(record.read_values(name, *_NUMBERS), np.float64)
     if len(values) == 0 or len(values) % steps:
-        found, needed = f"{len(values)} numbers", f"as many for each of {counted(steps, 'step')}"
+        found, needed = f"{len(values)} numbers", f"the same count for each of {counted(steps, 'step')}"
         raise InputError(where=f"{where}: {name}", found=found, needed=needed)
     return values.reshape(steps, -1)
 
@@ -255,41 +257,43 @@ def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str
         InputError: A shard cannot be read, or no episode can be used.
         UnreachableError: The network fails.
     """
-    is_far = storage.is_url(config.path)
-    threads = _IN_FLIGHT if is_far else CONNECTIONS
-    if is_far:
+    is_remote = storage.is_url(config.path)
+    threads = _IN_FLIGHT if is_remote else CONNECTIONS
+    if is_remote:
         _require_usable_sample(shards, config, cameras)
 
     def scan(number: int) -> list[ScanResult]:
         with open_shard(shards[number]) as read:
             return list(_scan_shard(shards[number], number, read, config, cameras))
 
-    found = (one for of_shard in map_in_threads(scan, range(len(shards)), threads) for one in of_shard)
-    return build_table(found, config, sum(shard.episodes for shard in shards), progress)
+    results = (result for of_shard in map_in_threads(scan, range(len(shards)), threads) for result in of_shard)
+    return build_table(results, config, sum(shard.episodes for shard in shards), progress)
 
 
 def locate_record(table: EpisodeTable, shards: Sequence[Shard], index: int) -> tuple[Shard, RecordSpan]:
     """Return the shard and the position of an episode's record."""
-    number, *place = (int(table.locators[name][index]) for name in _LOCATOR_COLUMNS)
-    return shards[number], RecordSpan(shards[number].path, *place)
+    number, *span = (int(table.locators[name][index]) for name in _LOCATOR_COLUMNS)
+    return shards[number], RecordSpan(shards[number].path, *span)
 
 
 def _scan_shard(
-    shard: Shard, place: int, read: ReadBytes, config: RldsData, cameras: Sequence[str]
+    shard: Shard, shard_index: int, read: ReadBytes, config: RldsData, cameras: Sequence[str]
 ) -> Iterator[ScanResult]:
     """Yield the result of each expected record of a shard; records behind a damaged length are problems."""
     offset = 0
     for number in range(shard.episodes):
-        hidden = range(number, shard.episodes)
+        remaining = range(number, shard.episodes)
         if offset == shard.size:
-            yield from (_make_count_problem(shard, one, f"the file ends after {number} records") for one in hidden)
+            yield from (
+                _make_count_problem(shard, record, f"the file ends after {number} records") for record in remaining
+            )
             return
         try:
             span = parse_header(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
         except InputError as error:
-            yield from (EpisodeProblem.from_error(error, f"{shard.name}: record {one}") for one in hidden)
+            yield from (EpisodeProblem.from_error(error, f"{shard.name}: record {record}") for record in remaining)
             return
-        yield _scan_record(read, span, place, f"{shard.name}: record {number}", config, cameras)
+        yield _scan_record(read, span, shard_index, f"{shard.name}: record {number}", config, cameras)
         offset = span.end
     if offset != shard.size:
         yield _make_count_problem(shard, shard.episodes, f"{shard.size - offset:,} bytes after the last record")
@@ -297,7 +301,7 @@ def _scan_shard(
 
 def _make_count_problem(shard: Shard, number: int, found: str) -> EpisodeProblem:
     name, where = f"{shard.name}: record {number}", f"{shard.path}: record {number}"
-    needed = f"{shard.episodes} records, says dataset_info.json"
+    needed = f"{shard.episodes} records, according to dataset_info.json"
     return EpisodeProblem(name, where, found, needed, "Download the file again")
 
 
@@ -305,24 +309,24 @@ def _scan_record(
     read: ReadBytes, span: RecordSpan, shard: int, name: str, config: RldsData, cameras: Sequence[str]
 ) -> ScanResult:
     """Return the index entry or the problem of a record; a problem has the name `name` if the identity is unknown."""
-    is_far, fields, record = storage.is_url(span.path), config.fields, Record(read, span)
+    is_remote, fields, record = storage.is_url(span.path), config.fields, Record(read, span)
     try:
-        if is_far:
+        if is_remote:
             by_states = [{*fields.identity_features, *fields.state}] if config.states == "pose" else []
             record = Record(read, span, record.locate([{*fields.identity_features, STEP_FLAG}, *by_states]))
         name = read_identity(record, fields)
-        states = None if is_far else _read_checked_states(record, config, cameras, f"{span} ({name})")
+        states = None if is_remote else _read_checked_states(record, config, cameras, f"{span} ({name})")
         steps = read_num_steps(record, config) if states is None else len(states)
         if steps == 0:
             raise no_steps_error(f"{span} ({name})")
     except InputError as error:
-        return EpisodeProblem.from_error(error if is_far else _prefer_crc_error(error, read, span), name)
-    place = dict(zip(_LOCATOR_COLUMNS, (shard, span.number, span.offset, span.length), strict=True))
+        return EpisodeProblem.from_error(error if is_remote else _prefer_crc_error(error, read, span), name)
+    locator = dict(zip(_LOCATOR_COLUMNS, (shard, span.number, span.offset, span.length), strict=True))
     success = (
         True if "/success/" in name else False if "/failure/" in name else None
     )  # only DROID's identities contain the outcome
     info = EpisodeInfo(id=name, num_steps=steps, success=success)
-    return IndexEntry(info, str(span), place, STATES_NOT_READ if states is None else summarize_states(states))
+    return IndexEntry(info, str(span), locator, STATES_NOT_READ if states is None else summarize_states(states))
 
 
 def _read_checked_states(

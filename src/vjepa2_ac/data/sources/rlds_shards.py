@@ -49,19 +49,21 @@ def find_shards(folder: str) -> list[Shard]:
     where = storage.join(folder, _INFO)
     info = _read_info(folder, where)
     if (form := info.get("fileFormat", "tfrecord")) != "tfrecord":
-        raise InputError(where=where, found=f"fileFormat {form}", needed="tfrecord", fix="Convert it with TFDS")
+        raise InputError(
+            where=where, found=f"fileFormat {form}", needed="tfrecord", fix="Convert the data set with TFDS"
+        )
     try:
         listed = [shard for split in info["splits"] for shard in _list_shards(split, str(info["name"]))]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        found = f"not a description of a data set ({error!r})"
-        raise InputError(where=where, found=found, needed="TFDS's own") from None
+        found = f"not a valid data set description ({error!r})"
+        raise InputError(where=where, found=found, needed=f"a {_INFO} as written by TFDS") from None
     if not listed:
         raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
     names = [name for name, *_ in listed]
     present = {file.name: file for file in storage.list_files(folder)}
     if missing := [name for name in names if name not in present]:
         found = f"{len(missing)} of {len(names)} shards are missing: {format_identities(missing)}"
-        fix = f"Download them, or rename the shards that are there as {_INFO} lists them"
+        fix = f"Download them, or rename the existing files to the names in {_INFO}"
         raise InputError(where=folder, found=found, needed=f"every shard that {_INFO} lists", fix=fix)
     return [
         Shard(storage.join(folder, name), count, present[name].size, present[name].version, split)
@@ -80,9 +82,9 @@ def read_dataset_name(folder: str) -> str:
 
 def _read_info(folder: str, where: str) -> dict[str, Any]:
     try:
-        return read_json_object(where, needed="a description as TFDS writes it")
+        return read_json_object(where, needed=f"a {_INFO} as written by TFDS")
     except MissingFileError:
-        fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
+        fix = "Set data.path to the data set; docs/QUICKSTART.md describes how to download DROID"
         found, needed = _describe_missing_info(folder), f"a folder with {_INFO}"
         raise InputError(where="data.path", found=found, needed=needed, fix=fix) from None
 
@@ -96,7 +98,7 @@ def _describe_missing_info(folder: str) -> str:
         return (
             f"no {_INFO} in {folder}; did you mean {format_identities([storage.join(folder, name) for name in inner])}?"
         )
-    return f"no {_INFO} in {folder}, only {format_identities(names)}"
+    return f"no {_INFO} in {folder}, which contains {format_identities(names)}"
 
 
 def _list_shards(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int, str]]:
@@ -136,11 +138,11 @@ def open_shard(shard: Shard) -> Iterator[ReadBytes]:
             return
         handle = os.open(shard.path, os.O_RDONLY)
         try:
-            found = os.fstat(handle)
-            if (found.st_size, str(found.st_mtime_ns)) != (shard.size, shard.version):
-                changed = f"{found.st_size:,} bytes: it has changed since the data set was opened"
-                needed = f"the file of {shard.size:,} bytes that was there"
-                raise InputError(where=shard.path, found=changed, needed=needed, fix="Start again")
+            status = os.fstat(handle)
+            if (status.st_size, str(status.st_mtime_ns)) != (shard.size, shard.version):
+                found = f"{status.st_size:,} bytes: the file has changed since the data set was opened"
+                needed = f"the original file of {shard.size:,} bytes"
+                raise InputError(where=shard.path, found=found, needed=needed, fix="Run the command again")
             yield lambda offset, length: os.pread(handle, length, offset)
         finally:
             os.close(handle)
@@ -160,6 +162,6 @@ class _RemoteWindows:
                 return window[offset - start : offset - start + length]
         if length <= 0:
             return b""
-        wanted = min(max(length, _WINDOW_BYTES), self._shard.size - offset)
-        self._windows.append((offset, storage.read_range(self._shard.path, offset, wanted)))
+        window_length = min(max(length, _WINDOW_BYTES), self._shard.size - offset)
+        self._windows.append((offset, storage.read_range(self._shard.path, offset, window_length)))
         return self._windows[-1][1][:length]

@@ -82,8 +82,8 @@ def parse_header(header: bytes, path: str, number: int, offset: int, size: int) 
         raise _truncated_error(where, size, offset + HEADER_BYTES)
     length, crc = struct.unpack_from("<QI", header)
     if crc != _masked_crc(header[:8]):
-        found = "the CRC of the length does not match: not a TFRecord file, or a damaged one"
-        raise InputError(where=where, found=found, needed="a TFRecord file as TFDS writes it")
+        found = "the CRC of the record length does not match, so the file is damaged or not a TFRecord file"
+        raise InputError(where=where, found=found, needed="a TFRecord file as written by TFDS")
     span = RecordSpan(path=path, number=number, offset=offset, length=length)
     if span.end > size:
         raise _truncated_error(where, size, span.end)
@@ -107,7 +107,7 @@ def verify_crc(read: ReadBytes, span: RecordSpan) -> None:
     if len(footer) < _FOOTER_BYTES:
         raise _truncated_error(str(span), end + len(footer), span.end)
     if _mask(crc) != struct.unpack("<I", footer)[0]:
-        found = "the CRC of the data does not match: the file is damaged"
+        found = "the CRC of the data does not match, so the file is damaged"
         raise InputError(where=str(span), found=found, fix="Download the file again")
 
 
@@ -133,7 +133,7 @@ def iterate_features(read: ReadBytes, start: int, length: int) -> Iterator[tuple
         feature_length, feature_start = _parse_field_head(head, name_end, _SECOND)
         entry_end = position + used + size
         if position + feature_start + feature_length != entry_end or entry_end > end:
-            raise NotAnExampleError(f"the parts of the feature at byte {position} do not fit together")
+            raise NotAnExampleError(f"the lengths in the feature at byte {position} are inconsistent")
         try:
             yield head[name_start:name_end].decode(), (position + feature_start, feature_length)
         except UnicodeDecodeError:
@@ -147,16 +147,16 @@ def find_items(read: ReadBytes, feature: ByteRange, count: int | None = None) ->
     Raises:
         NotAnExampleError: The feature is not a list of bytes, or damaged.
     """
-    places: list[ByteRange] = []
+    ranges: list[ByteRange] = []
     start, end = feature[0], sum(feature)
     position = _find_content(read(start, _HEAD_BYTES), start, end, _FIRST) if start < end else end
-    while position < end and len(places) != count:
+    while position < end and len(ranges) != count:
         length, used = _parse_field_head(read(position, _HEAD_BYTES), 0, _FIRST)
-        places.append((position + used, length))
+        ranges.append((position + used, length))
         position += used + length
     if position > end:
-        raise NotAnExampleError(f"the item at byte {places[-1][0]} reaches beyond its list")
-    return places
+        raise NotAnExampleError(f"the item at byte {ranges[-1][0]} extends beyond its list")
+    return ranges
 
 
 def decode_feature(data: bytes) -> tuple[Kind | None, Sequence[Any] | np.ndarray]:
@@ -168,14 +168,14 @@ def decode_feature(data: bytes) -> tuple[Kind | None, Sequence[Any] | np.ndarray
     if not data:
         return None, ()
     if data[0] == _FIRST:
-        places = find_items(lambda offset, length: data[offset : offset + length], (0, len(data)))
-        return "bytes_list", [data[offset : offset + length] for offset, length in places]
+        ranges = find_items(lambda offset, length: data[offset : offset + length], (0, len(data)))
+        return "bytes_list", [data[offset : offset + length] for offset, length in ranges]
     content = data[_find_content(data, 0, len(data), _SECOND if data[0] == _SECOND else _THIRD) :]
     packed = content[_find_content(content, 0, len(content), _FIRST) :] if content else b""
     if data[0] == _THIRD:
         return "int64_list", _decode_integers(packed)
     if len(packed) % 4:
-        raise NotAnExampleError(f"{len(packed)} bytes of floats")
+        raise NotAnExampleError(f"{len(packed)} bytes of floats are not a multiple of 4")
     return "float_list", np.frombuffer(packed, "<f4")
 
 
@@ -207,7 +207,7 @@ def encode_entry(name: str, kind: Kind, values: Sequence[Any] | np.ndarray) -> b
 
 
 def _truncated_error(where: str, size: int, needed: int) -> InputError:
-    found = f"the file ends after {size:,} bytes, within this record: it is truncated"
+    found = f"the file is truncated: it ends after {size:,} bytes, within this record"
     return InputError(where=where, found=found, needed=f"at least {needed:,} bytes", fix="Download the file again")
 
 
@@ -219,18 +219,18 @@ def _mask(crc: int) -> int:
     return ((crc >> 15 | crc << 17) + _MASK_DELTA) & 0xFFFFFFFF
 
 
-def _parse_field_head(data: bytes, place: int, tag: int) -> tuple[int, int]:
+def _parse_field_head(data: bytes, offset: int, tag: int) -> tuple[int, int]:
     """Parse the head of a length-delimited field at an offset; return its length and the offset of its content."""
-    if place < len(data) and data[place] == tag:
-        return _decode_varint(data, place + 1)
-    raise NotAnExampleError(f"no field {tag >> 3} where one must start")
+    if offset < len(data) and data[offset] == tag:
+        return _decode_varint(data, offset + 1)
+    raise NotAnExampleError(f"field {tag >> 3} is missing at its expected position")
 
 
 def _find_content(head: bytes, start: int, end: int, tag: int) -> int:
     """Return the offset of the content of a field that must fill its message from `start` to `end`."""
     length, used = _parse_field_head(head, 0, tag)
     if start + used + length != end:
-        raise NotAnExampleError(f"the field at byte {start} does not end where its message does")
+        raise NotAnExampleError(f"the field at byte {start} does not end at the end of its message")
     return start + used
 
 
@@ -238,22 +238,22 @@ def _decode_integers(packed: bytes) -> Sequence[int] | np.ndarray:
     """Decode packed varints to signed 64-bit integers."""
     if packed.isascii():  # one byte each, as flags
         return np.frombuffer(packed, np.uint8)
-    found, place = [], 0
-    while place < len(packed):
-        value, place = _decode_varint(packed, place)
+    integers, offset = [], 0
+    while offset < len(packed):
+        value, offset = _decode_varint(packed, offset)
         value &= (1 << 64) - 1
-        found.append(value - (1 << 64) if value >> 63 else value)
-    return found
+        integers.append(value - (1 << 64) if value >> 63 else value)
+    return integers
 
 
 def _decode_varint(data: bytes, start: int) -> tuple[int, int]:
     """Decode a varint; return its value and the offset of its end."""
     value = 0
-    for place, byte in enumerate(data[start : start + _VARINT_BYTES]):
-        value |= (byte & 0x7F) << 7 * place
+    for index, byte in enumerate(data[start : start + _VARINT_BYTES]):
+        value |= (byte & 0x7F) << 7 * index
         if byte < 0x80:
-            return value, start + place + 1
-    raise NotAnExampleError("a number does not end")
+            return value, start + index + 1
+    raise NotAnExampleError(f"a varint is longer than {_VARINT_BYTES} bytes or truncated")
 
 
 def _encode_varint(value: int) -> bytes:
