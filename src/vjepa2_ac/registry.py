@@ -1,8 +1,8 @@
-"""Doors for other people's code: what a config may name, here, in installed packages, and in modules of the user's.
+"""Registries of extension points: losses, planners, data formats and others, which a config selects by name.
 
-A thing is found by its name in one of the registries below. This package's own are listed here as `module:object` and
-imported when they are used; an installed package lists its own as entry points of the registry's group; a module that
-`plugins` in a config or `--plugin` names registers its own when it is imported. docs/extending.md has a recipe of each.
+Each registry finds objects by name. Built-in objects are listed here as `module:object` and imported on first use.
+Installed packages provide objects as entry points of the registry's group. Modules that `plugins` in a config or
+`--plugin` names register objects when they are imported. docs/extending.md has an example for each registry.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ _Thing = TypeVar("_Thing")
 
 
 class Registry:
-    """Things of one kind, by name.
+    """Objects of one kind, by name.
 
     Args:
-        kind: What they are, in messages.
-        group: The entry points of installed packages.
-        own: Those of this package, each as `module:object` below it.
+        kind: Name of the kind, for messages.
+        group: Entry point group of installed packages.
+        builtin: The objects of this package, each as `module:object` relative to the package.
     """
 
-    def __init__(self, kind: str, group: str, own: Mapping[str, str]) -> None:
+    def __init__(self, kind: str, group: str, builtin: Mapping[str, str]) -> None:
         self.kind, self.group = kind, group
-        self._things: dict[str, Any] = {name: f"vjepa2_ac.{place}" for name, place in own.items()}
-        self._origins: dict[str, str] = {**self._things}  # module:object of what has registered itself
+        self._things: dict[str, Any] = {name: f"vjepa2_ac.{path}" for name, path in builtin.items()}
+        self._origins: dict[str, str] = {**self._things}  # module:object of each registered object
 
     def register(self, name: str) -> Callable[[_Thing], _Thing]:
-        """Return a decorator that adds a function, a class or an object.
+        """Return a decorator that registers a function, a class or an object under a name.
 
         Raises:
-            InputError: Something else is registered by this name. A module that is loaded again may register again.
+            InputError: Another object has this name. A module that is loaded again may register again.
         """
         caller = sys._getframe(1).f_globals["__name__"]
 
         def add(thing: _Thing) -> _Thing:
-            path = getattr(thing, "__qualname__", "")  # an object has none, and does not know its module
+            path = getattr(thing, "__qualname__", "")  # instances have neither a qualified name nor a module
             origin = f"{getattr(thing, '__module__', caller) if path else caller}:{path}"
             if self._origins.setdefault(name, origin) != origin:
-                found = f"registered by {_module(self._origins[name])} already"
+                found = f"already registered by {_module(self._origins[name])}"
                 raise InputError(where=f"{self.kind} {name!r}", found=found, fix="Choose another name")
             _registered.append(_package(origin))
             self._things[name] = thing
@@ -63,20 +63,23 @@ class Registry:
         return add
 
     def names(self) -> list[str]:
-        """Return all names, those of this package first; nothing is imported."""
-        return list(dict.fromkeys([*self._things, *(one.name for one in installed(self.group))]))
+        """Return all names, built-in names first. Nothing is imported."""
+        return list(dict.fromkeys([*self._things, *(one.name for one in installed_entry_points(self.group))]))
 
-    def known(self, name: str) -> str:
-        """Return a name that is registered.
+    def require_registered(self, name: str) -> str:
+        """Return the name if it is registered.
 
         Raises:
-            ValueError: It is not; the message lists the names that are.
-            InputError: Several packages have registered it.
+            ValueError: The name is not registered; the message lists the registered names.
+            InputError: Several packages have registered the name.
         """
         if name not in (names := self.names()):
-            known = f"Known are {', '.join(map(repr, names))}" if names else "None is registered: is its plug-in named?"
-            raise ValueError(f"no {self.kind} of this name. {did_you_mean(name, names)}{known}")
-        origins = [self._origins.get(name), *(one.value for one in installed(self.group) if one.name == name)]
+            known = f"Expected one of {', '.join(map(repr, names))}" if names else "None is registered. Add its plugin"
+            raise ValueError(f"no {self.kind} has this name. {did_you_mean(name, names)}{known}")
+        origins = [
+            self._origins.get(name),
+            *(one.value for one in installed_entry_points(self.group) if one.name == name),
+        ]
         packages = {_package(origin): _module(origin) for origin in origins if origin}
         if len(packages) > 1:
             found = f"registered by {' and by '.join(packages.values())}"
@@ -84,74 +87,74 @@ class Registry:
         return name
 
     def find(self, name: str) -> Any:
-        """Return the thing of a name, imported now.
+        """Return the object with a name; it is imported on first use.
 
         Raises:
-            ValueError: There is none.
+            ValueError: The name is not registered.
         """
-        thing = self._things.get(self.known(name))
+        thing = self._things.get(self.require_registered(name))
         if thing is None:
-            thing = load_installed(next(one for one in installed(self.group) if one.name == name))
+            thing = load_entry_point(next(one for one in installed_entry_points(self.group) if one.name == name))
         elif isinstance(thing, str):
             module, _, attribute = thing.partition(":")
             thing = getattr(import_module(module), attribute)
         self._things[name] = thing
         return thing
 
-    def section(self, name: str) -> type[BaseModel] | None:
-        """Return the class of a thing's own options, its `Config`; None: it has none."""
+    def options_class(self, name: str) -> type[BaseModel] | None:
+        """Return the class of an object's options, its attribute `Config`; None without options."""
         return getattr(self.find(name), "Config", None)
 
-    def options(self, name: str, given: Mapping[str, Any], *, at: tuple[str, ...] = ()) -> dict[str, BaseModel]:
-        """Return the checked options of a thing, as the keyword argument that it takes them by; empty: it has none.
+    def options(self, name: str, values: Mapping[str, Any], *, at: tuple[str, ...] = ()) -> dict[str, BaseModel]:
+        """Validate the options of an object, and return them as its keyword argument `options`; empty without options.
 
         Args:
-            name: The thing.
-            given: Its options.
+            name: Name of the object.
+            values: Its options.
             at: Location of the options below the config key that is checked, for messages.
 
         Raises:
-            ValueError: They are not what its `Config` says, or it has none.
+            ValueError: The options are invalid, or the object has no options.
         """
-        section = self.section(name)
+        section = self.options_class(name)
         if section is not None:
             try:
-                return {"options": section.model_validate(dict(given))}
+                return {"options": section.model_validate(dict(values))}
             except ValidationError as error:
                 raise _located(error, section, at) from None
-        if given:
-            raise ValueError(f"{self.kind} {name!r} has no options of its own, and {', '.join(given)} is given")
+        if values:
+            raise ValueError(f"{self.kind} {name!r} has no options of its own, but {', '.join(values)} was set")
         return {}
 
-    def changed_options(self, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Check options, and return those that are not the defaults.
+    def changed_options(self, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Validate options, and return those that differ from the defaults.
 
-        Things of this package have a default for each option: without options they are not imported.
+        Built-in objects have a default for each option, so without options they are not imported.
 
         Raises:
-            ValueError: As `options`.
+            ValueError: As for `options`.
         """
-        if not given and isinstance(self._things.get(name), str):
+        if not values and isinstance(self._things.get(name), str):
             return {}
-        checked = self.options(name, given, at=("options",))
+        checked = self.options(name, values, at=("options",))
         changed = checked["options"].model_dump(exclude_defaults=True) if checked else {}
-        return {key: given[key] for key in given if key in changed}
+        return {key: values[key] for key in values if key in changed}
 
-    def make(self, name: str, given: Mapping[str, Any]) -> Any:
-        """Return the thing of a name; of a class an object that was made with its options.
+    def create(self, name: str, values: Mapping[str, Any]) -> Any:
+        """Return the object with a name; for a class, an instance with these options.
 
         Raises:
-            ValueError: As `options`.
+            ValueError: As for `options`.
         """
-        found, options = self.find(name), self.options(name, given)
-        return found(**options) if isinstance(found, type) else found
+        thing, options = self.find(name), self.options(name, values)
+        return thing(**options) if isinstance(thing, type) else thing
 
     @property
     def options_schema(self) -> Any:
-        """The options of things by their names: for a knob that holds several of them."""
+        """Field with the JSON schema of the options of all objects, for a config key that maps names to options."""
 
         def add(schema: dict[str, Any]) -> None:
-            sections = {name: self.section(name) for name in self.names()}
+            sections = {name: self.options_class(name) for name in self.names()}
             if sections:
                 schema["properties"] = {
                     name: {} if section is None else section.model_json_schema() for name, section in sections.items()
@@ -162,14 +165,14 @@ class Registry:
 
 
 def _located(error: ValidationError, section: type[BaseModel], at: tuple[str, ...]) -> ValidationError:
-    """Return the errors of options at their location in the config; that of an unknown option names a known one."""
+    """Return the errors of options with their location in the config; for unknown options with a suggestion."""
     lines = []
     for one in error.errors(include_url=False):
         kind, text, location = one["type"], one["msg"], one["loc"]
         if kind == "extra_forbidden":
-            known = f"known here: {', '.join(section.model_fields)}"
-            meant = did_you_mean(str(location[-1]), section.model_fields)
-            kind, text = UNKNOWN_OPTION, f"unknown key; {f'd{meant[1:-1]}' if meant else known}"
+            known = f"known keys: {', '.join(section.model_fields)}"
+            suggestion = did_you_mean(str(location[-1]), section.model_fields)
+            kind, text = UNKNOWN_OPTION, f"unknown key; {f'd{suggestion[1:-1]}' if suggestion else known}"
         custom = PydanticCustomError(kind, text)
         lines.append(InitErrorDetails(type=custom, loc=(*at, *location), input=one["input"]))
     return ValidationError.from_exception_data(error.title, lines)
@@ -177,7 +180,7 @@ def _located(error: ValidationError, section: type[BaseModel], at: tuple[str, ..
 
 UNKNOWN_OPTION = "unknown_option"
 
-SOURCES = Registry("form of data", "vjepa2_ac.sources", {})
+SOURCES = Registry("data format", "vjepa2_ac.sources", {})
 LOSSES = Registry(
     "loss",
     "vjepa2_ac.losses",
@@ -211,13 +214,13 @@ METRICS = Registry("metric", "vjepa2_ac.metrics", {"l1": "evaluation.result:L1",
 TRACKERS = Registry("tracker", "vjepa2_ac.trackers", {})
 TRANSFORMS = Registry("transform", "vjepa2_ac.transforms", {})
 PLANNING_FILES = Registry(
-    "file of planning",
+    "planning file",
     "",  # no entry points
     {"prior": "policies.action_prior:load_prior_for_planning", "monitor": "policies.monitor:load_monitor_for_planning"},
 )
-"""Readers of the files that `planning` names and that packages beside the core make."""
+"""Readers of the files that `planning` keys refer to; they are in packages outside of the core."""
 TRAINING_HOOKS = Registry(
-    "hook of training",
+    "training hook",
     "",  # no entry points
     {
         "data.stride": "inspection.variants:choose_stride",
@@ -226,19 +229,19 @@ TRAINING_HOOKS = Registry(
         "coverage": "inspection.coverage:coverage_in",
     },
 )
-"""Functions and classes of packages beside the core that training calls."""
+"""Functions and classes outside of the core packages that training calls."""
 REGISTRIES = (SOURCES, LOSSES, PLANNERS, ENERGIES, METRICS, TRACKERS, TRANSFORMS)
 
 
 # ---- imports ----
 
-_US = "vjepa2_ac"
-_registered: list[str] = []  # packages, one for each thing that was registered
-_plugins: set[str] = set()  # modules that were imported and have registered something
+_PACKAGE = "vjepa2_ac"
+_registered: list[str] = []  # package of each registered object
+_plugins: set[str] = set()  # imported modules that have registered an object
 
 
-def installed(group: str) -> EntryPoints:
-    """Return the entry points of a group. Packages in the working directory are not installed."""
+def installed_entry_points(group: str) -> EntryPoints:
+    """Return the entry points of a group, without those of packages in the working directory."""
     with _installed_only():
         return _entry_points(group, tuple(sys.path))
 
@@ -248,26 +251,26 @@ def _entry_points(group: str, _path: tuple[str, ...]) -> EntryPoints:
     return entry_points(group=group)
 
 
-def load_installed(entry_point: EntryPoint) -> Any:
+def load_entry_point(entry_point: EntryPoint) -> Any:
     """Return the object of an entry point.
 
     Raises:
-        InputError: It cannot be imported.
+        InputError: The object cannot be imported.
     """
     with _installed_only():
         return _imported(entry_point.load, f"{entry_point.name} = {entry_point.value}", entry_point.group)
 
 
 def import_plugins(modules: Iterable[str], *, where: str, here: bool = True) -> None:
-    """Import the modules that register things.
+    """Import modules that register objects.
 
     Args:
-        modules: Their names, as `import` takes them.
-        where: What names them, for messages.
+        modules: Names of the modules.
+        where: Where the modules are named, for messages.
         here: As for `import_user_module`.
 
     Raises:
-        InputError: As `import_user_module`; or a module registers nothing.
+        InputError: As for `import_user_module`; or a module registers nothing.
     """
     for module in modules:
         before = len(_registered)
@@ -279,20 +282,22 @@ def import_plugins(modules: Iterable[str], *, where: str, here: bool = True) -> 
 
 
 def import_user_module(module: str, *, where: str, here: bool = True) -> ModuleType:
-    """Return a module of the user's.
+    """Import a module of the user.
 
     Args:
-        module: Its name, as `import` takes it.
-        where: What names it, for messages.
-        here: Whether it may be in the working directory. False where a run names it, which may be a third party's:
-            then only installed packages that mention this one are imported.
+        module: Name of the module.
+        where: Where the module is named, for messages.
+        here: Whether the module may be in the working directory. False for modules named by a run, which may be from a
+            third party: then only installed packages that mention this one are imported.
 
     Raises:
         InputError: There is no such module, or it cannot be imported.
     """
     parts = module.split(".")
-    if not all(map(str.isidentifier, parts)) or "__main__" in parts or parts[0] == _US:
-        raise InputError(where=where, found=f"plugin {module!r}", needed="a module of yours, as in `import my_module`")
+    if not all(map(str.isidentifier, parts)) or "__main__" in parts or parts[0] == _PACKAGE:
+        raise InputError(
+            where=where, found=f"plugin {module!r}", needed="the name of your module, as in `import my_module`"
+        )
     if module in sys.modules:
         return sys.modules[module]
     package = _package(module)
@@ -301,28 +306,31 @@ def import_user_module(module: str, *, where: str, here: bool = True) -> ModuleT
             sys.path.append(str(Path.cwd()))
         spec = find_spec(package)
         if spec is None:
-            fix = "Install it, or run where it is" if here else f"Install it, or name it by --plugin {module}"
+            fix = "Install it, or run the command in its folder" if here else f"Install it, or add --plugin {module}"
             raise InputError(where=where, found=f"plugin {module!r}: no such module", fix=fix)
-        if not (here or _mentions_us(spec)):
+        if not (here or _mentions_this_package(spec)):
             _refuse(module, where)
         return _imported(lambda: import_module(module), f"plugin {module!r}", where)
 
 
-def _mentions_us(spec: ModuleSpec) -> bool:
-    """Return whether the files of a package mention this one, as all do that register something; imports nothing."""
+def _mentions_this_package(spec: ModuleSpec) -> bool:
+    """Return whether a file of a package mentions this package, as all plugins do. Nothing is imported."""
     files = [Path(spec.origin)] if spec.has_location and spec.origin else []
     files += [file for folder in spec.submodule_search_locations or () for file in Path(folder).rglob("*.py")]
-    return any(_US.encode() in file.read_bytes() for file in files)
+    return any(_PACKAGE.encode() in file.read_bytes() for file in files)
 
 
 def _refuse(module: str, where: str) -> NoReturn:
-    found, needed = f"plugin {module!r} registers nothing", "a module that registers a loss, a planner, …"
-    raise InputError(where=where, found=found, needed=needed, fix="docs/extending.md has a recipe for each")
+    found, needed = (
+        f"plugin {module!r} registers nothing",
+        "a module that registers a loss, a planner or another object",
+    )
+    raise InputError(where=where, found=found, needed=needed, fix="See docs/extending.md for examples")
 
 
 @contextlib.contextmanager
 def _installed_only() -> Iterator[None]:
-    """Import nothing from the working directory, within the context: `python -m` puts it first."""
+    """Within the context, import nothing from the working directory, which `python -m` puts first on the path."""
     before = sys.path[:]
     sys.path[:] = [path for path in before if not (Path(path).exists() and Path(path).samefile("."))]
     try:
@@ -332,15 +340,15 @@ def _installed_only() -> Iterator[None]:
 
 
 def _imported(load: Callable[[], _Thing], what: str, where: str) -> _Thing:
-    """Return what is imported; any exception becomes one error with the line of the plug-in."""
+    """Return the imported object; any exception becomes one error with the line of the plugin."""
     try:
         return load()
     except (Exception, SystemExit) as error:
-        lines = [one for one in traceback.extract_tb(error.__traceback__) if "importlib" not in one.filename]
-        place = next((f"; {one.filename}, line {one.lineno}" for one in lines if one.filename != __file__), "")
+        lines = [line for line in traceback.extract_tb(error.__traceback__) if "importlib" not in line.filename]
+        location = next((f"; {line.filename}, line {line.lineno}" for line in lines if line.filename != __file__), "")
         cause = f"{type(error).__name__}: {error}".splitlines()[0]
-        fix = "Correct or leave out the plug-in"
-        raise InputError(where=where, found=f"{what} cannot be imported ({cause}{place})", fix=fix) from error
+        fix = "Correct or remove the plugin"
+        raise InputError(where=where, found=f"{what} cannot be imported ({cause}{location})", fix=fix) from error
 
 
 def _module(origin: str) -> str:

@@ -195,7 +195,7 @@ class ComponentOf:
         is_known = bool(form) and form.keys() <= {"name", "options"}
         if not is_known or not isinstance(name, str) or not isinstance(options, Mapping):
             raise ValueError(f"{_FORMS} is expected")
-        return Component(name, self.registry.changed_options(self.registry.known(name), options))
+        return Component(name, self.registry.changed_options(self.registry.require_registered(name), options))
 
     def __get_pydantic_core_schema__(self, _source: Any, _handler: Any) -> core_schema.CoreSchema:
         """Return the schema with which pydantic reads and writes the key."""
@@ -213,6 +213,6 @@ class ComponentOf:
                 "additionalProperties": False,
             }
             for name in names
-            if (section := self.registry.section(name)) is not None
+            if (section := self.registry.options_class(name)) is not None
         ]
         return {"anyOf": [{"type": "string", **({"enum": names} if names else {})}, *with_options]}

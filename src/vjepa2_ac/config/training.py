@@ -154,7 +154,7 @@ class TrackingConfig(Section):
     @model_validator(mode="after")
     def _others_are_known(self) -> TrackingConfig:
         for name, options in self.others.items():
-            TRACKERS.options(TRACKERS.known(name), options, at=("others", name))
+            TRACKERS.options(TRACKERS.require_registered(name), options, at=("others", name))
         return self
 
 

@@ -143,7 +143,7 @@ class ClipTransforms:
     @classmethod
     def from_config(cls, data: DataConfig, seed: int) -> ClipTransforms:
         """Create the transforms of a config, once, in the process that starts the workers."""
-        transforms = ((config.name, TRANSFORMS.make(config.name, config.options)) for config in data.transforms)
+        transforms = ((config.name, TRANSFORMS.create(config.name, config.options)) for config in data.transforms)
         return cls(tuple(transforms), seed)
 
     def apply(self, clip: Clip, position: int) -> Clip:

@@ -151,7 +151,7 @@ class EnergyFunction:
         """Return the function that a config names; an `EnergyFunction` is returned unchanged."""
         if isinstance(energy, EnergyFunction):
             return energy
-        return cls(energy, ENERGIES.make(energy.distance.name, energy.distance.options))
+        return cls(energy, ENERGIES.create(energy.distance.name, energy.distance.options))
 
 
 class WorldModelCost:

@@ -217,7 +217,7 @@ class Objective:
 
     def __init__(self, world_model: LatentDynamics, training: TrainingConfig) -> None:
         self.world_model, self.rollout_steps = world_model, training.rollout_steps
-        self.distance: Distance = LOSSES.make(training.loss.name, training.loss.options)
+        self.distance: Distance = LOSSES.create(training.loss.name, training.loss.options)
 
     def __call__(self, batch: LatentBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return (teacher forcing, rollout); the loss is their sum."""
