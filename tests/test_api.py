@@ -71,13 +71,13 @@ def test_importing_the_package_imports_next_to_nothing_and_dir_knows_the_names()
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
-def test_a_name_that_is_not_there_is_told_with_those_that_are() -> None:
+def test_unknown_public_name_lists_known_names() -> None:
     with pytest.raises(AttributeError, match=r"no 'load_modle'; its public names are Controller, .* load_model"):
         vjepa2_ac.load_modle  # type: ignore[attr-defined]  # noqa: B018
 
 
 @pytest.mark.usefixtures("clone")
-def test_the_code_of_the_page_runs_as_it_stands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_docs_code_runs(capsys: pytest.CaptureFixture[str]) -> None:
     names: dict[str, Any] = {}
     for block in BLOCKS:
         quick = block.replace('"steps": 20', '"steps": 2, "allow_weak_base": True').replace("samples=50", "samples=12")
@@ -114,18 +114,18 @@ def test_a_model_is_ready_to_predict() -> None:
     ],
     ids=lambda value: "-".join(value.values()) if isinstance(value, dict) else "",
 )
-def test_a_model_that_cannot_be_had_is_told(arguments: dict[str, Any], words: str) -> None:
+def test_unloadable_model_raises(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(UserError, match=words):
         load_model(**arguments)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA")
-def test_cuda_that_is_not_there_is_told() -> None:
+def test_unavailable_cuda_raises() -> None:
     with pytest.raises(UserError, match="finds no CUDA device"):
         load_model(TINY, device="cuda:0")
 
 
-def test_a_device_is_asked_by_its_own_index(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_capability_uses_the_device_index(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda index: f"card {index}")
@@ -142,7 +142,7 @@ def test_a_device_is_asked_by_its_own_index(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @torch.no_grad()
-def test_a_run_and_its_exported_adapter_predict_alike(make_config: MakeConfig, tmp_path: Path) -> None:
+def test_run_and_exported_adapter_give_equal_predictions(make_config: MakeConfig, tmp_path: Path) -> None:
     folder = write_adapted_run(make_config(run_dir=str(tmp_path / "run")))
     run = load_run(folder)
     assert run.checkpoint.name != load_run(folder, "newest").checkpoint.name
@@ -160,7 +160,7 @@ def test_a_run_and_its_exported_adapter_predict_alike(make_config: MakeConfig, t
 # Data.
 
 
-def test_a_config_opens_its_data_and_knobs_change_it(simulated: Path) -> None:
+def test_open_dataset_applies_config_and_keyword_arguments(simulated: Path) -> None:
     values = {"run_dir": "none", "data": {"path": simulated, "frames": 3}, "model": {"base": TINY}}
     config = load_config(values, ["data.stride=auto"])
     with pytest.raises(UserError, match="stride=4"):
@@ -188,7 +188,7 @@ def test_frames_and_batches_have_the_same_latents(simulated: Path) -> None:
 
 
 @pytest.mark.parametrize("frames", [np.zeros((4, 4, 3)), np.zeros((4, 4), np.uint8), np.zeros((3, 4, 4), np.uint8)])
-def test_what_is_no_frame_is_told(frames: np.ndarray) -> None:
+def test_invalid_frames_raise(frames: np.ndarray) -> None:
     with pytest.raises(UserError, match="uint8"):
         encode(load_model(TINY), frames)
 
@@ -196,7 +196,7 @@ def test_what_is_no_frame_is_told(frames: np.ndarray) -> None:
 # Runs.
 
 
-def test_a_run_is_trained_resumed_and_measured(make_config: MakeConfig, tmp_path: Path) -> None:
+def test_run_is_trained_resumed_and_evaluated(make_config: MakeConfig, tmp_path: Path) -> None:
     notes: list[str] = []
     steps: dict[int, float] = {}
     config = make_config(training__steps=2, validation__every=2, data__test_share=0.4)

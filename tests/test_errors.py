@@ -26,24 +26,24 @@ from vjepa2_ac.reports.metrics_json import read_metrics
         (InputError(where="a", found="is it?", fix="Yes."), "a: is it? Yes."),
     ],
 )
-def test_where_what_was_found_what_was_needed_and_the_way_out(error: InputError, message: str) -> None:
+def test_message_has_location_finding_expectation_and_fix(error: InputError, message: str) -> None:
     assert str(error) == message
 
 
-def test_an_error_of_a_loader_worker_arrives_as_it_was() -> None:
+def test_error_is_pickled_unchanged_from_a_worker() -> None:
     error = InputError(where="a", found="b", needed="c", fix="d")
     other = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
     assert (type(other), str(other), other.fix) == (InputError, str(error), "d")
 
 
-def test_a_terminal_shows_what_is_quoted_and_does_not_obey_it() -> None:
+def test_control_characters_are_escaped() -> None:
     error = InputError(where="run\x1b[2J", found="key '\x1b]0;title\x07' and \u202e\udc80\u2028", fix="One\nTwo")
     assert str(error) == "run\\x1b[2J: key '\\x1b]0;title\\x07' and \\u202e\\udc80\\u2028. One\nTwo."
     assert str(error).encode()  # a lone surrogate could not be written
     assert printable("å 日本\u3000ö\n") == "å 日本\u3000ö\n"
 
 
-def test_what_is_quoted_does_not_flood_the_terminal() -> None:
+def test_long_quoted_input_is_truncated() -> None:
     error = InputError(where="w", found="begin" + "x" * 1_000_000 + "end", fix="Way out")
     assert len(str(error)) < 10_000
     assert "begin" in str(error)
@@ -75,7 +75,7 @@ WHEEL = f"vjepa2_ac-{version('vjepa2-ac')}-py3-none-any.whl"
         (None, "", f'pip install "./{WHEEL}"'),
     ],
 )
-def test_the_line_that_installs_an_extra_fits_the_installation(
+def test_install_command_fits_the_installation(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, origin: str | None, extra: str, command: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -102,7 +102,7 @@ def test_a_printed_command_quotes_what_a_shell_would_split(tmp_path: Path) -> No
     assert shlex.split(str(caught.value).split("`")[1]) == ["vjepa2-ac", "evaluate", str(odd)]
 
 
-def test_no_command_is_printed_with_a_path_that_is_not_quoted() -> None:
+def test_printed_commands_quote_paths() -> None:
     package = Path(vjepa2_ac.__file__).parent
     allowed = {"data converter {name}", "download {one.name}", "download {model.name}"}  # names of this package
     found = [
@@ -120,5 +120,5 @@ def test_no_command_is_printed_with_a_path_that_is_not_quoted() -> None:
         (1, "process", "1 process"), (2, "process", "2 processes"), (2, "batch", "2 batches"),
     ],
 )  # fmt: skip
-def test_a_noun_has_the_plural_of_its_number(number: int, noun: str, text: str) -> None:
+def test_counted_noun_is_plural_if_needed(number: int, noun: str, text: str) -> None:
     assert counted(number, noun) == text

@@ -80,14 +80,14 @@ def sizes_of(run: Path) -> ModelSizes:
 
 
 @pytest.mark.parametrize("kind", ["lora", "none"])
-def test_the_official_checkpoint_predicts_as_the_run_does(trained, tmp_path: Path, kind: str) -> None:
+def test_official_export_predicts_as_the_run(trained, tmp_path: Path, kind: str) -> None:
     run = trained(adapter__kind=kind)
     written = export_run(run, tmp_path / "out.pt", "official").path
     assert written == tmp_path / "out.pt"
     assert_predicts_as(load_official(written, sizes_of(run)), run)
 
 
-def test_merged_is_a_folder_that_predicts_as_the_run_does(trained, tmp_path: Path) -> None:
+def test_merged_export_predicts_as_the_run(trained, tmp_path: Path) -> None:
     run = trained()
     assert export_run(run, tmp_path / "merged") == Exported(tmp_path / "merged", str(select_checkpoint(run)))
     assert_predicts_as(WorldModel.from_pretrained(tmp_path / "merged"), run)
@@ -110,7 +110,7 @@ def poison(path: Path) -> str:
     return name
 
 
-def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(copied, tmp_path: Path) -> None:
+def test_non_finite_merge_raises_and_writes_nothing(copied, tmp_path: Path) -> None:
     run = copied()
     rewrite_adapter(run, lora_alpha=1e300)
     with pytest.raises(InputError, match=r"alpha: .*less than or equal"):
@@ -122,7 +122,7 @@ def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(copied, t
     ("kind", "file"),
     [("lora", "adapter_model.safetensors"), ("none", "predictor.safetensors")],
 )
-def test_a_trained_weight_that_is_not_finite_is_named(copied, tmp_path: Path, kind: str, file: str) -> None:
+def test_non_finite_weight_raises_with_its_name(copied, tmp_path: Path, kind: str, file: str) -> None:
     run = copied(adapter__kind=kind)
     checkpoint = load_subject(run).checkpoint
     name = poison(checkpoint / "adapter" / file)
@@ -152,7 +152,7 @@ def test_the_card_describes_base_data_and_training(
     assert f"{sum(value.numel() for name, value in weights.items() if '.lora_' in name):,} parameters" in card
 
 
-def test_names_are_no_markup_in_the_card(trained, tmp_path: Path) -> None:
+def test_names_are_escaped_in_the_model_card(trained, tmp_path: Path) -> None:
     run = shutil.copytree(trained(), tmp_path / "<svg onload=a()>\n```\n# x: y`")
     export_run(run, tmp_path / "hub", "hub")
     card = (tmp_path / "hub" / CARD).read_text()
@@ -175,7 +175,7 @@ def test_the_code_of_the_card_runs(trained, tmp_path: Path) -> None:
     assert isinstance(names["predictor"], peft.PeftModel)
 
 
-def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied, tmp_path: Path) -> None:
+def test_model_card_contains_metrics_with_their_checkpoint(copied, tmp_path: Path) -> None:
     run = copied(checkpoint__every=1)
     assert main(["evaluate", str(run), *QUICK]) == 0
     measured = json.loads((run / METRICS_FILE).read_text())
@@ -191,7 +191,7 @@ def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied
     assert "another checkpoint**: `step-00000001`, not `step-00000002`" in card
 
 
-def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: Path) -> None:
+def test_damaged_metrics_raise_before_export_writes(copied, tmp_path: Path) -> None:
     run = copied()
     (run / METRICS_FILE).write_text("{")
     with pytest.raises(InputError, match=r"metrics\.json.*vjepa2-ac evaluate"):
@@ -199,7 +199,7 @@ def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: 
     assert not (tmp_path / "hub").exists()
 
 
-def test_a_run_without_an_adapter_has_nothing_for_the_hub(trained, tmp_path: Path) -> None:
+def test_hub_export_without_adapter_raises(trained, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"without an adapter.*--to merged or --to official"):
         export_run(trained(adapter__kind="none"), tmp_path / "hub", "hub")
 
@@ -217,7 +217,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("no_work")
 @pytest.mark.parametrize("form", ["merged", "official", "hub"])
-def test_a_destination_that_cannot_be_used_is_refused_before_work_begins(tmp_path: Path, form: Any) -> None:
+def test_unusable_destination_raises_before_the_export(tmp_path: Path, form: Any) -> None:
     (tmp_path / "there.pt").write_text("precious")
     for place in (tmp_path, tmp_path / "there.pt"):
         with pytest.raises(InputError, match=r"something is there already|the name of a \.pt file"):

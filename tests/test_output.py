@@ -25,7 +25,7 @@ def start(popen: Popen) -> Start:
     return lambda code, **streams: popen([sys.executable, "-c", BEGINNING + code], **streams)
 
 
-def test_work_goes_on_when_its_reader_leaves(start: Start, tmp_path: Path) -> None:
+def test_work_continues_after_the_pipe_is_closed(start: Start, tmp_path: Path) -> None:
     code = f"""
     for number in range(20_000):
         print(f"line {{number:06d}}", "." * 80)
@@ -39,7 +39,7 @@ def test_work_goes_on_when_its_reader_leaves(start: Start, tmp_path: Path) -> No
     assert (tmp_path / "done").read_text() == "", "a reader who left lost nothing"
 
 
-def test_a_silent_command_prints_on_stderr_what_it_does_and_ends_at_once(start: Start) -> None:
+def test_silent_command_reports_on_stderr_and_exits_on_signal(start: Start) -> None:
     code = """
     import time
     from vjepa2_ac.cli import waiting
@@ -61,7 +61,7 @@ def command(*arguments: str, **streams: object) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-c", code], check=False, timeout=120, stderr=subprocess.PIPE, **streams)
 
 
-def test_a_command_ends_quietly_without_its_reader_and_loudly_without_room() -> None:
+def test_closed_pipe_is_silent_and_full_disk_is_an_error() -> None:
     reader, writer = os.pipe()
     os.close(reader)
     without_reader = command("config", "schema", stdout=writer)
@@ -80,7 +80,7 @@ def messages_of(process: subprocess.CompletedProcess) -> list[bytes]:
 
 
 @pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
-def test_streams_that_were_closed_are_no_files_of_ours(tmp_path: Path, closed: tuple[int, ...]) -> None:
+def test_closed_streams_are_not_reused_by_files(tmp_path: Path, closed: tuple[int, ...]) -> None:
     def close() -> None:
         for handle in closed:
             os.close(handle)
@@ -99,7 +99,7 @@ def test_streams_that_were_closed_are_no_files_of_ours(tmp_path: Path, closed: t
     assert (tmp_path / "file").read_text() == "ours"
 
 
-def test_a_terminal_that_is_gone_is_nobodys_error(start: Start) -> None:
+def test_closed_terminal_is_no_error(start: Start) -> None:
     ours, theirs = pty.openpty()
     code = """
     print(sys.stdout.isatty(), flush=True)
@@ -137,7 +137,7 @@ def test_both_streams_on_one_file_keep_their_order_and_all_text(start: Start) ->
     ]
 
 
-def test_a_pipe_that_others_made_unblocking_is_waited_for(start: Start) -> None:
+def test_non_blocking_pipe_is_written_completely(start: Start) -> None:
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     process = start("    print('x' * 500_000)\n    assert not lost()\n", stdout=writer)
@@ -147,7 +147,7 @@ def test_a_pipe_that_others_made_unblocking_is_waited_for(start: Start) -> None:
     assert process.wait(timeout=120) == 0
 
 
-def test_streams_of_a_test_or_a_notebook_stay_theirs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_replaced_streams_are_not_changed(capsys: pytest.CaptureFixture[str]) -> None:
     before = sys.stdout
     with guard_output() as lost:
         assert sys.stdout is before

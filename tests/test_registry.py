@@ -113,20 +113,20 @@ def test_a_source_of_this_package_cannot_be_defined_again(site: Path) -> None:
         ("import no_such_library_x", r"ModuleNotFoundError: No module named 'no_such_library_x'; .*line 1"),
     ],
 )
-def test_a_plugin_that_fails_is_one_error_with_the_line(write: Write, code: str, cause: str) -> None:
+def test_failing_plugin_raises_one_error_with_its_line(write: Write, code: str, cause: str) -> None:
     write("p_fails", code)
     with pytest.raises(InputError, match=rf"^own.yaml: plugins: plugin 'p_fails' cannot be imported \({cause}\)"):
         parse_config({**VALUES, "plugins": ["p_fails"]}, where="own.yaml")
 
 
 @pytest.mark.parametrize("name", ["../evil", "", "a-b", "a..b", "p_new.__main__", "vjepa2_ac.cli"])
-def test_names_that_are_no_modules_are_refused(name: str) -> None:
-    with pytest.raises(InputError, match="a module of yours"):
+def test_invalid_module_names_raise(name: str) -> None:
+    with pytest.raises(InputError, match="the name of your module"):
         import_plugins([name], where="plugins")
 
 
 @pytest.mark.usefixtures("write")
-def test_a_module_that_registers_nothing_is_refused_each_time(write: Write) -> None:
+def test_module_without_registration_raises_each_time(write: Write) -> None:
     write("p_helper", "x = 1")
     write("p_outer", "import p_inner")
     write("p_inner")

@@ -170,7 +170,7 @@ def _located(error: ValidationError, section: type[BaseModel], at: tuple[str, ..
     for one in error.errors(include_url=False):
         kind, text, location = one["type"], one["msg"], one["loc"]
         if kind == "extra_forbidden":
-            known = f"known keys: {', '.join(section.model_fields)}"
+            known = f"known here: {', '.join(section.model_fields)}"
             suggestion = did_you_mean(str(location[-1]), section.model_fields)
             kind, text = UNKNOWN_OPTION, f"unknown key; {f'd{suggestion[1:-1]}' if suggestion else known}"
         custom = PydanticCustomError(kind, text)

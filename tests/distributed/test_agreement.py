@@ -36,9 +36,7 @@ def test_ranks_whose_errors_differ_in_the_last_digits_lose_patience_together(mak
         ("encoding_loses_its_connection", "gs://data: no answer"),
     ],
 )
-def test_what_one_rank_alone_meets_ends_both_with_its_error(
-    make_config, tmp_path: Path, happens: str, found: str
-) -> None:
+def test_error_of_one_rank_is_raised_in_both(make_config, tmp_path: Path, happens: str, found: str) -> None:
     config = make_config(data__cache="auto", data__cache_dir=str(tmp_path / "cache"))
     for said in start_both(config, tmp_path, happens, status=3):
         assert said.startswith(("InputError: ", "MissingFileError: ", "UnreachableError: "))
@@ -60,5 +58,5 @@ def test_the_share_of_broken_episodes_is_that_of_all_ranks_together(make_config,
         assert "4 of 8 episodes are broken" in said
 
 
-def test_a_rank_that_indexes_for_long_is_waited_for(make_config, tmp_path: Path) -> None:
+def test_other_ranks_wait_for_a_slow_index(make_config, tmp_path: Path) -> None:
     start_both(make_config(training__steps=1), tmp_path, "indexing_takes_longer_than_the_time_out", status=0)

@@ -82,7 +82,7 @@ def test_bfloat16_that_is_only_emulated_is_refused(
 @pytest.mark.parametrize(
     "training", [{"precision": "fp16"}, {"precision": "fp32", "dtype": "float32"}, {"device": "cpu"}], ids=str
 )
-def test_what_an_old_gpu_computes_is_not_refused(training: dict[str, str]) -> None:
+def test_supported_precision_on_old_gpu_is_accepted(training: dict[str, str]) -> None:
     assert select_device(parsed(**training).training).type == training.get("device", "cuda")
 
 

@@ -56,7 +56,7 @@ class Store:
         ({"WORLD_SIZE": "4"}, "the other 3 of 4 processes"),
     ],
 )
-def test_who_is_waited_for_is_reported_while_it_is(
+def test_missing_processes_are_reported_while_waiting(
     launched: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, changes: Any, missing: str
 ) -> None:
     reported = threading.Event()

@@ -74,7 +74,7 @@ def test_a_process_killed_at_any_time_ends_all_and_fewer_resume(endless) -> None
     assert (state.clips_per_step, state.clips_done) == (4, 4 * state.step)
 
 
-def test_restarts_in_one_store_are_refused(make_config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_restarts_with_a_shared_store_raise(make_config, monkeypatch: pytest.MonkeyPatch) -> None:
     """They would wait for those that have ended."""
     monkeypatch.setenv("TORCHELASTIC_USE_AGENT_STORE", "True")
     monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "3")
@@ -82,7 +82,7 @@ def test_restarts_in_one_store_are_refused(make_config, monkeypatch: pytest.Monk
         make_accelerator(make_config())
 
 
-def test_a_launcher_starts_all_again_and_they_go_on(make_config, tmp_path: Path, popen) -> None:
+def test_relaunched_processes_resume(make_config, tmp_path: Path, popen) -> None:
     path, run = tmp_path / "config.yaml", tmp_path / "run"
     path.write_text(config_as_yaml(make_config(checkpoint__every=1)))
     launcher = ["--nproc-per-node=2", "--max-restarts=1", "--rdzv-backend=c10d", "--rdzv-endpoint=127.0.0.1:0"]

@@ -34,7 +34,7 @@ def without_dropout(make_config, tmp_path):
     return make
 
 
-def test_two_processes_stopped_and_gone_on_as_one_make_the_run_of_one(without_dropout, reporter, tmp_path) -> None:
+def test_two_processes_resumed_as_one_equal_a_single_process_run(without_dropout, reporter, tmp_path) -> None:
     """One rank is signalled, both stop after the same step; one process goes on with all clips of a step."""
     whole = train(without_dropout("whole", training__steps=16, training__accumulation=4), type(reporter)())
     config = without_dropout("shared", training__steps=16, training__accumulation=2)
@@ -60,7 +60,7 @@ def test_two_processes_stopped_and_gone_on_as_one_make_the_run_of_one(without_dr
     assert_equal_up_to_rounding(whole, tmp_path / "shared")
 
 
-def test_two_nodes_of_torchrun_make_the_run_of_one_process(without_dropout, reporter, tmp_path) -> None:
+def test_two_torchrun_nodes_equal_a_single_process_run(without_dropout, reporter, tmp_path) -> None:
     whole = train(without_dropout("whole", training__accumulation=2), reporter)
     without_dropout("nodes", training__accumulation=1)
     port = free_port()
@@ -75,7 +75,7 @@ def test_two_nodes_of_torchrun_make_the_run_of_one_process(without_dropout, repo
     assert_equal_up_to_rounding(whole, tmp_path / "nodes")
 
 
-def test_what_processes_say_to_each_other(tmp_path, without_dropout) -> None:
+def test_collectives_of_a_training_step(tmp_path, without_dropout) -> None:
     """Sums, gradients, broken episodes, a micro-batch that is empty for one process: in processes_together.py."""
     without_dropout("pair", data__broken_episodes="skip", training__max_grad_norm=None)
     run_ranks([str(ROOT / "tests/support/processes_together.py"), str(tmp_path / "pair.yaml")])
@@ -101,7 +101,7 @@ def test_more_processes_than_micro_batches_are_refused(make_config, reporter) ->
         count_micro_batches(config, RunState(step=3, clips_per_step=8, clips_per_process=8), 5, reporter)
 
 
-def test_accumulation_changed_on_purpose_counts_as_it_is_written(make_config, reporter) -> None:
+def test_explicit_accumulation_change_is_used(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=3)
     assert count_micro_batches(config, RunState(step=3, clips_per_step=8, clips_per_process=4), 2, reporter) == 6
 
@@ -124,7 +124,7 @@ def test_every_clip_of_a_step_has_one_process(
     assert sorted(chain(*firsts)) == list(range(5, 5 + steps * micro_batches_per_step * batch_size, batch_size))
 
 
-def test_a_run_whose_step_changes_counts_on_from_the_clips_it_has_had(make_config, reporter) -> None:
+def test_changed_clips_per_step_resume_from_clips_done(make_config, reporter) -> None:
     train(make_config(training__steps=2), reporter)
     changed = make_config(training__steps=4, training__accumulation=1)
     folder = train(changed, reporter, allow_config_change=True)

@@ -38,7 +38,7 @@ def assert_same(one: dict[str, Any], other: dict[str, Any]) -> None:
         np.testing.assert_allclose(second[name], value, rtol=1e-6, atol=1e-9, err_msg=name)
 
 
-def test_processes_that_share_an_evaluation_find_what_one_finds(make_config, tmp_path: Path, reporter) -> None:
+def test_shared_evaluation_equals_single_process_evaluation(make_config, tmp_path: Path, reporter) -> None:
     """7 clips in batches of 3, of which two are broken: one process has one clip; some actions are the others'."""
     changes = {"frames": 6, "test_share": 0.4, "broken_episodes": "skip"}
     data = {f"data__{name}": value for name, value in changes.items()}
@@ -54,7 +54,7 @@ def test_processes_that_share_an_evaluation_find_what_one_finds(make_config, tmp
     assert alone["clips"]["count"] == together["clips"]["count"] == 5
 
 
-def test_a_shared_validation_is_that_of_one_process(make_config, tmp_path: Path) -> None:
+def test_shared_validation_equals_single_process_validation(make_config, tmp_path: Path) -> None:
     changes = {"training__steps": 2, "validation__clips": 7, "validation__batch_size": 2, "validation__every": 2}
     changes |= {"adapter__dropout": 0.0, "data__broken_episodes": "skip", "training__accumulation": 1}
     for processes in (1, 2):
@@ -65,7 +65,7 @@ def test_a_shared_validation_is_that_of_one_process(make_config, tmp_path: Path)
     np.testing.assert_array_equal(*(list(numbers_of(rows[0]).values()) for rows in (first, second)))
 
 
-def test_an_error_of_one_in_shared_work_is_raised_in_all(make_config, tmp_path: Path) -> None:
+def test_error_in_shared_work_is_raised_in_all_processes(make_config, tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     path.write_text(config_as_yaml(make_config()))
     script = str(ROOT / "tests/support/disagreeing_ranks.py")

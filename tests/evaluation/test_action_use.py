@@ -60,7 +60,7 @@ def drawn_for(
     return drawn[:samples], drawn[samples:]
 
 
-def test_a_move_is_the_longest_within_reach_there_and_back() -> None:
+def test_moves_are_the_longest_within_reach_in_both_directions() -> None:
     there, back = moves(line(times=10))[:2]
     assert float(there.action[0]) == pytest.approx(0.07), "7 of its 9 steps: 8 are beyond 7.5 cm"
     assert torch.equal(there.action, -back.action)
@@ -70,7 +70,7 @@ def test_a_move_is_the_longest_within_reach_there_and_back() -> None:
     assert there.episode_id == back.episode_id
 
 
-def test_commands_that_are_no_changes_are_taken_as_they_are() -> None:
+def test_recorded_commands_are_used_unchanged_as_moves() -> None:
     batch = line()
     batch.actions[:, 2] *= 3
     found = moves(batch, make_vector_actions(7, "target"))
@@ -78,14 +78,14 @@ def test_commands_that_are_no_changes_are_taken_as_they_are() -> None:
     assert all(torch.equal(one.action, batch.actions[clip, 2]) for clip, one in enumerate(found))
 
 
-def test_who_knows_the_world_ranks_the_true_action_first() -> None:
+def test_perfect_predictor_ranks_the_true_action_first() -> None:
     found = ranked(Oracle(), walked(0.02 * torch.randn(CLIPS, 4, 7, generator=torch.Generator().manual_seed(0))))
     assert (found.rank.value, found.box.value, found.shell.value) == (0.0, 0.0, 0.0)
     assert found.spread.value > 0.1
     assert len(found.ranks) == 2 * CLIPS
 
 
-def test_who_ignores_actions_ranks_by_chance_and_spreads_nothing() -> None:
+def test_predictor_that_ignores_actions_ranks_at_chance_with_zero_spread() -> None:
     found = ranked(Copier(), line())
     assert set(found.ranks) == {0.5}
     assert found.spread.value == 0.0
@@ -98,7 +98,7 @@ class _Taught(Oracle):
         return super().predict(latents, actions.clamp(0.0, 0.01), states, extrinsics)
 
 
-def test_who_knows_only_short_steps_to_the_front_is_right_of_each_step_and_found_out() -> None:
+def test_predictor_that_knows_only_short_forward_steps_has_a_ranking_error() -> None:
     """The trap: on the steps of the data the model is perfect, and a planner has nothing to go by beyond them."""
     batch = line()
     own_steps = batch.latents[:, :-1], batch.actions, batch.states
@@ -117,7 +117,7 @@ class _Broken(Oracle):
         return torch.nan * super().predict(latents, actions, states, extrinsics)
 
 
-def test_predictions_that_are_not_finite_rank_last() -> None:
+def test_non_finite_predictions_rank_last() -> None:
     assert ranked(_Broken(), walked(torch.full((CLIPS, 4, 7), 0.01))).rank.value == 1.0
 
 
@@ -130,13 +130,13 @@ class _Length(Oracle):
         return super().predict(latents, seen, states, extrinsics)
 
 
-def test_the_shell_tells_a_direction_from_a_distance() -> None:
+def test_shell_alternatives_measure_sensitivity_to_direction() -> None:
     found = ranked(_Length(), line(), samples=200)
     assert found.shell.value == pytest.approx(0.5, abs=0.1), "all of one length are alike"
     assert found.box.value < 0.5
 
 
-def test_actions_on_the_shell_are_as_long_as_the_true_one_and_go_everywhere() -> None:
+def test_shell_alternatives_have_the_true_length_and_all_directions() -> None:
     (move, _), samples = moves(line(times=10))[:2], 4000
     _, drawn = drawn_for(move, [move], POSE_CHANGE, samples, np.random.default_rng(0))
     assert np.linalg.norm(drawn[:, :3], axis=1) == pytest.approx(np.full(samples, 0.07))
@@ -146,7 +146,7 @@ def test_actions_on_the_shell_are_as_long_as_the_true_one_and_go_everywhere() ->
     assert not drawn_for(still, [move], POSE_CHANGE, samples, np.random.default_rng(0))[1].any()
 
 
-def test_numbers_of_vectors_are_lengths_in_their_largest_change() -> None:
+def test_vector_components_are_scaled_by_their_largest_change() -> None:
     space = make_vector_actions(3, "change")
     move = replace(moves(line())[0], action=torch.tensor([0.1, 0.0, 0.0]))
     others = replace(move, action=torch.tensor([0.0, 5.0, 0.0]))
@@ -155,7 +155,7 @@ def test_numbers_of_vectors_are_lengths_in_their_largest_change() -> None:
     assert not drawn[:, 2].any(), "what never changes is not changed"
 
 
-def test_what_others_are_drawn_does_not_depend_on_the_moves_beside_it() -> None:
+def test_alternatives_of_a_move_do_not_depend_on_other_moves() -> None:
     batch = walked(0.02 * torch.randn(CLIPS, 4, 7, generator=torch.Generator().manual_seed(0)))
     begun = moves(batch)
     probes = ProbeOptions(samples=20, at_once=7)
@@ -171,7 +171,7 @@ def starts(step: int = 0) -> list[RolloutStart]:
     return [rollout_start(batch, clip, step) for clip in range(FEW)]
 
 
-def test_energy_and_change_are_the_distances_of_the_world() -> None:
+def test_energy_and_change_equal_analytic_distances() -> None:
     start = starts()[0]
     true = start.action.double().numpy()
     other = true + np.array([0.03, 0, 0, 0, 0, 0, 0])
@@ -182,7 +182,7 @@ def test_energy_and_change_are_the_distances_of_the_world() -> None:
     assert change[1] == pytest.approx(1.5 / DIM, abs=1e-5)
 
 
-def test_ranks_and_change_are_counted_by_hand() -> None:
+def test_ranks_and_change_equal_manual_computation() -> None:
     """A model that predicts a third of an action's effect ranks larger actions first: as many as are drawn there."""
 
     class Third(Oracle):
@@ -205,7 +205,7 @@ def test_ranks_and_change_are_counted_by_hand() -> None:
     assert (found.samples, found.episode_ids) == (SAMPLES, tuple(start.episode_id for start in begun))
 
 
-def test_the_box_moves_only_the_hand() -> None:
+def test_box_alternatives_change_only_the_position() -> None:
     begun = starts()
     start = begun[0]
     boxed, _ = drawn_for(start, begun, POSE_CHANGE, 500, np.random.default_rng(0))

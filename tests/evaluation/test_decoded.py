@@ -106,14 +106,14 @@ def test_a_perfect_predictor_equals_the_decoded_truth_bit_for_bit_and_a_copier_d
     assert of(oracle, "adapter")["ssim.whole.decoded_truth"] == pytest.approx([1.0] * (TIME - 1), abs=1e-6)
 
 
-def test_what_goes_half_of_the_way_is_between_its_neighbours() -> None:
+def test_half_motion_predictor_scores_between_persistence_and_truth() -> None:
     found = measured(Halfway())
     for metric in ("psnr_db.whole.truth", "ssim.moving.truth"):
         low, mine, high = (of(found, one)[metric] for one in (DECODED_PERSISTENCE, "adapter", DECODED_TRUTH))
         assert all(a < b < c for a, b, c in zip(low, mine, high, strict=True))
 
 
-def test_a_clip_in_which_nothing_moves_does_not_count_in_the_moving_region() -> None:
+def test_static_clip_is_excluded_from_moving_region_metrics() -> None:
     still = replace(BATCH, latents=BATCH.latents.clone(), actions=BATCH.actions.clone())
     still.latents[:3] = still.latents[:3, :1]
     found = measure_decoded(evaluated_models(Copier()), clips(still, TRAINED), TRAINED)
@@ -126,7 +126,7 @@ def test_a_clip_in_which_nothing_moves_does_not_count_in_the_moving_region() -> 
     assert any("3 clips are left out" in note for note in found.notes)
 
 
-def test_from_a_cache_nothing_is_compared_with_true_frames() -> None:
+def test_cached_latents_are_not_compared_with_true_frames() -> None:
     found = measure_decoded(evaluated_models(Oracle()), replace(clips(BATCH, TRAINED), has_frames=False), TRAINED)
     assert not [metric for _, metric in found.curves if metric.endswith(".truth") or ".moving." in metric]
     assert "come from a cache" in found.notes[0]

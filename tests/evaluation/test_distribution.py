@@ -114,7 +114,7 @@ def smoothed(rng: np.random.Generator, true: np.ndarray) -> np.ndarray:
     return MEAN + 0.8 * (equally_spread(rng, true) - MEAN)
 
 
-def test_without_a_difference_the_expectation_is_zero() -> None:
+def test_mmd_of_equal_distributions_has_expectation_zero() -> None:
     values = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -133,7 +133,7 @@ def test_smoothed_predictions_score_worse_than_equally_spread_ones() -> None:
     assert smooth > spread + 3 * np.std(np.subtract(*np.transpose(ours))) / math.sqrt(30)
 
 
-def test_a_real_difference_is_found_and_lies_in_the_interval() -> None:
+def test_mmd_interval_contains_a_real_difference() -> None:
     rng = np.random.default_rng(0)
     true = features(rng)
     found = mmd(0.6 * equally_spread(rng, true), true, MMD_IDS)

@@ -97,7 +97,7 @@ def test_a_model_that_ignores_actions_has_the_action_ranking_error_of_chance() -
     assert summarize(found, make_rows(found)).uses_actions.conclusion == "no"
 
 
-def test_a_difference_is_what_is_computed_by_hand() -> None:
+def test_paired_difference_equals_manual_computation() -> None:
     found = evaluated(Halfway(), Copier())
     errors, base = pair_of(found)
     assert [one.value for one in over_persistence(errors, "teacher_forced")] == pytest.approx([0.5] * 4)
@@ -106,7 +106,7 @@ def test_a_difference_is_what_is_computed_by_hand() -> None:
     assert [(one.low, one.value, one.high) for one in gains] == [pytest.approx((0.5, 0.5, 0.5))] * 4
 
 
-def test_wrong_actions_give_the_errors_that_they_give(oracle: Evaluation) -> None:
+def test_errors_with_wrong_actions_equal_direct_predictions(oracle: Evaluation) -> None:
     errors = oracle.models["adapter"].errors
     zero = over_persistence(errors, "teacher_forced", actions="zero")
     assert [one.value for one in zero] == pytest.approx([1.0] * (TIME - 1), rel=1e-5), "nothing done, nothing moves"
@@ -117,7 +117,7 @@ def test_wrong_actions_give_the_errors_that_they_give(oracle: Evaluation) -> Non
     assert shuffled.tolist() == pytest.approx(expected.tolist(), rel=1e-4)
 
 
-def test_chosen_steps_alone_count(oracle: Evaluation) -> None:
+def test_only_selected_steps_are_averaged(oracle: Evaluation) -> None:
     first = np.zeros((12, TIME - 1), bool)
     first[:, 0] = True
     errors = oracle.models["adapter"].errors
@@ -128,7 +128,7 @@ def test_chosen_steps_alone_count(oracle: Evaluation) -> None:
         assert one_step_over_persistence(errors, "true", steps).value == pytest.approx(value)
 
 
-def test_the_same_evaluation_twice_gives_the_same_file_and_another_seed_other_actions(oracle: Evaluation) -> None:
+def test_same_seed_gives_equal_metrics_file_and_another_seed_other_actions(oracle: Evaluation) -> None:
     assert metrics_as_dict(evaluated(Oracle(), Copier())) == metrics_as_dict(oracle)
     first, second = (found.models["adapter"].ranking for found in (oracle, evaluated(Oracle(), seed=1)))
     assert first is not None
@@ -136,7 +136,7 @@ def test_the_same_evaluation_twice_gives_the_same_file_and_another_seed_other_ac
     assert first.change != second.change
 
 
-def test_examples_are_the_best_the_worst_and_the_liveliest_with_their_errors() -> None:
+def test_examples_are_best_worst_and_most_motion_clips() -> None:
     found = evaluated(Halfway(), Copier())
     reasons = " ".join(example.why for example in found.examples)
     assert "most motion" in reasons
@@ -149,7 +149,7 @@ def test_examples_are_the_best_the_worst_and_the_liveliest_with_their_errors() -
         np.testing.assert_allclose(example.errors["adapter"], example.errors["base"] / 2, rtol=1e-3)
 
 
-def test_vectors_have_no_centimetres_and_too_few_numbers_no_landscape() -> None:
+def test_vector_actions_have_no_unit_and_short_ones_no_landscape() -> None:
     evaluated_models = [EvaluatedModel("model", "trained", Oracle())]
     vectors, narrow = (
         evaluate(
@@ -168,7 +168,7 @@ def test_vectors_have_no_centimetres_and_too_few_numbers_no_landscape() -> None:
     json.dumps(metrics_as_dict(narrow), allow_nan=False)
 
 
-def test_each_model_is_measured_only_while_it_is_switched_on() -> None:
+def test_each_model_predicts_within_its_prediction_context() -> None:
     on: list[str] = []
 
     @contextmanager
@@ -214,13 +214,13 @@ def of(*actions: list[float], space: ActionSpace = POSE_CHANGE) -> Clips:
         ([0, 0, 0, 0, 0, 0, 0.04], False),
     ],
 )
-def test_a_step_moves_if_the_hand_goes_turns_or_grips(action: list[float], moves: bool) -> None:
+def test_step_counts_as_moving_if_hand_translates_rotates_or_grips(action: list[float], moves: bool) -> None:
     clips = of(action)
     assert clips.moving.tolist() == [[moves]]
     assert clips.action_size[0, 0] == pytest.approx(np.linalg.norm(action[:3]) * 100)
 
 
-def test_vectors_move_beside_their_largest_ones() -> None:
+def test_moving_steps_of_vectors_are_relative_to_their_largest_actions() -> None:
     clips = of([1.0, 0.0], [0.05, 0.0], [0.0, 0.2], [0.0, 0.0], space=make_vector_actions(2, "change"))
     assert clips.moving.tolist() == [[True, False, True, False]]
     assert not of([0.0, 0.0], space=make_vector_actions(2, "change")).moving.any(), "nothing at all is no motion"
@@ -265,16 +265,14 @@ def test_a_validation_has_the_errors_of_an_evaluation_of_the_same_clips() -> Non
 
 
 @pytest.mark.parametrize("size", [1, 3, 12])
-def test_other_actions_are_those_of_the_clip_before_whatever_the_batch(size: int) -> None:
+def test_shuffled_actions_are_those_of_the_previous_clip_for_any_batch_size(size: int) -> None:
     batch = clips_batch()
     others = torch.cat([tried for _, tried in with_shuffled_actions(in_batches(batch, size))])
     assert torch.equal(others, batch.actions[[1, *range(11)]]), "the first clip has those of the second"
 
 
 @pytest.mark.parametrize("processes", [2, 3, 4])
-def test_processes_that_share_clips_give_each_the_same_actions_whatever_clips_are_broken(
-    processes: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shuffled_actions_do_not_depend_on_number_of_processes(processes: int, monkeypatch: pytest.MonkeyPatch) -> None:
     batch = clips_batch()
     for whole in product([True, False], repeat=7):
         readable = [place for place in range(7) if whole[place]]
@@ -294,7 +292,7 @@ def test_processes_that_share_clips_give_each_the_same_actions_whatever_clips_ar
         assert torch.equal(torch.cat(found), expected), whole
 
 
-def test_a_clip_alone_gets_its_own_actions_backwards() -> None:
+def test_single_clip_gets_its_reversed_actions() -> None:
     batch = rows(clips_batch(), [0])
     [(_, others)] = list(with_shuffled_actions([batch]))
     assert torch.equal(others, batch.actions.flip(1))

@@ -86,7 +86,7 @@ def figures_of(folder: Path | str) -> dict[str, Any]:
     return json.loads((Path(folder) / "metrics.json").read_text())
 
 
-def test_a_run_is_measured_against_its_base_with_everything_that_belongs_to_it(measured: WrittenEvaluation) -> None:
+def test_run_is_compared_with_its_base_model_in_all_measurements(measured: WrittenEvaluation) -> None:
     evaluation = measured.evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     assert (evaluation.base, evaluation.trained) == ("base", "adapter")
@@ -99,7 +99,7 @@ def test_a_run_is_measured_against_its_base_with_everything_that_belongs_to_it(m
 
 
 @pytest.mark.usefixtures("measured")
-def test_figures_depend_on_neither_the_batch_size_nor_the_workers(config: Config, run: str, tmp_path: Path) -> None:
+def test_metrics_do_not_depend_on_batch_size_or_workers(config: Config, run: str, tmp_path: Path) -> None:
     changed = config.model_copy(update={"validation": config.validation.model_copy(update={"batch_size": 2})})
     path = Path(run) / "config.yaml"
     before = path.read_text()
@@ -130,7 +130,7 @@ def test_a_model_is_measured_on_the_data_of_a_config_and_equals_the_base_of_a_ru
     assert rollout(of_model, "model") == pytest.approx(rollout(figures_of(run), "base"), rel=1e-5)
 
 
-def test_others_are_measured_on_the_same_latents(run: str, tmp_path: Path, base_folder: Path) -> None:
+def test_other_runs_are_measured_on_the_same_latents(run: str, tmp_path: Path, base_folder: Path) -> None:
     found = measure(run, asked(against=("base", run, str(base_folder)), out=tmp_path))
     assert list(found.evaluation.models) == ["base", "run", "model", "adapter"]
     assert [model.role for model in found.evaluation.models.values()] == ["base", "other", "other", "trained"]
@@ -150,9 +150,7 @@ def test_another_encoder_cannot_be_measured_on_these_latents(run: str, tmp_path:
 
 
 @pytest.mark.usefixtures("measured")
-def test_a_cache_gives_the_figures_of_the_frames_and_frames_of_its_own(
-    config: Config, run: str, tmp_path: Path
-) -> None:
+def test_cached_latents_give_the_metrics_of_frames(config: Config, run: str, tmp_path: Path) -> None:
     encode_for(config, load_base(config.model, seed=0), open_dataset(config.data))
     path = written(config, tmp_path, cache="require")
     assert main(["evaluate", run, "--data", path, "--out", str(tmp_path / "cached"), "--clips", "5", *QUICK]) == 0
@@ -161,7 +159,7 @@ def test_a_cache_gives_the_figures_of_the_frames_and_frames_of_its_own(
     assert fly["clips"] == cached["clips"]
 
 
-def test_a_run_without_a_base_is_measured_alone_unless_a_base_is_asked_for(
+def test_run_without_base_model_is_measured_alone_or_raises_if_base_is_requested(
     make_config: MakeConfig,
 ) -> None:
     config = make_config(model__base="random", model__sizes=TINY_CONFIG, adapter__kind="none")
@@ -203,7 +201,7 @@ def test_invalid_input_is_reported_before_a_model_is_loaded(
         evaluate_subject(run, make(config))
 
 
-def test_a_model_without_data_and_a_file_in_the_way_are_errors(run: str, tmp_path: Path, base_folder: Path) -> None:
+def test_model_without_data_and_occupied_output_raise(run: str, tmp_path: Path, base_folder: Path) -> None:
     with pytest.raises(InputError, match=r"no config\.yaml.*--data CONFIG"):
         evaluate_subject(str(base_folder), asked())
     with pytest.raises(InputError, match="no such folder"):

@@ -67,7 +67,7 @@ def named(imagination: RolloutComparison) -> dict[tuple[str, str], DecodedRollou
     return {(one.model, one.name): one for one in imagination.rollouts}
 
 
-def test_all_actions_are_imagined_by_base_and_adapter(imagine: Imagine) -> None:
+def test_all_actions_are_rolled_out_by_base_and_adapter(imagine: Imagine) -> None:
     found = imagine(actions=("true", "close"))
     assert list(named(found)) == [(who, what) for what in (AS_RECORDED, "close") for who in ("base", "adapter")]
     for one in found.rollouts:
@@ -88,7 +88,7 @@ def test_a_perfect_predictor_shows_decoded_truth_bit_for_bit(
     assert (found.decoded_truth != found.decoded_first).any()
 
 
-def test_a_model_is_given_one_frame_and_recorded_states_with_recorded_actions_only(
+def test_rollouts_use_recorded_states_only_with_recorded_actions(
     imagine: Imagine, given: list[tuple[Tensor, ...]], true_latents: list[Tensor], make_config: MakeConfig
 ) -> None:
     found = imagine(actions=("true", "right"))
@@ -110,7 +110,7 @@ def test_a_model_is_given_one_frame_and_recorded_states_with_recorded_actions_on
     assert np.abs(states[0, 1:].numpy() - recorded[1:-1]).max() > 0.01, "else the recording would show nothing"
 
 
-def test_frames_are_those_of_the_clip_that_was_named(imagine: Imagine, make_config: MakeConfig) -> None:
+def test_frames_are_those_of_the_requested_clip(imagine: Imagine, make_config: MakeConfig) -> None:
     dataset = open_dataset(make_config().data)
     name = dataset.table.identity(int(dataset.episodes[2]))
     found = imagine(actions=("true",), episode=name[3:], start=5)  # a part that no other name has
@@ -122,7 +122,7 @@ def test_frames_are_those_of_the_clip_that_was_named(imagine: Imagine, make_conf
     np.testing.assert_array_equal(found.truth[1:], later.truth[:-1])
 
 
-def test_the_clip_is_that_of_the_split_with_the_most_motion(imagine: Imagine, make_config: MakeConfig) -> None:
+def test_default_clip_has_the_most_motion_of_the_split(imagine: Imagine, make_config: MakeConfig) -> None:
     split = "validation"
     found = imagine(actions=("true",), evaluation=EvaluationOptions(split=split))
     dataset = open_dataset(make_config(data__frames=STEPS + 1).data)
@@ -140,7 +140,7 @@ def test_the_clip_is_that_of_the_split_with_the_most_motion(imagine: Imagine, ma
     assert motions[found.episode_id, found.start] == pytest.approx(max(motions.values()))
 
 
-def test_files_of_actions_have_their_names_and_never_that_of_the_recording(
+def test_action_files_are_named_after_the_file(
     imagine: Imagine, given: list[tuple[Tensor, ...]], tmp_path: Path
 ) -> None:
     rows = np.tile([0, 0, 0.02, 0, 0, 0, 0], (STEPS + 2, 1))
@@ -157,7 +157,7 @@ def test_files_of_actions_have_their_names_and_never_that_of_the_recording(
         np.testing.assert_allclose(states[0, :, 2] - states[0, 0, 2], 0.02 * np.arange(STEPS), atol=1e-5)
 
 
-def test_a_model_is_imagined_with_the_data_that_are_named(
+def test_model_is_rolled_out_on_the_given_data(
     imagine: Imagine, base_folder: Path, make_config: MakeConfig, tmp_path: Path
 ) -> None:
     options = EvaluationOptions(data=make_config(), out=tmp_path)
@@ -165,7 +165,7 @@ def test_a_model_is_imagined_with_the_data_that_are_named(
     assert list(named(found)) == [("model", AS_RECORDED), ("model", "up")]
 
 
-def test_where_nothing_was_simulated_no_outcome_is_known(whole_run: Path, whole_decoder: Path) -> None:  # noqa: F811
+def test_real_data_have_no_simulated_outcome(whole_run: Path, whole_decoder: Path) -> None:  # noqa: F811
     asked = ImagineOptions(decoder=str(whole_decoder), actions=("up",), steps=2)
     found = imagine_clip(str(whole_run), asked, simulate=simulated_outcome)
     assert (found.notes, [one.truth for one in found.rollouts]) == ((), [None, None])
@@ -191,9 +191,7 @@ def test_where_nothing_was_simulated_no_outcome_is_known(whole_run: Path, whole_
         ({"decoder": "nowhere"}, "--decoder nowhere"),
     ],
 )
-def test_what_cannot_be_imagined_is_refused_and_named(
-    imagine: Imagine, make_config: MakeConfig, asked: dict, found: str
-) -> None:
+def test_invalid_imagine_options_raise(imagine: Imagine, make_config: MakeConfig, asked: dict, found: str) -> None:
     if asked.get("episode") == "first":
         dataset = open_dataset(make_config().data)
         asked = asked | {"episode": dataset.table.identity(int(dataset.episodes[0]))}
@@ -201,7 +199,7 @@ def test_what_cannot_be_imagined_is_refused_and_named(
         imagine(**asked)
 
 
-def test_under_vector_states_only_recorded_actions_can_be_imagined(make_config: MakeConfig) -> None:
+def test_vector_states_allow_only_recorded_actions(make_config: MakeConfig) -> None:
     vectors = {"states": "vector", "actions": "recorded", "join_actions": "last"}
     config = make_config(**{f"data__{key}": value for key, value in vectors.items()})
     dataset = open_dataset(config.data)

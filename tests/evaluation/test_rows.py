@@ -20,7 +20,7 @@ from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 WHOLE = evaluation(others=("runs/other",))
 
 
-def test_a_key_and_a_model_name_one_row_and_a_key_one_line() -> None:
+def test_key_and_model_identify_a_row() -> None:
     rows = make_rows(WHOLE)
     assert len({(row.key, row.model) for row in rows}) == len(rows)
     names = {row.key: (row.group, row.name, row.form, row.better) for row in rows}
@@ -28,7 +28,7 @@ def test_a_key_and_a_model_name_one_row_and_a_key_one_line() -> None:
     assert len(set(names.values())) == len(names), "a line says what it is"
 
 
-def test_rows_are_the_estimates() -> None:
+def test_rows_equal_the_estimates() -> None:
     rows = {(row.key, row.model): row.estimate for row in make_rows(WHOLE)}
     base, adapter = (WHOLE.models[name] for name in ("base", "adapter"))
     assert rows["rollout.l1.over_persistence.3", "adapter"] == over_persistence(adapter.errors, "rollout")[2]
@@ -94,7 +94,7 @@ def test_an_added_metric_appears_in_rows_verdict_and_comparison(tmp_path: Path) 
         assert both["rollout.l2.over_persistence.4", run].value == pytest.approx(0.25)
 
 
-def test_more_is_better_where_a_metric_says_so() -> None:
+def test_metric_direction_decides_what_is_better() -> None:
     better, worse = (evaluated(*pair, LARGER) for pair in ((Oracle(), Halfway()), (Copier(), Halfway())))
     assert not summarize(better, make_rows(better)).predicts.reference, "it agrees with L1"
     assert not summarize(worse, make_rows(worse)).predicts.reference

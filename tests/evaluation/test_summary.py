@@ -336,7 +336,7 @@ def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
     assert plans.statement.endswith(f"on {problems} reach problem{'s' * (problems > 1)}")
 
 
-def test_a_measured_plan_is_not_denied_by_the_use_of_the_actions() -> None:
+def test_measured_planning_drops_the_claim_that_planning_is_impossible() -> None:
     summary = summary_of(model("adapter", 0.5))
     assert summary.sentence.endswith("ignores the actions, so the model cannot be used for planning.")
     shares = {"adapter": estimate_share(45, 50), "random": estimate_share(0, 50), "oracle": estimate_share(50, 50)}

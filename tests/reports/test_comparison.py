@@ -170,12 +170,12 @@ def test_different_clips_are_not_compared(tmp_path: Path, changes: dict[str, obj
         compare([one, other])
 
 
-def test_other_latents_are_pointed_out(tmp_path: Path) -> None:
+def test_different_latents_give_a_note(tmp_path: Path) -> None:
     one, other = written(tmp_path / "one", Halfway()), written(tmp_path / "other", Halfway(), seed=5)
     assert "another encoder or crop" in compare([one, other]).notes[0]
 
 
-def test_a_run_that_was_not_evaluated_is_named_with_the_way_out(tmp_path: Path) -> None:
+def test_unevaluated_run_raises_with_the_command_that_evaluates_it(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no metrics\.json.*vjepa2-ac evaluate"):
         compare([written(tmp_path / "one", Oracle()), tmp_path])
     with pytest.raises(InputError, match="no such folder"):
@@ -192,7 +192,7 @@ def test_a_run_that_was_not_evaluated_is_named_with_the_way_out(tmp_path: Path) 
         ({"format": 99}, "format: Input should be 6"),
     ],
 )
-def test_damaged_metrics_are_named(tmp_path: Path, changes: dict[str, object], words: str) -> None:
+def test_damaged_metrics_file_raises_with_its_path(tmp_path: Path, changes: dict[str, object], words: str) -> None:
     one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
     metrics = json.loads((other / METRICS_FILE).read_text())
     (other / METRICS_FILE).write_text(json.dumps(metrics | changes))

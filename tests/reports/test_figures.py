@@ -74,14 +74,14 @@ def test_many_goals_and_a_mask_are_shown(tmp_path: Path) -> None:
     assert not np.array_equal(masked, plain)
 
 
-def test_what_was_imagined_is_a_row_of_its_own_also_of_a_decision_without_a_plan(tmp_path: Path) -> None:
+def test_decoded_plan_adds_a_row_even_without_a_plan(tmp_path: Path) -> None:
     decoder = load_decoder(write_decoder(tmp_path / "decoder", tiny_model()))
     found, path = asked(start=100), tmp_path / "imagined.png"
     with Image.open(plot_plan(found, path, imagine_plan(found, decoder))) as picture:
         assert picture.height > pixels_of(found, tmp_path).shape[0] + 100
 
 
-def test_images_stand_side_by_side_below_their_words() -> None:
+def test_images_are_stacked_horizontally_below_their_captions() -> None:
     images = [np.full((20, 60, 3), shade, dtype=np.uint8) for shade in (50, 120)]
     frame = stack_horizontally(images, ["a", "b"], "both")
     body = frame[-40:]

@@ -141,7 +141,7 @@ def named(name: str) -> Evaluation:
 
 
 @pytest.mark.usefixtures("drawn")
-def test_no_name_can_change_the_page_but_for_its_text(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_names_change_only_text_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
     html = page_of(named(HOSTILE))
     leave_figures_empty(monkeypatch)
     harmless, hostile = Page(page_of(named("a/b"))), Page(html)
@@ -158,7 +158,7 @@ def test_no_name_can_change_the_page_but_for_its_text(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.usefixtures("drawn")
-def test_the_page_refers_to_nothing_but_itself_and_is_the_same_each_time(usual: Usual) -> None:
+def test_page_is_self_contained_and_deterministic(usual: Usual) -> None:
     one, html, page = usual
     links = [one[key] or "" for _, one in page.elements for key in ("href", "src", "srcset") if key in one]
     assert all(link.startswith("data:image/") for link in links)
@@ -223,7 +223,7 @@ def page() -> str:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("drawn")
-def test_the_page_opens_from_its_file_without_complaint_or_request(tmp_path) -> None:
+def test_page_opens_in_a_browser_without_errors_or_requests(tmp_path) -> None:
     (tmp_path / "report.html").write_text(page(), encoding="utf-8")
     seen = open_page(tmp_path / "report.html", tmp_path)
     assert (seen.console, seen.requests) == ((), ())
@@ -232,7 +232,7 @@ def test_the_page_opens_from_its_file_without_complaint_or_request(tmp_path) -> 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("drawn")
-def test_what_a_name_smuggles_in_is_not_run_even_if_it_were_not_escaped(tmp_path) -> None:
+def test_content_security_policy_blocks_injected_scripts(tmp_path) -> None:
     smuggled = tmp_path / "smuggled.html"
     smuggled.write_text(page().replace("<main>", '<main><script>document.title = "run"</script>'), encoding="utf-8")
     seen = open_page(smuggled, tmp_path)

@@ -34,7 +34,7 @@ from vjepa2_ac.spaces import matrices_from_euler
 REACHES = HOME + np.array([[0] * 7, [0.4, 0.3, 0.0, 0.4, 0.1, 0.2, 0.5], [-0.6, 0.2, 0.3, -0.2, 0.0, -0.3, 0.0]])
 
 
-def test_the_scene_and_the_arithmetic_agree_on_where_the_flange_is() -> None:
+def test_scene_and_kinematics_agree_on_the_flange_pose() -> None:
     model = compile_scene(DOMAIN_A)
     np.testing.assert_array_equal(model.jnt_range[:7].T, [LOW, HIGH])
     data = mujoco.MjData(model)
@@ -46,7 +46,7 @@ def test_the_scene_and_the_arithmetic_agree_on_where_the_flange_is() -> None:
         np.testing.assert_allclose(data.site("flange").xmat.reshape(3, 3), matrices_from_euler(pose[3:]), atol=1e-6)
 
 
-def test_the_scene_has_the_sizes_that_tasks_and_oracles_count_with() -> None:
+def test_scene_sizes_equal_the_constants_of_tasks() -> None:
     model = compile_scene(DOMAIN_A, block=True, mark=True)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -61,7 +61,7 @@ def test_the_scene_has_the_sizes_that_tasks_and_oracles_count_with() -> None:
 
 
 @pytest.mark.parametrize("domain", [DOMAIN_A, DOMAIN_B], ids=["A", "B"])
-def test_the_hand_is_in_the_image_where_the_reported_poses_say(domain: Domain) -> None:
+def test_hand_pixels_match_projected_pose(domain: Domain) -> None:
     arm = SimulatedArm(domain)
     images = []
     for joints in REACHES:
@@ -75,7 +75,7 @@ def test_the_hand_is_in_the_image_where_the_reported_poses_say(domain: Domain) -
     assert 0.03 < changed < 0.6
 
 
-def test_leaving_out_rays_that_pass_the_arm_by_changes_no_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_skipped_rays_change_no_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     sparing, thorough = (SimulatedArm(DOMAIN_B) for _ in range(2))
     for joints in REACHES:
         sparing.set_joints(joints, 0.0)
@@ -86,7 +86,7 @@ def test_leaving_out_rays_that_pass_the_arm_by_changes_no_pixel(monkeypatch: pyt
             np.testing.assert_array_equal(seen, thorough.image())
 
 
-def test_textures_are_drawn_anew_and_things_circle_while_time_passes_without_touching_anything() -> None:
+def test_textures_are_random_and_moving_objects_circle_without_contact() -> None:
     ranges = DomainRanges(textures=True, moving=2)
     domain, other = (sample_domain(np.random.default_rng(seed), ranges) for seed in (1, 2))
     plain = replace(domain, texture_seed=0, moving=0)
@@ -113,14 +113,14 @@ def test_textures_are_drawn_anew_and_things_circle_while_time_passes_without_tou
     np.testing.assert_array_equal(again.image(), images[-1])
 
 
-def test_missing_mujoco_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_mujoco_raises_with_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(UnreachableError, match=r"MuJoCo.*\[sim\]"):
         load_mujoco()
 
 
 @pytest.mark.parametrize("domain", [DOMAIN_A, DOMAIN_B], ids=["A", "B"])
-def test_where_nothing_is_in_the_way_an_arm_with_contacts_follows_as_without(domain: Domain) -> None:
+def test_contact_arm_in_free_space_follows_like_kinematic_arm(domain: Domain) -> None:
     free, touching = SimulatedArm(domain), ContactArm(domain)
     for step in range(3):
         target = free.state + np.array([0.05, -0.05, -0.04, 0.0, 0.0, 0.0, 0.3])
@@ -131,7 +131,7 @@ def test_where_nothing_is_in_the_way_an_arm_with_contacts_follows_as_without(dom
         assert other[6] == pytest.approx(one[6], abs=0.02), step
 
 
-def test_a_block_is_where_it_was_put_and_falls_on_the_table() -> None:
+def test_block_is_placed_and_falls_on_the_table() -> None:
     arm, block = ContactArm(DOMAIN_B), np.array([0.4, 0.2, 0.25, 0.3])
     arm.place(block, None)
     np.testing.assert_allclose(arm.block, block, atol=1e-9)

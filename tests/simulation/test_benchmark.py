@@ -35,7 +35,7 @@ def of_joints(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     return str(folder / "model"), folder / "joints.yaml"
 
 
-def test_a_robot_of_joints_is_steered_by_its_joints(
+def test_joint_model_acts_in_joint_space(
     of_joints: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model, config = of_joints
@@ -52,7 +52,7 @@ def test_a_robot_of_joints_is_steered_by_its_joints(
     assert "other numbers than the simulated arm measures" in capsys.readouterr().err
 
 
-def test_the_film_shows_images_and_goal(model: str) -> None:
+def test_video_shows_images_and_goal(model: str) -> None:
     options = BenchmarkOptions(episodes=2, steps=2, films=1)
     result = run_benchmark(load_for_planning(model, overrides=SMALL), options).results[0]
     filmed, other = result.episodes
@@ -68,7 +68,7 @@ def metrics(folder: Path) -> dict:
     return json.loads((folder / CLOSED_LOOP_FILE).read_text())
 
 
-def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
+def test_simulate_prints_each_policy_and_writes_json_and_video(
     model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert (
@@ -98,7 +98,7 @@ def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     )  # the first and the last image are held
 
 
-def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
+def test_non_finite_model_returns_zero_actions_and_exits_with_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     broken = tiny_model()
@@ -125,7 +125,7 @@ def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
         (["record", "{here}/x", "--films", "1"], "--films"),
     ],
 )
-def test_what_cannot_be_is_one_line(
+def test_invalid_simulate_options_print_one_error_line(
     words: list[str], wrong: str, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = [word.format(model=model, here=tmp_path) for word in words]
@@ -136,7 +136,7 @@ def test_what_cannot_be_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_goals_on_the_way_come_from_one_demonstration_of_the_same_problem(model: str, tmp_path: Path) -> None:
+def test_sub_goals_come_from_a_demonstration_of_the_same_problem(model: str, tmp_path: Path) -> None:
     given = ["simulate", model, "--task", "reach", "--episodes", "1", "--steps", "4", "--films", "0", *SMALL]
     found = {}
     ways_to_give = {name: ["--sub-goals", name] for name in ("demonstration", "every-step")}

@@ -58,7 +58,7 @@ def start(request: pytest.FixtureRequest, recorded) -> Resimulation:
     ("name", "index"),  # of a task, episode 0 follows a script and 1 is play
     [("A", 0), ("push", 0), ("three cameras", 1), ("random pick", 1), ("moving objects, push", 1)],
 )
-def test_what_is_simulated_again_is_what_was_recorded_in_states_and_images(name: str, index: int, recorded) -> None:
+def test_resimulation_equals_recorded_states_and_images(name: str, index: int, recorded) -> None:
     cameras = RECORDED_CAMERAS if SPECS[name].cameras == 3 else ["exterior_1_left"]
     for camera in cameras:
         source = RldsSource(DataConfig(path=str(recorded(name)), camera=tuple(cameras)))
@@ -69,7 +69,7 @@ def test_what_is_simulated_again_is_what_was_recorded_in_states_and_images(name:
             np.testing.assert_array_equal(seen.frames[0], episode.read_frames([step])[0])
 
 
-def test_the_hand_goes_where_the_name_says_in_states_and_in_images(start: Resimulation) -> None:
+def test_named_actions_move_the_hand_in_their_direction(start: Resimulation) -> None:
     names = ("none", "up", "down", "left", "right")
     none, up, down, left, right = (start.simulate(make_named_actions(name, 2), STRIDE) for name in names)
     assert down.states[-1, 2] < none.states[-1, 2] - 0.001  # in `push` it is at the table already
@@ -97,7 +97,7 @@ def test_the_start_is_the_recorded_one_and_no_outcome_depends_on_another(start: 
     np.testing.assert_array_equal(first.states, again.states)
 
 
-def test_other_data_are_refused(recorded, droid: Path) -> None:
+def test_resimulating_other_data_raises(recorded, droid: Path) -> None:
     ours = episode_of(recorded("A"))
     for episode, step, camera, message in (
         (episode_of(droid), 0, "exterior_1_left", "not the episode"),
@@ -108,14 +108,14 @@ def test_other_data_are_refused(recorded, droid: Path) -> None:
             resimulate(recorded("A"), episode, step, camera)
 
 
-def test_the_pages_example_runs(recorded, capsys: pytest.CaptureFixture[str]) -> None:
+def test_docs_example_runs(recorded, capsys: pytest.CaptureFixture[str]) -> None:
     examples = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning_reference.md").read_text(), flags=re.DOTALL)
     (example,) = (one for one in examples if "resimulate" in one)
     exec(example.replace("data/sim", str(recorded("A"))), {})  # noqa: S102 - our own page
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["none", "up", "left", "close"]
 
 
-def test_a_recording_that_shows_something_else_is_refused(recorded, tmp_path: Path) -> None:
+def test_resimulating_a_changed_recording_raises(recorded, tmp_path: Path) -> None:
     episode = episode_of(recorded("A"))
     moved = replace(episode, states=episode.states + 1e-3)
     with pytest.raises(InputError, match=r"control step 4: .*the state differs by up to 0\.001"):
@@ -138,7 +138,7 @@ def film_of(base_folder: Path, whole_decoder: Path, make_config: MakeConfig, tmp
     return film
 
 
-def test_of_simulated_data_the_truth_of_every_sequence_is_shown(simulated: Path, film_of) -> None:
+def test_imagine_shows_simulated_truth_for_simulated_data(simulated: Path, film_of) -> None:
     found = film_of(simulated, "true", "none", "up")
     truths = {one.name: one.truth for one in found.rollouts}
     np.testing.assert_array_equal(truths[AS_RECORDED], found.truth)
@@ -151,7 +151,7 @@ def test_of_simulated_data_the_truth_of_every_sequence_is_shown(simulated: Path,
     assert {one.name for one in found.rollouts if one.outlines is not None} == {"none", "up"}
 
 
-def test_if_it_cannot_be_simulated_again_a_note_says_why(simulated: Path, film_of, tmp_path: Path) -> None:
+def test_failed_resimulation_gives_a_note(simulated: Path, film_of, tmp_path: Path) -> None:
     data = shutil.copytree(simulated, tmp_path / "data")
     (data / SIMULATION_FILE).write_text("{}")
     found = film_of(data, "up")

@@ -59,12 +59,12 @@ def test_inverse_kinematics_returns_to_every_pose_within_the_limits() -> None:
         assert np.rad2deg(np.arccos(min(1.0, cosine))) < 0.05
 
 
-def test_a_pose_out_of_reach_is_refused() -> None:
+def test_unreachable_pose_raises() -> None:
     with pytest.raises(OutOfReachError, match="no joint angles"):
         inverse_kinematics(np.array([1.5, 0.0, 0.5, np.pi, 0.0, 0.0]))
 
 
-def test_the_suite_refuses_arrays_of_another_shape() -> None:
+def test_shape_checks_reject_wrong_array_shapes() -> None:
     """`tests/conftest.py` checks the annotations of this package."""
     with pytest.raises(TypeCheckError):
         forward_kinematics(np.zeros(3))

@@ -134,20 +134,20 @@ def written(folder: Path, spec: RecordingSpec, **changes: Any) -> Path:
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=["A", "random", "task", "place", "recipe"])
-def test_the_spec_that_is_read_is_the_one_that_was_recorded(tmp_path: Path, spec: RecordingSpec) -> None:
+def test_read_spec_equals_recorded_spec(tmp_path: Path, spec: RecordingSpec) -> None:
     read = read_simulation(written(tmp_path, spec))
     assert read == RecordedSimulation.of(spec, 2)
     assert (read.worlds, read.episodes) == (spec.worlds, 2)
 
 
-def test_a_folder_without_the_file_is_refused(tmp_path: Path) -> None:
+def test_folder_without_simulation_file_raises(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"simulation\.json: no such file: .*Expected .*simulate record.*Record it again"
     ):
         read_simulation(tmp_path)
 
 
-def test_episodes_of_others_are_refused(tmp_path: Path) -> None:
+def test_episode_of_another_recording_raises(tmp_path: Path) -> None:
     simulation = read_simulation(written(tmp_path, RecordingSpec("A", 5)))
     ours = record_name(RecordingSpec("A", 5), 1)
     assert simulation.number_of(ours) == 1
@@ -171,6 +171,6 @@ def record_name(spec: RecordingSpec, index: int) -> str:
         ({"task": "stack"}, "task: "),
     ],
 )
-def test_a_damaged_file_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_damaged_simulation_file_raises(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_simulation(written(tmp_path, RecordingSpec(DOMAIN_A, 5), **changes))

@@ -63,7 +63,7 @@ CASES = [("reach", DOMAIN_B), ("push", DOMAIN_A), ("pick", DOMAIN_B), ("place", 
 
 
 @pytest.mark.parametrize(("task", "domain"), CASES, ids=[f"{task} {domain.name}" for task, domain in CASES])
-def test_the_oracle_solves_it_and_zero_and_random_actions_do_not(task: TaskName, domain: Domain) -> None:
+def test_oracle_solves_tasks_and_zero_and_random_actions_do_not(task: TaskName, domain: Domain) -> None:
     arm = arm_for(task, domain, size=(18, 32))
     oracle = run_task(BenchmarkOptions(task, domain, 3, seed=11), Oracle(LIMITS), arm)
     assert oracle.success_rate.value == 1.0
@@ -89,7 +89,7 @@ def test_the_oracle_solves_it_and_zero_and_random_actions_do_not(task: TaskName,
 
 
 @pytest.mark.parametrize("task", ["reach", "push"])
-def test_moving_objects_start_every_episode_where_they_start_for_every_policy(task: TaskName) -> None:
+def test_moving_objects_start_equally_in_every_episode(task: TaskName) -> None:
     options = BenchmarkOptions(task, replace(DOMAIN_B, moving=3), episodes=2, steps=2, films=2)
     arm = arm_for(task, options.world, size=(45, 80))
     zero, random, again = (run_task(options, one, arm) for one in (ZeroActions(), RandomActions(SMALL), ZeroActions()))
@@ -124,7 +124,7 @@ def test_joints_are_observed_moved_and_kept_within_their_limits(arm: SimulatedAr
     assert arm.joints[1] == pytest.approx(HIGH[1], abs=1e-3)
 
 
-def test_what_is_no_action_is_refused(arm: SimulatedArm) -> None:
+def test_invalid_action_raises(arm: SimulatedArm) -> None:
     for action in (np.zeros(6), np.full(7, np.nan)):
         with pytest.raises(ValueError, match="no action of 7 or 8 finite numbers"):
             run_trial(ArmEnvironment(arm), Scripted(action), trial_of(1, steps=1))
@@ -142,7 +142,7 @@ def test_a_command_out_of_reach_moves_the_arm_part_of_the_way_and_is_counted(arm
     assert run_trial(ArmEnvironment(arm), Scripted(way(0.0, 0.0, 0.05)), trial_of(1, 1)).unreachable == 0
 
 
-def test_a_planner_acts_within_its_limits_and_some_episodes_are_filmed(arm: SimulatedArm) -> None:
+def test_planner_acts_within_limits_and_stores_frames_of_some_episodes(arm: SimulatedArm) -> None:
     policy, reported = Planning(controller(horizon=1, limits=SMALL), name="tiny"), []
     options = BenchmarkOptions("reach", DOMAIN_B, episodes=2, steps=2, films=1)
     result = run_task(options, policy, arm, lambda *numbers: reported.append(numbers))

@@ -57,7 +57,7 @@ def test_a_problem_is_the_same_in_the_world_whatever_the_domain(task: str) -> No
         ),
     ],
 )
-def test_results_of_earlier_versions_were_of_the_same_problems(task: str, goal: list, block_goal: list | None) -> None:
+def test_problems_equal_those_of_earlier_versions(task: str, goal: list, block_goal: list | None) -> None:
     problem = make_problem(task, DOMAIN_A, 3, 1)
     np.testing.assert_allclose(problem.goal[:3], goal, rtol=0, atol=1e-14)
     assert (problem.block_goal is None) == (block_goal is None)
@@ -65,7 +65,7 @@ def test_results_of_earlier_versions_were_of_the_same_problems(task: str, goal: 
         np.testing.assert_allclose(problem.block_goal[:3], block_goal, rtol=0, atol=1e-14)
 
 
-def test_a_block_is_placed_when_it_lies_on_the_mark_and_is_released() -> None:
+def test_place_succeeds_if_block_is_released_on_the_mark() -> None:
     problem = make_problem("place", DOMAIN_A, 0, 0)
     beside, held, open_hand = np.array([0.03, 0.0, 0.0, 1.0]), problem.goal.copy(), problem.goal
     held[6] = HOLDING

@@ -41,7 +41,7 @@ def command(how: str = "") -> str:
     return shlex.join([sys.executable, fake_world.__file__, how])
 
 
-def test_a_model_and_those_without_one_act_on_the_problems_that_the_expert_solves(
+def test_policies_act_on_problems_that_the_expert_solves(
     model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = ["simulate", model, "--world", command("sometimes hard"), "--episodes", "3", "--films", "1", "--all"]
@@ -60,7 +60,7 @@ def test_a_model_and_those_without_one_act_on_the_problems_that_the_expert_solve
     assert {path.name for path in tmp_path.iterdir()} == {CLOSED_LOOP_FILE, "closed_loop.mp4"}
 
 
-def test_a_policy_that_knows_the_goal_reaches_it_in_any_world() -> None:
+def test_oracle_reaches_the_goal_in_an_external_environment() -> None:
     class Homing(ZeroActions):
         def reset(self, trial: Trial, goal_image: Image) -> None:  # noqa: ARG002
             self.place = fake_world.place_of(trial.seed)
@@ -77,7 +77,7 @@ def test_a_policy_that_knows_the_goal_reaches_it_in_any_world() -> None:
     assert [trial.seed for trial in trials.trials] == [trial.seed for trial in again.trials] == [5, 6, 7, 8]
 
 
-def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+def test_recording_resumes_and_is_a_valid_data_set(tmp_path: Path) -> None:
     with ExternalEnvironment(command()) as world:
         assert record_world(world, tmp_path, range(2)) == (2, 2)
         first = {file.name: file.stat().st_mtime_ns for file in tmp_path.iterdir()}
@@ -105,13 +105,13 @@ def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) 
         (command("hard"), "the expert solves 0 of 4 problems in 3 model steps. Expected half of them"),
     ],
 )
-def test_what_a_world_does_wrong_is_said(model: str, world: str, said: str) -> None:
+def test_environment_that_cannot_be_used_raises(model: str, world: str, said: str) -> None:
     subject = load_for_planning(model, overrides=SMALL)
     with pytest.raises(InputError, match=said), ExternalEnvironment(world) as opened:
         run_world_benchmark(subject, opened, BenchmarkOptions(episodes=2, films=0))
 
 
-def test_options_of_our_arm_mean_nothing_in_a_world(model: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_simulated_arm_options_with_world_raise(model: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", model, "--world", command(), "--task", "reach"]) == 2
     assert "--task: simulate" in capsys.readouterr().err
     assert main(["simulate", model, "--world", command(), "--domain", "B"]) == 2
@@ -126,7 +126,7 @@ WORLDS = ("robosuite", "libero", "metaworld")
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_pins_are_the_same_wherever_they_stand_and_programs_are_alone(name: str) -> None:
+def test_environment_pins_agree_and_programs_do_not_import_this_package(name: str) -> None:
     places = {"Makefile": rf"WORLD_{name} := (.+)", "docs/worlds.md": rf"`{name}.py` \| `pip install ([^`]+)`"}
     places[f"examples/worlds/{name}.py"] = r"bin/pip install (.+)"
     pins = {place: re.findall(pattern, (ROOT / place).read_text()) for place, pattern in places.items()}
@@ -136,7 +136,7 @@ def test_pins_are_the_same_wherever_they_stand_and_programs_are_alone(name: str)
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_a_real_world_is_driven_by_its_expert(name: str, tmp_path: Path) -> None:
+def test_installed_environment_is_solved_by_its_expert(name: str, tmp_path: Path) -> None:
     python = ROOT / "worlds" / name / "bin" / "python"
     if not python.exists():
         pytest.skip(f"no environment of {name} (docs/worlds.md): make worlds/{name}")
@@ -205,7 +205,7 @@ def fail(command: str, timeout_s: float | None = None) -> str:
 
 @pytest.mark.usefixtures("short_wait")
 @pytest.mark.parametrize("written", ["", "{"])
-def test_a_world_that_does_not_answer_is_refused_in_time_with_its_last_errors(program: Program, written: str) -> None:
+def test_environment_timeout_raises_with_last_error_output(program: Program, written: str) -> None:
     print_both = f"print('waiting for a key', file=sys.stderr, flush=True); print({written!r}, end='', flush=True)"
     message = fail(program(f"{print_both}; time.sleep(1000)"), 0.1)
     assert "no answer within 0.1 s\nwaiting for a key\n" in message
@@ -213,17 +213,17 @@ def test_a_world_that_does_not_answer_is_refused_in_time_with_its_last_errors(pr
 
 
 @pytest.mark.usefixtures("short_wait")
-def test_a_world_that_closes_its_output_and_still_runs_is_refused(program: Program) -> None:
+def test_environment_with_closed_output_raises(program: Program) -> None:
     assert "it has closed its output" in fail(program("os.close(1); time.sleep(1000)"), 0.1)
 
 
-def test_a_line_without_end_is_refused_at_a_bounded_size(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endless_line_raises_at_size_limit(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worlds, "_MOST_BYTES", 1 << 20)
     assert "a line of more than 1 MiB" in fail(program("while True: sys.stdout.write('x' * 65536)"))
 
 
 @pytest.mark.usefixtures("short_wait")
-def test_a_world_that_does_not_read_its_requests_is_refused(program: Program) -> None:
+def test_environment_that_does_not_read_requests_raises(program: Program) -> None:
     with EnvironmentProcess(program(first=f"{HELLO}time.sleep(1000)"), 0.01) as world:
         world.exchange()
         errors = []
@@ -266,7 +266,7 @@ def test_a_wrong_answer_is_one_error_that_names_the_command(
     assert re.search(found, fail(program(request_code, first=first)))
 
 
-def test_an_answer_that_no_request_asked_for_is_refused(program: Program, tmp_path: Path) -> None:
+def test_unrequested_answer_raises(program: Program, tmp_path: Path) -> None:
     go_on, said = tmp_path / "go on", tmp_path / "said"
     wait = f"while not os.path.exists({str(go_on)!r}): time.sleep(0.01)"
     with ExternalEnvironment(program(f"say()\n    {wait}\n    say()\n    open({str(said)!r}, 'w')")) as world:
@@ -320,7 +320,7 @@ def is_running(number: int) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads /proc")
-def test_world_and_its_children_end_when_we_are_killed(program: Program) -> None:
+def test_environment_and_children_are_killed_with_this_process(program: Program) -> None:
     words = [sys.executable, "-c", OPENER, program(first=STUBBORN, end="time.sleep(1000)")]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as opener:
         started = [int(word) for word in opener.stdout.readline().split()]
@@ -332,7 +332,7 @@ def test_world_and_its_children_end_when_we_are_killed(program: Program) -> None
 
 @pytest.mark.usefixtures("short_wait")
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads /proc")
-def test_a_world_that_ignores_the_end_of_its_input_is_killed_with_its_children(program: Program) -> None:
+def test_environment_that_ignores_closed_input_is_killed(program: Program) -> None:
     with EnvironmentProcess(program(first=STUBBORN, end="time.sleep(1000)"), 0.1) as world:
         about = world.exchange()
     wait_until(lambda: not any(map(is_running, [about["pid"], about["child"]])))

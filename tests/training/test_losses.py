@@ -68,7 +68,7 @@ def test_other_distances_equal_pytorch(keys: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("keys", "complaint"),
     [
-        ({"loss": "huber"}, "no loss of this name"),
+        ({"loss": "huber"}, "no loss has this name"),
         ({"loss": {"name": "l1", "options": {"beta": 0.5}}}, "no options of its own"),
     ],
 )
