@@ -14,11 +14,14 @@ from vjepa2_ac.cli import main, tables
 from vjepa2_ac.cli import progress as console_module
 from vjepa2_ac.cli.progress import ConsoleReporter, ProgressBar
 from vjepa2_ac.cli.tables import TrainingConsole
+from vjepa2_ac.cli.waiting import Work
 from vjepa2_ac.evaluation.measure import VALIDATION_PREDICTIONS
 from vjepa2_ac.evaluation.result import PredictionErrors, Validation
 from vjepa2_ac.inspection.findings import Finding
 
-FIGURES = {"loss": 0.51234, "samples_per_second": 1.5, "data_wait_share": 0.1}
+FIGURES = {
+    "loss": 0.51234, "learning_rate": 1e-4, "samples_per_second": 1.5, "memory_gb": 2.5, "data_wait_share": 0.1,
+}  # fmt: skip
 
 
 def shown_on(monkeypatch: pytest.MonkeyPatch, *, terminal: bool) -> io.StringIO:
@@ -38,7 +41,7 @@ def errors() -> PredictionErrors:
     return PredictionErrors(("a", "b", "c", "d"), arrays)
 
 
-def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_have_loss_learning_rate_speed_memory_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     written = shown_on(monkeypatch, terminal=False)
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
@@ -53,7 +56,7 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
     assert one_step == "  one-step error        0.250; with zero actions 1.000, with shuffled actions 1.000"
     assert rollout == "  rollout error         0.500 after 1 model step, 0.500 after 3"
     assert re.fullmatch(r"  action-ranking error  15 % \[\d+, \d+\] \(0 % is best, chance 50 %\)", ranked)
-    words = "loss 0.5123  one-step error 0.250 of persistence  1.50 clips/s"
+    words = "loss 0.5123  lr 1.0e-04  1.50 clips/s  2.5 GB"
     expected = [f"training 11/100  {words}  0:06:40 left", f"training 14/100  {words}  0:06:27 left"]
     assert lines == expected, "a line before 5 seconds, then one every 10"
 
@@ -91,7 +94,21 @@ def test_a_terminal_has_one_bar_with_the_same_words(monkeypatch: pytest.MonkeyPa
     reporter.__exit__()
     last = [line for line in written.getvalue().splitlines() if "training" in line][-1]
     assert "2/2" in last
-    assert "loss 0.5123  1.50 clips/s" in last
+    assert "loss 0.5123  lr 1.0e-04  1.50 clips/s  2.5 GB" in last
+
+
+def test_training_bar_follows_a_validation(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = shown_on(monkeypatch, terminal=True)
+    reporter = TrainingConsole()
+    reporter.on_start(0, 2)
+    reporter.on_step(1, FIGURES)
+    reporter.task("validating")
+    assert Work.title == "validating"
+    reporter.on_validation(1, Validation(errors(), None))
+    assert Work.title == "training"
+    reporter.on_step(2, FIGURES)
+    reporter.__exit__()
+    assert "2/2" in [line for line in written.getvalue().splitlines() if "training" in line][-1]
 
 
 def test_a_task_with_a_unit_shows_its_speed_and_the_next_one_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:

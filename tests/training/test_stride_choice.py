@@ -8,6 +8,7 @@ import pytest
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.reporter import INDEXING
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.training.loop import train
 
@@ -49,7 +50,8 @@ def test_only_a_stride_at_which_the_runs_own_clips_fit_is_chosen(
         train(make_config(data__stride="auto", data__frames=12, run_dir="unused"), reporter)
 
 
-def test_a_model_that_has_learned_nothing_is_not_asked(make_config: Make, reporter: Any) -> None:
+def test_auto_stride_with_a_random_base_raises_before_indexing(make_config: Make, reporter: Any) -> None:
     config = make_config(data__stride="auto", model__base="random", model__sizes={}, adapter__kind="none")
-    with pytest.raises(InputError, match=r"learned nothing.*Set data\.stride to a number"):
+    with pytest.raises(InputError, match=r"auto, with model\.base random.*Set data\.stride to a number"):
         train(config, reporter)
+    assert INDEXING not in reporter.tasks

@@ -195,7 +195,7 @@ class TrainingConsole(ConsoleReporter):
 
     def __init__(self) -> None:
         super().__init__()
-        self._steps, self._validation = 0, ""
+        self._steps = 0
 
     def on_start(self, done: int, total: int) -> None:
         """Start the progress bar at `done` of `total` optimizer steps."""
@@ -204,9 +204,10 @@ class TrainingConsole(ConsoleReporter):
             bar(done, total)
 
     def on_step(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Update the progress bar after an optimizer step: loss, last validation, speed, time waiting for data."""
+        """Update the progress bar after an optimizer step: loss, learning rate, speed and memory."""
         speed = metrics["samples_per_second"]
-        parts = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
+        parts = [f"loss {metrics['loss']:.4f}", f"lr {metrics['learning_rate']:.1e}"]
+        parts += [f"{speed:.{1 if speed >= 10 else 2}f} clips/s", f"{metrics['memory_gb']:.1f} GB"]
         if metrics.get("data_wait_share", 0.0) > _MUCH_WAITING:
             parts.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
         self._bar(step, self._steps, "  ".join(part for part in parts if part))
@@ -216,7 +217,6 @@ class TrainingConsole(ConsoleReporter):
         errors = found.errors
         true, zero, shuffled = (one_step_over_persistence(errors, actions).value for actions in ACTIONS)
         rollout = [estimate.value for estimate in over_persistence(errors, "rollout")]
-        self._validation = f"one-step error {true:.3f} of persistence"
         rank = "not measured (needs validation.ranking_clips and clips in which the robot moves)"
         if found.ranking is not None:
             measured = found.ranking.rank
@@ -228,3 +228,5 @@ class TrainingConsole(ConsoleReporter):
             f"  rollout error         {rollout[0]:.3f} after 1 model step, {rollout[-1]:.3f} after {len(rollout)}",
             f"  action-ranking error  {rank}",
         )
+        if self._steps:
+            self.on_start(step, self._steps)  # the bar of the validation has replaced that of the training

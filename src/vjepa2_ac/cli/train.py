@@ -80,8 +80,8 @@ def _train(options: argparse.Namespace) -> None:
     if is_first_process() and not options.check:
         from vjepa2_ac.runs.subject import describe_selection
 
-        cli.show(f"The run is in {folder}; see how good it is: {shell_command('evaluate', folder)}")
         cli.show(describe_selection(folder))
+        cli.show(f"The run is in {folder}. To evaluate it: {shell_command('evaluate', folder)}")
 
 
 def _encode(options: argparse.Namespace) -> None:

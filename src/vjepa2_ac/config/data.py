@@ -252,7 +252,10 @@ class DataConfig(Section):
                 not cameras,
                 "camera: the list is empty. Set one or more names, or null for the first camera of the source",
             ),
-            (unknown, f"camera: source {self.source} has no {', '.join(unknown)}. Available: {', '.join(known or ())}"),
+            (
+                unknown,
+                f"camera: source {self.source} has no camera {', '.join(unknown)}. Available: {', '.join(known or ())}",
+            ),
             (
                 self.is_cache and self.stride == "auto",
                 "stride: auto is not possible with a latent cache. Set the stride of the cache",

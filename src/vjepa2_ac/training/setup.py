@@ -65,6 +65,9 @@ def set_up(
         InputError: A part of the run cannot be used; names that part.
     """
     accelerator = accelerator or make_accelerator(config)
+    if config.data.stride == "auto" and config.model.is_random:  # before the data set is indexed
+        needed, fix = "a trained base model, which is evaluated at each candidate stride", "Set data.stride to a number"
+        raise InputError(where="data.stride", found="auto, with model.base random", needed=needed, fix=fix)
     if config.training.compile == "blocks":
         require_compiler(accelerator.device.type, where="training.compile")
     strip = TRAINING_HOOKS.find("validation.decoder")(config) if config.validation.decoder is not None else None

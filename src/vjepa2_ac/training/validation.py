@@ -107,6 +107,7 @@ def validate(run: Run, reporter: Reporter) -> Validation:
     among the processes. All processes receive the result of the first one: results that differ in the last digits
     could otherwise make processes stop at different steps.
     """
+    reporter.task("validating" if run.state.step else "validating the model before the first step")
     run.world_model.eval()
     with run.accelerator.autocast(), share_work(run.accelerator):
         validation = _measure(run)
@@ -164,7 +165,6 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
     """
     if run.state.step:
         return None
-    reporter.task("measuring the model before the first step")
     validation = validate(run, reporter)
     config, error = run.config, one_step_over_persistence(validation.errors).value
     if error < 1.0 or config.training.allow_weak_base or config.model.is_random:
