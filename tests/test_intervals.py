@@ -17,12 +17,12 @@ from vjepa2_ac.intervals import (
 )
 
 
-def test_a_ratio_weighs_clips_by_their_motion() -> None:
+def test_ratio_weights_clips_by_their_motion() -> None:
     assert estimate_ratio(np.array([1.0, 0.0]), np.array([1.0, 3.0]), ("a", "b")).value == 0.25
 
 
 @pytest.mark.parametrize("episodes", [6, 30])
-def test_intervals_cover_the_truth_at_the_stated_rate(episodes: int) -> None:
+def test_interval_coverage_equals_the_stated_rate(episodes: int) -> None:
     """400 simulations: a rate of 95 % is measured to +-1.1 % (one standard deviation); three of these are allowed."""
     rng = np.random.default_rng(0)
     covered = 0
@@ -36,7 +36,7 @@ def test_intervals_cover_the_truth_at_the_stated_rate(episodes: int) -> None:
     assert covered / 400 == pytest.approx(0.95, abs=0.035)
 
 
-def test_what_makes_an_episode_hard_for_both_does_not_widen_their_difference() -> None:
+def test_shared_episode_difficulty_does_not_widen_the_difference() -> None:
     rng = np.random.default_rng(0)
     hard = rng.normal(1.0, 0.3, size=20)
     ones, ids = np.ones(20), tuple(map(str, range(20)))
@@ -45,7 +45,7 @@ def test_what_makes_an_episode_hard_for_both_does_not_widen_their_difference() -
     assert estimate_ratio(hard, ones, ids).high - estimate_ratio(hard, ones, ids).low > 0.2
 
 
-def test_the_level_of_an_interval_is_that_of_few_episodes() -> None:
+def test_interval_level_is_widened_for_few_episodes() -> None:
     """Quantiles of a uniform distribution are their levels: here Phi(-sqrt(n / (n - 1)) t), with Student's t, n - 1."""
     for episodes, student in ((2, 12.7062), (5, 2.77645), (30, 2.04523)):
         (found,) = bootstrap_by_weights(lambda weights: np.linspace(0, 1, len(weights))[:, None], episodes)
@@ -53,13 +53,13 @@ def test_the_level_of_an_interval_is_that_of_few_episodes() -> None:
         assert (found.low, found.high) == pytest.approx((level, 1 - level), rel=1e-3)
 
 
-def test_an_episode_is_drawn_with_all_of_its_clips() -> None:
+def test_bootstrap_draws_whole_episodes() -> None:
     """Two episodes: each alone or both are all that can be drawn, and the interval reaches from end to end."""
     found = estimate_mean(np.array([1.0, 1.0, 5.0]), ("a", "a", "b"))
     assert (found.low, found.value, found.high) == pytest.approx((1.0, 7 / 3, 5.0), abs=0.01)
 
 
-def test_one_episode_has_no_interval_and_what_is_not_a_number_is_none_in_json() -> None:
+def test_single_episode_has_no_interval_and_nan_is_none_in_json() -> None:
     alone = estimate_mean(np.array([1.0, 2.0]), ("a", "a"))
     assert alone.as_dict() == {"value": 1.5, "low": None, "high": None}
     assert str(alone) == "1.500"
@@ -67,14 +67,14 @@ def test_one_episode_has_no_interval_and_what_is_not_a_number_is_none_in_json() 
     assert estimate_ratio(np.zeros(2), np.zeros(2), ("a", "b")).as_dict() == {"value": None, "low": None, "high": None}
 
 
-def test_the_side_of_an_interval_needs_all_of_it() -> None:
+def test_compare_to_needs_the_whole_interval_on_one_side() -> None:
     assert Estimate(1.0, 0.5, 1.5).compare_to(1.4) == 0
     assert Estimate(1.0, 0.5, 1.5).compare_to(1.6) == -1
     assert Estimate(1.0, 0.5, 1.5).compare_to(0.4) == 1
     assert Estimate(1.0, math.nan, math.nan).compare_to(0.0) == 0
 
 
-def test_weights_of_episodes_give_the_interval_of_their_sums() -> None:
+def test_bootstrap_by_weights_equals_bootstrap_of_sums() -> None:
     rng = np.random.default_rng(3)
     values, ids = rng.random(12), [f"episode {clip % 4}" for clip in range(12)]
     sums = values.reshape(3, 4).sum(axis=0)
@@ -86,7 +86,7 @@ def test_weights_of_episodes_give_the_interval_of_their_sums() -> None:
     assert not alone.has_interval
 
 
-def test_published_intervals_come_out() -> None:
+def test_published_intervals_are_reproduced() -> None:
     # Brown, Cai, DasGupta (2001) and any table: Wilson's 95 % intervals.
     middle, none, all_of_it = estimate_share(10, 20), estimate_share(0, 20), estimate_share(50, 50)
     assert middle.value == 0.5

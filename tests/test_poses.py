@@ -39,16 +39,16 @@ def assert_same_pose(found: np.ndarray, expected: np.ndarray, tolerance: float =
     )
 
 
-def test_actions_equal_the_official_ones(official: dict[str, np.ndarray]) -> None:
+def test_actions_equal_official_actions(official: dict[str, np.ndarray]) -> None:
     np.testing.assert_allclose(actions_from_states(official["poses"]), official["deltas"], atol=1e-9)
 
 
-def test_camera_frame_equals_the_official_one(official: dict[str, np.ndarray]) -> None:
+def test_camera_frame_equals_official_camera_frame(official: dict[str, np.ndarray]) -> None:
     found = states_in_camera_frame(official["poses"], official["extrinsics"])
     np.testing.assert_allclose(found, official["camera_frame"], atol=1e-9)
 
 
-def test_applied_actions_equal_the_official_ones(official: dict[str, np.ndarray]) -> None:
+def test_applied_actions_equal_official_poses(official: dict[str, np.ndarray]) -> None:
     found = apply_action(official["poses"][:-1], official["deltas"])
     assert_same_pose(found, official["composed"], 1e-6)
 
@@ -64,7 +64,7 @@ def test_integrating_the_actions_of_a_trajectory_returns_its_states(seed: int, s
 
 
 @pytest.mark.parametrize("library", [np.asarray, torch.from_numpy], ids=["numpy", "torch"])
-def test_euler_angles_are_those_of_scipy(library: Any) -> None:
+def test_euler_angles_equal_scipy(library: Any) -> None:
     angles = np.random.default_rng(0).uniform(-3, 3, (500, 3))
     expected = Rotation.from_euler("xyz", angles)
     matrices = matrices_from_euler(library(angles))
@@ -72,6 +72,6 @@ def test_euler_angles_are_those_of_scipy(library: Any) -> None:
     np.testing.assert_allclose(np.asarray(euler_from_matrices(matrices)), expected.as_euler("xyz"), atol=1e-9)
 
 
-def test_one_state_has_no_action() -> None:
+def test_single_state_raises() -> None:
     with pytest.raises(ValueError, match="two states"):
         actions_from_states(np.zeros((1, 7)))

@@ -28,7 +28,7 @@ def test_rotations_are_composed_and_vectors_subtract() -> None:
     np.testing.assert_array_equal(make_vector_states(7).compute_differences(STATES), np.diff(STATES, axis=0))
 
 
-def test_what_no_robot_measures_is_named_with_its_step_and_the_fix() -> None:
+def test_implausible_state_raises_with_step_and_fix() -> None:
     spoiled = STATES.copy()
     spoiled[1, 1] = 400.0
     with pytest.raises(InputError, match=r"a\.h5: step 1: .*millimetres.*Check the fields"):
@@ -47,7 +47,7 @@ def test_what_no_robot_measures_is_named_with_its_step_and_the_fix() -> None:
     ],
     ids=["millimetres and degrees", "centimetres", "degrees", "no length", "no angles"],
 )
-def test_a_whole_episode_in_other_units_is_said_to_look_like_them(scale: list[float], hints: list[str]) -> None:
+def test_episode_in_other_units_names_the_likely_unit(scale: list[float], hints: list[str]) -> None:
     states = np.tile(STATES, (10, 1)) * scale
     with pytest.raises(InputError) as raised:
         POSE.require_plausible(states, "a.h5", fix="Check the fields")
@@ -57,7 +57,7 @@ def test_a_whole_episode_in_other_units_is_said_to_look_like_them(scale: list[fl
 
 
 @pytest.mark.parametrize("place", [0, 4])
-def test_a_single_outlier_is_not_said_to_be_another_unit(place: int) -> None:
+def test_single_outlier_does_not_suggest_another_unit(place: int) -> None:
     states = np.tile(STATES, (10, 1))
     states[7, place] = 300.0
     with pytest.raises(InputError, match=r"step 7") as raised:
@@ -65,7 +65,7 @@ def test_a_single_outlier_is_not_said_to_be_another_unit(place: int) -> None:
     assert raised.value.fix == "Check the fields"
 
 
-def test_any_finite_numbers_may_be_a_vector_and_an_episode_has_steps() -> None:
+def test_vectors_need_finite_numbers_and_at_least_one_step() -> None:
     require_finite(np.full((2, 3), 1e6), "here", fix="")
     with pytest.raises(InputError, match=r"here: step 1: .*finite numbers"):
         require_finite(np.array([[0.0], [np.inf]]), "here", fix="")
@@ -85,14 +85,12 @@ def test_any_finite_numbers_may_be_a_vector_and_an_episode_has_steps() -> None:
         ({"actions": "recorded", "join_actions": "sum"}, Widths(8, 7), "unknown"),
     ],
 )
-def test_which_state_follows_from_an_action_is_what_the_config_says_of_it(
-    knobs: dict[str, object], widths: Widths, follows: str
-) -> None:
+def test_action_semantics_follow_the_config(knobs: dict[str, object], widths: Widths, follows: str) -> None:
     spaces = get_spaces(DataConfig(path="d", source="npz", states="vector", **knobs), widths)
     assert (spaces.action.follows, spaces.widths) == (follows, widths)
 
 
-def test_poses_are_in_the_frame_of_the_config_and_read_in_that_of_the_base() -> None:
+def test_pose_frame_is_the_config_frame_and_reading_uses_the_base_frame() -> None:
     camera = DataConfig(path="d", source="npz", pose_frame="camera")
     assert get_spaces(DataConfig(path="d"), POSE_WIDTHS) == POSES
     assert get_spaces(camera, POSE_WIDTHS) == Spaces(CAMERA_POSE, POSE_CHANGE)
@@ -110,7 +108,7 @@ def changed(place: int, value: float) -> np.ndarray:
 
 @pytest.mark.parametrize("place", range(7))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_an_invalid_number_is_refused_at_any_position(place: int, sign: int) -> None:
+def test_invalid_number_raises_at_any_index(place: int, sign: int) -> None:
     complaint = ["millimetres", "degrees", "0 for open"][place // 3]
     wrong = {0: 300.0, 1: 90.0, 2: 1.2 if sign > 0 else 0.2}[place // 3]
     with pytest.raises(InputError, match=complaint):
@@ -124,13 +122,13 @@ def test_an_invalid_number_is_refused_at_any_position(place: int, sign: int) -> 
             EXTRINSICS.require_state(changed(place, sign * wrong)[:6], "camera")
 
 
-def test_what_a_robot_may_measure_is_taken() -> None:
+def test_plausible_states_are_accepted() -> None:
     for place, value in ((6, 1.05), (6, -0.05), (6, 1.0), (5, -2 * math.pi), (3, math.pi), (0, 1.2), (2, -0.4)):
         POSE.require_state(changed(place, value), "state")
         EXTRINSICS.require_state(changed(place, value)[:6], "camera")
 
 
-def test_a_pose_has_its_numbers_and_a_vector_any_that_are_finite() -> None:
+def test_require_state_checks_width_and_finiteness() -> None:
     make_vector_states(2).require_state(np.array([300.0, -90.0]), "state")
     for numbers, space, complaint in (
         (np.zeros(5), EXTRINSICS, "5 numbers"),

@@ -26,13 +26,13 @@ def assert_same_poses(found: torch.Tensor, expected: np.ndarray, tolerance: floa
 
 @pytest.mark.parametrize("which", [0, 1])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-6), (torch.float32, 1e-5)])
-def test_composed_poses_are_the_official_ones(which: int, dtype: torch.dtype, tolerance: float) -> None:
+def test_composed_poses_equal_official_poses(which: int, dtype: torch.dtype, tolerance: float) -> None:
     with np.load(GOLDEN / "poses.npz") as official:
         poses, deltas = (torch.from_numpy(official[f"{name}_{which}"]).to(dtype) for name in ("poses", "deltas"))
         assert_same_poses(apply_actions(poses[:-1], deltas), official[f"composed_{which}"], tolerance)
 
 
-def test_a_trajectorys_actions_lead_along_it() -> None:
+def test_actions_of_a_trajectory_reproduce_it() -> None:
     states = synthetic_states(30)
     actions = torch.from_numpy(actions_from_states(states))
     found = integrate_changes(torch.from_numpy(states[0]), torch.stack([actions, actions * 0]))
@@ -41,12 +41,12 @@ def test_a_trajectorys_actions_lead_along_it() -> None:
 
 
 @pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, 1.5, 0.0])
-def test_angles_at_and_near_gimbal_lock_are_still_the_rotation(pitch: float) -> None:
+def test_angles_near_gimbal_lock_represent_the_rotation(pitch: float) -> None:
     matrices = matrices_from_euler(torch.tensor([[0.4, pitch, -1.1]], dtype=torch.float64))
     torch.testing.assert_close(matrices_from_euler(euler_from_matrices(matrices)), matrices, atol=2e-6, rtol=0)
 
 
-def test_at_gimbal_lock_the_yaw_is_zero_and_gradients_are_finite() -> None:
+def test_gimbal_lock_has_zero_yaw_and_finite_gradients() -> None:
     up = torch.tensor([[0.0, 0.6, 0.8], [0.0, 0.8, -0.6], [-1.0, 0.0, 0.0]], requires_grad=True)
     angles = euler_from_matrices(up)
     assert not angles[2].detach()
@@ -55,13 +55,13 @@ def test_at_gimbal_lock_the_yaw_is_zero_and_gradients_are_finite() -> None:
     assert torch.isfinite(up.grad).all()
 
 
-def test_gradients_are_those_of_finite_differences() -> None:
+def test_gradients_equal_finite_differences() -> None:
     state = torch.tensor([0.4, 0.0, 0.3, 3.0, 0.3, 0.2, 0.5], dtype=torch.float64)
     actions = 0.1 * torch.randn(2, 3, 7, generator=torch.Generator().manual_seed(0)).double()
     assert torch.autograd.gradcheck(lambda given: integrate_changes(state, given), (actions.requires_grad_(),))
 
 
-def test_autocast_does_not_coarsen_poses() -> None:
+def test_autocast_keeps_pose_precision() -> None:
     states, actions = torch.rand(5, 7), 0.1 * torch.rand(5, 7)
     plain = apply_actions(states, actions)
     with torch.autocast("cpu", dtype=torch.bfloat16):

@@ -28,7 +28,7 @@ def truncated(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
-def test_a_decoder_is_read_as_it_was_written_bit_for_bit(whole_decoder: Path, tmp_path: Path) -> None:
+def test_decoder_survives_save_and_load_bit_exactly(whole_decoder: Path, tmp_path: Path) -> None:
     one = load_decoder(whole_decoder)
     save_decoder(tmp_path / "again", one.card, one.decoder.state_dict())
     other = load_decoder(tmp_path / "again")
@@ -43,7 +43,7 @@ def test_a_decoder_is_read_as_it_was_written_bit_for_bit(whole_decoder: Path, tm
 @pytest.mark.parametrize(
     ("damage", "found"), [(Path.unlink, "No such file"), (truncated, "not a complete safetensors file")]
 )
-def test_damaged_weights_are_refused_and_named(folder: Path, damage: Callable[[Path], None], found: str) -> None:
+def test_damaged_weights_raise_with_their_name(folder: Path, damage: Callable[[Path], None], found: str) -> None:
     damage(folder / WEIGHTS)
     with pytest.raises(InputError, match=found) as caught:
         load_decoder(folder)
@@ -59,7 +59,7 @@ def test_damaged_weights_are_refused_and_named(folder: Path, damage: Callable[[P
         ({"shape": {"size": "tiny", "dim": 10**12, "grid": 2, "patch_size": 16}}, "shape.dim"),
     ],
 )
-def test_a_card_with_wrong_values_is_refused_and_names_them(folder: Path, changes: dict, found: str) -> None:
+def test_invalid_card_values_raise_with_their_names(folder: Path, changes: dict, found: str) -> None:
     values = json.loads((folder / CARD).read_text())
     (folder / CARD).write_text(json.dumps(values | changes))
     with pytest.raises(InputError, match=re.escape(found)) as caught:
@@ -69,7 +69,7 @@ def test_a_card_with_wrong_values_is_refused_and_names_them(folder: Path, change
 
 
 @pytest.mark.parametrize("name", ["nowhere", "file", "empty"])
-def test_a_folder_without_a_decoder_is_refused_with_the_command_that_makes_one(tmp_path: Path, name: str) -> None:
+def test_folder_without_a_decoder_raises_with_the_command(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"--decoder .*no decoder\.json") as caught:
@@ -77,7 +77,7 @@ def test_a_folder_without_a_decoder_is_refused_with_the_command_that_makes_one(t
     assert "vjepa2-ac decoder CONFIG" in str(caught.value)
 
 
-def test_a_model_of_another_encoder_crop_or_size_is_refused(whole_decoder: Path, base_folder: Path) -> None:
+def test_model_with_another_encoder_crop_or_size_raises(whole_decoder: Path, base_folder: Path) -> None:
     decoder, model = load_decoder(whole_decoder), WorldModel.from_pretrained(base_folder)
     data, square = DataConfig(path=decoder.card.data), DataConfig(path=decoder.card.data, crop="square")
     assert decoder.require_fit(model, data, subject="run") == ()
@@ -92,7 +92,7 @@ def test_a_model_of_another_encoder_crop_or_size_is_refused(whole_decoder: Path,
         same.require_fit(larger, data, subject="run")
 
 
-def test_a_decoder_of_other_data_warns_with_both_data_sets(
+def test_decoder_of_other_data_warns_with_both_data_sets(
     whole_decoder: Path, base_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     decoder, model = load_decoder(whole_decoder), WorldModel.from_pretrained(base_folder)
@@ -126,7 +126,7 @@ def latents_of(*batch: int, seed: int = 1) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_an_image_depends_on_its_own_frame_alone(size: str) -> None:
+def test_decoded_image_depends_on_its_own_frame_only(size: str) -> None:
     decoder, latents = decoder_of(size), latents_of(4)
     images = decoder.decode(latents)
     other = latents.clone()
@@ -137,7 +137,7 @@ def test_an_image_depends_on_its_own_frame_alone(size: str) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_how_many_frames_are_decoded_at_once_does_not_matter(size: str) -> None:
+def test_decoded_images_are_independent_of_the_chunk_size(size: str) -> None:
     decoder, latents = decoder_of(size), latents_of(2, 5)
     whole = decoder.decode(latents)
     assert whole.shape == (2, 5, 3, 24, 24)
@@ -146,7 +146,7 @@ def test_how_many_frames_are_decoded_at_once_does_not_matter(size: str) -> None:
     torch.testing.assert_close(decoder.decode(latents[1, 3]), whole[1, 3], atol=1e-5, rtol=0)
 
 
-def test_a_decoder_begins_as_the_linear_one() -> None:
+def test_decoder_starts_equal_to_the_linear_decoder() -> None:
     linear, decoder, latents = decoder_of("linear", seed=3), decoder_of("tiny"), latents_of(3)
     assert not torch.equal(decoder(latents), linear(latents))
     decoder.copy_linear(linear)
@@ -157,7 +157,7 @@ def test_a_decoder_begins_as_the_linear_one() -> None:
     assert last.abs().max() > 0, "or it would remain the linear one"
 
 
-def test_of_the_linear_decoder_a_patch_depends_on_its_token_alone_of_the_others_on_all() -> None:
+def test_patch_depends_on_one_token_in_the_linear_decoder_and_on_all_in_others() -> None:
     latents = latents_of(1)
     other = latents.clone()
     other[0, 5] += 1.0  # second row, third column
@@ -170,7 +170,7 @@ def test_of_the_linear_decoder_a_patch_depends_on_its_token_alone_of_the_others_
         assert bool(moved[~inside].any()) == (size != "linear")
 
 
-def test_the_loss_of_equal_images_is_0_and_each_part_sees_what_it_is_for() -> None:
+def test_loss_of_equal_images_is_zero_and_each_term_detects_its_difference() -> None:
     images = torch.rand(2, 3, 48, 48, generator=torch.Generator().manual_seed(0))
     assert float(decoder_loss(images, images)[0]) == pytest.approx(0, abs=1e-6)
     brighter = decoder_loss(images + 0.1, images)[1]

@@ -20,7 +20,7 @@ from vjepa2_ac.model.checkpoints import load_base
 
 
 @pytest.mark.parametrize("crop", ["released", "square"])
-def test_pairs_are_what_the_encoder_saw_and_what_it_gave(
+def test_pairs_are_encoder_inputs_and_their_latents(
     make_config: MakeConfig, encode_split: EncodeSplit, crop: str
 ) -> None:
     config = make_config(data__crop=crop, data__cache_dtype="fp32")
@@ -45,7 +45,7 @@ def test_pairs_are_what_the_encoder_saw_and_what_it_gave(
 
 
 @pytest.mark.parametrize(("frames", "split"), [(7, "train"), (30, "test"), (10_000, "train")])
-def test_frames_are_of_the_split_at_most_as_many_as_asked_and_spread(
+def test_selected_frames_are_spread_over_the_split_up_to_the_count(
     make_config: MakeConfig, frames: int, split: str
 ) -> None:
     config = make_config(data__camera=["wrist_left", "exterior_1_left"])
@@ -64,7 +64,7 @@ def test_frames_are_of_the_split_at_most_as_many_as_asked_and_spread(
         assert max(counts) - min(counts) <= 1
 
 
-def test_an_episode_that_could_not_be_encoded_is_left_out_and_a_damaged_file_is_named(
+def test_unencoded_episode_is_skipped_and_damaged_file_raises(
     make_config: MakeConfig, encode_split: EncodeSplit
 ) -> None:
     pairs = encode_split(make_config())
@@ -110,7 +110,7 @@ def fit(pairs: Linear) -> Decoder:
     return fit_linear(pairs, SHAPE, torch.device("cpu"), no_progress)  # type: ignore[arg-type]
 
 
-def test_it_finds_a_linear_truth_up_to_rounding_and_ridge() -> None:
+def test_linear_fit_recovers_a_linear_decoder() -> None:
     pairs = Linear()
     found = fit(pairs)
     torch.testing.assert_close(found.linear.weight, pairs.truth.linear.weight, atol=2e-3, rtol=0)
@@ -121,7 +121,7 @@ def test_it_finds_a_linear_truth_up_to_rounding_and_ridge() -> None:
     assert not any(one.requires_grad for one in found.parameters())
 
 
-def test_a_frame_that_is_shown_exactly_has_no_decibels_but_is_counted() -> None:
+def test_exact_frames_are_counted_and_excluded_from_psnr() -> None:
     """Its PSNR is infinite, and so would be the mean, which JSON cannot hold."""
     pairs, black = Linear(frames=9), torch.zeros(3, 16, 16)
     pairs.images[:2] = 0  # as the mean image shows them

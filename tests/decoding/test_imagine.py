@@ -35,7 +35,7 @@ def start_of(latents: Tensor, **more: Tensor) -> Start:
     return Start(latents[0], STATE, POSE, **more)  # type: ignore[arg-type]
 
 
-def test_states_under_other_actions_are_integrated_from_the_first_one() -> None:
+def test_states_of_alternative_actions_are_integrated_from_the_first_state() -> None:
     latents, model = truth(), Remembering()
     compute_rollout(model.rollout, start_of(latents), make_named_actions("left", STEPS, size_m=0.03))
     context, actions, states, extrinsics = model.given
@@ -46,7 +46,7 @@ def test_states_under_other_actions_are_integrated_from_the_first_one() -> None:
     np.testing.assert_allclose(states[0].numpy(), expected, atol=1e-6)
 
 
-def test_a_gripper_changes_as_far_as_it_can() -> None:
+def test_gripper_changes_are_clipped_to_the_closedness_range() -> None:
     model = Remembering()
     compute_rollout(model.rollout, start_of(truth()), make_named_actions("close", STEPS))
     _, actions, states, _ = model.given
@@ -54,13 +54,13 @@ def test_a_gripper_changes_as_far_as_it_can() -> None:
     np.testing.assert_allclose(states[0, :, 6].numpy(), [0.9, 1, 1, 1], atol=1e-6)
 
 
-def test_the_camera_of_the_first_frame_holds_for_all_steps() -> None:
+def test_camera_pose_of_the_first_frame_is_used_for_all_steps() -> None:
     model, camera = Remembering(), torch.arange(6.0)
     compute_rollout(model.rollout, start_of(truth(), extrinsics=camera), make_named_actions("none", STEPS))
     assert torch.equal(model.given[3], camera.expand(1, STEPS, 6))
 
 
-def test_known_states_are_given_as_they_are() -> None:
+def test_recorded_states_are_passed_unchanged() -> None:
     model, actions = Remembering(), make_named_actions("up", STEPS)
     states = integrate_states(STATE, actions)[:-1] + 0.5
     compute_rollout(model.rollout, start_of(truth()), actions, states)
@@ -72,7 +72,7 @@ def decoder(tmp_path_factory: pytest.TempPathFactory) -> TrainedDecoder:
     return load_decoder(write_decoder(tmp_path_factory.mktemp("decoder") / "d", tiny_model()))
 
 
-def test_the_imagined_steps_are_the_decoded_rollout_of_the_chosen_actions(decoder: TrainedDecoder) -> None:
+def test_plan_images_are_the_decoded_rollout_of_its_actions(decoder: TrainedDecoder) -> None:
     answer = asked(100, 101, nodes=0, horizon=3)
     found = imagine_plan(answer, decoder)
     plan, cost = answer.decision.plan, answer.decision.cost
@@ -87,13 +87,13 @@ def test_the_imagined_steps_are_the_decoded_rollout_of_the_chosen_actions(decode
     assert np.array_equal(found.goal, to_display_frames(crop_frames(image(101)[None]), 48)[0])
 
 
-def test_of_a_long_plan_eight_steps_are_shown_the_end_among_them(decoder: TrainedDecoder) -> None:
+def test_long_plan_shows_eight_steps_including_the_last(decoder: TrainedDecoder) -> None:
     steps = imagine_plan(asked(nodes=0, horizon=11), decoder).steps
     assert len(steps) == 8
     assert [min(steps), max(steps)] == [1, 11]
 
 
 @pytest.mark.parametrize("answer", [{"start": 100}, {"broken": True}])
-def test_without_a_plan_or_finite_predictions_nothing_is_imagined(decoder: TrainedDecoder, answer: dict) -> None:
+def test_no_images_without_a_plan_or_finite_predictions(decoder: TrainedDecoder, answer: dict) -> None:
     answer = asked(nodes=0, **answer)
     assert imagine_plan(answer, decoder).steps == {}

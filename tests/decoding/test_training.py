@@ -40,7 +40,7 @@ def assert_same_decoder(one: Path, other: Path) -> None:
 # ---- what it learns ------------------------------------------------------------------------------------------------
 
 
-def test_it_memorises_four_frames(make_decoder: MakeConfig, encode_split: EncodeSplit) -> None:
+def test_decoder_memorises_four_frames(make_decoder: MakeConfig, encode_split: EncodeSplit) -> None:
     config = make_decoder(knobs={"frames": 4, "steps": 80}, data__cache_dtype="fp32")
     pairs = encode_split(config, frames=4).read(range(4))
     decoder = load_decoder(train_decoder(config)).decoder
@@ -51,7 +51,7 @@ def test_it_memorises_four_frames(make_decoder: MakeConfig, encode_split: Encode
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_a_training_that_was_asked_to_stop_resumes_exactly(
+def test_stopped_training_resumes_exactly(
     make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     learn = DecoderSteps.run
@@ -71,7 +71,7 @@ def test_a_training_that_was_asked_to_stop_resumes_exactly(
     assert_same_decoder(whole_decoder, tmp_path / "decoder")
 
 
-def test_a_killed_training_resumes_exactly(
+def test_killed_training_resumes_exactly(
     nursery: Nursery, make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "config.yaml").write_text(as_yaml(make_decoder()))
@@ -83,7 +83,7 @@ def test_a_killed_training_resumes_exactly(
     assert_same_decoder(whole_decoder, out)
 
 
-def test_what_a_killed_start_left_in_a_finished_folder_is_removed_and_a_check_writes_nothing(
+def test_leftovers_in_a_finished_folder_are_removed_and_check_writes_nothing(
     make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, reporter: SilentReporter
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")
@@ -110,7 +110,7 @@ def test_what_a_killed_start_left_in_a_finished_folder_is_removed_and_a_check_wr
         ({"data__test_share": 0.1}, r"data\.test_share: 0\.2, not 0\.1"),
     ],
 )
-def test_the_folder_of_another_decoder_is_refused_and_what_differs_is_named(
+def test_folder_of_another_decoder_raises_with_the_difference(
     make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, changes: dict, name: str
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")
@@ -127,7 +127,7 @@ def test_the_folder_of_another_decoder_is_refused_and_what_differs_is_named(
         ({"data__stride": "auto"}, r"data\.stride"),
     ],
 )
-def test_what_cannot_be_decoded_is_refused_before_the_data_is_opened(
+def test_undecodable_config_raises_before_the_data_is_opened(
     make_decoder: MakeConfig, tmp_path: Path, changes: dict, words: str
 ) -> None:
     with pytest.raises(InputError, match=words):
@@ -136,7 +136,7 @@ def test_what_cannot_be_decoded_is_refused_before_the_data_is_opened(
 
 
 @pytest.mark.parametrize("sizes", [{"image_size": 28, "patch_size": 14}])
-def test_a_model_whose_images_no_decoder_makes_is_refused(
+def test_model_with_unsupported_image_or_patch_size_raises(
     make_decoder: MakeConfig, tmp_path: Path, sizes: dict
 ) -> None:
     WorldModel.random(ModelSizes.model_validate(TINY | sizes), seed=0).save_pretrained(tmp_path / "odd")
@@ -144,7 +144,7 @@ def test_a_model_whose_images_no_decoder_makes_is_refused(
         train_decoder(make_decoder(model__base=str(tmp_path / "odd")))
 
 
-def test_a_learning_rate_that_is_too_high_is_named(make_decoder: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_diverging_learning_rate_raises_with_its_key(make_decoder: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     def exploded(images: torch.Tensor, targets: torch.Tensor) -> tuple[torch.Tensor, dict]:
         return (images - targets).sum() * math.inf, {}
 
@@ -157,7 +157,7 @@ def test_a_learning_rate_that_is_too_high_is_named(make_decoder: MakeConfig, mon
 
 
 @pytest.mark.parametrize(("steps", "peak"), [(150, 10), (10, 0), (20_000, 500)])
-def test_the_learning_rate_rises_to_its_peak_and_falls_to_none(steps: int, peak: int) -> None:
+def test_learning_rate_warms_up_and_decays_to_zero(steps: int, peak: int) -> None:
     config = DecoderConfig(steps=steps, learning_rate=0.5)
     rates = [learning_rate_at(step, config) for step in range(1, steps + 1)]
     assert rates[:peak] == pytest.approx([0.5 * (step + 1) / peak for step in range(peak)])
@@ -166,7 +166,7 @@ def test_the_learning_rate_rises_to_its_peak_and_falls_to_none(steps: int, peak:
     assert max(rates) <= 0.5
 
 
-def test_settings_that_change_no_number_are_no_other_decoder(
+def test_settings_without_effect_keep_the_decoder(
     make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, reporter: SilentReporter
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")

@@ -30,7 +30,7 @@ def settings(goal: SubGoal) -> tuple:
     return goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper
 
 
-def test_what_is_written_is_read_again(folder: Path) -> None:
+def test_goals_survive_write_and_read(folder: Path) -> None:
     found = read_goal_folder(folder)
     assert [settings(goal) for goal in found] == [settings(goal) for goal in GOALS]
     for goal, written in zip(found, GOALS, strict=True):
@@ -41,14 +41,14 @@ def test_what_is_written_is_read_again(folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["goal_1.png", "goal_2.png", "goal_3.png", GOALS_FILE]
 
 
-def test_noise_and_energies_of_older_versions_are_ignored(folder: Path) -> None:
+def test_fields_of_older_versions_are_ignored(folder: Path) -> None:
     noise = {"energy": 0.08, "pairs": 12, "encoder": "a" * 64, "distance": "l1"}
     edit(folder, lambda content: content.update(noise=noise), None)
     edit(folder, first(began=0.3))
     assert len(read_goal_folder(folder)) == 3
 
 
-def test_a_folder_written_by_hand_needs_no_more_than_files(tmp_path: Path) -> None:
+def test_hand_written_folder_needs_only_files(tmp_path: Path) -> None:
     for name in ("grasped.png", "placed.png"):
         (tmp_path / name).write_bytes(encode_png(image(1)))
     written = {"format": 1, "goals": [{"file": "grasped.png", "at_most": 4, "at_least": 4}, {"file": "placed.png"}]}
@@ -78,20 +78,20 @@ def first(**changes: object) -> Any:
         (lambda goals: goals.append(3), r"goals\.3"),
     ],
 )  # fmt: skip
-def test_a_broken_goal_is_refused_by_name(change: Any, wrong: str, folder: Path) -> None:
+def test_invalid_goal_raises_with_its_name(change: Any, wrong: str, folder: Path) -> None:
     edit(folder, change)
     with pytest.raises(InputError, match=wrong):
         read_goal_folder(folder)
 
 
 @pytest.mark.parametrize("text", ["[]", "{", '{"goals": []}', '{"format": 2, "goals": []}', '{"format": 1}'])
-def test_a_file_that_says_something_else_is_refused(text: str, folder: Path) -> None:
+def test_invalid_goals_file_raises(text: str, folder: Path) -> None:
     (folder / GOALS_FILE).write_text(text)
     with pytest.raises(InputError, match=r"goals\.json: "):
         read_goal_folder(folder)
 
 
-def test_images_that_are_none_or_of_another_size_are_refused(folder: Path) -> None:
+def test_invalid_or_differently_sized_images_raise(folder: Path) -> None:
     (folder / "goal_2.png").write_bytes(encode_png(image(2)[:40]))
     with pytest.raises(InputError, match=r"goal_2\.png: 48 x 40 pixels"):
         read_goal_folder(folder)
@@ -100,7 +100,7 @@ def test_images_that_are_none_or_of_another_size_are_refused(folder: Path) -> No
         read_goal_folder(folder)
 
 
-def test_a_folder_without_goals_says_what_makes_one(tmp_path: Path) -> None:
+def test_folder_without_goals_raises_with_the_command(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"goals\.json: cannot be read.*`vjepa2-ac goals` writes"):
         read_goal_folder(tmp_path)
     with pytest.raises(ValueError, match="no goals"):
@@ -108,7 +108,7 @@ def test_a_folder_without_goals_says_what_makes_one(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
-def test_a_file_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_image_outside_the_folder_raises(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "outside.png").write_bytes(encode_png(image(1)))
     (tmp_path / "goals-too").mkdir()
     (tmp_path / "goals-too" / "near.png").write_bytes(encode_png(image(1)))

@@ -33,7 +33,7 @@ def goals(here: Path, out: Path, *more: str, source: str = "config.yaml") -> tup
     return status, json.loads((out / "goals.json").read_text()) if status == 0 else {}
 
 
-def test_an_episode_becomes_goals_by_its_gripper(
+def test_goals_command_selects_gripper_key_frames(
     workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, file = goals(workshop, tmp_path / "goals", "--share", "0.5", "--slack", "1")
@@ -54,7 +54,7 @@ def test_an_episode_becomes_goals_by_its_gripper(
     assert str(tmp_path / "goals/goals.json") in printed
 
 
-def test_an_episode_is_named_or_numbered_and_every_so_many_frames_are_taken(workshop: Path, tmp_path: Path) -> None:
+def test_goals_command_accepts_name_or_number_and_takes_every_nth_frame(workshop: Path, tmp_path: Path) -> None:
     _, numbered = goals(workshop, tmp_path / "a", "--episode", "1", "--every", "10", "data.stride=5")
     name = numbered["origin"]["episode"]
     _, named = goals(workshop, tmp_path / "b", "--episode", name, "--every", "10", "data.stride=5")
@@ -64,7 +64,7 @@ def test_an_episode_is_named_or_numbered_and_every_so_many_frames_are_taken(work
     assert named["origin"]["every"] == 10
 
 
-def test_plan_takes_the_folder(workshop: Path, tmp_path: Path) -> None:
+def test_plan_command_accepts_a_goal_folder(workshop: Path, tmp_path: Path) -> None:
     folder, model = tmp_path / "goals", str(workshop / "model")
     goals(workshop, folder, "--share", "0.5")
     given = ["--goals", str(folder), "--state", STATE, "--nodes", "0", "--out", str(tmp_path / "plan"), *QUICK]
@@ -75,7 +75,7 @@ def test_plan_takes_the_folder(workshop: Path, tmp_path: Path) -> None:
     assert {row[6] for row in plan["actions"]} == {0.0}, "it is held on the way to the first goal"
 
 
-def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
+def test_invalid_goal_folder_raises_before_planning(
     workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, model = tmp_path / "goals", str(workshop / "model")
@@ -101,7 +101,7 @@ def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
         (["config.yaml", "data.stride=auto"], "data.stride: auto"),
     ],
 )
-def test_what_cannot_be_is_one_line_and_leaves_nothing(
+def test_invalid_input_prints_one_line_and_writes_nothing(
     words: list[str], wrong: str, workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source, *more = words
@@ -113,7 +113,7 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_plan_takes_its_goal_from_an_episode(whole_run: Path, data_folder: Path, tmp_path: Path) -> None:
+def test_plan_command_takes_its_goal_from_an_episode(whole_run: Path, data_folder: Path, tmp_path: Path) -> None:
     dataset = open_dataset(data_folder, frames=4, stride=2)
     last, third = dataset.source.read(1).read_frames([len(dataset.source.read(1).states) - 1, 3])
     Image.fromarray(third).save(tmp_path / "third.png")

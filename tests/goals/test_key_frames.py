@@ -56,7 +56,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(("parts", "keys"), CASES.values(), ids=CASES)
-def test_key_frames_are_where_the_gripper_changes_and_the_arm_stops(parts: tuple, keys: list) -> None:
+def test_key_frames_are_gripper_changes_and_stops(parts: tuple, keys: list) -> None:
     assert named(way(*parts)) == keys
 
 
@@ -65,7 +65,7 @@ def test_key_frames_are_where_the_gripper_changes_and_the_arm_stops(parts: tuple
         st.tuples(st.integers(1, 12), st.sampled_from([0.0, 0.1, -0.2]), st.sampled_from([0.0, 0.0, 0.5])), min_size=1
     )
 )
-def test_key_frames_ascend_leave_out_the_start_and_are_few(parts: list) -> None:
+def test_key_frames_are_ascending_few_and_exclude_the_start(parts: list) -> None:
     states = way(*parts)
     states[:, 6] = np.abs((states[:, 6] + 1) % 2 - 1)  # to and fro between 0 and 1
     for rule in (None, MODEL_STEP_RULE):
@@ -75,7 +75,7 @@ def test_key_frames_ascend_leave_out_the_start_and_are_few(parts: list) -> None:
 
 
 @given(st.integers(2, 60), st.integers(1, 20))
-def test_every_so_many_frames_end_with_the_last(frames: int, step: int) -> None:
+def test_every_nth_frame_ends_with_the_last_frame(frames: int, step: int) -> None:
     found = [key.frame for key in select_every_nth_frame(frames, step)]
     gaps = np.diff([0, *found])
     assert found[-1] == frames - 1
@@ -84,7 +84,7 @@ def test_every_so_many_frames_end_with_the_last(frames: int, step: int) -> None:
 
 
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=5), st.integers(1, 6))
-def test_frames_between_keep_the_key_frames_and_are_so_far_apart(gaps: list[int], step: int) -> None:
+def test_added_frames_keep_key_frames_and_the_step(gaps: list[int], step: int) -> None:
     keys = [KeyFrame(int(frame), f"key {frame}") for frame in np.cumsum(gaps)]
     found = add_frames_between(keys, step)
     assert [key for key in found if key.name != "on the way"] == keys
@@ -93,7 +93,7 @@ def test_frames_between_keep_the_key_frames_and_are_so_far_apart(gaps: list[int]
     assert (ways < 1.5 * step).all() if step > 1 else (ways == 1).all()
 
 
-def test_goals_have_the_durations_and_the_gripper_of_the_demonstration() -> None:
+def test_goals_have_durations_and_gripper_modes_of_the_demonstration() -> None:
     states = way((10, 0.2, 0), (5, 0, 0.5), (21, 0.2, 0))
     keys = find_gripper_key_frames(states)
     images = [np.full((16, 16, 3), place, np.uint8) for place in range(len(keys))]

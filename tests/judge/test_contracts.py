@@ -26,7 +26,7 @@ def ran(python: str | Path, script: str, folder: Path, **environment: str) -> di
     return found
 
 
-def test_the_solver_of_stable_worldmodel_searches_by_our_model(tmp_path: Path) -> None:
+def test_stable_worldmodel_solver_plans_with_this_model(tmp_path: Path) -> None:
     """Without its dependency torchvision: of the package only the solvers are imported."""
     install(sys.executable, "--no-deps", "--target", str(tmp_path / "site"), "stable-worldmodel==0.1.1")
     install(

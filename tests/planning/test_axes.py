@@ -46,7 +46,7 @@ def write(path: Path, model: WorldModel, degrees: float = 43.0, **changes: Any) 
     return str(path)
 
 
-def test_turned_states_follow_from_turned_actions() -> None:
+def test_rotated_actions_lead_to_rotated_states() -> None:
     """What the model sees is a world like the robot's, only turned: acting and turning can be done in either order."""
     states, tried = some(50, 7), some(50, 7, seed=1) - 0.4
     torch.testing.assert_close(
@@ -56,7 +56,7 @@ def test_turned_states_follow_from_turned_actions() -> None:
     )  # fmt: skip
 
 
-def test_a_turn_is_counterclockwise_from_above_and_keeps_height_and_gripper() -> None:
+def test_rotation_is_counterclockwise_from_above_and_keeps_height_and_gripper() -> None:
     quarter = Axes(math.pi / 2)
     turned = quarter.rotate_actions(torch.tensor([0.03, 0.0, 0.02, 0.0, 0.0, 0.1, 0.5]))
     torch.testing.assert_close(turned, torch.tensor([0.0, 0.03, 0.02, 0.0, 0.0, 0.1, 0.5]), atol=1e-6, rtol=0)
@@ -66,7 +66,7 @@ def test_a_turn_is_counterclockwise_from_above_and_keeps_height_and_gripper() ->
 
 
 @pytest.mark.parametrize("extrinsics", [False, True])
-def test_the_energy_in_turned_axes_is_that_of_turned_actions_from_turned_states(extrinsics: bool) -> None:
+def test_energy_with_axes_equals_energy_of_rotated_actions_and_states(extrinsics: bool) -> None:
     model, start, tried = tiny_model(extrinsics=extrinsics), scene(extrinsics=extrinsics), actions(6, 2)
     plain = replace(
         start,
@@ -81,7 +81,7 @@ def test_the_energy_in_turned_axes_is_that_of_turned_actions_from_turned_states(
     assert not torch.allclose(turned, untouched, atol=1e-4)
 
 
-def test_limits_hold_for_what_the_robot_executes(tmp_path: Path) -> None:
+def test_limits_apply_to_executed_actions_with_calibrated_axes(tmp_path: Path) -> None:
     """Limits of a long thin box: turned by 43 degrees they would be exceeded."""
     model = tiny_model()
     limits = LimitsConfig(xyz=(0.05, 0.002, 0.05))
@@ -103,14 +103,14 @@ def test_limits_hold_for_what_the_robot_executes(tmp_path: Path) -> None:
         ({"yaw_degrees": {"value": "north", "low": None, "high": None}}, r"yaw_degrees\.value"),
     ],
 )
-def test_a_file_that_nothing_can_be_planned_by_is_refused(tmp_path: Path, changes: dict, complaint: str) -> None:
+def test_unusable_axes_file_raises(tmp_path: Path, changes: dict, complaint: str) -> None:
     model = tiny_model()
     path = write(tmp_path / "axes.json", model, **changes)
     with pytest.raises(InputError, match=f"(?s)planning.axes.*{complaint}"):
         controller(model, axes=path)
 
 
-def test_axes_of_other_weights_and_of_no_file_are_refused(tmp_path: Path) -> None:
+def test_axes_of_another_model_or_missing_file_raise(tmp_path: Path) -> None:
     model, other = tiny_model(), tiny_model()
     with torch.no_grad():
         other.base_predictor.predictor_proj.weight.add_(0.1)
@@ -120,7 +120,7 @@ def test_axes_of_other_weights_and_of_no_file_are_refused(tmp_path: Path) -> Non
         controller(model, axes="no/axes.json")
 
 
-def test_a_run_plans_by_axes_of_its_own_trained_weights_merged_or_not(make_config: Any, tmp_path: Path) -> None:
+def test_run_accepts_axes_calibrated_for_its_trained_weights(make_config: Any, tmp_path: Path) -> None:
     config: Config = make_config(planning={"samples": 12, "iterations": 2})
     run = write_adapted_run(config)
     loaded = load_subject(run)
@@ -133,7 +133,7 @@ def test_a_run_plans_by_axes_of_its_own_trained_weights_merged_or_not(make_confi
         Controller.of_subject(load_for_planning(str(run), overrides=[f"planning.axes={for_base}"]))
 
 
-def test_what_a_fit_writes_can_be_read(tmp_path: Path) -> None:
+def test_calibration_output_can_be_read(tmp_path: Path) -> None:
     errors = 1.1 - np.cos(np.deg2rad(np.array(TRIED_DEGREES) - 90.0))
     fit = fit_axes(np.tile(errors, (40, 1)), [f"{place // 4}" for place in range(40)])
     assert fit.problem is None

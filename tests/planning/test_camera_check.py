@@ -52,14 +52,14 @@ def scene() -> np.ndarray:
 
 
 @pytest.mark.parametrize("noise", [0.0, 2.0, 10.0])
-def test_a_covered_lens_is_uniform_whatever_its_noise(noise: float) -> None:
+def test_covered_lens_with_noise_is_a_uniform_frame(noise: float) -> None:
     assert is_uniform(covered(noise))
     for level in (0, 90, 255):
         assert is_uniform(np.full((180, 320, 3), level, np.uint8))
     assert is_uniform(np.full((180, 320, 3), (0, 140, 30), np.uint8)), "a decoder that failed"
 
 
-def test_a_frozen_frame_moves_nothing_until_another_one_comes() -> None:
+def test_frozen_frame_gives_zero_actions_until_the_image_changes() -> None:
     run = controller()
     found = [
         why(run, image(seed), state) for seed, state in ((0, STATE), (0, MOVED), (0, MOVED), (1, MOVED), (1, MOVED))
@@ -70,7 +70,7 @@ def test_a_frozen_frame_moves_nothing_until_another_one_comes() -> None:
     assert why(run, image(1), STATE) == "planned", "a reset forgets"
 
 
-def test_a_driver_that_writes_every_image_into_the_same_memory_is_no_frozen_camera() -> None:
+def test_reused_image_buffer_is_not_a_frozen_frame() -> None:
     run, memory = controller(), image(0)
     why(run, memory, STATE)
     memory[:] = image(1)
@@ -85,12 +85,12 @@ def test_a_driver_that_writes_every_image_into_the_same_memory_is_no_frozen_came
         ([0, 0, 0, 0, 0, 0, 0.9], False),
     ],
 )  # fmt: skip
-def test_a_pose_has_moved_by_more_than_half_a_centimetre_or_three_degrees(change: list[float], moves: bool) -> None:
+def test_pose_has_moved_above_half_a_centimetre_or_three_degrees(change: list[float], moves: bool) -> None:
     for state in (STATE, np.array([0.4, 0, 0.3, math.pi, 0, -math.pi, 0])):  # angles jump from pi to -pi
         assert has_moved(state, apply_action(state, np.array(change)), POSE, np.ones(7)) == moves
 
 
-def test_one_unusable_camera_of_two_is_enough() -> None:
+def test_fault_of_one_of_two_cameras_stops_the_robot() -> None:
     run = tiny_controller(views=2)
     two = lambda left, right: np.hstack([image(left, 48, 48) if left else BLACK[:48, :48], image(right, 48, 48)])  # noqa: E731
     run.reset(two(100, 101))
@@ -103,7 +103,7 @@ def test_one_unusable_camera_of_two_is_enough() -> None:
 
 
 @pytest.mark.parametrize("crop", ["released", "square", "letterbox"])
-def test_only_what_the_model_receives_of_an_image_counts(crop: Crop) -> None:
+def test_contrast_check_uses_only_the_cropped_image(crop: Crop) -> None:
     wide = image(100, 48, 120)
     run = Controller(tiny_model(), QUICK, crop=crop)
     run.reset(wide)
@@ -113,7 +113,7 @@ def test_only_what_the_model_receives_of_an_image_counts(crop: Crop) -> None:
     assert why(run, np.full_like(wide, 128)) == "uniform frame", "bars are no contrast"
 
 
-def test_goals_make_no_progress_on_an_unusable_frame() -> None:
+def test_faulty_frame_does_not_advance_the_goal() -> None:
     run = controller()
     goals = [dataclasses.replace(goal, share=0.5) for goal in make_timed_goals([image(100), image(101)], [3])]
     goals[0] = dataclasses.replace(goals[0], at_least=1)

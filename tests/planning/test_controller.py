@@ -29,7 +29,7 @@ def test_actions_are_within_the_limits_and_lower_the_energy() -> None:
     assert run.decision.plan.energy < still
 
 
-def test_a_decision_holds_the_predicted_states_of_its_plan() -> None:
+def test_decision_contains_the_predicted_states_of_its_plan() -> None:
     run = controller()
     actions(run, 1)
     expected = [STATE]
@@ -41,7 +41,7 @@ def test_a_decision_holds_the_predicted_states_of_its_plan() -> None:
 
 @torch.no_grad()
 @pytest.mark.parametrize("planner", ["cem", "gradient"])
-def test_a_model_in_bfloat16_plans_as_well(planner: str) -> None:
+def test_bfloat16_model_can_plan(planner: str) -> None:
     model = tiny_model().to(torch.bfloat16)
     assert actions(controller(model, planner=Component(planner)), 2).any()
 
@@ -55,7 +55,7 @@ def test_a_model_in_bfloat16_plans_as_well(planner: str) -> None:
         (image(0).astype(np.float32), "RGB image"), (image(0)[:4, :4], "RGB image"),
     ],
 )  # fmt: skip
-def test_an_image_that_cannot_be_used_is_refused(frame: np.ndarray, complaint: str) -> None:
+def test_invalid_image_raises(frame: np.ndarray, complaint: str) -> None:
     run = controller()
     run.reset(image(100))
     with pytest.raises(InputError, match=complaint):
@@ -64,7 +64,7 @@ def test_an_image_that_cannot_be_used_is_refused(frame: np.ndarray, complaint: s
         run.reset(image(100), frame, durations=(1,))
 
 
-def test_acting_without_a_goal_is_an_error() -> None:
+def test_act_without_a_goal_raises() -> None:
     with pytest.raises(ValueError, match="reset"):
         controller().act(image(0), STATE)
     with pytest.raises(ValueError, match="0 goals"):
@@ -76,7 +76,7 @@ def test_acting_without_a_goal_is_an_error() -> None:
 
 
 @pytest.mark.parametrize("steps", ["last", "sum"])
-def test_the_present_energy_is_that_of_an_image_that_stays(steps: str) -> None:
+def test_current_energy_is_the_distance_of_the_current_image(steps: str) -> None:
     run = controller(energy=EnergyConfig(steps=steps))
     run.reset(image(100), image(101), durations=(1,))
     run.act(image(1), STATE)
@@ -86,7 +86,7 @@ def test_the_present_energy_is_that_of_an_image_that_stays(steps: str) -> None:
     assert run.decision.current_energy == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_decision_that_failed_can_be_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_decision_can_be_repeated_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     undisturbed, run = actions(controller()), controller()
     run.reset(image(100))
     run.act(image(0), STATE)
@@ -102,7 +102,7 @@ def fail(*_: object) -> None:
     raise RuntimeError("out of memory")
 
 
-def test_one_model_step_of_the_last_plan_is_gone_when_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warm_start_is_the_last_plan_shifted_by_one_step(monkeypatch: pytest.MonkeyPatch) -> None:
     run = controller(warm_start=True, horizon=3)
     actions(run, 1)
     before, starts, plan = run.decision.plan, [], run.planner.plan
@@ -112,7 +112,7 @@ def test_one_model_step_of_the_last_plan_is_gone_when_the_next_begins(monkeypatc
     assert not torch.equal(before.mean[0], before.mean[1])
 
 
-def test_a_mask_decides_what_counts_of_the_image_and_is_cropped_as_it_is() -> None:
+def test_mask_is_cropped_like_the_image_and_weights_patches() -> None:
     run = controller()
     mask = np.zeros((60, 48), bool)
     mask[:20, :16] = True
@@ -129,7 +129,7 @@ def test_a_mask_decides_what_counts_of_the_image_and_is_cropped_as_it_is() -> No
 
 
 @pytest.mark.parametrize("joined", ["difference", "sum", "last"])
-def test_a_model_without_states_plans_vectors_and_takes_states_of_any_width_for_changes(joined: str) -> None:
+def test_model_without_state_input_plans_vectors_of_any_state_width(joined: str) -> None:
     run, found = vector_controller(joined, states=False), []
     for width in (8, 11, 3)[: 1 if joined == "last" else None]:
         run.reset(image(100))
@@ -141,6 +141,6 @@ def test_a_model_without_states_plans_vectors_and_takes_states_of_any_width_for_
             run.act(image(2), np.zeros(11))
 
 
-def test_a_model_whose_states_are_no_poses_is_refused() -> None:
+def test_model_with_other_state_width_raises() -> None:
     with pytest.raises(InputError, match=r"states of 8 and actions of 8 numbers\. Expected 7 and 7"):
         controller(vector_model(8))

@@ -27,7 +27,7 @@ def read(found: PlanResult, folder: Path) -> dict:
     return json.loads(path.read_text(), parse_constant=refuse)
 
 
-def test_an_answer_is_what_the_controller_decides() -> None:
+def test_result_equals_the_decision_of_the_controller() -> None:
     found = asked()
     controller = Controller(tiny_model(), QUICK, seed=5)
     controller.reset(image(100))
@@ -38,7 +38,7 @@ def test_an_answer_is_what_the_controller_decides() -> None:
     assert asked(nodes=0).slices == asked(nodes=2).slices == ()
 
 
-def test_the_file_holds_the_decision(tmp_path: Path) -> None:
+def test_plan_file_contains_the_decision(tmp_path: Path) -> None:
     found = asked()
     file = read(found, tmp_path)
     plan = found.decision.plan
@@ -65,7 +65,7 @@ def test_the_file_holds_the_decision(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("still", [0.5, 1.0 - 1e-7, 1.0, 2.0, np.nan])
 @pytest.mark.parametrize("now", [0.8, 1.25])
-def test_a_plan_is_called_worse_than_exactly_the_lower_energies(tmp_path: Path, still: float, now: float) -> None:
+def test_worse_than_names_exactly_the_references_with_lower_energy(tmp_path: Path, still: float, now: float) -> None:
     found = asked(nodes=0)
     energy = found.decision.plan.energy
     decision = replace(found.decision, current_energy=now * energy)
@@ -79,7 +79,7 @@ def test_a_plan_is_called_worse_than_exactly_the_lower_energies(tmp_path: Path, 
     assert found.worse_than == {name: f"The plan is predicted to be worse than the {said[name]}" for name in worse}
 
 
-def test_a_broken_model_does_nothing_and_the_file_says_why(tmp_path: Path) -> None:
+def test_broken_model_gives_zero_action_and_its_reason_is_written(tmp_path: Path) -> None:
     found = asked(broken=True)
     file = read(found, tmp_path)
     assert file["why"] == "no finite energy"

@@ -40,7 +40,7 @@ def plain_predictions(model: WorldModel, start: Scene, tried: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize(("adapted", "extrinsics"), [(False, False), (True, False), (False, True)])
-def test_predictions_are_those_of_the_plain_computation(adapted: bool, extrinsics: bool) -> None:
+def test_rollout_equals_a_plain_implementation(adapted: bool, extrinsics: bool) -> None:
     model, start, tried = (
         tiny_model(adapted=adapted, extrinsics=extrinsics),
         scene(extrinsics=extrinsics),
@@ -56,7 +56,7 @@ def test_predictions_are_those_of_the_plain_computation(adapted: bool, extrinsic
 
 @torch.no_grad()
 @pytest.mark.parametrize("joined", ["sum", "last"])
-def test_vectors_add_and_a_model_of_targets_is_given_the_states_that_changes_lead_to(joined: str) -> None:
+def test_target_model_receives_states_integrated_from_changes(joined: str) -> None:
     model = vector_model(3)
     model.base_predictor.action_encoder.weight.mul_(40)
     start, tried = Scene(draw(TOKENS, DIM), draw(3)), actions(2, 4)[..., :3]
@@ -69,7 +69,7 @@ def test_vectors_add_and_a_model_of_targets_is_given_the_states_that_changes_lea
 
 
 @torch.no_grad()
-def test_energies_do_not_depend_on_how_many_are_computed_at_once() -> None:
+def test_energies_are_independent_of_the_batch_size() -> None:
     model, tried = tiny_model(), actions(7, 2)
     expected = cost(model, samples_at_once=7)(tried)
     for at_once in (1, 3, 100):
@@ -77,7 +77,7 @@ def test_energies_do_not_depend_on_how_many_are_computed_at_once() -> None:
     assert expected.unique().numel() == 7
 
 
-def test_no_more_samples_go_through_the_predictor_at_once_than_were_asked_for() -> None:
+def test_predictor_batches_are_at_most_samples_at_once() -> None:
     model, seen = tiny_model(), []
     model.base_predictor.register_forward_pre_hook(lambda _, given: seen.append(len(given[0])))
     with torch.no_grad():
@@ -92,7 +92,7 @@ def test_no_more_samples_go_through_the_predictor_at_once_than_were_asked_for() 
     assert sorted(seen) == [3, 3, 4, 4]
 
 
-def test_each_distance_is_its_formula() -> None:
+def test_distances_equal_their_formulas() -> None:
     found, wanted = draw(5, TOKENS, DIM, seed=1), draw(TOKENS, DIM, seed=2)
     torch.testing.assert_close(distance(found, wanted, EnergyConfig()), (found - wanted).abs().mean(dim=(1, 2)))
     torch.testing.assert_close(
@@ -105,7 +105,7 @@ def test_each_distance_is_its_formula() -> None:
 
 
 @torch.no_grad()
-def test_the_goals_weights_are_used() -> None:
+def test_energy_uses_the_weights_of_the_goal() -> None:
     model, tried = tiny_model(), actions(3, 1)
     weights = torch.arange(float(TOKENS))
     measure = WorldModelCost(model, scene(), goal(weights=weights), EnergyConfig())
@@ -114,7 +114,7 @@ def test_the_goals_weights_are_used() -> None:
 
 
 @torch.no_grad()
-def test_the_goal_that_counts_depends_on_what_was_done() -> None:
+def test_goal_of_the_energy_depends_on_the_steps_done() -> None:
     model, tried, wanted = tiny_model(), actions(3, 1), goal(2, durations=(4,))
     energies = [WorldModelCost(model, scene(), wanted, EnergyConfig(), done=done)(tried) for done in (0, 3, 4)]
     single = [WorldModelCost(model, scene(), Goal(one[None]), EnergyConfig())(tried) for one in wanted.latents]
@@ -122,7 +122,7 @@ def test_the_goal_that_counts_depends_on_what_was_done() -> None:
         torch.testing.assert_close(found, expected)
 
 
-def test_gradients_flow_to_the_actions_the_same_for_every_cut() -> None:
+def test_gradients_are_independent_of_the_batch_size() -> None:
     model, found = tiny_model(), []
     for at_once in (5, 2):
         tried = actions(5, 3).requires_grad_()
@@ -133,7 +133,7 @@ def test_gradients_flow_to_the_actions_the_same_for_every_cut() -> None:
 
 
 @pytest.mark.parametrize("planner", ["cem", "icem", "mppi", "gradient"])
-def test_every_planner_goes_downhill_in_a_world_model(planner: str) -> None:
+def test_every_planner_lowers_the_energy_with_a_world_model(planner: str) -> None:
     component = {"name": planner, "options": {"starts": 4} if planner == "gradient" else {}}
     limits = LimitsConfig(rotation=0.1)
     settings = PlanningConfig(planner=component, horizon=2, samples=32, iterations=6, limits=limits)
@@ -146,12 +146,12 @@ def test_every_planner_goes_downhill_in_a_world_model(planner: str) -> None:
     assert plan.iterations[-1].elite_energy < plan.iterations[0].elite_energy
 
 
-def test_a_model_in_training_mode_is_refused() -> None:
+def test_model_in_training_mode_raises() -> None:
     with pytest.raises(ValueError, match="eval"):
         cost(tiny_model(adapted=True).train())
 
 
-def test_an_energy_that_is_a_class_is_constructed_once_for_a_controller(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_energy_class_is_constructed_once_per_controller(monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
 
     class Counted:
@@ -181,7 +181,7 @@ def weighted(actions: Tensor) -> Tensor:
     return (actions * torch.arange(1.0, 29.0).reshape(4, 7)).sum(dim=(1, 2))
 
 
-def test_a_slice_changes_two_numbers_of_the_first_action_and_no_others() -> None:
+def test_energy_slice_varies_two_components_of_the_first_action_only() -> None:
     slices = compute_energy_slices(
         weighted, CHOSEN, make_pose_search_space(PlanningConfig(horizon=4, limits=LIMITS)), nodes=5
     )
@@ -194,7 +194,7 @@ def test_a_slice_changes_two_numbers_of_the_first_action_and_no_others() -> None
                 assert one.energy[row, column] == pytest.approx(float(weighted(changed[None])[0]), rel=1e-5)
 
 
-def test_a_slice_reaches_beyond_the_limits_also_along_an_axis_that_is_held() -> None:
+def test_energy_slice_exceeds_the_limits_along_fixed_axes_too() -> None:
     slices = compute_energy_slices(
         weighted, CHOSEN, make_pose_search_space(PlanningConfig(horizon=4, limits=LIMITS)), nodes=3
     )
@@ -238,7 +238,7 @@ def operations_of(work: Callable[[], object]) -> set[str]:
 
 @torch.no_grad()
 @pytest.mark.parametrize(("steps", "kind"), [("last", "l1"), ("sum", "cosine")])
-def test_energies_are_computed_without_asking_the_device(steps: str, kind: str) -> None:
+def test_energies_are_computed_without_device_synchronisation(steps: str, kind: str) -> None:
     measure, tried = cost(tiny_model(), samples_at_once=4, steps=steps, distance=kind), actions(10, 3)
     reported: list[tuple[int, int]] = []
     measure.progress = lambda *progress: reported.append(progress)

@@ -40,7 +40,7 @@ def decided(run: Controller, seen: np.ndarray) -> tuple[int, int, bool, bool]:
     )
 
 
-def test_the_next_goal_follows_once_an_image_is_near_the_present_one() -> None:
+def test_next_goal_applies_once_the_image_is_near_the_current_goal() -> None:
     run = controller()
     run.follow([SubGoal(image(100), at_least=2, at_most=6, share=0.5), SubGoal(image(101))])
     assert decided(run, image(0)) == (0, 0, False, False)
@@ -55,7 +55,7 @@ def begun(run: Controller, seen: np.ndarray, goal: int) -> float:
     return float((run.encode(seen) - run.encode(image(goal))).abs().mean())
 
 
-def test_a_noisy_image_of_the_goal_ends_it_and_what_is_done_stays_done() -> None:
+def test_noisy_goal_image_reaches_the_goal_permanently() -> None:
     run, goals = controller(), [SubGoal(image(100), share=0.5)]
     run.follow(goals)
     assert decided(run, image(0)) == (0, 0, False, False)
@@ -80,7 +80,7 @@ def test_each_goal_has_its_own_gripper_mode() -> None:
     assert float(run.space.upper[0, 6]) == pytest.approx(0.75)
 
 
-def test_a_plan_looks_ahead_to_what_follows_at_the_latest() -> None:
+def test_plan_includes_later_goals_at_their_latest_steps() -> None:
     run = controller(horizon=6)
     bounded, unbounded = SubGoal(image(100), at_most=2, share=0.01), SubGoal(image(101), share=0.01)
     run.follow([bounded, unbounded, SubGoal(image(102), at_most=1), SubGoal(image(103))])
@@ -100,7 +100,7 @@ def test_a_plan_looks_ahead_to_what_follows_at_the_latest() -> None:
         ([SubGoal(image(100).astype(float))], r"goal 0: .*float64"),
     ],
 )  # fmt: skip
-def test_goals_that_cannot_be_followed_are_refused_and_change_nothing(goals: list[SubGoal], wrong: str) -> None:
+def test_invalid_goals_raise_and_leave_the_controller_unchanged(goals: list[SubGoal], wrong: str) -> None:
     run = controller()
     run.follow([SubGoal(image(100))])
     run.act(image(0), STATE)
@@ -113,7 +113,7 @@ def test_goals_that_cannot_be_followed_are_refused_and_change_nothing(goals: lis
         run.follow([])
 
 
-def test_the_pages_example_runs(tmp_path: Path) -> None:
+def test_example_of_the_planning_guide_runs(tmp_path: Path) -> None:
     examples = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning.md").read_text(), flags=re.DOTALL)
     (example,) = (one for one in examples if "read_goal_folder" in one)
     write_goals(tmp_path, [SubGoal(image(100), "grasped", at_most=3), SubGoal(image(101))])
@@ -125,7 +125,7 @@ def test_the_pages_example_runs(tmp_path: Path) -> None:
     assert decided(run, image(100)) == (1, 1, True, False), "by the share that the example gives"
 
 
-def test_a_gripper_mode_needs_a_gripper_and_something_to_plan() -> None:
+def test_gripper_mode_without_gripper_or_free_component_raises() -> None:
     run = vector_controller("difference")
     with pytest.raises(InputError, match=r"'held' of a goal: .*vector states"):
         run.follow([SubGoal(image(100), gripper="held")])
@@ -163,7 +163,7 @@ def courses(draw: st.DrawFn) -> tuple[list[SubGoal], list[list[float]]]:
 
 
 @given(courses())
-def test_goals_never_go_back_and_each_applies_within_its_bounds(course: tuple) -> None:
+def test_goal_index_never_decreases_and_steps_are_within_bounds(course: tuple) -> None:
     rules, energies = course
     found = progress_over(rules, energies)
     places = [one.goal_index for one in found]
@@ -177,7 +177,7 @@ def test_goals_never_go_back_and_each_applies_within_its_bounds(course: tuple) -
 
 
 @given(courses())
-def test_a_goal_that_gave_way_early_was_below_its_share(course: tuple) -> None:
+def test_goal_ends_early_only_below_its_energy_share(course: tuple) -> None:
     rules, energies = course
     found = progress_over(rules, energies)
     for step, (before, after) in enumerate(pairwise(found), start=1):
@@ -191,7 +191,7 @@ def test_a_goal_that_gave_way_early_was_below_its_share(course: tuple) -> None:
             assert after.is_done == reached
 
 
-def test_the_next_goal_begins_with_its_own_first_energy() -> None:
+def test_initial_energy_is_measured_when_a_goal_begins() -> None:
     rules = [rule("grasp", 1, 9, 0.5), rule(share=0.5)]
     found = progress_over(rules, [[1.0, 5.0], [0.6, 4.0], [0.4, 3.0], [9.0, 2.0], [9.0, 1.4], [9.0, 9.0]])
     assert [one.goal_index for one in found] == [0, 0, 1, 1, 1, 1]
@@ -203,7 +203,7 @@ def test_the_next_goal_begins_with_its_own_first_energy() -> None:
     assert not found[5].changed
 
 
-def test_an_energy_that_is_no_number_moves_nothing_on_before_its_time() -> None:
+def test_nan_energy_does_not_advance_the_goal_before_at_most() -> None:
     nan = float("nan")
     rules = [rule("", 1, 3, 0.5), rule(share=0.5)]
     found = progress_over(rules, [[nan, nan]] * 6)

@@ -15,7 +15,7 @@ ROWS = np.array([[0.05, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0], [0.0, -0.02, 0.01, 0.0, 0
 
 
 @pytest.mark.parametrize(("one", "other"), [("up", "down"), ("left", "right"), ("forward", "back"), ("close", "open")])
-def test_opposites_sum_to_zero_and_lead_apart_along_one_axis(one: str, other: str) -> None:
+def test_opposite_named_actions_sum_to_zero_and_move_along_one_axis(one: str, other: str) -> None:
     there, back = make_named_actions(one, 3), make_named_actions(other, 3)
     assert there.any()
     assert not (there + back).any()
@@ -26,7 +26,7 @@ def test_opposites_sum_to_zero_and_lead_apart_along_one_axis(one: str, other: st
     np.testing.assert_allclose(ends[0][same], START[same], atol=1e-9)
 
 
-def test_steps_are_as_long_as_asked_and_never_beyond_the_limits() -> None:
+def test_named_actions_have_the_requested_length_within_the_limits() -> None:
     taught = LimitsConfig(xyz=(0.03, 0.02, 0.0), gripper=0.5)
     assert make_named_actions("forward", 1)[0, 0] == 0.05
     assert make_named_actions("forward", 1, limits=taught)[0, 0] == 0.03
@@ -75,9 +75,7 @@ def test_actions_are_read_from_arrays_and_tables(tmp_path: Path) -> None:
         ("a.npy", np.array([[None] * 7]), "cannot be read"),
     ],
 )
-def test_files_of_something_else_are_refused(
-    tmp_path: Path, name: str, content: str | bytes | np.ndarray, message: str
-) -> None:
+def test_invalid_action_files_raise(tmp_path: Path, name: str, content: str | bytes | np.ndarray, message: str) -> None:
     path = tmp_path / name
     if isinstance(content, np.ndarray):
         np.save(path, content)

@@ -160,7 +160,7 @@ def tried(scene: Scene, *names: str) -> None:
         assert np.isfinite(decide(controller, PlanRequest(images[0], STATE, goals, mask), nodes=0).actions).all()
 
 
-def test_every_option_has_another_value(scene: Scene) -> None:
+def test_every_option_is_varied(scene: Scene) -> None:
     keys = {key.removeprefix("planning.") for key in collect_effects(Config) if key.startswith("planning.")}
     assert set(OTHERS) == keys, "a new key needs another value here"
     usual = scene.config()
@@ -168,7 +168,7 @@ def test_every_option_has_another_value(scene: Scene) -> None:
         assert scene.config(name) != usual
 
 
-def test_every_pair_of_options_works_or_is_refused_before_the_first_decision(scene: Scene) -> None:
+def test_every_pair_of_options_works_or_raises_before_the_first_decision(scene: Scene) -> None:
     refused, together = set(), {name: set[str]() for name in OTHERS | MORE}
     for one, other in combinations(OTHERS | MORE, 2):
         shared = entries(one).keys() & entries(other).keys()

@@ -44,7 +44,7 @@ def prediction(world_model: WorldModel) -> torch.Tensor:
     return world_model.predict(latents, torch.full((1, 1, 7), 0.1), torch.full((1, 1, 7), 0.2))
 
 
-def test_a_run_is_planned_with_as_its_own_config_says(run: Path) -> None:
+def test_run_plans_with_its_own_config(run: Path) -> None:
     steering = load_for_planning(str(run))
     assert steering.chosen == "step-00000010 (the best by error)"
     assert steering.config.planning.horizon == 2
@@ -58,7 +58,7 @@ def test_a_run_is_planned_with_as_its_own_config_says(run: Path) -> None:
     assert Controller.of_subject(steering, seed=3).seed == 3
 
 
-def test_the_checkpoint_that_is_named_is_the_one_that_plans(run: Path, base_folder: Path) -> None:
+def test_named_checkpoint_is_used_for_planning(run: Path, base_folder: Path) -> None:
     newest, best, base = (
         prediction(load_for_planning(*given[:1], checkpoint=given[1]).world_model)
         for given in ((str(run), "newest"), (str(run), "selected"), (str(base_folder), "selected"))
@@ -68,7 +68,7 @@ def test_the_checkpoint_that_is_named_is_the_one_that_plans(run: Path, base_fold
     assert not torch.allclose(base, best, atol=1e-4)
 
 
-def test_a_model_needs_no_config_and_takes_one(make_config, base_folder: Path, tmp_path: Path) -> None:
+def test_model_plans_with_and_without_a_config(make_config, base_folder: Path, tmp_path: Path) -> None:
     alone = load_for_planning(str(base_folder), overrides=["planning.samples=20", "seed=4"])
     assert (alone.config.planning.samples, alone.config.seed, alone.config.planning.horizon) == (20, 4, 1)
     path = tmp_path / "its.yaml"
@@ -87,7 +87,7 @@ def test_a_model_needs_no_config_and_takes_one(make_config, base_folder: Path, t
         ({"checkpoint": "best"}, "not the folder of a run"),
     ],
 )
-def test_what_a_model_cannot_be_asked_for_is_refused(base_folder: Path, given: dict, complaint: str) -> None:
+def test_invalid_planning_settings_raise(base_folder: Path, given: dict, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
         load_for_planning(str(base_folder), **given)
 
@@ -100,7 +100,7 @@ VECTORS = {
 }
 
 
-def test_a_run_of_vectors_plans_within_what_it_was_taught(make_config, reporter) -> None:
+def test_vector_run_plans_within_the_motions_of_its_data(make_config, reporter) -> None:
     """Joint angles and a gripper: as many numbers as the data have, and no number changes more than it was taught."""
     folder = train(make_config(**VECTORS, training__steps=1), reporter)
     taught = json.loads((folder / "changes.json").read_text())["changes"]
@@ -143,7 +143,7 @@ ADAPTERS = {
 
 
 @pytest.mark.parametrize("adapter", ADAPTERS.values(), ids=ADAPTERS)
-def test_a_run_is_merged_in_its_bases_type_and_its_fingerprints_are_those_of_what_was_trained(
+def test_merged_run_has_the_dtype_of_its_base_and_fingerprints_of_the_trained_weights(
     make_config, adapter: dict
 ) -> None:
     config = make_config(adapter=adapter, model__dtype="bfloat16", training__precision="bf16")
@@ -179,7 +179,7 @@ def read_warnings(folder: Path, *overrides: str) -> tuple[str, ...]:
     return warn_if_limits_exceed_data(load_planning_config(str(folder), overrides=list(overrides)), folder)
 
 
-def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config, reporter) -> None:
+def test_pose_run_records_data_limits_and_plans_within_them(make_config, reporter) -> None:
     folder = train(make_config(planning=PLANNING, training__steps=1), reporter)
     noted = json.loads((folder / "changes.json").read_text())
     source = open_source(read_run_config(folder).data)
@@ -207,7 +207,7 @@ def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config
     assert resolve_config(str(folder), asked).planning.limits.xyz == limits
 
 
-def test_a_run_without_it_plans_as_before_and_its_limits_cannot_be_those_of_the_data(make_config, base_folder) -> None:
+def test_run_without_recorded_motions_plans_but_rejects_data_limits(make_config, base_folder) -> None:
     folder = write_adapted_run(make_config(planning=PLANNING))
     assert load_for_planning(str(folder)).warnings == ()
     error = r"planning\.limits\.xyz: data, for a model or an older run.*such as planning\.limits\.xyz=\[0\.05.*inspect"
@@ -219,7 +219,7 @@ def test_a_run_without_it_plans_as_before_and_its_limits_cannot_be_those_of_the_
         Controller(load_subject(folder).world_model, taught)
 
 
-def test_whoever_loads_a_run_is_warned_of_limits_that_leave_what_it_was_taught(
+def test_limits_beyond_the_training_data_are_logged_as_warnings(
     taught_run: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     session = load_for_planning(str(taught_run), overrides=["planning.limits.xyz=[0.05,0.02,0.012]"])
@@ -252,13 +252,13 @@ def test_whoever_loads_a_run_is_warned_of_limits_that_leave_what_it_was_taught(
         ([30.0, *TAUGHT[1:]], "positions in metres"),
     ],
 )
-def test_a_note_that_says_no_limits_is_an_error(taught_run: Path, changes: object, complaint: str) -> None:
+def test_invalid_recorded_motions_raise(taught_run: Path, changes: object, complaint: str) -> None:
     note(taught_run, changes=changes)
     with pytest.raises(InputError, match=rf"changes\.json: .*{complaint}"):
         load_for_planning(str(taught_run))
 
 
-def test_vectors_are_compared_number_by_number(make_config) -> None:
+def test_vector_limits_are_compared_by_component(make_config) -> None:
     config = make_config(data__states="vector", data__path="elsewhere", planning=PLANNING)
     folder = Path(config.run_dir)
     folder.mkdir()

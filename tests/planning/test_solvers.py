@@ -57,7 +57,7 @@ def rosenbrock(actions: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_the_lowest_place_of_a_parabola_is_found(planner: str) -> None:
+def test_every_planner_finds_the_minimum_of_a_parabola(planner: str) -> None:
     target = torch.tensor([[0.3, -0.2], [0.1, 0.7], [-0.6, 0.0]])
     plan = solve(planner, parabola(target), space(3), iterations=40)
     torch.testing.assert_close(plan.actions, target, atol=0.03, rtol=0)
@@ -77,7 +77,7 @@ def upstream_cost(actions: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("case", json.loads((GOLDEN / "cem.json").read_text()), ids=lambda case: str(case["seed"]))
-def test_cem_gives_upstreams_plan_for_upstreams_seed(case: dict) -> None:
+def test_cem_equals_the_upstream_plan_for_the_same_seed(case: dict) -> None:
     given = case["arguments"]
     closing = given.get("close_gripper")
     usual = {"momentum_mean": 0.25, "momentum_std": 0.95}
@@ -107,7 +107,7 @@ def jepa_wms_cost(actions: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("case", json.loads((GOLDEN / "cem_jepa_wms.json").read_text()), ids=lambda c: str(c["seed"]))
-def test_cem_with_settings_of_jepa_wms_gives_its_plan(case: dict) -> None:
+def test_cem_with_jepa_wms_settings_equals_its_plan(case: dict) -> None:
     none = dict.fromkeys(("momentum_mean", "momentum_std", "momentum_mean_gripper", "momentum_std_gripper"), 0.0)
     settings = PlanningConfig(
         planner={"name": "cem", "options": {**none, "try_mean": True}},
@@ -133,7 +133,7 @@ def test_the_same_seed_gives_the_same_plan_and_another_seed_another(planner: str
 
 @pytest.mark.parametrize("planner", PLANNERS)
 @pytest.mark.parametrize("says", [math.nan, math.inf, -math.inf])
-def test_without_a_finite_energy_nothing_is_done(planner: str, says: float) -> None:
+def test_no_finite_energy_gives_zero_actions(planner: str, says: float) -> None:
     plan = solve(planner, lambda actions: actions.sum(dim=(1, 2)) * 0 + says, space(2), iterations=3)
     assert not plan.actions.any()
     assert plan.stopped == "no finite energy"
@@ -142,7 +142,7 @@ def test_without_a_finite_energy_nothing_is_done(planner: str, says: float) -> N
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_samples_without_a_finite_energy_do_no_harm(planner: str) -> None:
+def test_samples_without_finite_energy_are_ignored(planner: str) -> None:
     target = torch.tensor([[0.4, -0.3]])
 
     def cost(actions: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ def test_samples_without_a_finite_energy_do_no_harm(planner: str) -> None:
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_a_cost_that_wants_ever_more_does_not_push_a_plan_beyond_the_limits(planner: str) -> None:
+def test_unbounded_cost_keeps_the_plan_within_the_limits(planner: str) -> None:
     settings = config(
         planner, iterations=30, horizon=4, action_repeat=2,
         limits=LimitsConfig(xyz=(0.05, 0.03, 0.0), rotation=0.1),
@@ -179,7 +179,7 @@ class Watch:
 
 @pytest.mark.parametrize("planner", PLANNERS)
 @pytest.mark.parametrize(("budget", "iterations"), [(0.1, 1), (2.9, 2), (3.0, 3), (99.0, 5)])
-def test_no_iteration_begins_that_would_end_after_the_time_budget(planner: str, budget: float, iterations: int) -> None:
+def test_iterations_stop_before_the_time_budget_is_exceeded(planner: str, budget: float, iterations: int) -> None:
     watch = Watch()
 
     def slow(actions: Tensor) -> Tensor:
@@ -196,7 +196,7 @@ def test_no_iteration_begins_that_would_end_after_the_time_budget(planner: str, 
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_a_warm_start_begins_where_the_last_plan_led(planner: str) -> None:
+def test_warm_start_begins_at_the_previous_plan(planner: str) -> None:
     target = torch.tensor([[0.2, 0.1], [0.8, -0.9], [-0.7, 0.6]])
     before = solve(planner, parabola(target), space(3), iterations=40)
     following = torch.cat([target[1:], target[-1:]])
@@ -211,7 +211,7 @@ def test_a_warm_start_begins_where_the_last_plan_led(planner: str) -> None:
     assert first(start) < first(None)
 
 
-def test_icems_elites_take_part_again() -> None:
+def test_icem_reuses_elites() -> None:
     before = solve("icem", rosenbrock, space(2), iterations=3)
     start = before.make_next_start()
     shown: list[Tensor] = []
@@ -228,7 +228,7 @@ def test_icems_elites_take_part_again() -> None:
     assert all(later.lowest <= earlier.lowest for earlier, later in pairwise(plan.iterations))
 
 
-def test_mppi_tries_its_mean_and_weighs_by_energy() -> None:
+def test_mppi_evaluates_its_mean_and_weights_by_energy() -> None:
     options = MppiSolver.Config(temperature=0.5, std_decay=0.5)
     search = MppiSolver(space(), config("mppi", samples=3), torch.Generator(), options=options)
     assert torch.equal(search.sample()[0], search.mean)
@@ -242,7 +242,7 @@ def test_mppi_tries_its_mean_and_weighs_by_energy() -> None:
 
 @pytest.mark.parametrize("decisions", [1, 2, 7, 8])
 @pytest.mark.parametrize("exponent", [0.0, 2.0])
-def test_coloured_noise_has_variance_one_everywhere(decisions: int, exponent: float) -> None:
+def test_coloured_noise_has_unit_variance(decisions: int, exponent: float) -> None:
     noise = draw_coloured_noise(40_000, decisions, 1, exponent, torch.Generator().manual_seed(0))
     torch.testing.assert_close(noise.var(dim=0), torch.ones(decisions, 1), atol=0.05, rtol=0)
     assert noise.mean(dim=0).abs().max() < 0.03

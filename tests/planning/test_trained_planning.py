@@ -51,9 +51,7 @@ def decided(model: WorldModel, config: PlanningConfig = PLAIN) -> list[np.ndarra
 
 
 @every_adapter
-def test_the_same_is_decided_as_by_the_model_that_was_trained(
-    adapter: AdapterConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_merged_model_decides_like_the_trained_model(adapter: AdapterConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     model, tried = trained_model(adapter), actions(20, 2)
     with torch.no_grad():
         expected, of_base = cost(model)(tried), cost(tiny_model())(tried)
@@ -66,7 +64,7 @@ def test_the_same_is_decided_as_by_the_model_that_was_trained(
 
 @every_adapter
 @torch.no_grad()
-def test_in_bfloat16_energies_are_those_of_float32_to_rounding(adapter: AdapterConfig) -> None:
+def test_bfloat16_energies_equal_float32_up_to_rounding(adapter: AdapterConfig) -> None:
     model, tried = trained_model(adapter, torch.bfloat16), actions(50, 2)
     precise, base = copy.deepcopy(model).float(), tiny_model().to(torch.bfloat16)
     exact, of_base = cost(precise)(tried), cost(copy.deepcopy(base).float())(tried)
@@ -76,7 +74,7 @@ def test_in_bfloat16_energies_are_those_of_float32_to_rounding(adapter: AdapterC
 
 
 @every_adapter
-def test_the_given_model_is_not_changed(adapter: AdapterConfig) -> None:
+def test_controller_leaves_the_model_unchanged(adapter: AdapterConfig) -> None:
     model = trained_model(adapter, torch.bfloat16).train()
     weights = {name: value.clone() for name, value in model.state_dict().items()}
     trained = [value.requires_grad for value in model.parameters()]
@@ -108,7 +106,7 @@ def _with_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("traced")
 @pytest.mark.parametrize("adapted", [False, True])
 @pytest.mark.parametrize("planner", ["cem", "gradient"])
-def test_compiled_plans_are_the_plain_ones(adapted: bool, planner: str) -> None:
+def test_compiled_plans_equal_uncompiled_plans(adapted: bool, planner: str) -> None:
     model, planned = tiny_model(adapted=adapted), {"planner": Component(planner)}
     expected = decided(model, IN_PARTS.model_copy(update=planned))
     assert not counters["stats"]
@@ -118,7 +116,7 @@ def test_compiled_plans_are_the_plain_ones(adapted: bool, planner: str) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_what_cannot_be_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_compiler_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     model = tiny_model()
     monkeypatch.setattr(compilation, "missing_for_compilation", lambda kind: f"no compiler for {kind}")
     with pytest.raises(InputError, match=r"no compiler for cpu.*planning.compile=off"):

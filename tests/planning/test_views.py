@@ -35,7 +35,7 @@ def energies(run: Controller, actions: torch.Tensor) -> torch.Tensor:
         return run.decision.cost(actions)
 
 
-def test_the_energy_of_two_views_is_the_mean_of_theirs() -> None:
+def test_energy_of_two_views_is_the_mean_of_both() -> None:
     goals, frames = (image(100), image(101)), (image(1), image(2))
     actions = torch.randn(5, 2, 7, generator=torch.Generator().manual_seed(0)) * 0.05
     both = decided(np.hstack(goals), np.hstack(frames), 2)
@@ -49,7 +49,7 @@ def test_the_energy_of_two_views_is_the_mean_of_theirs() -> None:
         torch.testing.assert_close(states, the_same)
 
 
-def test_a_mask_may_leave_one_view_out() -> None:
+def test_mask_can_exclude_one_view() -> None:
     goal, frame = np.hstack([image(100), image(101)]), np.hstack([image(1), image(2)])
     mask = np.zeros(goal.shape[:2], dtype=bool)
     mask[:, : mask.shape[1] // 2] = True
@@ -60,13 +60,13 @@ def test_a_mask_may_leave_one_view_out() -> None:
         decided(goal, frame, 2, np.zeros_like(mask))
 
 
-def test_what_cannot_be_split_is_refused() -> None:
+def test_image_width_that_does_not_fit_the_views_raises() -> None:
     odd = np.zeros((64, 65, 3), dtype=np.uint8)
     with pytest.raises(InputError, match=r"65 pixels wide.* 2 views share"):
         decided(odd, odd, 2)
 
 
-def test_goals_are_made_of_both_cameras_and_a_film_shows_both(tmp_path: Path) -> None:
+def test_goals_and_video_contain_both_cameras(tmp_path: Path) -> None:
     data = tmp_path / "data"
     record_dataset(data, RecordingSpec("A", 9, seed=0, cameras=2), episodes=2)
     config = RldsData(path=str(data), camera=("exterior_1_left", "exterior_2_left"))
@@ -83,7 +83,7 @@ def test_goals_are_made_of_both_cameras_and_a_film_shows_both(tmp_path: Path) ->
     assert benchmark.results[0].episodes[0].frames.shape[2] == 2 * FRAME_SIZE[1]
 
 
-def test_an_image_of_two_views_is_imagined_view_by_view(tmp_path: Path) -> None:
+def test_image_of_two_views_is_predicted_by_view(tmp_path: Path) -> None:
     model, values = tiny_model(), {"run_dir": "r", "data": {"path": "d", "stride": 4}, "model": {"base": "b"}}
     decoder, images = str(write_decoder(tmp_path / "decoder", model)), [image(1), image(2)]
 

@@ -37,7 +37,7 @@ NEAR = st.tuples(st.floats(0.27, 0.63), st.floats(-0.23, 0.23), st.floats(0.08, 
 
 @given(NEAR, arrays(np.float64, (3, 7), elements=st.floats(-1, 1)), st.none() | st.floats(0.02, 0.1))
 @example((0.27, 0.0, 0.3), np.array([[-1.0, 1, 0, 0, 0, 0, 0]] * 3), 0.05)  # outside, and moving along the wall
-def test_every_target_is_inside_and_every_action_allowed(where, wild, l1) -> None:
+def test_clipped_actions_stay_inside_the_workspace_and_limits(where, wild, l1) -> None:
     limits, state = limits_of(l1), position(*where)
     space = make_pose_search_space(PlanningConfig(limits=limits, horizon=3))
     actions = space.clip(torch.from_numpy(wild).float()).double().numpy()
@@ -52,7 +52,7 @@ def test_every_target_is_inside_and_every_action_allowed(where, wild, l1) -> Non
 
 
 @given(NEAR)
-def test_the_search_does_not_leave_the_box_with_its_first_decision(where) -> None:
+def test_first_decision_of_the_search_stays_inside_the_workspace(where) -> None:
     config, state = PlanningConfig(limits=limits_of(), horizon=4, action_repeat=2), position(*where)
     wide, narrow = make_pose_search_space(config), box().narrow(make_pose_search_space(config), state)
     for bound, outwards in ((narrow.upper, 1), (narrow.lower, -1)):
@@ -64,7 +64,7 @@ def test_the_search_does_not_leave_the_box_with_its_first_decision(where) -> Non
     assert narrow.upper[1:].equal(wide.upper[1:]), "where later decisions begin is not known"
 
 
-def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -> None:
+def test_robot_returns_from_slightly_outside_and_stops_far_outside() -> None:
     run = controller(limits=LimitsConfig(workspace=CORNERS))
     run.reset(image(100))
     action = run.act(image(0), position(0.63, 0.0, 0.3))
@@ -76,14 +76,14 @@ def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -
 
 
 @pytest.mark.parametrize("space", [CAMERA_POSE, make_vector_states(8)])
-def test_a_box_is_of_poses_in_the_base_frame(space) -> None:
+def test_workspace_without_base_frame_poses_raises(space) -> None:
     with pytest.raises(InputError, match="workspace: a model whose states are not poses"):
         Workspace.from_limits(limits_of(), space)
     assert Workspace.from_limits(LimitsConfig(), space) is None
 
 
 @pytest.mark.parametrize("corners", [((0, 0, 0), (1, 1, 0)), ((0, 0, 0), (1, 1, math.nan)), ((0, 0, 0), (1, 1, 600))])
-def test_a_box_without_room_or_in_millimetres_is_refused(corners) -> None:
+def test_empty_workspace_or_millimetres_raise(corners) -> None:
     with pytest.raises(ValueError, match="workspace"):
         LimitsConfig(workspace=corners)
 
@@ -103,21 +103,21 @@ def pose(horizon: int = 1, action_repeat: int = 1, **limits: object) -> SearchSp
     values=st.lists(st.floats(width=32), min_size=7, max_size=7),
     l1=st.none() | st.floats(1e-3, 0.1),
 )
-def test_allowed_actions_are_within_all_limits(values: list[float], l1: float | None) -> None:
+def test_clipped_decisions_are_within_all_limits(values: list[float], l1: float | None) -> None:
     allowed = pose(l1=l1).clip(torch.tensor([values]))[0].double()
     assert torch.isfinite(allowed).all()
     assert (allowed.abs() <= torch.tensor(WIDEST, dtype=torch.float64)).all()
     assert l1 is None or allowed[:3].abs().sum() <= l1
 
 
-def test_actions_within_the_limits_are_unchanged_and_longer_ones_keep_their_direction() -> None:
+def test_clip_keeps_allowed_actions_and_the_direction_of_longer_ones() -> None:
     inside = torch.tensor([[0.01, -0.02, 0.0, 0.1, -0.1, 0.19, -0.7]])
     assert torch.equal(pose(l1=0.031).clip(inside), inside)
     torch.testing.assert_close(pose(l1=0.015).clip(inside)[0, :3], torch.tensor([0.005, -0.01, 0.0]))
 
 
 @pytest.mark.parametrize("l1", [1e-50, 0.075])
-def test_no_motion_is_allowed_under_any_limit_of_the_norm_and_has_a_finite_gradient(l1: float) -> None:
+def test_zero_motion_is_allowed_with_a_finite_gradient(l1: float) -> None:
     motion = torch.zeros(2, 3, 7, requires_grad=True)
     allowed = pose(horizon=3, l1=l1).clip(motion)
     allowed.sum().backward()
@@ -132,7 +132,7 @@ def test_no_motion_is_allowed_under_any_limit_of_the_norm_and_has_a_finite_gradi
         ("free", 0.24, 0.24), ("held", 0.5, 0.0), ("open", 0.5, -1.0), ("close", -0.5, 1.0),
     ],
 )  # fmt: skip
-def test_each_gripper_mode_does_what_it_says(mode: str, given: float, expected: float) -> None:
+def test_gripper_modes_limit_and_round_the_gripper(mode: str, given: float, expected: float) -> None:
     decisions = torch.zeros(1, 7)
     decisions[0, 6] = given
     assert float(pose(gripper_mode=mode).finalize(decisions)[0, 6]) == pytest.approx(expected)
@@ -149,6 +149,6 @@ def test_each_gripper_mode_does_what_it_says(mode: str, given: float, expected: 
         ({"limits": {"rotation": 10.0}}, "less than or equal to 3.14"),  # degrees
     ],
 )
-def test_settings_that_do_not_fit_are_refused(values: dict, complaint: str) -> None:
+def test_inconsistent_settings_raise(values: dict, complaint: str) -> None:
     with pytest.raises(ValidationError, match=complaint):
         PlanningConfig.model_validate(values)

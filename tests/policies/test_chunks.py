@@ -29,7 +29,7 @@ def walks(seed: int, steps: int = 12) -> np.ndarray:
 
 @settings(max_examples=15)
 @given(st.integers(0, 30), st.sampled_from([1, 3, 4]))
-def test_the_same_motion_in_every_form_is_the_same_change(seed: int, control_steps: int) -> None:
+def test_every_chunk_form_gives_the_same_changes(seed: int, control_steps: int) -> None:
     targets = walks(seed)
     deltas = np.stack([actions_from_states(np.concatenate([STATE[None], one])) for one in targets])
     offsets = np.array([[actions_from_states(np.stack([STATE, one]))[0] for one in way] for way in targets])
@@ -41,7 +41,7 @@ def test_the_same_motion_in_every_form_is_the_same_change(seed: int, control_ste
         np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
-def test_control_steps_that_fill_no_model_step_are_left_out_and_vectors_add() -> None:
+def test_incomplete_model_steps_are_dropped_and_vectors_add() -> None:
     chunks = np.arange(30.0).reshape(1, 10, 3)
     found = changes_of_chunks(chunks, np.zeros(3), form="deltas", control_steps=4, space=make_vector_states(3))
     np.testing.assert_allclose(found, [[chunks[0, :4].sum(0), chunks[0, 4:8].sum(0)]])
@@ -56,12 +56,12 @@ def test_control_steps_that_fill_no_model_step_are_left_out_and_vectors_add() ->
         (np.full((2, 8, 7), 400.0), "metres"),
     ],
 )
-def test_what_is_no_chunk_is_refused(chunks: np.ndarray, found: str) -> None:
+def test_invalid_chunks_raise(chunks: np.ndarray, found: str) -> None:
     with pytest.raises(InputError, match=found):
         changes_of_chunks(chunks, STATE, form="targets", control_steps=4)
 
 
-def test_scores_are_the_planners_energies_and_leave_no_trace() -> None:
+def test_scores_equal_planner_energies_and_leave_the_controller_unchanged() -> None:
     run = Controller(tiny_model(), QUICK)
     run.reset(image(100))
     run.act(image(0), STATE)

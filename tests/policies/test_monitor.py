@@ -37,7 +37,7 @@ def dataset(data_folder: Path) -> Dataset:
     return open_dataset(data_folder, frames=4, stride=STRIDE, workers=0, validation_share=0.4, test_share=0.3)
 
 
-def test_every_frame_is_predicted_from_the_one_before_it(whole_run: Path, dataset: Dataset) -> None:
+def test_each_frame_is_predicted_from_the_previous_frame(whole_run: Path, dataset: Dataset) -> None:
     model = load_run(whole_run, device="cpu").world_model
     (found,) = measure_episodes(model, dataset, [2])
     episode = dataset.source.read(2)
@@ -51,7 +51,7 @@ def test_every_frame_is_predicted_from_the_one_before_it(whole_run: Path, datase
         assert found.find_first_alarm(replace(by, expected=tuple(usual), threshold=threshold)) == expected
 
 
-def test_the_threshold_is_of_the_held_out_episodes_alone(whole_run: Path, dataset: Dataset) -> None:
+def test_threshold_uses_held_out_episodes_only(whole_run: Path, dataset: Dataset) -> None:
     model = load_run(whole_run, device="cpu").world_model
     monitor = calibrate_monitor(model, dataset, 0.3)
     held_out = np.flatnonzero(dataset.split_mask("validation") | dataset.split_mask("test"))
@@ -62,7 +62,7 @@ def test_the_threshold_is_of_the_held_out_episodes_alone(whole_run: Path, datase
     assert monitor.threshold in monitor.scores
 
 
-def test_the_command_notices_a_broken_picture(
+def test_monitor_command_detects_a_corrupted_image(
     whole_run: Path, dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     episode, data = dataset.source.read(1), tmp_path / "npz"
@@ -114,7 +114,7 @@ def acting(monitor: str | None, frames: int = 4, **changes: object) -> list:
 
 @settings(max_examples=30)
 @given(st.integers(19, 200), st.sampled_from([0.05, 0.1, 0.3]), st.integers(0, 1000))
-def test_a_further_episode_is_above_the_threshold_as_often_as_promised(count: int, share: float, seed: int) -> None:
+def test_false_alarm_rate_is_at_most_the_requested_rate(count: int, share: float, seed: int) -> None:
     drawn = torch.rand(count, generator=torch.Generator().manual_seed(seed))
     threshold = compute_conformal_threshold(drawn, share)
     above = int((drawn > threshold).sum())
@@ -122,25 +122,25 @@ def test_a_further_episode_is_above_the_threshold_as_often_as_promised(count: in
 
 
 @pytest.mark.parametrize(("count", "share"), [(18, 0.05), (5, 0.1), (3, 0.0)])
-def test_too_few_episodes_for_a_promise_are_refused(count: int, share: float) -> None:
+def test_too_few_episodes_for_a_threshold_raise(count: int, share: float) -> None:
     with pytest.raises(InputError, match=f"{count} held-out episodes"):
         compute_conformal_threshold(torch.rand(count), share)
 
 
-def test_the_score_is_what_patches_are_farther_off_than_usual() -> None:
+def test_surprise_is_the_mean_excess_over_the_usual_error() -> None:
     errors, usual = torch.zeros(2, 4), torch.tensor([1.0, 0.0, 0.0, 0.0])
     errors[0, 0], errors[1, 0], errors[1, 3] = 1.0, 3.0, 2.0  # in a patch that is often far off, and in a calm one
     assert compute_surprise(errors, usual).tolist() == [0.0, 1.0]
 
 
-def test_what_is_not_a_number_is_an_alarm(tmp_path: Path) -> None:
+def test_nan_surprise_is_an_alarm(tmp_path: Path) -> None:
     monitor = Monitor.read(written(tmp_path, 9.0), tiny_model().fingerprints(), tokens=9, where="test")
     still = torch.zeros(9, 5)
     assert not monitor.compare(still, still).is_alarm
     assert monitor.compare(still, torch.full_like(still, float("nan"))).is_alarm
 
 
-def test_what_the_last_decision_predicted_is_compared_with_what_is_seen(tmp_path: Path) -> None:
+def test_monitor_compares_the_last_prediction_with_the_current_frame(tmp_path: Path) -> None:
     first, second, *_ = acting(written(tmp_path, 1e6))
     assert first.surprise is None
     predicted, _ = first.cost.rollout(first.plan.actions[None, :1])
@@ -151,7 +151,7 @@ def test_what_the_last_decision_predicted_is_compared_with_what_is_seen(tmp_path
     assert all(one.surprise is None for one in acting(None))
 
 
-def test_settings_and_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+def test_mismatched_monitor_settings_and_files_raise(tmp_path: Path) -> None:
     path = written(tmp_path, 1.0)
     known = json.loads(Path(path).read_text())
     Path(path).write_text(json.dumps(known | {"predictor": "0" * 64}))

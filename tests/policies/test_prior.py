@@ -52,7 +52,7 @@ def acting(folder: Path | None, **changes: object) -> Controller:
     return run
 
 
-def test_alone_it_acts_within_the_limits_without_a_search(folder: Path) -> None:
+def test_prior_planner_acts_within_the_limits_without_search(folder: Path) -> None:
     run = acting(folder, planner=Component("prior"), limits=LimitsConfig(xyz=(0.05, 0.01, 0.05)))
     np.testing.assert_allclose(run.decision.action, [0.03, -0.01, 0.01, 0, 0, 0, 0.3], atol=1e-6)
     assert run.decision.plan.evaluations == 1
@@ -60,7 +60,7 @@ def test_alone_it_acts_within_the_limits_without_a_search(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("planner", ["cem", "icem", "mppi", "gradient"])
-def test_every_search_starts_from_it_as_wide_as_it_is_unsure(folder: Path, planner: str) -> None:
+def test_search_starts_from_the_mean_and_std_of_the_prior(folder: Path, planner: str) -> None:
     run = acting(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
     first = run.decision.plan.iterations[0]
     spread = np.sqrt(2) * np.exp(-3.0)
@@ -74,7 +74,7 @@ def test_every_search_starts_from_it_as_wide_as_it_is_unsure(folder: Path, plann
     np.testing.assert_array_equal(run.decision.action, again.decision.action)
 
 
-def test_a_plan_of_several_steps_follows_what_the_model_predicts(tmp_path: Path) -> None:
+def test_prior_of_several_steps_uses_predicted_frames(tmp_path: Path) -> None:
     torch.manual_seed(0)
     prior, model = ActionPrior(SIZES).eval().requires_grad_(False), tiny_model()
     card = PriorCard("vjepa2-ac prior 1", SIZES, model.encoder_fingerprint(), "released", "nowhere", 0)
@@ -95,7 +95,7 @@ def test_a_plan_of_several_steps_follows_what_the_model_predicts(tmp_path: Path)
         seen, state = predicted[0, -1], states[0, -1]
 
 
-def test_it_is_refused_for_another_encoder_and_where_a_file_is_damaged(folder: Path) -> None:
+def test_prior_of_another_encoder_or_damaged_file_raises(folder: Path) -> None:
     card = json.loads((folder / CARD).read_text())
     (folder / CARD).write_text(json.dumps(card | {"encoder": "0" * 64}))
     with pytest.raises(InputError, match=r"a prior for encoder"):
@@ -109,7 +109,9 @@ def test_it_is_refused_for_another_encoder_and_where_a_file_is_damaged(folder: P
         load_prior(folder, where="planning.prior")
 
 
-def test_training_is_repeatable_beats_doing_nothing_and_sees_the_goal(make_config: MakeConfig, tmp_path: Path) -> None:
+def test_prior_training_is_deterministic_beats_zero_action_and_uses_the_goal(
+    make_config: MakeConfig, tmp_path: Path
+) -> None:
     """On episodes whose actions are drawn at random, what leads to a goal is only to be seen in the goal."""
     config, reporter = make_config(), SilentReporter()
     first = train_prior(config, tmp_path / "a", PriorOptions(steps=60, batch_size=8), reporter)
@@ -121,7 +123,7 @@ def test_training_is_repeatable_beats_doing_nothing_and_sees_the_goal(make_confi
     assert load_prior(tmp_path / "a", where="test")[0].sizes.ahead == config.data.frames - 1
 
 
-def test_the_command_writes_it_beside_the_run_and_says_how_to_plan(
+def test_prior_command_writes_into_the_run_and_prints_the_planning_command(
     whole_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "prior"
@@ -132,7 +134,7 @@ def test_the_command_writes_it_beside_the_run_and_says_how_to_plan(
     assert main(["prior", str(tmp_path)]) == 2
 
 
-def test_a_command_without_a_prior_refuses_the_planner_of_that_name() -> None:
+def test_prior_planner_without_a_prior_raises() -> None:
     config = PlanningConfig(planner="prior", prior="nowhere")
     with pytest.raises(InputError, match=r"planning\.planner: prior, but no action prior is loaded"):
         Planner(config).plan(lambda actions: actions.sum(dim=(1, 2)), torch.Generator())

@@ -70,7 +70,7 @@ def knowing(*, blind: bool = False) -> Controller:
     return run
 
 
-def test_policies_of_known_quality_come_out_in_their_order(dataset: Dataset) -> None:
+def test_policies_of_known_quality_are_ranked_correctly(dataset: Dataset) -> None:
     policies = [policy(dataset, name, noise) for name, noise in (("bad", 1.0), ("good", 0.05), ("fair", 0.3))]
     found = score_policies(knowing(), dataset, policies)
     assert [one.name for one in found.policies] == ["good", "fair", "bad"]
@@ -84,7 +84,7 @@ def test_policies_of_known_quality_come_out_in_their_order(dataset: Dataset) -> 
     assert json.loads(json.dumps(found.as_dict()))["is_blind"] is False
 
 
-def test_a_model_at_chance_is_said_to_be_blind(dataset: Dataset) -> None:
+def test_model_at_chance_is_blind(dataset: Dataset) -> None:
     found = score_policies(knowing(blind=True), dataset, [policy(dataset, "one", 0.1)])
     assert found.is_blind
     assert found.others_below_true.low < 0.5
@@ -98,7 +98,7 @@ class Noting(Knowing):
         return super().score(frame, state, chunks)
 
 
-def test_other_actions_are_of_other_episodes(dataset: Dataset) -> None:
+def test_alternative_actions_are_from_other_episodes(dataset: Dataset) -> None:
     run, one = Noting(tiny_model(), PlanningConfig()), policy(dataset, "one", 0.1)
     score_policies(run, dataset, [one])
     episodes = [name for name, step in sorted(one.points) if step < STEPS - 1]
@@ -111,7 +111,7 @@ def test_other_actions_are_of_other_episodes(dataset: Dataset) -> None:
             assert len(places)
 
 
-def test_views_are_read_side_by_side_as_the_planner_sees_them(tmp_path: Path) -> None:
+def test_views_are_read_side_by_side_as_in_planning(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for number in range(3):
         views = {name: rng.integers(0, 255, (STEPS, 24, 32, 3), dtype=np.uint8) for name in ("frames", "right")}
@@ -128,7 +128,7 @@ def test_views_are_read_side_by_side_as_the_planner_sees_them(tmp_path: Path) ->
         score_policies(run, open_dataset(tmp_path, camera="frames", **how), [one])
 
 
-def test_places_that_not_all_have_are_left_out_and_unknown_episodes_refused(dataset: Dataset) -> None:
+def test_points_missing_in_a_file_are_skipped_and_unknown_episodes_raise(dataset: Dataset) -> None:
     one, other = policy(dataset, "one", 0.1), policy(dataset, "other", 0.1)
     fewer = PolicyChunks("other", other.points[:2], other.chunks[:2])
     assert score_policies(knowing(), dataset, [one, fewer]).places == 2
@@ -138,7 +138,7 @@ def test_places_that_not_all_have_are_left_out_and_unknown_episodes_refused(data
         score_policies(knowing(), dataset, [PolicyChunks("none", (("x", 0),), other.chunks[:1])])
 
 
-def test_files_are_read_and_nothing_in_them_runs(tmp_path: Path) -> None:
+def test_policy_files_are_read_without_executing_code(tmp_path: Path) -> None:
     good = {"episodes": np.array(["a", "b"]), "frames": np.array([0, 3]), "chunks": np.zeros((2, 1, 4, 7))}
     np.savez(tmp_path / "good.npz", **good)
     found = read_policy_chunks(tmp_path / "good.npz")
@@ -156,7 +156,7 @@ def test_files_are_read_and_nothing_in_them_runs(tmp_path: Path) -> None:
         read_policy_chunks(tmp_path / "absent.npz")
 
 
-def test_a_run_knows_from_its_validation_whether_it_can_tell(tmp_path: Path, whole_run: Path) -> None:
+def test_run_ranking_error_is_read_from_its_validation(tmp_path: Path, whole_run: Path) -> None:
     found = read_run_ranking_error(str(whole_run), "step-00000006 (the newest)")
     assert found is not None
     assert 0 <= found.value <= 1

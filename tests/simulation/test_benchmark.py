@@ -46,7 +46,7 @@ def test_joint_model_acts_in_joint_space(
     assert (np.abs(np.diff(distances, axis=1)) > 0.1).all(), "the arm moves"
     capsys.readouterr()
     assert main(given) == 2
-    assert "planning.limits.axes: data, for a model without a record" in capsys.readouterr().err
+    assert "planning.limits.axes: data, but the model has no record" in capsys.readouterr().err
     (tmp_path / "other.yaml").write_text(config.read_text().replace("joint_position", "other"))
     assert main([*given, "--config", str(tmp_path / "other.yaml"), "planning.limits.axes=[0.2]"]) == 2
     assert "other numbers than the simulated arm measures" in capsys.readouterr().err
