@@ -1,4 +1,4 @@
-"""Imagination is given one frame and its state, and nothing after it; a plan's images are those it was chosen by."""
+"""Decoded rollouts use only the first frame and its state; the images of a plan are its decoded predictions."""
 
 import numpy as np
 import pytest

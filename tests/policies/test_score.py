@@ -1,4 +1,4 @@
-"""Policies are put in order by the energy of what they would do, and not where the model cannot tell actions apart."""
+"""Policies are ranked by the energy of their actions, unless the model ranks actions no better than chance."""
 
 import json
 from pathlib import Path

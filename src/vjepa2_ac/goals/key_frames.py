@@ -39,11 +39,11 @@ class KeyFrame:
 class StillRule:
     """Rule for stops of the arm; all values are in frames."""
 
-    lasts: int = 4  # shortest rest that counts as a stop
-    apart: int = 4  # a stop closer than this to another key frame is left out
+    min_rest: int = 4  # shortest rest that counts as a stop
+    min_distance: int = 4  # a stop closer than this to another key frame is left out
 
 
-MODEL_STEP_RULE = StillRule(lasts=1, apart=1)
+MODEL_STEP_RULE = StillRule(min_rest=1, min_distance=1)
 """The rule if a frame is a model step."""
 
 
@@ -70,11 +70,11 @@ def find_gripper_key_frames(states: States, rule: StillRule | None = None) -> tu
     changes = _find_gripper_changes(states[:, GRIPPER])
     for begin, end in changes:
         closes = states[end, GRIPPER] > states[begin, GRIPPER]
-        if begin >= rule.apart:
+        if begin >= rule.min_distance:
             names.setdefault(begin, "before closing" if closes else "before opening")
         names[_find_end_of_change(states, begin, end)] = "closed" if closes else "opened"
-    for begin in _find_stops(states, rule.lasts):
-        is_near = [abs(begin - frame) < rule.apart for frame in (0, last, *names)]
+    for begin in _find_stops(states, rule.min_rest):
+        is_near = [abs(begin - frame) < rule.min_distance for frame in (0, last, *names)]
         if not any(is_near) and not any(first <= begin <= end for first, end in changes):
             names[begin] = "stop"
     if not names or not _is_same(states[max(names)], states[last]):
@@ -105,15 +105,15 @@ def _find_end_of_change(states: States, begin: int, end: int) -> int:
     return begin + int(candidates[-1]) if len(candidates) else end
 
 
-def _find_stops(states: States, lasts: int) -> list[int]:
-    """Return the frames at which the arm comes to rest for at least `lasts` frames; a rest at the start is left out."""
+def _find_stops(states: States, min_rest: int) -> list[int]:
+    """Return the frames at which the arm comes to rest for at least `min_rest` frames; a rest at the start is left out."""
     still = _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MIN_FINGER_MOTION)
     begins = [frame for frame in range(1, len(still)) if still[frame] and not still[frame - 1]]
-    return [begin for begin in begins if still[begin : begin + lasts].all() and begin + lasts <= len(still)]
+    return [begin for begin in begins if still[begin : begin + min_rest].all() and begin + min_rest <= len(still)]
 
 
-def _is_same(one: Float[np.ndarray, " 7"], other: Float[np.ndarray, " 7"]) -> bool:
-    return bool(_are_below(actions_from_states(np.stack([one, other])), _SAME_M, _SAME_RAD, MIN_GRIPPER_CHANGE)[0])
+def _is_same(first: Float[np.ndarray, " 7"], second: Float[np.ndarray, " 7"]) -> bool:
+    return bool(_are_below(actions_from_states(np.stack([first, second])), _SAME_M, _SAME_RAD, MIN_GRIPPER_CHANGE)[0])
 
 
 def _are_below(

@@ -35,7 +35,7 @@ class KeyFrameOptions(Timing):
     """Options for selecting key frames, and rules for their durations. A frame is a control step of an episode."""
 
     every: int | None = None  # distance in frames; None: frames at which the gripper changes or the arm stops
-    apart: int = StillRule.apart  # smallest number of frames between a stop and another goal
+    apart: int = StillRule.min_distance  # smallest number of frames between a stop and another goal
     stride: int = 4  # frames per model step
     views: int = 1  # number of cameras whose images are side by side, beginning with the first
 
@@ -89,32 +89,32 @@ def make_goals(
     index = find_episode(dataset, episode_name)
     name, states = dataset.table.identity(index), dataset.source.read(index, config.cameras[0]).states
     if len(states) < 2:
-        raise InputError(where=name, found=f"{len(states)} frames", needed="2 at least")
+        raise InputError(where=name, found=f"{len(states)} frames", needed="at least 2")
     poses = states if config.states == "pose" else None
     if options.every is not None:
         keys = select_every_nth_frame(len(states), options.every)
     elif poses is None:
-        found, needed = f"{name}: no measured poses", "an episode with poses and gripper"
-        raise InputError(where="goals", found=found, needed=needed, fix="Take every n-th frame: --every N")
+        found, needed = "no measured poses", "an episode with poses and gripper"
+        raise InputError(where=name, found=found, needed=needed, fix="Use --every N to take every n-th frame")
     else:
-        keys = find_gripper_key_frames(poses, StillRule(apart=options.apart))
+        keys = find_gripper_key_frames(poses, StillRule(min_distance=options.apart))
     first, *images = read_views(dataset, index, options.views, [0, *(key.frame for key in keys)])
     goals, origin = make_sub_goals(images, keys, options, poses), {"data": config.path, "episode": name}
     return DemonstrationGoals(options, keys, goals, first, len(states), poses, {**origin, "camera": config.camera})
 
 
-def read_episode_frame(config: DataConfig, place: str) -> UInt8[np.ndarray, "height width 3"]:
+def read_episode_frame(config: DataConfig, text: str) -> UInt8[np.ndarray, "height width 3"]:
     """Return the image at EPISODE:STEP of a data set, or the last image of EPISODE.
 
     Raises:
         InputError: There is no such episode or step, or the episode cannot be read.
     """
-    name, _, step = place.rpartition(":") if re.fullmatch(r".+:\d+", place) else (place, "", "")
+    name, _, step = text.rpartition(":") if re.fullmatch(r".+:\d+", text) else (text, "", "")
     require_frames(config, to="read a goal image")
     dataset = open_dataset(config)
     episode = dataset.source.read(find_episode(dataset, name))
     count = len(episode.states)
     if step and int(step) >= count:
-        found = f"an episode of {counted(count, 'step')}"
-        raise InputError(where=f"--goal-from {place}", found=found, needed="one of them, from 0")
+        found = f"the episode has {counted(count, 'step')}"
+        raise InputError(where=f"--goal-from {text}", found=found, needed=f"a step from 0 to {count - 1}")
     return np.asarray(episode.read_frames([int(step) if step else count - 1])[0])

@@ -131,7 +131,7 @@ class Controller:
         )  # the allowed changes of the state, of the last decision
         self.planner = Planner(self.config, self.space)
         self._workspace = Workspace.from_limits(self.config.limits, spaces.state)
-        self._searched: dict[GripperMode | None, SearchSpace] = {None: self.space}
+        self._search_spaces: dict[GripperMode | None, SearchSpace] = {None: self.space}
         self._goals: tuple[SubGoal, ...] = ()
         self._progress: GoalProgress | None = None  # at the last usable frame
         self._done = 0
@@ -144,14 +144,14 @@ class Controller:
         self._prior_start: PriorStart | None = None
         if not (config.axes or config.monitor or config.prior):
             return
-        known = world_model.fingerprints()
+        fingerprints = world_model.fingerprints()
         if config.axes:
             require_base_frame(f"planning.axes: {config.axes}", is_base=self.spaces.state.is_base_pose)
-            self._axes = _load_axes(config.axes, known)
+            self._axes = _load_axes(config.axes, fingerprints)
         if config.monitor:
-            self._compare = PLANNING_FILES.find("monitor")(config.monitor, known, self.cameras)
+            self._compare = PLANNING_FILES.find("monitor")(config.monitor, fingerprints, self.cameras)
         if config.prior:
-            self._prior_start = PLANNING_FILES.find("prior")(config.prior, known, self.cameras)
+            self._prior_start = PLANNING_FILES.find("prior")(config.prior, fingerprints, self.cameras)
 
     @classmethod
     def of_run(
@@ -238,8 +238,8 @@ class Controller:
             cancelled: Called before each goal is encoded; returns whether to stop.
 
         Raises:
-            SearchCancelledError: `cancelled` returned true; the previous goals still apply.
-            InputError: An image is invalid, sizes differ, the mask is empty, a goal would never end, the last one has a
+            SearchCancelledError: `cancelled` returned true; the previous goals current_energies apply.
+            InputError: An image is invalid, sizes differ, the mask is empty, a goal has no end, the last goal has a
                 bound, or a gripper mode is set for a robot whose states are vectors, or leaves no free component.
             ValueError: No goals.
         """
@@ -249,8 +249,8 @@ class Controller:
             require_image(goal.image, where=f"goal {index}", like=goals[0].image if index else None)
             self.cameras.require_contrast(goal.image, where=f"goal {index}")
         require_goal_ends(goals)
-        searched = {goal.gripper: self._make_search_space(goal.gripper) for goal in goals} | {
-            None: self._searched[None]
+        search_spaces = {goal.gripper: self._make_search_space(goal.gripper) for goal in goals} | {
+            None: self._search_spaces[None]
         }
         report, latents = raise_if_cancelled(cancelled), []
         for index, goal in enumerate(goals):
@@ -258,7 +258,7 @@ class Controller:
             latents.append(self.encode(goal.image))
         weights = self.cameras.compute_patch_weights(mask, goals[0].image)
         self._goals, self._goal_latents, self._patch_weights = tuple(goals), torch.stack(latents), weights
-        self._searched, self.space = searched, searched[None]
+        self._search_spaces, self.space = search_spaces, search_spaces[None]
         self.cameras.latest_frames, self._progress, self._done, self.decision = (), None, 0, None
 
     def act(
@@ -288,15 +288,15 @@ class Controller:
             ValueError: No goal was set.
         """
         state = self._check_input(frame, state)
-        largest = self.space.upper[0].double().numpy()
-        newest, fault = self.cameras.check_frame(frame, state, self.spaces.state, largest)
+        max_change = self.space.upper[0].double().numpy()
+        latest_frames, fault = self.cameras.check_frame(frame, state, self.spaces.state, max_change)
         if fault is None:
             decision = self._decide(self.encode(frame), state, samples, cancelled)
             self._progress = decision.progress
         else:
             decision = self._decide_without_motion(state, fault)
         # Set after all calls that can raise, so that an error leaves the controller unchanged.
-        self.cameras.latest_frames, self._done, self.decision = newest, self._done + 1, decision
+        self.cameras.latest_frames, self._done, self.decision = latest_frames, self._done + 1, decision
         return decision.action
 
     @torch.no_grad()
@@ -329,18 +329,20 @@ class Controller:
         latents = self.encode(frame)
         if chunks.ndim != 3 or 0 in chunks.shape or chunks.shape[2] != self.space.dim:
             needed = f"chunks x model steps x {self.space.dim}"
-            raise InputError(where="chunks", found=f"an array of the shape {chunks.shape}", needed=needed)
+            raise InputError(where="chunks", found=f"an array with shape {chunks.shape}", needed=needed)
         progress = self._update_progress(latents)
-        still, _ = self._compute_current_energies(latents, progress, chunks.shape[1])
+        current_energies, _ = self._compute_current_energies(latents, progress, chunks.shape[1])
         cost = self._make_cost(latents, state, progress)
         cost.progress = raise_if_cancelled(cancelled)
         energies = cost(torch.from_numpy(np.concatenate([np.zeros_like(chunks[:1]), chunks])).float()).double()
-        return ChunkScores(energies[1:].numpy(), float(energies[0]), self._combine_steps(still), progress.goal_index)
+        return ChunkScores(
+            energies[1:].numpy(), float(energies[0]), self._combine_steps(current_energies), progress.goal_index
+        )
 
     def _check_input(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " dim"]:
         """Return the measured state; refuse a frame or a state that cannot be used, and a controller without a goal."""
         if not self._goals:
-            raise ValueError("no goal: call reset first")
+            raise ValueError("no goal was set; call reset first")
         require_image(frame, where="frame", like=self._goals[0].image)
         state, space = np.asarray(state, dtype=np.float64), self.spaces.state
         is_needed = self._model.sizes.predictor.use_states or self.spaces.action.follows != "change"
@@ -388,8 +390,8 @@ class Controller:
         """Return the distance of the current image from the goal of each of the next steps, and the goals' indices."""
         goal, done = self._get_goal(progress.goal_index), self._done - progress.start_step
         goal_latents = goal.get_latents(done, steps)
-        still = distance(latents.expand_as(goal_latents), goal_latents, self._energy, goal.weights)
-        return still, tuple(progress.goal_index + goal.get_index(done + step) for step in range(steps))
+        current_energies = distance(latents.expand_as(goal_latents), goal_latents, self._energy, goal.weights)
+        return current_energies, tuple(progress.goal_index + goal.get_index(done + step) for step in range(steps))
 
     def _make_cost(self, latents: Latents, state: State, progress: GoalProgress) -> WorldModelCost:
         goal, done = self._get_goal(progress.goal_index), self._done - progress.start_step
@@ -407,17 +409,17 @@ class Controller:
         cancelled: Cancelled,
     ) -> Decision:
         progress = self._update_progress(latents)
-        still, goal_indices = self._compute_current_energies(latents, progress, self.config.horizon)
-        energy = self._combine_steps(still)
+        current_energies, goal_indices = self._compute_current_energies(latents, progress, self.config.horizon)
+        energy = self._combine_steps(current_energies)
         command = self._get_command(state, np.zeros(len(state)))
         zero_action = Decision(command, "at the goal", energy, goal_indices, progress, surprise=self._surprise(latents))
-        if progress.is_done or float(still.max()) <= REACHED:
+        if progress.is_done or float(current_energies.max()) <= REACHED:
             return replace(zero_action, is_done=progress.goal_index == len(self._goals) - 1)
         if self._workspace is not None and not is_within_limits(
             self._workspace.get_return_motion(state[:3]), self.config.limits
         ):
             return replace(zero_action, why="outside the workspace")
-        self.space = self._searched[self._goals[progress.goal_index].gripper]
+        self.space = self._search_spaces[self._goals[progress.goal_index].gripper]
         cost = self._make_cost(latents, state, progress)
         plan = self._search(state, cost, self._get_start(cost, progress, samples), cancelled)
         why: Reason = "planned" if plan.stopped == "finished" else plan.stopped
@@ -455,19 +457,19 @@ class Controller:
 
     def _search(self, state: np.ndarray, cost: WorldModelCost, start: PlanStart | None, cancelled: Cancelled) -> Plan:
         """Return the plan of a search, kept inside the workspace if there is one, with the energy of its actions."""
-        generator, box = torch.Generator().manual_seed(self.seed + self._done), self._workspace
-        space = self.space if box is None else box.narrow(self.space, state)
+        generator, workspace = torch.Generator().manual_seed(self.seed + self._done), self._workspace
+        space = self.space if workspace is None else workspace.narrow(self.space, state)
         plan = self.planner.plan(cost, generator, start, cancelled, space)
-        if box is None or plan.stopped == "no finite energy":
+        if workspace is None or plan.stopped == "no finite energy":
             return plan
-        kept = torch.from_numpy(box.clip_actions(state, plan.actions.double().numpy(), self.config.limits)).to(
+        actions = torch.from_numpy(workspace.clip_actions(state, plan.actions.double().numpy(), self.config.limits)).to(
             plan.actions
         )
-        if torch.equal(kept, plan.actions):
+        if torch.equal(actions, plan.actions):
             return plan
         with torch.no_grad():
-            energy = float(cost(kept[None])[0])
-        return replace(plan, actions=kept, energy=energy, evaluations=plan.evaluations + 1)
+            energy = float(cost(actions[None])[0])
+        return replace(plan, actions=actions, energy=energy, evaluations=plan.evaluations + 1)
 
     def _make_search_space(self, gripper: GripperMode | None) -> SearchSpace:
         """Return the search space of a gripper mode.
@@ -476,7 +478,7 @@ class Controller:
             InputError: No component is free, or the index of the gripper is unknown.
         """
         if gripper is None:
-            return self._searched[None]
+            return self._search_spaces[None]
         where, fix = f"gripper mode {gripper!r} of a goal", "Remove the gripper mode of the goal"
         if not self.spaces.state.is_pose:
             found = "a model with vector states, whose gripper is unknown"
@@ -493,14 +495,14 @@ class Controller:
         return state + change if self.spaces.action.follows == "target" else change
 
 
-def _load_axes(path: str, known: Fingerprints) -> Axes:
+def _load_axes(path: str, fingerprints: Fingerprints) -> Axes:
     """Read calibrated axes, and check that they were fitted for this model.
 
     Raises:
         InputError: Planning cannot use the axes, or they were fitted for another model.
     """
     axes = read_axes(path)
-    if (axes.encoder, axes.predictor) != (known.encoder, known.predictor):
+    if (axes.encoder, axes.predictor) != (fingerprints.encoder, fingerprints.predictor):
         found = f"axes that were calibrated for another model, {axes.subject}"
         fix = "Calibrate them for this model: `vjepa2-ac data calibrate CONFIG --axes MODEL`"
         raise InputError(where=f"planning.axes: {path}", found=found, fix=fix)

@@ -188,14 +188,14 @@ class Workspace:
             actions: Changes of the state in each model step, within the limits.
             limits: The limits of an action.
         """
-        kept, position = np.array(actions, dtype=np.float64), np.array(state[:3], dtype=np.float64)
+        clipped, position = np.array(actions, dtype=np.float64), np.array(state[:3], dtype=np.float64)
         reach = np.array(limits.xyz_m)
-        for action in kept:
+        for action in clipped:
             motion = np.clip(position + action[:3], self.low, self.high) - position
             if abs(motion - action[:3]).max() > _NEAR_M:
                 action[:3] = _shorten_to_l1(np.clip(motion, -reach, reach), self.get_return_motion(position), limits.l1)
             position = position + action[:3]
-        return kept
+        return clipped
 
     def get_return_motion(self, position: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Return the shortest motion that ends inside the box; zeros for a position inside."""
@@ -222,7 +222,9 @@ def _shorten_to_l1(
     return np.asarray(shortest + beyond * min(1.0, max(allowed, 0.0) / max(length, _NEAR_M)))
 
 
-def is_within_limits(way: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
+def is_within_limits(motion: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
     """Return whether motions of the flange are within the limits of each axis and of the L1 norm."""
     longest = np.inf if limits.l1 is None else limits.l1
-    return bool((abs(way) <= np.array(limits.xyz_m) + slack_m).all() and (abs(way).sum(-1) <= longest + slack_m).all())
+    return bool(
+        (abs(motion) <= np.array(limits.xyz_m) + slack_m).all() and (abs(motion).sum(-1) <= longest + slack_m).all()
+    )

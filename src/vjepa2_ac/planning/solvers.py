@@ -124,9 +124,9 @@ class Solver:
         """Return the current result; None: the best evaluated decisions."""
         return None
 
-    def _fill_action(self, others: float, *, gripper: float) -> Float[Tensor, " dim"]:
-        """Return a vector with `others` for each component of an action and `gripper` for the gripper."""
-        numbers = torch.full((self._space.dim,), others)
+    def _fill_action(self, value: float, *, gripper: float) -> Float[Tensor, " dim"]:
+        """Return a vector with `gripper` for the gripper of an action and `value` for all other components."""
+        numbers = torch.full((self._space.dim,), value)
         if self._space.gripper is not None:
             numbers[self._space.gripper] = gripper
         return numbers
@@ -397,7 +397,7 @@ class GradientSolver(Solver):
             ValueError: There are no gradients.
         """
         if evaluated.gradients is None:
-            raise ValueError("the cost has no gradients")
+            raise ValueError("the cost function returned no gradients")
         self._scaled.grad = evaluated.gradients * self._unit
         self._adam.step()
         self._schedule.step()

@@ -127,7 +127,7 @@ def changes_of_chunks(
     values = np.array(chunks, dtype=np.float64)
     if values.ndim != 3 or not len(values) or values.shape[2] != len(space) or not np.isfinite(values).all():
         needed = f"finite numbers, chunks x control steps x {len(space)}: {', '.join(space.names)}"
-        raise InputError(where="chunks", found=f"an array of the shape {values.shape}", needed=needed)
+        raise InputError(where="chunks", found=f"an array with shape {values.shape}", needed=needed)
     if values.shape[1] < control_steps:
         needed = f"at least {control_steps}, the control steps of one model step"
         raise InputError(where="chunks", found=counted(values.shape[1], "control step"), needed=needed)
