@@ -1,4 +1,4 @@
-"""Poses and actions: equal to the official code, and laws of every trajectory (golden/DATA_ORIGIN.md)."""
+"""Poses and actions equal the official code and satisfy the invariants of trajectories (golden/DATA_ORIGIN.md)."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Spaces say what each number is; whoever asks for a position, a rotation or a gripper gets that of the space."""
+"""State and action spaces: parts, units, plausibility checks and action semantics."""
 
 import math
 

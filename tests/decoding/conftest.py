@@ -1,3 +1,3 @@
-"""What the tests of this folder use."""
+"""Fixtures of the decoder tests."""
 
 from decoders import encode_split, make_decoder, whole_decoder  # noqa: F401

@@ -1,4 +1,4 @@
-"""The decoder: its folder is read as it was written; an image depends on all latents of its frame alone."""
+"""The decoder survives save and load; an image depends on all latents of its own frame only."""
 
 import json
 import re

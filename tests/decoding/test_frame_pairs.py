@@ -1,4 +1,4 @@
-"""Frames and latents of the decoder: what the encoder saw, of the right episodes; what is fitted to them."""
+"""Training pairs of the decoder are encoder inputs and their latents; the linear fit and the metrics are correct."""
 
 from dataclasses import dataclass
 from pathlib import Path

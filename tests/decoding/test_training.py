@@ -1,4 +1,4 @@
-"""Training of a decoder: it learns what latents show, and goes on as if nothing had happened."""
+"""Decoder training learns to reconstruct frames and resumes exactly."""
 
 import math
 import os

@@ -1,4 +1,4 @@
-"""A folder of goals: what is written is read again, and what is broken is refused by name."""
+"""Goal folders survive write and read, and invalid folders raise."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""`vjepa2-ac goals` makes a folder of goals of an episode, and `plan` takes it."""
+"""`vjepa2-ac goals` makes a goal folder from an episode, and `plan` uses it."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Key frames of made-up demonstrations: by the gripper, and every n-th frame."""
+"""Key frames of synthetic demonstrations: gripper changes, stops, and every n-th frame."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Run by test_contracts.py: the package's own CEM, by our cost. Parts that need torchvision are not imported."""
+"""Run stable-worldmodel's CEM with our cost (called by test_contracts.py). Modules that need torchvision are not imported."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Calibrated axes turn what the model is given, and only that; files that nothing can be planned by are refused."""
+"""Calibrated axes rotate the model's input but not the limits; unusable axes files raise."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Frames that must not move a robot: without contrast, or equal to the last one although the robot has moved."""
+"""Faulty frames give zero actions: frames without contrast, and frozen frames although the robot moved."""
 
 import dataclasses
 import io

@@ -1,4 +1,4 @@
-"""The controller in a robot's loop: images and states in, actions within the limits and a reason out."""
+"""The controller returns actions within the limits and a reason for each image and state."""
 
 import numpy as np
 import pytest

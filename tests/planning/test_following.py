@@ -1,4 +1,4 @@
-"""A controller that follows goals: which one applies, what the gripper may do, when all is done; laws of the rule."""
+"""Sub-goals: which goal applies, its gripper mode, when the last goal is reached, and invariants of the rule."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Named actions are opposites, within the limits, and lead where their names say; files of actions are checked."""
+"""Named actions have the right direction and stay within the limits; action files are validated."""
 
 from pathlib import Path
 

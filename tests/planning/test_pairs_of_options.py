@@ -1,4 +1,4 @@
-"""Every pair of planning options works in every command that plans, or is refused before the first decision."""
+"""Every pair of planning options works in every planning command, or raises before the first decision."""
 
 import json
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""A planning session uses a run or model with its own config and the motions of its data, or refuses it."""
+"""Planning uses a run or a model with its own config and the motions of its data, or raises."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""A trained model plans like its base, compiled blocks like plain ones, and the given model stays as it was."""
+"""Merged and compiled models plan like the trained model, which stays unchanged."""
 
 import copy
 

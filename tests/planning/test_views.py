@@ -1,4 +1,4 @@
-"""Several cameras side by side: the energy is the mean over views, each of which the model sees by itself."""
+"""Several cameras side by side: the energy is the mean over the views, which are predicted independently."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The action space and the workspace: every action becomes allowed, and targets are inside the box or nothing moves."""
+"""The search space and the workspace: actions are clipped to the limits, and targets stay inside the box."""
 
 import math
 

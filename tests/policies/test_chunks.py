@@ -1,4 +1,4 @@
-"""Chunks of a policy become changes of model steps, in whatever form they come, and get the planner's energies."""
+"""Action chunks of every form are converted to changes per model step and get the planner's energies."""
 
 import numpy as np
 import pytest

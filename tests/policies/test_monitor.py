@@ -1,4 +1,4 @@
-"""Held-out episodes give the threshold with the promised rate of false alarms; a broken picture is noticed."""
+"""The monitor's threshold has the requested false alarm rate, and a corrupted image raises an alarm."""
 
 import json
 import shutil

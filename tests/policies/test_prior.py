@@ -1,4 +1,4 @@
-"""A prior proposes actions: searches start from it, it acts alone, and its training sees the goal."""
+"""The action prior starts searches, plans without a search, and learns to use the goal."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The example's column begins at 0 and ends at 1 in every episode, and joins a LeRobot set."""
+"""The example's progress column is 0 at the start and 1 at the end of an episode, and is added to a LeRobot set."""
 
 import runpy
 from pathlib import Path

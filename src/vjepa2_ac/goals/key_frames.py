@@ -106,7 +106,7 @@ def _find_end_of_change(states: States, begin: int, end: int) -> int:
 
 
 def _find_stops(states: States, min_rest: int) -> list[int]:
-    """Return the frames at which the arm comes to rest for at least `min_rest` frames; a rest at the start is left out."""
+    """Return the frames at which the arm comes to rest for at least `min_rest` frames, except a rest at the start."""
     still = _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MIN_FINGER_MOTION)
     begins = [frame for frame in range(1, len(still)) if still[frame] and not still[frame - 1]]
     return [begin for begin in begins if still[begin : begin + min_rest].all() and begin + min_rest <= len(still)]
