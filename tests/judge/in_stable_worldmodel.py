@@ -1,4 +1,4 @@
-"""Run stable-worldmodel's CEM with our cost (called by test_contracts.py). Modules that need torchvision are not imported."""
+"""Run stable-worldmodel's CEM with our cost (called by test_contracts.py). Nothing imports torchvision."""
 
 import json
 import sys

@@ -88,7 +88,7 @@ def test_plan_includes_later_goals_at_their_latest_steps() -> None:
     for seed in range(3):
         run.act(image(seed), STATE)
         found.append(run.decision.goals)
-    assert found == [(0, 0, 1, 1, 1, 1), (0, 1, 1, 1, 1, 1), (1,) * 6], "nobody knows when the second one ends"
+    assert found == [(0, 0, 1, 1, 1, 1), (0, 1, 1, 1, 1, 1), (1,) * 6], "the end of the second goal is unknown"
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_initial_energy_is_measured_when_a_goal_begins() -> None:
     assert [one.goal_index for one in found] == [0, 0, 1, 1, 1, 1]
     assert [one.start_step for one in found] == [0, 0, 2, 2, 2, 2]
     assert [one.initial_energy for one in found] == [1.0, 1.0, 3.0, 3.0, 3.0, 3.0]
-    assert [one.is_done for one in found] == [False] * 4 + [True] * 2, "what is reached stays so"
+    assert [one.is_done for one in found] == [False] * 4 + [True] * 2, "a reached goal stays reached"
     assert found[2].changed == "Goal 1 (grasp), after 2 steps: energy 0.4 is below 50% of 1."
     assert found[4].changed == "Goal 2, after 2 steps: energy 1.4 is below 50% of 3."
     assert not found[5].changed
