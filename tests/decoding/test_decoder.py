@@ -84,11 +84,11 @@ def test_model_with_another_encoder_crop_or_size_raises(whole_decoder: Path, bas
     other = WorldModel.random(ModelSizes.model_validate(TINY), seed=4)
     with pytest.raises(InputError, match=r"does not fit the encoder and crop of run.*vjepa2-ac decoder CONFIG"):
         decoder.require_fit(other, data, subject="run")
-    with pytest.raises(InputError, match=r"data\.crop released, not square"):
+    with pytest.raises(InputError, match=r"data\.crop released, the model's is square"):
         decoder.require_fit(model, square, subject="run")
     larger = WorldModel.random(ModelSizes.model_validate(TINY | {"image_size": 64}), seed=3)
     same = replace(decoder, card=replace(decoder.card, encoder=larger.encoder_fingerprint()))  # the same weights
-    with pytest.raises(InputError, match="image size 32, not 64"):
+    with pytest.raises(InputError, match="image size 32, the model's is 64"):
         same.require_fit(larger, data, subject="run")
 
 

@@ -232,7 +232,7 @@ def test_blur_is_named_exactly_where_error_and_spread_both_fell(with_base: bool,
     assert not weak.predicts.reference, "there is no spread with one clip"
 
 
-def map_tensors(result: ModelResult, distance: float, sharpness: float, episodes: int = 8) -> ModelResult:
+def with_landscape(result: ModelResult, distance: float, sharpness: float, episodes: int = 8) -> ModelResult:
     """Return a model with landscapes of a mean distance and sharpness, which differ a little by clip."""
     rng, ids = np.random.default_rng(0), [f"episode {number}" for number in range(episodes)]
     distances = distance + rng.uniform(-0.5, 0.5, episodes)
@@ -259,14 +259,14 @@ def map_tensors(result: ModelResult, distance: float, sharpness: float, episodes
 def test_a_better_landscape_needs_a_nearer_minimum_than_the_base_model_and_a_random_point(
     base: tuple[float, float] | None, adapter: tuple[float, float], conclusion: str
 ) -> None:
-    base_model = [] if base is None else [mapped(model("base", 1.0), *base)]
-    summary = summary_of(*base_model, mapped(model("adapter", 0.7, shuffled=0.9), *adapter))
+    base_model = [] if base is None else [with_landscape(model("base", 1.0), *base)]
+    summary = summary_of(*base_model, with_landscape(model("adapter", 0.7, shuffled=0.9), *adapter))
     verdict = summary.landscape
     assert verdict is not None
     assert summary.verdicts[3] == verdict
     assert (verdict.conclusion, verdict.unit, verdict.baseline) == (conclusion, "cm", 25.0)
     assert verdict.value == pytest.approx(adapter[0], abs=0.5)
-    few = summary_of(mapped(model("adapter", 0.7), *adapter, episodes=1)).landscape
+    few = summary_of(with_landscape(model("adapter", 0.7), *adapter, episodes=1)).landscape
     assert few is not None
     assert few.conclusion == "inconclusive"
     assert few.reference.endswith("; 1 episode is too few for a conclusion)")
@@ -285,8 +285,8 @@ def test_predictions_that_are_not_finite_have_no_conclusion() -> None:
 
 @pytest.mark.parametrize("distance", [10.0, 20.3])
 def test_the_sentence_names_a_landscape_that_is_not_better(distance: float) -> None:
-    base = mapped(ranked("base", 1.0, 0.05), 13.8, 0.072)
-    sentence = summary_of(base, mapped(ranked("adapter", 0.7, 0.02, shuffled=0.9), distance, 0.0086)).sentence
+    base = with_landscape(ranked("base", 1.0, 0.05), 13.8, 0.072)
+    sentence = summary_of(base, with_landscape(ranked("adapter", 0.7, 0.02, shuffled=0.9), distance, 0.0086)).sentence
     assert sentence.startswith("Better prediction than the base model")
     denied = "But the energy minimum is not nearer to the true action than that of the base model."
     assert sentence.endswith(denied) == (distance > 13.8)
@@ -354,7 +354,7 @@ def test_every_summary_fits_a_screen_and_has_whole_sentences(
 ) -> None:
     models = [ranked("base", 1.0, 0.05)] * with_base + [ranked("adapter", level, rank, shuffled=shuffled, noise=0.1)]
     spread = [with_spread(one, 0.9 if one.role == "base" else 0.8) for one in models]
-    measured = evaluation(*(mapped(one, distance, 0.0086, episodes) for one in spread), episodes=episodes)
+    measured = evaluation(*(with_landscape(one, distance, 0.0086, episodes) for one in spread), episodes=episodes)
     subject = f"runs/{'a-kitchen-with-a-name-that-is-long-enough-to-wrap-' * 2}"
     measured = replace(measured, about=replace(measured.about, subject=subject), copies=spread[0].distribution)
     measured = with_errors(measured, "adapter", by(level, abs(2 - level)))
