@@ -144,7 +144,7 @@ def test_gripper_modes_limit_and_round_the_gripper(mode: str, given: float, expe
         ({"horizon": 3, "action_repeat": 2}, "multiple of action_repeat"),
         ({"samples": 5}, "more than 5 samples"),
         ({"planner": "prior"}, "planner=prior needs prior"),
-        ({"limits": {"xyz": (0.0, 0.0, 0.0), "gripper_mode": "held"}}, "nothing is left"),
+        ({"limits": {"xyz": (0.0, 0.0, 0.0), "gripper_mode": "held"}}, "nothing can be planned"),
         ({"limits": {"xyz": (50.0, 50.0, 50.0)}}, "less than or equal to 1"),  # millimetres
         ({"limits": {"rotation": 10.0}}, "less than or equal to 3.14"),  # degrees
     ],
