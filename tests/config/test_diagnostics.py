@@ -49,6 +49,11 @@ def test_an_unknown_key_is_told_the_one_that_was_meant(unknown: str, meant: str)
     assert complaints(f"{unknown}=1") == [f"{unknown}: unknown key; did you mean {meant}?"]
 
 
+def test_mistyped_camera_gets_a_suggestion() -> None:
+    (line,) = complaints("data.camera=wrist_lef")
+    assert re.search(r"has no camera wrist_lef\. Did you mean wrist_left\? Available: .*exterior_1_left", line)
+
+
 def test_a_key_like_no_other_is_told_those_that_there_are() -> None:
     (line,) = complaints("tracking.zzz=1")
     assert re.search(r"known here: tensorboard, wandb", line)

@@ -22,6 +22,7 @@ from vjepa2_ac.config.section import (
     Section,
     Share,
 )
+from vjepa2_ac.errors import did_you_mean
 from vjepa2_ac.registry import SOURCES, TRANSFORMS
 
 # YAML parses the serial number of a camera as an integer.
@@ -246,16 +247,14 @@ class DataConfig(Section):
     def _parts_fit(self) -> DataConfig:
         known, cameras = self.known_cameras, self.cameras
         unknown = [camera for camera in cameras if known is not None and camera not in known]
+        available = f"{did_you_mean(unknown[0], known or ())}Available: {', '.join(known or ())}" if unknown else ""
         splits, of_camera = self.validation_share + self.test_share, self.pose_frame == "camera"
         return self.check_rules(
             (
                 not cameras,
                 "camera: the list is empty. Set one or more names, or null for the first camera of the source",
             ),
-            (
-                unknown,
-                f"camera: source {self.source} has no camera {', '.join(unknown)}. Available: {', '.join(known or ())}",
-            ),
+            (unknown, f"camera: source {self.source} has no camera {', '.join(unknown)}. {available}"),
             (
                 self.is_cache and self.stride == "auto",
                 "stride: auto is not possible with a latent cache. Set the stride of the cache",
