@@ -39,9 +39,7 @@ pytestmark = pytest.mark.usefixtures("default_signals")
 
 
 @pytest.mark.parametrize(("number", "at"), [(signal.SIGTERM, 3), (signal.SIGINT, 1)])
-def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
-    make_config, reporter, tmp_path, whole_run, number, at
-) -> None:
+def test_resume_after_a_stop_signal_is_exact(make_config, reporter, tmp_path, whole_run, number, at) -> None:
     config = make_config(run_dir=str(tmp_path / "stopped"), checkpoint__keep_best=False)
     with pytest.raises(StoppedError, match=f"{signal.Signals(number).name}: stopped after step {at}"):
         train(config, signalled_reporter(type(reporter)(), at, number))

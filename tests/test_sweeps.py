@@ -51,7 +51,7 @@ def trials(main: Callable[..., None], folder: Path) -> list[Any]:
     return found
 
 
-def test_a_sweep_that_is_stopped_goes_on_with_the_trial_that_was_open(
+def test_stopped_sweep_resumes_with_the_open_trial(
     sweep: Callable[..., None], config: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     folder, step_of_the_loop, seen = tmp_path / "sweep", loop.training_step, []
@@ -79,7 +79,7 @@ def test_a_sweep_that_is_stopped_goes_on_with_the_trial_that_was_open(
     assert f"in {min(zip(done, runs, strict=True), key=lambda one: one[0].value)[1]}" in capsys.readouterr().out
 
 
-def test_a_trial_that_is_refused_has_failed_and_the_sweep_goes_on(
+def test_sweep_continues_after_a_trial_with_an_invalid_config(
     sweep: Callable[..., None], config: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     space = {"adapter.rank": sweep.__globals__["CategoricalDistribution"]([0])}

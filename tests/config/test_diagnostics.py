@@ -18,7 +18,7 @@ def complaints(*overrides: str, values: dict[str, Any] | None = None) -> list[st
     return [line.strip() for line in str(caught.value).splitlines() if line.startswith("  ")]
 
 
-def test_all_errors_are_told_at_once_with_their_keys() -> None:
+def test_all_config_errors_are_reported_together_with_their_keys() -> None:
     values = {"data": {"path": "d", "strid": 4, "frames": 1}, "model": {"base": "b"}, "training": {"rank": 8}}
     assert complaints("training.learning_rate=fast", "data.stride=0", values=values) == [
         "run_dir: missing; it has no default",
@@ -30,7 +30,7 @@ def test_all_errors_are_told_at_once_with_their_keys() -> None:
     ]
 
 
-def test_rules_about_several_values_are_told_when_each_is_right() -> None:
+def test_rules_between_values_are_checked_when_each_value_is_valid() -> None:
     found = complaints("training.decay_steps=5", "data.validation_share=0.97")
     assert any("nothing to train on" in line for line in found)
     assert any("decay_steps is only for" in line for line in found)
@@ -45,7 +45,7 @@ def test_rules_about_several_values_are_told_when_each_is_right() -> None:
         ("dat", "data"),
     ],
 )
-def test_an_unknown_key_is_told_the_one_that_was_meant(unknown: str, meant: str) -> None:
+def test_unknown_key_error_suggests_the_closest_key(unknown: str, meant: str) -> None:
     assert complaints(f"{unknown}=1") == [f"{unknown}: unknown key; did you mean {meant}?"]
 
 
@@ -54,7 +54,7 @@ def test_mistyped_camera_gets_a_suggestion() -> None:
     assert re.search(r"has no camera wrist_lef\. Did you mean wrist_left\? Available: .*exterior_1_left", line)
 
 
-def test_a_key_like_no_other_is_told_those_that_there_are() -> None:
+def test_unknown_key_error_lists_existing_keys_without_a_close_match() -> None:
     (line,) = complaints("tracking.zzz=1")
     assert re.search(r"known here: tensorboard, wandb", line)
 

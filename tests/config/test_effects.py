@@ -159,7 +159,7 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
     return keys
 
 
-def test_a_knob_that_does_not_say_what_it_affects_is_an_error() -> None:
+def test_config_key_without_affects_annotation_raises() -> None:
     class Forgotten(Section):
         batch: Annotated[int, Affects.RUN] = 1
         workers: int = 1
@@ -187,7 +187,7 @@ def test_the_options_of_a_plug_in_are_a_part_of_the_key_of_a_cache(monkeypatch: 
 
 @pytest.mark.parametrize("states", ["pose", "vector"])
 @pytest.mark.parametrize("source", WRITERS)
-def test_a_knob_that_changes_makes_strangers_of_what_it_affects_and_of_nothing_else(
+def test_changed_key_invalidates_exactly_what_it_affects(
     source: str, states: str, sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path
 ) -> None:
     if (source, states) == ("droid_raw", "vector"):
@@ -251,7 +251,7 @@ def test_settings_of_a_later_start_are_kept_in_the_run_unless_they_decide_it(tmp
     assert kept > 50
 
 
-def test_a_run_goes_on_only_where_no_knob_that_decides_it_has_changed(tmp_path: Path) -> None:
+def test_run_resumes_only_if_no_key_that_affects_it_has_changed(tmp_path: Path) -> None:
     config = with_encoder(config_of("rlds", tmp_path, tmp_path / "run"))
     (tmp_path / "run").mkdir()
     (tmp_path / "run/config.yaml").write_text(config_as_yaml(config))
@@ -278,7 +278,7 @@ def test_planning_takes_the_values_that_affect_a_decision_and_names_them() -> No
                 load_planning_config("model.pt", overrides=[f"{key}=1"])
 
 
-def test_a_mark_of_a_section_holds_for_its_knobs_and_a_value_has_that_of_its_knob() -> None:
+def test_annotation_of_a_section_applies_to_its_keys_and_their_values() -> None:
     assert get_effect("tracking.wandb", Config) == Affects.NOTHING
     assert get_effect("data.fields.cameras.left", Config) == get_effect("data.fields.cameras", Config) == Affects.CLIPS
     assert get_effect("replay.data.frames", Config) == get_effect("replay.data", Config) == Affects.RUN

@@ -37,7 +37,7 @@ def test_every_config_of_the_project_loads_and_is_in_line(path: Path) -> None:
     assert load_config(path).adapter.alpha_warning is None
 
 
-def test_an_alpha_that_grows_with_the_rank_under_rslora_is_out_of_line() -> None:
+def test_large_alpha_with_rslora_gives_a_warning() -> None:
     found = AdapterConfig(rank=64, alpha=128).alpha_warning
     assert "a scale of 16; alpha 32 gives 4" in found
     assert "Set adapter.alpha=32" in found
@@ -105,7 +105,7 @@ def test_what_is_not_a_config_is_refused(tmp_path: Path, text: str) -> None:
         load_config(tmp_path / "nowhere.yaml")
 
 
-def test_another_form_of_data_takes_the_place_of_that_in_the_file_with_its_knobs(tmp_path: Path) -> None:
+def test_override_of_data_source_removes_options_of_the_former_format(tmp_path: Path) -> None:
     resolved = config_as_yaml(parse_config(MINIMAL, where=""))
     assert "fields:" in resolved
     cached = load_config(write(tmp_path, resolved), ["data.source=latents", "data.path=cache"])
@@ -116,7 +116,7 @@ def test_another_form_of_data_takes_the_place_of_that_in_the_file_with_its_knobs
         load_config(write(tmp_path, resolved), ["data.lerobot.gripper_open=2"])
 
 
-def test_every_knob_is_read_somewhere() -> None:
+def test_every_config_key_is_read() -> None:
     source = "\n".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
     read = {(owner.removeprefix("_"), name) for owner, name in re.findall(r"(\w+)(?=\.(\w+))", source)}
     for key in set(all_keys()) - {"plugins"}:  # these are read before the config is checked
@@ -179,7 +179,7 @@ MINE = {"name": "mine", "options": {"alphaa": 1}}
         (TRANSFORMS, "data.transforms.0.options", {"transforms": [MINE]}),
     ],
 )
-def test_a_wrong_option_is_named_by_its_whole_key(
+def test_wrong_option_error_has_the_dotted_key(
     monkeypatch: pytest.MonkeyPatch, registry: Registry, section: str, values: dict
 ) -> None:
     monkeypatch.setitem(registry._things, "mine", WithAlpha)
@@ -191,7 +191,7 @@ def test_a_wrong_option_is_named_by_its_whole_key(
     assert f"  {section}.alpha: missing; it has no default" in lines
 
 
-def test_options_that_are_needed_are_asked_for_even_if_none_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_required_options_raise_without_any_options(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(LOSSES._things, "mine", WithAlpha)
     with pytest.raises(InputError, match=r"training\.loss\.options\.alpha: missing"):
         parse_config(MINIMAL | {"training": {"loss": "mine"}}, where="x.yaml")

@@ -217,7 +217,7 @@ def test_whatever_operation_fails_older_checkpoints_stay_and_nothing_half_is_lef
         assert newest_checkpoint(folder) == folder / checkpoint_name(20), "with room again"
 
 
-def test_what_survives_a_power_cut_is_whole_and_is_there_before_an_older_one_goes(tmp_path, monkeypatch) -> None:
+def test_checkpoint_is_synced_before_an_older_one_is_removed(tmp_path, monkeypatch) -> None:
     write(tmp_path, 10, keep=1)
     happened: list[str] = []
 
@@ -319,7 +319,7 @@ def test_an_optimizer_file_that_would_run_code_is_refused_and_does_not(make_conf
 # Files of unknown origin: invalid ones are refused by name
 
 
-def test_every_field_of_a_state_comes_back(tmp_path: Path) -> None:
+def test_run_state_round_trip_keeps_every_field(tmp_path: Path) -> None:
     state = RunState(
         10, run_id="a", clips_done=40, clips_per_step=4, clips_per_process=2, processes=2,
         data=(DataState("f", 3, {"e": "why"}),), best_step=10, best_error=0.5,
@@ -383,7 +383,7 @@ def test_one_that_is_not_there_is_an_error_that_names_those_that_are(run: Path, 
         select_checkpoint(run, by)
 
 
-def test_a_damaged_one_is_not_used_in_place_of_what_was_asked_for(run: Path) -> None:
+def test_damaged_requested_checkpoint_raises(run: Path) -> None:
     (run / "checkpoints/step-00000020/optimizer.pt").write_bytes(b"torn")
     for by in ("best", "20"):
         with pytest.raises(InputError, match=r"step-00000020 is damaged: .*one of the steps 10, 30"):

@@ -44,7 +44,7 @@ sys.stdin.read()
 """
 
 
-def test_a_start_that_was_killed_at_any_file_stands_in_nobodys_way(make_config, tmp_path, monkeypatch) -> None:
+def test_run_starts_after_a_start_was_killed_at_any_file(make_config, tmp_path, monkeypatch) -> None:
     faults = Faults(monkeypatch)
     monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)
     for dies_at in range(1, 100):
@@ -63,7 +63,7 @@ def test_a_start_that_was_killed_at_any_file_stands_in_nobodys_way(make_config, 
     check_run_folder(config)
 
 
-def test_a_folder_of_other_things_stays_refused_though_a_lock_lies_in_it(make_config, tmp_path) -> None:
+def test_folder_with_other_files_raises_even_with_a_lock(make_config, tmp_path) -> None:
     config = make_config()
     with RunLock(Path(config.run_dir)) as lock:
         lock.take()
@@ -86,7 +86,7 @@ def test_small_files_of_a_run_that_are_none_are_no_traceback(tmp_path: Path, mak
 # The lock
 
 
-def test_a_folder_in_use_is_refused_until_its_process_is_killed(tmp_path: Path) -> None:
+def test_folder_in_use_raises_until_its_process_is_killed(tmp_path: Path) -> None:
     words = [sys.executable, "-c", HOLD, str(tmp_path / "run")]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "held\n"
@@ -209,7 +209,7 @@ LINES = [
 ]
 
 
-def test_every_address_of_a_config_is_named_with_its_knob() -> None:
+def test_every_url_of_a_config_is_listed_with_its_key() -> None:
     assert list_remote_locations(parse_config(ELSEWHERE, where="")) == LINES
     here = {"run_dir": "r", "data": {"path": "d", "exclude": ["gs://is-but-a-name"]}, "model": {"base": "b.pt"}}
     assert list_remote_locations(parse_config(here, where="")) == []
@@ -261,7 +261,7 @@ def test_a_new_folder_is_made_and_locked_when_the_run_begins_and_not_before(make
 
 
 @pytest.mark.parametrize("check_only", [False, True])
-def test_a_folder_is_locked_before_the_remote_is_asked_and_a_check_locks_nothing(
+def test_folder_is_locked_before_remote_access_and_not_by_a_check(
     make_config, reporter, monkeypatch, tmp_path: Path, check_only: bool
 ) -> None:
     config = make_config(checkpoint__remote=str(tmp_path / "remote"))

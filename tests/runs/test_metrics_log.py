@@ -100,7 +100,7 @@ def test_a_run_that_cannot_write_its_record_writes_its_checkpoint_and_says_of_wh
     ]  # fmt: skip
 
 
-def test_where_a_checkpoint_makes_room_the_run_goes_on_and_its_record_is_whole(
+def test_run_continues_with_all_metrics_after_a_checkpoint_frees_disk_space(
     make_config, reporter, tmp_path, monkeypatch, whole_run
 ) -> None:
     disk, save = FullDisk(monkeypatch), outputs.save_checkpoint

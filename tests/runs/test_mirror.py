@@ -170,9 +170,7 @@ def gate(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Gate]:
 
 
 @pytest.mark.usefixtures("bucket")
-def test_training_goes_on_while_something_is_sent_and_nothing_is_sent_twice_at_once(
-    run: Path, gate: Callable[[str], Gate]
-) -> None:
+def test_training_continues_during_an_upload_and_uploads_do_not_overlap(run: Path, gate: Callable[[str], Gate]) -> None:
     held = gate("optimizer.pt")
     mirror = mirror_of(run)
     write(run, 10, keep=1)
@@ -193,7 +191,7 @@ def test_training_goes_on_while_something_is_sent_and_nothing_is_sent_twice_at_o
 
 
 @pytest.mark.usefixtures("bucket")
-def test_a_copy_that_does_not_end_in_time_is_named_and_left(
+def test_upload_that_exceeds_its_time_is_reported_and_abandoned(
     run: Path, gate: Callable[[str], Gate], caplog: pytest.LogCaptureFixture
 ) -> None:
     held = gate("weights")
@@ -379,7 +377,7 @@ def machine(tmp_path: Path, disk: str, monkeypatch: pytest.MonkeyPatch, make_con
     return start
 
 
-def test_the_later_start_keeps_the_place_and_the_earlier_one_is_told_once(
+def test_later_start_keeps_the_remote_folder_and_the_earlier_one_warns_once(
     machine, disk: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     first = machine("one")
@@ -399,7 +397,7 @@ def test_the_later_start_keeps_the_place_and_the_earlier_one_is_told_once(
     assert len(caplog.records) == 1
 
 
-def test_two_that_begin_at_once_do_not_both_keep_the_place(
+def test_only_one_of_two_simultaneous_starts_keeps_the_remote_folder(
     machine, disk: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each saw an empty place; the runs have different names."""

@@ -59,7 +59,7 @@ def test_an_empty_place_is_tried_and_left_empty(bucket: Gcs, config: Config) -> 
     assert not local(config).exists()
 
 
-def test_a_fresh_machine_gets_the_newest_checkpoint_and_the_small_files(bucket: Gcs, config: Config) -> None:
+def test_new_machine_downloads_the_newest_checkpoint_and_the_small_files(bucket: Gcs, config: Config) -> None:
     source, reporter = run_there(bucket, config, 5, 10, 20, best_step=10, best_error=0.5), SilentReporter()
     assert open_remote(config, reporter) == config
     newest = newest_checkpoint(local(config) / "checkpoints")
@@ -185,7 +185,7 @@ def test_a_run_without_a_complete_checkpoint_there_that_cannot_be_fetched_is_not
 @pytest.mark.parametrize(
     ("match", "failure"), [("POST /upload/", 403), ("DELETE", 403), ("prefix=", 403), ("POST /upload/", 401)]
 )
-def test_a_place_without_permission_is_an_error_with_the_way_out(
+def test_remote_folder_without_permission_raises_with_a_fix(
     bucket: Gcs, config: Config, match: str, failure: int
 ) -> None:
     bucket.fail_next(failure, times=9, match=match)
@@ -265,7 +265,7 @@ def stop_after(step: int, config: Config, reporter) -> None:
 
 
 @pytest.mark.usefixtures("bucket", "default_signals")
-def test_after_preemption_a_fresh_machine_goes_on_as_if_nothing_had_happened(
+def test_resume_on_a_new_machine_after_preemption_is_exact(
     config_on: MakeConfig, reporter, tmp_path: Path, whole_run: Path
 ) -> None:
     stop_after(3, config_on("one"), reporter)
@@ -281,7 +281,7 @@ def test_after_preemption_a_fresh_machine_goes_on_as_if_nothing_had_happened(
 
 
 @pytest.mark.usefixtures("bucket", "default_signals")
-def test_a_place_that_is_down_for_the_whole_run_costs_warnings_and_no_step(
+def test_unreachable_remote_folder_causes_warnings_and_loses_no_step(
     bucket: Gcs, config_on: MakeConfig, reporter, tmp_path: Path, whole_run: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     bucket.fail_next(503, times=10_000)
@@ -356,7 +356,7 @@ def die_in_upload(config: object, reporter, monkeypatch: pytest.MonkeyPatch, *, 
     ("before_file", "machine", "complete"),
     [(2, "another", []), (FILES, "another", []), (2, "this", []), (FILES + 3, "another", [2])],
 )
-def test_a_run_killed_in_an_upload_goes_on_from_the_last_complete_checkpoint_and_is_mirrored(
+def test_run_killed_during_an_upload_resumes_from_the_last_complete_checkpoint(
     config_on,
     reporter,
     monkeypatch,
@@ -389,7 +389,7 @@ def test_half_a_checkpoint_of_another_run_is_refused_before_the_first_step(
     assert reporter.steps == []
 
 
-def test_small_files_alone_keep_nobody_out(config_on, reporter, place: str) -> None:
+def test_remote_small_files_without_a_checkpoint_do_not_block_a_new_run(config_on, reporter, place: str) -> None:
     """Who removes the checkpoints of a place starts a run anew there, with another config if need be."""
     train(config_on("this", place), reporter)
     for name in remote_checkpoints(place):

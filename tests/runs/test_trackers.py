@@ -138,7 +138,7 @@ def test_a_run_without_tensorboard_prints_how_to_install_it(
     assert "[tensorboard]" in line
 
 
-def test_weights_and_biases_goes_on_in_the_same_run_without_a_network(tmp_path: Path) -> None:
+def test_resumed_run_continues_the_same_offline_wandb_run(tmp_path: Path) -> None:
     pytest.importorskip("wandb")
     config = run_config(tmp_path, wandb="offline")
     for first_step in (0, 1):
@@ -152,7 +152,7 @@ def test_weights_and_biases_goes_on_in_the_same_run_without_a_network(tmp_path: 
         assert word in written
 
 
-def test_trackio_goes_on_in_the_same_run(tmp_path: Path) -> None:
+def test_resumed_run_continues_the_same_trackio_run(tmp_path: Path) -> None:
     trackio = pytest.importorskip("trackio")
     config = run_config(tmp_path, trackio=True)
     for first_step in (0, 1):

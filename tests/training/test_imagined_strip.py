@@ -81,7 +81,7 @@ def test_a_strip_that_fails_costs_a_warning_and_never_the_run(
     assert "could not be drawn ([Errno 28] No space left" in caplog.text
 
 
-def test_a_decoder_that_will_not_do_is_told_before_what_is_expensive(
+def test_unusable_validation_decoder_raises_before_expensive_work(
     make_config, reporter, decoder, tmp_path, monkeypatch
 ) -> None:
     other = write_decoder(tmp_path / "other", load_base(make_config().model, seed=0), encoder="other")

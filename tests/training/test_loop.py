@@ -152,9 +152,7 @@ def test_allowed_changes_of_the_optimizer_take_effect(make_config, reporter) -> 
     assert all(moments["step"] == 2 for moments in run.optimizer.state_dict()["state"].values())
 
 
-def test_a_run_goes_on_with_data_that_were_moved_and_with_no_others(
-    make_config, reporter, tmp_path, data_folder
-) -> None:
+def test_run_resumes_with_moved_data_and_refuses_other_data(make_config, reporter, tmp_path, data_folder) -> None:
     folder = train(make_config(training__steps=2), reporter)
     for name in ("moved", "others"):
         shutil.copytree(data_folder, tmp_path / name)  # with the times of the files

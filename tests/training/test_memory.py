@@ -51,7 +51,7 @@ def usual(**training: object) -> Config:
     return parse_config({**USUAL, "training": training}, where="test")
 
 
-def test_a_run_that_fits_needs_no_knob_and_a_large_one_names_them() -> None:
+def test_memory_savings_are_suggested_only_for_a_run_that_does_not_fit() -> None:
     config, sizes = usual(batch_size=8), model_sizes()
     stored, checkpointed = (estimate_memory(config, sizes).total(checkpointing=one) for one in (False, True))
     assert checkpointed < stored

@@ -171,7 +171,7 @@ def test_frames_of_another_size_are_refused_before_the_first_step_and_go_through
         train(replaying(replay__data__path=str(larger), training__steps=1, **caches, **places, **other), reporter)
 
 
-def test_held_out_episodes_that_would_be_replayed_are_named(replaying, reporter, data_folder) -> None:
+def test_warning_lists_held_out_episodes_in_the_replay_data(replaying, reporter, data_folder) -> None:
     set_up(replaying(replay__data__path=str(data_folder)), reporter)
     (warning,) = [note for note in reporter.notes if "the replay data set would train on" in note]
     held_out = open_dataset(replaying().data).windows("validation")

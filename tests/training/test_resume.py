@@ -17,7 +17,7 @@ def of(config: object) -> dict[str, str]:
     return dict(validation_settings(config, open_dataset(config.data)))  # type: ignore[attr-defined, arg-type]
 
 
-def test_the_best_of_other_frames_no_longer_counts_and_the_reason_is_named(make_config, reporter, monkeypatch) -> None:
+def test_best_checkpoint_is_discarded_if_the_validation_has_changed(make_config, reporter, monkeypatch) -> None:
     errors = iter([0.9, 0.2, 0.3, 0.8, 0.6])  # the first is the base's
     monkeypatch.setattr(validation, "validation_metrics", lambda _: {validation.BEST_BY: next(errors)})
     every = {"validation__every": 1, "checkpoint__every": 1, "training__steps": 2, "checkpoint__keep_best": "error"}
@@ -76,7 +76,7 @@ def test_a_rank_decides_and_the_error_between_equal_ones() -> None:
         ({"data__split_by": r"episode_(\d+)"}, {"its clips"}),
     ],
 )
-def test_what_changes_the_measurement_is_named(
+def test_changed_validation_settings_are_listed(
     make_config, reporter, change: dict[str, object], named: set[str]
 ) -> None:
     before, now = of(make_config()), of(make_config(**change))

@@ -90,9 +90,7 @@ def test_the_lowest_rank_is_selected_though_the_error_falls_on(make_config, repo
     )
 
 
-def test_a_run_that_stops_after_its_base_was_saved_goes_on_as_if_it_had_not(
-    make_config, reporter, tmp_path, monkeypatch
-) -> None:
+def test_resume_after_saving_the_base_is_exact(make_config, reporter, tmp_path, monkeypatch) -> None:
     whole = train(make_config(run_dir=str(tmp_path / "whole")), reporter)
     halted = make_config(run_dir=str(tmp_path / "halted"))
     monkeypatch.setattr(loop, "_optimize", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))

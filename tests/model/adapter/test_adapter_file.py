@@ -92,7 +92,7 @@ def test_a_start_that_changes_the_base_is_refused(start: str) -> None:
         AdapterConfig(peft={"init_lora_weights": start})
 
 
-def test_an_option_that_is_a_knob_is_called_so() -> None:
+def test_peft_option_with_its_own_config_key_raises() -> None:
     with pytest.raises(ValidationError, match=r"peft\.r: set adapter\.rank instead"):
         AdapterConfig(peft={"r": 4})
 

@@ -153,7 +153,7 @@ def test_a_set_of_targets_stands_for_its_layers(model: WorldModel, targets: tupl
         ({"targets": ("extrinsics_encoder",)}, "extrinsics_encoder matches no layer"),
     ],
 )
-def test_a_knob_that_does_not_fit_the_predictor_is_refused(
+def test_adapter_key_that_does_not_fit_the_predictor_raises(
     model: WorldModel, knobs: dict[str, object], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
@@ -290,7 +290,7 @@ def truncate(folder: Path) -> None:
         (change_rank, r"24 tensors do not match .*has shape \[4, 36\], not \[8, 36\]"),
     ],
 )
-def test_a_folder_that_is_not_a_whole_adapter_is_named(
+def test_incomplete_adapter_folder_raises_with_its_path(
     fresh: Fresh, tmp_path: Path, spoil: Callable[[Path], object], message: str
 ) -> None:
     model = fresh()

@@ -208,7 +208,7 @@ def with_another_tensor(whole: dict[str, Any]) -> None:
         (lambda _: {"encoder": {"a": torch.zeros(1)}}, "no tensor 'patch_embed.proj.weight' in encoder"),
     ],
 )
-def test_a_file_that_is_not_a_whole_encoder_is_refused(tmp_path: Path, change: Any, message: str) -> None:
+def test_incomplete_encoder_file_raises(tmp_path: Path, change: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
         model_of(rewrite(V21, change, tmp_path / "changed.pt"), heads=PUBLISHED_HEADS[V21])
 
@@ -248,7 +248,7 @@ def test_a_transformers_folder_that_says_something_else_is_refused(
         model_of(folder)
 
 
-def test_pretrainings_masked_predictor_is_not_taken_for_one_of_actions() -> None:
+def test_pretraining_checkpoint_as_base_raises() -> None:
     with pytest.raises(InputError, match=r"no action input.*set model\.encoder\.path to this file"):
         load_base(ModelConfig(base=str(V21)), seed=0)
 

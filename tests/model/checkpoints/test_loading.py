@@ -58,7 +58,7 @@ def test_a_folder_that_is_no_model_gives_the_command_that_makes_one_of_a_run(tmp
 
 
 @pytest.mark.parametrize("part", [ENCODER, PREDICTOR])
-def test_a_weight_that_is_not_finite_is_named(model: WorldModel, tmp_path: Path, part: str) -> None:
+def test_weight_that_is_not_finite_raises_with_its_name(model: WorldModel, tmp_path: Path, part: str) -> None:
     model.save_pretrained(tmp_path)
     weights = load_file(tmp_path / part)
     name = sorted(weights)[-1]
@@ -88,7 +88,7 @@ def loaded(file: Path, encoder: Path, **settings: Any) -> WorldModel:
     return load_base(ModelConfig.model_validate(config), seed=0)
 
 
-def test_it_predicts_as_the_model_that_was_written_and_its_licence_is_told_once(
+def test_loaded_model_predicts_as_the_saved_one_and_logs_its_licence_once(
     file: Path, encoder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING):

@@ -131,7 +131,7 @@ def test_a_refusal_is_final_and_no_network_is_said(serve, tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_whose_size_is_not_said_is_refused(serve, tmp_path: Path) -> None:
+def test_download_without_content_length_raises(serve, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"without Content-Length\. Expected the size of the file"):
         download(serve(Behaviour(says_size=False)), tmp_path / "model.pt")
     assert list(tmp_path.iterdir()) == []
@@ -147,7 +147,7 @@ def test_less_than_the_published_file_is_not_taken_for_it(serve, tmp_path: Path)
     assert download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP).read_bytes() == CONTENT
 
 
-def test_a_file_that_is_here_and_cannot_be_the_published_one_is_named(serve, tmp_path: Path) -> None:
+def test_existing_file_of_a_wrong_size_raises_with_its_path(serve, tmp_path: Path) -> None:
     behaviour = Behaviour()
     path, url = tmp_path / "made-up.pt", serve(behaviour)
     path.write_bytes(b"<html>")
@@ -169,7 +169,7 @@ def test_disk_space_for_the_rest_is_checked_before_the_first_byte(
     assert part.read_bytes() == CONTENT[:1000]
 
 
-def test_the_command_says_what_the_file_is_and_which_knob_takes_it(
+def test_download_prints_the_kind_of_file_and_its_config_key(
     serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(model_files, "PUBLISHED", (MADE_UP,))
@@ -183,13 +183,13 @@ def test_the_command_says_what_the_file_is_and_which_knob_takes_it(
 
 
 @pytest.mark.parametrize("url", ["foo.pt", "http://[", "http://a:b/", "http://a b/"])
-def test_what_is_no_address_is_told_at_once(tmp_path: Path, url: str) -> None:
+def test_invalid_url_raises_without_retries(tmp_path: Path, url: str) -> None:
     with pytest.raises(UnreachableError, match=r"cannot be read.*Check the URL"):
         download(url, tmp_path / "model.pt")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
-def test_a_full_disk_is_told_and_not_tried_again(serve, tmp_path: Path) -> None:
+def test_full_disk_raises_without_retries(serve, tmp_path: Path) -> None:
     (tmp_path / "model.pt.part").symlink_to("/dev/full")
     behaviour = Behaviour()
     with pytest.raises(InputError, match=r"model\.pt\.part: cannot be written: No space left.*Free some space"):

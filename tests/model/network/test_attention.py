@@ -158,7 +158,7 @@ def attended(clips: int) -> Tensor:
 
 @pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
 @pytest.mark.usefixtures("traced", "flex_is_traced")
-def test_where_flex_would_not_be_compiled_any_more_is_an_error_with_a_way_out() -> None:
+def test_too_many_flex_compilations_raise_with_a_fix() -> None:
     attended(1)
     with dynamo.patch(recompile_limit=2):
         attended(2)

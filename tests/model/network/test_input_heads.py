@@ -58,7 +58,7 @@ def trained(widths: Widths, config: AdapterConfig) -> WorldModel:
 
 
 @widths
-def test_only_heads_that_do_not_fit_are_replaced_and_each_is_told(widths: Widths) -> None:
+def test_only_input_heads_of_other_widths_are_replaced_and_reported(widths: Widths) -> None:
     model, before = base(), base().predictor.state_dict()
     lines = fit_heads(model, widths, seed=0)
     replaced = {name: width for name, width in zip(PUBLISHED_HEADS, widths[::-1], strict=True) if width != 7}
@@ -85,7 +85,7 @@ def test_a_fresh_head_that_would_not_be_trained_is_refused_with_the_line_to_add(
 
 @both_kinds
 @widths
-def test_what_was_trained_comes_back_onto_the_plain_base(tmp_path: Path, config: AdapterConfig, widths: Widths) -> None:
+def test_trained_input_heads_load_into_the_base_model(tmp_path: Path, config: AdapterConfig, widths: Widths) -> None:
     model = trained(widths, config)
     save_trained(model, tmp_path)
     loaded = base()

@@ -62,7 +62,7 @@ def break_sizes(folder: Path) -> None:
         ),
     ],
 )
-def test_a_folder_that_is_not_a_whole_model_is_named(
+def test_incomplete_model_folder_raises_with_its_path(
     model: WorldModel, tmp_path: Path, spoil: Callable[[Path], None], message: str
 ) -> None:
     model.save_pretrained(tmp_path / "model")
