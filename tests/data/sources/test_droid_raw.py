@@ -33,8 +33,8 @@ def write(root: Path, place: str = PLACE, **changes: Any) -> Path:
     return write_raw_droid(root / place, STATES, **{"pictures": FRAMES, "gop": 8, **changes})
 
 
-def source(path: Path, **knobs: Any) -> RawDroidSource:
-    return RawDroidSource(DataConfig(source="droid_raw", path=str(path), **knobs))
+def source(path: Path, **values: Any) -> RawDroidSource:
+    return RawDroidSource(DataConfig(source="droid_raw", path=str(path), **values))
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:
@@ -50,7 +50,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_an_episode_holds_the_measured_states_its_task_and_its_outcome(tree: Path) -> None:
+def test_episode_has_measured_states_task_and_outcome(tree: Path) -> None:
     raw = source(tree)
     infos = raw.infos()
     assert [info.success for info in infos] == [False, True]
@@ -60,7 +60,7 @@ def test_an_episode_holds_the_measured_states_its_task_and_its_outcome(tree: Pat
     assert (episode.control_rate_hz, episode.metadata) == (15.0, {"language": "move to place 0"})
 
 
-def test_every_camera_is_found_by_its_name_or_serial_number(tmp_path: Path) -> None:
+def test_cameras_are_selected_by_name_or_serial_number(tmp_path: Path) -> None:
     write(tmp_path)
     for camera, serial in (("left", LEFT), ("right", RIGHT), ("wrist", WRIST), (RIGHT, RIGHT)):
         for episode in (source(tmp_path, camera=camera).read(0), source(tmp_path).read(0, camera)):
@@ -74,12 +74,12 @@ def test_mistyped_camera_name_raises_with_a_suggestion(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["", "LAB", "LAB/success", PLACE])
-def test_an_identity_does_not_depend_on_which_part_of_the_tree_is_named(tree: Path, part: str) -> None:
+def test_identity_is_independent_of_the_configured_subfolder(tree: Path, part: str) -> None:
     assert PLACE in [info.id for info in source(tree / part).infos()]
 
 
 @pytest.mark.parametrize("frames", [STEPS - 1, STEPS, STEPS + 1])
-def test_an_episode_has_as_many_steps_as_frames(tmp_path: Path, frames: int) -> None:
+def test_episode_length_is_limited_by_states_and_frames(tmp_path: Path, frames: int) -> None:
     write(tmp_path, pictures={LEFT: (FRAMES[LEFT] * 2)[:frames]})
     raw = source(tmp_path)
     steps = min(frames, STEPS)
@@ -89,7 +89,7 @@ def test_an_episode_has_as_many_steps_as_frames(tmp_path: Path, frames: int) -> 
         raw.read(0).read_frames([steps])
 
 
-def test_steps_without_an_operator_are_dropped_with_their_frames(tmp_path: Path) -> None:
+def test_steps_without_operator_are_dropped_with_their_frames(tmp_path: Path) -> None:
     skipped = [0, 5, 6]
     kept = np.setdiff1d(np.arange(STEPS), skipped)
     poses = np.arange(STEPS * 6.0).reshape(STEPS, 6) / 100
@@ -101,7 +101,7 @@ def test_steps_without_an_operator_are_dropped_with_their_frames(tmp_path: Path)
     assert psnr(episode.read_frames([0, 4])[1], FRAMES[LEFT][7]) > 30
 
 
-def test_extrinsics_are_those_of_the_chosen_camera(tmp_path: Path) -> None:
+def test_extrinsics_belong_to_the_selected_camera(tmp_path: Path) -> None:
     still, moving = np.tile(np.arange(6.0), (STEPS, 1)), np.arange(STEPS * 6.0).reshape(STEPS, 6)
     write(tmp_path, extrinsics={LEFT: still, WRIST: moving})
     np.testing.assert_array_equal(source(tmp_path, camera="wrist").read(0).extrinsics, moving)
@@ -112,7 +112,7 @@ def test_extrinsics_are_those_of_the_chosen_camera(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("b_frames", [0, 2])
-def test_an_episode_is_parsed_and_its_video_walked_once_on_a_machine(
+def test_trajectory_and_video_are_parsed_once_per_machine(
     tmp_path: Path, b_frames: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path / "raw", pictures={LEFT: FRAMES[LEFT]}, b_frames=b_frames)
@@ -184,7 +184,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("damage", BROKEN)
-def test_an_episode_that_cannot_be_used_is_a_named_problem(tree: Path, tmp_path: Path, damage: str) -> None:
+def test_unusable_episode_is_a_problem_with_its_name_and_reason(tree: Path, tmp_path: Path, damage: str) -> None:
     root = shutil.copytree(tree, tmp_path / "raw")
     change, message = BROKEN[damage]
     change(root / PLACE)
@@ -197,7 +197,7 @@ def test_an_episode_that_cannot_be_used_is_a_named_problem(tree: Path, tmp_path:
         source(root / PLACE).infos()
 
 
-def test_a_tree_in_the_cloud_reads_as_here(tree: Path, gcs: Gcs, tmp_path: Path) -> None:
+def test_remote_tree_equals_local_tree(tree: Path, gcs: Gcs, tmp_path: Path) -> None:
     url, here = gcs.upload(tree, "bucket/droid_raw/1.0.1"), source(tree)
     raw = source(url, disk_cache={"dir": str(tmp_path)})
     assert list(raw.infos()) == list(here.infos())

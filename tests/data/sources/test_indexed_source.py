@@ -59,7 +59,7 @@ def run_together(*tasks: Callable[[], T]) -> list[T]:
     return results
 
 
-def test_a_source_that_contains_another_opens_and_is_pickled_with_its_index(tmp_path: Path) -> None:
+def test_nested_source_opens_and_is_pickled_with_its_index(tmp_path: Path) -> None:
     source = EveryOther(write_npz(tmp_path / "set", 5))
     [table] = run_together(source.infos)
     assert [info.id for info in table] == ["0", "2", "4"]
@@ -75,7 +75,7 @@ def test_a_source_that_contains_another_opens_and_is_pickled_with_its_index(tmp_
 
 
 @pytest.mark.parametrize("identity", ["a\0", "\0", "a\0b"])
-def test_an_identity_with_a_nul_is_a_problem_of_that_episode(identity: str, tmp_path: Path) -> None:
+def test_identity_with_nul_character_is_a_problem_of_that_episode(identity: str, tmp_path: Path) -> None:
     found = [IndexEntry(EpisodeInfo(name, 30), f"file {name!r}") for name in ("a", identity, "é")]
     table = build_table(found, DataConfig(path=str(tmp_path)), 3)
     assert [info.id for info in table] == ["a", "é"]

@@ -90,7 +90,7 @@ def first_video(root: Path) -> Path:
 # --- what is read ------------------------------------------------------------------------------------------------
 
 
-def test_states_are_those_that_were_written_whatever_the_version(either: Path, episodes: list[Recorded]) -> None:
+def test_states_equal_the_written_states_in_every_version(either: Path, episodes: list[Recorded]) -> None:
     source = source_of(either)
     assert isinstance(source, EpisodeSource)
     infos = source.infos()
@@ -109,7 +109,7 @@ def test_states_are_those_that_were_written_whatever_the_version(either: Path, e
 
 @pytest.mark.parametrize("gop", [2, 10])
 @pytest.mark.parametrize("write", [write_v30, write_v21])
-def test_each_frame_is_that_of_its_step(
+def test_frames_match_their_steps(
     write: Callable[..., Path], gop: int, episodes: list[Recorded], tmp_path: Path
 ) -> None:
     source = source_of(write(tmp_path / "set", episodes, gop=gop))
@@ -122,7 +122,7 @@ def test_each_frame_is_that_of_its_step(
             assert [numbers_of(frame) for frame in frames] == expected
 
 
-def test_what_is_read_does_not_depend_on_the_order_nor_on_threads_nor_on_the_process(either: Path) -> None:
+def test_reads_are_independent_of_order_threads_and_process(either: Path) -> None:
     def everything(source: LeRobotSource, order: list[int]) -> dict[int, tuple[bytes, bytes]]:
         with ThreadPoolExecutor(4) as pool:
             read: list[Episode] = list(pool.map(source.read, order))
@@ -140,7 +140,7 @@ def test_what_is_read_does_not_depend_on_the_order_nor_on_threads_nor_on_the_pro
 
 @pytest.mark.parametrize("pictures", ["png", "jpeg"])
 @pytest.mark.parametrize("write", [write_v30, write_v21])
-def test_frames_may_be_in_the_table(
+def test_frames_are_read_from_image_columns(
     write: Callable[..., Path], pictures: str, episodes: list[Recorded], tmp_path: Path
 ) -> None:
     source = source_of(write(tmp_path / "set", episodes[:3], pictures=pictures))
@@ -163,7 +163,7 @@ def count_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("write", [write_v30, write_v21])
-def test_a_later_clip_does_not_read_the_table_again(
+def test_later_clip_reads_images_from_the_cache(
     write: Callable[..., Path], episodes: list[Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root, cache = write(tmp_path / "set", episodes[:3], pictures="png"), {"dir": str(tmp_path / "cache")}
@@ -180,7 +180,7 @@ def test_a_later_clip_does_not_read_the_table_again(
 # --- conventions -------------------------------------------------------------------------------------------------
 
 
-def own_set(folder: Path, state: np.ndarray, **columns: np.ndarray) -> Path:
+def write_data_set(folder: Path, state: np.ndarray, **columns: np.ndarray) -> Path:
     frames = {"observation.images.front": [np.zeros((*SIZE, 3), np.uint8)] * len(state)}
     named = {"observation.state": state} | {name.replace("__", "."): values for name, values in columns.items()}
     return write_v30(folder, [Recorded(named, frames)])
@@ -190,13 +190,13 @@ OWN = {"state": ["observation.state"], "cameras": {"front": "observation.images.
 
 
 @pytest.mark.parametrize("convention", ["quaternion_wxyz", "quaternion_xyzw"])
-def test_every_way_to_write_a_rotation_is_the_same_rotation(convention: str, tmp_path: Path) -> None:
+def test_all_rotation_formats_give_the_same_pose(convention: str, tmp_path: Path) -> None:
     states = synthetic_states(20, seed=3)
     matrices = matrices_from_euler(states[:, 3:6])
     quaternions = Rotation.from_matrix(matrices).as_quat(scalar_first=convention == "quaternion_wxyz")
     quaternions[::2] *= -1  # q and -q are one rotation
     own = np.concatenate([states[:, :3], quaternions, states[:, 6:]], axis=1)
-    source = source_of(own_set(tmp_path / "set", own), lerobot=OWN | {"rotation": convention})
+    source = source_of(write_data_set(tmp_path / "set", own), lerobot=OWN | {"rotation": convention})
     read = source.read(0).states
     np.testing.assert_allclose(matrices_from_euler(read[:, 3:6]), matrices, atol=1e-9)
     np.testing.assert_allclose(read[:, 3:6], euler_from_matrices(matrices), atol=1e-9)
@@ -204,11 +204,11 @@ def test_every_way_to_write_a_rotation_is_the_same_rotation(convention: str, tmp
 
 
 @pytest.mark.parametrize(("opened", "closed"), [(0.08, 0.0), (0.0, 0.08), (100.0, 0.0), (-1.0, 1.0), (1.0, 0.0)])
-def test_the_gripper_is_closedness_whatever_its_range_and_sign(opened: float, closed: float, tmp_path: Path) -> None:
+def test_gripper_is_converted_to_closedness(opened: float, closed: float, tmp_path: Path) -> None:
     states = synthetic_states(15, seed=1)
     own = states.copy()
     own[:, 6] = opened + states[:, 6] * (closed - opened)
-    root = own_set(tmp_path / "set", own)
+    root = write_data_set(tmp_path / "set", own)
     source = source_of(root, lerobot=OWN | {"gripper_open": opened, "gripper_closed": closed})
     np.testing.assert_allclose(source.read(0).states, states, atol=1e-12)
     if abs(closed - opened) > 1.1:
@@ -240,9 +240,7 @@ def test_the_gripper_is_closedness_whatever_its_range_and_sign(opened: float, cl
         ({"lerobot": {"cameras": {"left": "observation.images.left"}}}, r"no camera observation\.images\.left"),
     ],
 )
-def test_a_mapping_that_does_not_fit_is_one_error_of_the_settings(
-    changes: dict[str, Any], message: str, either: Path
-) -> None:
+def test_wrong_mapping_raises_a_config_error(changes: dict[str, Any], message: str, either: Path) -> None:
     with pytest.raises(InputError, match=message):
         source_of(either, **changes).infos()
 
@@ -256,7 +254,7 @@ def test_a_mapping_that_does_not_fit_is_one_error_of_the_settings(
         ({"storage_format": "lance"}, "storage_format 'lance'.*Parquet files and MP4.*data converter lance_to_files"),
     ],
 )
-def test_other_versions_and_storage_are_refused_with_the_way_from_each(
+def test_unsupported_version_or_storage_raises_with_conversion_hint(
     changes: dict[str, Any], message: str, v30: Path, tmp_path: Path
 ) -> None:
     root = Path(shutil.copytree(v30, tmp_path / "set"))
@@ -283,7 +281,7 @@ def change_feature(root: Path, name: str, **changes: object) -> None:
     ],
     ids=["today", "before", "long before", "unmarked"],
 )
-def test_a_depth_map_is_no_camera(mark: dict[str, object], copy: Path) -> None:
+def test_depth_map_is_not_a_camera(mark: dict[str, object], copy: Path) -> None:
     change_feature(copy, KEY, info={"is_depth_map": False, "video.pix_fmt": "gray"})
     assert len(source_of(copy).infos()) == len(LENGTHS)
     change_feature(copy, KEY, **({"info": {}} | mark))
@@ -302,13 +300,13 @@ def test_a_depth_map_is_no_camera(mark: dict[str, object], copy: Path) -> None:
         lambda info: change_info(info.parent.parent, video_path=None),
     ],
 )
-def test_damaged_descriptions_are_named(spoil: Callable[[Path], None], copy: Path) -> None:
+def test_damaged_meta_files_raise_with_path(spoil: Callable[[Path], None], copy: Path) -> None:
     spoil(copy / "meta/info.json")
     with pytest.raises(InputError, match=r"meta/(info\.json|episodes)"):
         source_of(copy).infos()
 
 
-def test_no_data_set_says_what_a_data_set_is(tmp_path: Path) -> None:
+def test_missing_data_set_raises_with_expected_layout(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"data\.path: no meta/info\.json in .*the folder with meta, data"):
         source_of(tmp_path).infos()
 
@@ -331,7 +329,7 @@ def with_value(step: int, value: float) -> Callable[[list[list[float]]], np.ndar
     return lambda rows: np.where((np.arange(len(rows)) == step)[:, None], np.float32(value), np.float32(rows))
 
 
-def taken(*places: int) -> Callable[[Path], None]:
+def select_rows(*places: int) -> Callable[[Path], None]:
     def spoil(root: Path) -> None:
         table = pq.read_table(first_rows(root))
         pq.write_table(table.take([*places, *range(12, len(table))]), first_rows(root))
@@ -352,8 +350,8 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "uneven": (spoiled(lambda rows: pa.array([rows[0][:5], *rows[1:]], LIST)), "5 numbers in one row and 6 in another"),
     "gaps": (spoiled(lambda rows: pa.array([None, *rows[1:]], LIST)), "1 rows without a value"),
     "words": (spoiled(lambda rows: pa.array(["a"] * len(rows))), "values of type string"),
-    "lost rows": (taken(*range(10)), r"10 rows\. Expected 12"),
-    "mixed rows": (taken(1, 0, *range(2, 12)), "frame_index does not count from 0 to 11"),
+    "lost rows": (select_rows(*range(10)), r"10 rows\. Expected 12"),
+    "mixed rows": (select_rows(1, 0, *range(2, 12)), "frame_index does not count from 0 to 11"),
 }  # fmt: skip
 
 
@@ -366,13 +364,13 @@ def only_problem(root: Path) -> str:
 
 
 @pytest.mark.parametrize("damage", BROKEN)
-def test_an_episode_that_cannot_be_used_is_a_named_problem(damage: str, copy: Path) -> None:
+def test_unusable_episode_is_a_problem_with_its_name_and_reason(damage: str, copy: Path) -> None:
     spoil, message = BROKEN[damage]
     spoil(copy)
     assert re.search(message, only_problem(copy))
 
 
-def test_a_wrong_rate_is_found_out_by_the_timestamps(v21: Path, tmp_path: Path) -> None:
+def test_timestamps_reveal_wrong_rate(v21: Path, tmp_path: Path) -> None:
     root = Path(shutil.copytree(v21, tmp_path / "set"))
     change_info(root, fps=10)
     with pytest.raises(InputError, match=r"step 2: timestamp 0\.1333 s\. Expected 0\.2 s, at the 10 rows per second"):
@@ -414,9 +412,7 @@ OVERLAPS: dict[str, tuple[dict[str, dict[int, float]], dict[str, str]]] = {
 
 
 @pytest.mark.parametrize("how", OVERLAPS)
-def test_episodes_that_claim_the_same_seconds_of_a_video_are_refused_by_name(
-    how: str, v30: Path, tmp_path: Path
-) -> None:
+def test_overlapping_time_ranges_in_a_video_are_problems(how: str, v30: Path, tmp_path: Path) -> None:
     changes, expected = OVERLAPS[how]
     root = Path(shutil.copytree(v30, tmp_path / "set"))
     change_ranges(root, **changes)
@@ -437,9 +433,7 @@ def shorten(path: Path, num_frames: int, rate: int = FPS) -> None:
     write_mp4(path, frames[:num_frames], rate=rate)
 
 
-def test_a_video_that_is_shorter_than_its_rows_is_found_while_a_local_set_is_indexed(
-    v21: Path, v30: Path, tmp_path: Path
-) -> None:
+def test_indexing_a_local_data_set_detects_too_short_video(v21: Path, v30: Path, tmp_path: Path) -> None:
     root = Path(shutil.copytree(v21, tmp_path / "v21"))
     shorten(first_video(root), 11)
     message = (
@@ -457,7 +451,7 @@ def test_a_video_that_is_shorter_than_its_rows_is_found_while_a_local_set_is_ind
     assert "30 frames at 15 frames per second, up to 1.933 s" in problems[0].found
 
 
-def test_a_set_that_lerobot_wrote_gives_the_values_that_lerobot_reads(shared: Path) -> None:
+def test_values_equal_those_read_by_lerobot(shared: Path) -> None:
     fields = {"state": ["observation.state"], "success": None, "cameras": {"front": "observation.images.front"}}
     source = source_of(shared / "data/lerobot_v30", camera="front", lerobot=fields)
     with np.load(shared / "data/lerobot_v30.truth.npz") as truth:

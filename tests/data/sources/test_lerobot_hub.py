@@ -46,7 +46,7 @@ def source_of(name: str, cache: Path, **changes: Any) -> LeRobotSource:
 
 
 @pytest.mark.parametrize("version", ["v30", "v21"])
-def test_a_data_set_on_the_hub_is_the_one_that_was_written(
+def test_hub_data_set_equals_the_written_data_set(
     version: str, hub: Hub, episodes: list[Recorded], tmp_path: Path
 ) -> None:
     assert hub.url
@@ -63,22 +63,22 @@ def test_a_data_set_on_the_hub_is_the_one_that_was_written(
 
 
 @pytest.mark.parametrize("version", ["v30", "v21"])
-def test_a_bucket_gives_the_same(version: str, folder: Path, gcs: Gcs, tmp_path: Path) -> None:
-    far = source_of(gcs.upload(folder / version, f"robots/{version}"), tmp_path)
-    here = LeRobotSource(DataConfig(source="lerobot", path=str(folder / version)))
-    assert [info.id for info in far.infos()] == [info.id for info in here.infos()]
+def test_bucket_data_set_equals_local_data_set(version: str, folder: Path, gcs: Gcs, tmp_path: Path) -> None:
+    remote = source_of(gcs.upload(folder / version, f"robots/{version}"), tmp_path)
+    local = LeRobotSource(DataConfig(source="lerobot", path=str(folder / version)))
+    assert [info.id for info in remote.infos()] == [info.id for info in local.infos()]
     assert {request.object.split("/")[2] for request in gcs.reads()} == {"meta"}
     for number in (1, 4):
-        np.testing.assert_array_equal(far.read(number).states, here.read(number).states)
-        frames = [source.read(number).read_frames([3, 9]) for source in (far, here)]
+        np.testing.assert_array_equal(remote.read(number).states, local.read(number).states)
+        frames = [source.read(number).read_frames([3, 9]) for source in (remote, local)]
         np.testing.assert_array_equal(*frames)
     gcs.fail_next(503, match="/download/.*mp4")
     gcs.fail_next("short", match="/download/.*mp4")
-    far.read(0).read_frames([2])
+    remote.read(0).read_frames([2])
     assert gcs.faults_left == 0
 
 
-def test_the_outcome_is_in_the_tables_or_in_the_rows(hub: Hub, tmp_path: Path) -> None:
+def test_outcome_is_read_from_tables_or_rows(hub: Hub, tmp_path: Path) -> None:
     assert hub.url
     outcomes = [number % 3 != 2 for number in range(5)]
     assert [info.success for info in source_of("v30", tmp_path).infos()] == outcomes
@@ -86,7 +86,7 @@ def test_the_outcome_is_in_the_tables_or_in_the_rows(hub: Hub, tmp_path: Path) -
     assert [info.success for info in source_of("v21", tmp_path, outcome="success").infos()] == outcomes
 
 
-def test_a_gated_data_set_says_how_to_log_in(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gated_data_set_raises_with_login_command(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert hub.url
     for token in (None, "hf_wrong"):
         if token is not None:

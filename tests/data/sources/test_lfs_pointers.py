@@ -49,7 +49,7 @@ def config_of(form: str, path: str | Path, tmp_path: Path) -> DataConfig:
         ("droid_raw", "metadata_*.json"),
     ],
 )
-def test_a_pointer_is_named_when_the_set_is_opened(form: str, pattern: str, tmp_path: Path) -> None:
+def test_lfs_pointer_raises_when_the_data_set_is_opened(form: str, pattern: str, tmp_path: Path) -> None:
     folder = replaced_by_pointers(FORMS[form](tmp_path / "set", range(3)), pattern)
     with pytest.raises(InputError, match=r"a git-lfs pointer.*`git lfs pull`") as raised:
         open_dataset(config_of(form, folder, tmp_path / "cache"))
@@ -58,7 +58,7 @@ def test_a_pointer_is_named_when_the_set_is_opened(form: str, pattern: str, tmp_
 
 
 @pytest.mark.parametrize(("form", "pattern"), [("rlds", "*.tfrecord-*"), ("lerobot", "*.mp4"), ("npz", "*.npz")])
-def test_a_pointer_behind_a_url_is_named(form: str, pattern: str, gcs: Gcs, tmp_path: Path) -> None:
+def test_remote_lfs_pointer_raises(form: str, pattern: str, gcs: Gcs, tmp_path: Path) -> None:
     gcs.upload(replaced_by_pointers(FORMS[form](tmp_path / "set", range(3)), pattern), "robots/set")
     with pytest.raises(InputError, match=r"gs://robots/set/.*a git-lfs pointer"):
         open_dataset(config_of(form, "gs://robots/set", tmp_path / "cache"))

@@ -22,7 +22,9 @@ def dataset_of(folder: Path, progress: Progress | None = None) -> Dataset:
     return open_dataset(DataConfig.model_validate_json(json.dumps(values)), progress=progress)
 
 
-def test_without_its_reader_no_episode_is_called_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_reader_library_does_not_mark_episodes_as_broken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = write_v21(tmp_path / "set", [recorded(0, 20)])
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(
@@ -32,7 +34,7 @@ def test_without_its_reader_no_episode_is_called_broken(tmp_path: Path, monkeypa
     assert "broken" not in str(raised.value)
 
 
-def test_without_its_decoder_a_set_of_videos_is_not_indexed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_video_decoder_prevents_indexing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Or the states of a hundred thousand episodes would be read before the first frame is missed."""
     folder, told = write_v21(tmp_path / "set", [recorded(0, 20)]), []
     monkeypatch.setitem(sys.modules, "av", None)

@@ -35,7 +35,7 @@ def source(path: Path | str, **options: Any) -> NpzSource:
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_an_episode_is_what_was_written(tmp_path: Path, compressed: bool) -> None:
+def test_episode_equals_the_written_arrays(tmp_path: Path, compressed: bool) -> None:
     write(tmp_path / "kitchen/one.npz", compressed=compressed, success=True, language="pick it up", wrist=WRIST)
     plain = source(tmp_path)
     (info,) = plain.infos()
@@ -49,7 +49,7 @@ def test_an_episode_is_what_was_written(tmp_path: Path, compressed: bool) -> Non
     assert episode.joint_velocities is None
 
 
-def test_a_camera_has_its_own_poses_or_those_of_all_and_commands_are_read(tmp_path: Path) -> None:
+def test_extrinsics_per_camera_and_commands_are_read(tmp_path: Path) -> None:
     moving = np.arange(STEPS * 6.0).reshape(STEPS, 6)
     more = {"extrinsics": np.arange(6.0), "extrinsics_wrist": moving, "joint_velocities": STATES}
     write(tmp_path / "one.npz", wrist=WRIST, **more)
@@ -59,7 +59,7 @@ def test_a_camera_has_its_own_poses_or_those_of_all_and_commands_are_read(tmp_pa
     np.testing.assert_array_equal(plain.read(0).joint_velocities, STATES)
 
 
-def test_of_a_plain_file_only_the_asked_frames_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uncompressed_file_reads_only_requested_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "one.npz")
     episode = source(tmp_path).read(0)
     read: list[int] = []
@@ -74,7 +74,7 @@ def test_of_a_plain_file_only_the_asked_frames_are_read(tmp_path: Path, monkeypa
     assert sum(read) < FRAMES[:2].nbytes + 4 * io.DEFAULT_BUFFER_SIZE < FRAMES.nbytes / 2
 
 
-def test_a_file_that_changed_after_indexing_is_named(tmp_path: Path) -> None:
+def test_file_changed_after_indexing_raises(tmp_path: Path) -> None:
     path = write(tmp_path / "one.npz")
     plain = source(tmp_path)
     plain.infos()
@@ -123,7 +123,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("damage", BROKEN)
-def test_an_episode_that_cannot_be_used_is_a_named_problem(tmp_path: Path, damage: str) -> None:
+def test_unusable_episode_is_a_problem_with_its_name_and_reason(tmp_path: Path, damage: str) -> None:
     write(tmp_path / "a.npz")
     write(tmp_path / "b.npz")
     change, message = BROKEN[damage]
@@ -143,13 +143,13 @@ def test_an_episode_that_cannot_be_used_is_a_named_problem(tmp_path: Path, damag
 
 
 @pytest.mark.parametrize("name", ["\udcff.npz", "\udcff/one.npz"])
-def test_a_name_that_is_no_text_is_refused(tmp_path: Path, name: str) -> None:
+def test_array_name_that_is_not_utf8_raises(tmp_path: Path, name: str) -> None:
     write(tmp_path / name)
     with pytest.raises(InputError, match=r"udcff.*UTF-8"):
         source(tmp_path).infos()
 
 
-def test_of_a_file_in_the_cloud_nothing_is_fetched_twice(tmp_path: Path, gcs: Gcs) -> None:
+def test_remote_file_is_fetched_only_once(tmp_path: Path, gcs: Gcs) -> None:
     write(tmp_path / "set" / "one.npz")
     plain = source(gcs.upload(tmp_path / "set", "bucket/own"), disk_cache={"dir": str(tmp_path / "cache")})
     plain.read(0).read_frames([3])

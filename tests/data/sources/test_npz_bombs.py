@@ -81,7 +81,7 @@ def table_of(folder: Path) -> EpisodeTable:
 
 
 @pytest.mark.parametrize("bomb", BOMBS)
-def test_what_claims_more_than_an_episode_holds_is_refused_before_it_is_unpacked(tmp_path: Path, bomb: str) -> None:
+def test_oversized_arrays_are_rejected_before_decompression(tmp_path: Path, bomb: str) -> None:
     folder = tmp_path / "set"
     folder.mkdir()
     without(folder / "good.npz", "")
@@ -100,9 +100,7 @@ def test_what_claims_more_than_an_episode_holds_is_refused_before_it_is_unpacked
     assert peak < 6 * _MB
 
 
-def test_frames_that_unpack_to_far_more_bytes_than_the_file_has_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_above_the_compression_ratio_limit_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(npz, "_MAX_UNPACKED_BYTES", 1 << 20)
     folder = tmp_path / "set"
     folder.mkdir()

@@ -24,7 +24,7 @@ def repeated(value: str | bytes, rows: int) -> pa.Array:
     return pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array([value]))
 
 
-def test_texts_that_repeat_without_end_are_refused_before_python_has_them(
+def test_repeated_texts_are_rejected_before_conversion_to_python(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "tasks.parquet"
@@ -46,9 +46,7 @@ def test_texts_that_repeat_without_end_are_refused_before_python_has_them(
     ("name", "message"),
     [("contradicting_footer", "Definition level histogram"), ("mistyped_footer", "ColumnMetaData type does not match")],
 )
-def test_a_footer_that_contradicts_itself_is_damage_and_does_not_end_the_process(
-    name: str, message: str, tmp_path: Path
-) -> None:
+def test_inconsistent_footer_raises_without_aborting_the_process(name: str, message: str, tmp_path: Path) -> None:
     """Asked for this column's account in the footer, pyarrow 26 would abort this very process."""
     columns = ("frame_index", "timestamp", "observation.state.cartesian_position", "action.joint_velocity")
     with pytest.raises(InputError, match=rf"{name}\.parquet: the file is damaged: {message}"):
@@ -67,7 +65,7 @@ def write(path: Path, rows: int, width: int = 7, row_group: int | None = None) -
     return path
 
 
-def test_lists_without_end_are_refused_by_what_the_footer_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oversized_lists_are_rejected_from_the_footer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "rows.parquet", 10, width=70)
     assert rows_of(path).read_rows(str(path), 0)[STATE].shape == (10, 70)
     monkeypatch.setattr(parquet, "MAX_NUMBERS", 600)
@@ -75,7 +73,7 @@ def test_lists_without_end_are_refused_by_what_the_footer_says(tmp_path: Path, m
         rows_of(path).read_rows(str(path), 0)
 
 
-def test_images_that_repeat_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_images_above_the_size_limit_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, picture = tmp_path / "rows.parquet", b"\xff\xd8" + bytes(99_998)
     table = pa.table({"episode_index": np.repeat([0, 1], 50), "image": repeated(picture, 100)})
     pq.write_table(table, path, compression="zstd")

@@ -33,8 +33,8 @@ BRIDGE = RldsFields(
 )
 
 
-def open_droid(folder: Path, **knobs: Any) -> RldsSource:
-    return RldsSource(DataConfig(path=str(folder), **knobs))
+def open_droid(folder: Path, **values: Any) -> RldsSource:
+    return RldsSource(DataConfig(path=str(folder), **values))
 
 
 def at_step_2(features: Features, name: str, value: float) -> None:
@@ -50,7 +50,7 @@ def error_of(problem: EpisodeProblem) -> InputError:
     return InputError(where=problem.where, found=problem.found, needed=problem.needed, fix=problem.fix)
 
 
-def test_what_was_written_is_read(droid: Path) -> None:
+def test_episodes_equal_the_written_episodes(droid: Path) -> None:
     source = open_droid(droid)
     infos = source.infos()
     assert sorted(info.num_steps for info in infos) == [12, 13, 14, 15, 16, 17]
@@ -68,7 +68,7 @@ def test_what_was_written_is_read(droid: Path) -> None:
         assert episode.control_rate_hz == 15.0
 
 
-def test_only_the_frames_asked_for_are_decoded(spoiled: Spoil) -> None:
+def test_only_requested_frames_are_decoded(spoiled: Spoil) -> None:
     def spoil(features: Features) -> None:
         features["steps/observation/exterior_image_1_left"][1][5] = b"\xff\xd8 no JPEG"
         features["steps/observation/wrist_image_left"][1][:] = [b""] * 12
@@ -79,7 +79,7 @@ def test_only_the_frames_asked_for_are_decoded(spoiled: Spoil) -> None:
         episode.read_frames([4, 5])
 
 
-def test_states_and_images_equal_what_tfds_reads_bit_for_bit(shared: Path) -> None:
+def test_states_and_images_equal_tfds_bit_for_bit(shared: Path) -> None:
     folder = shared / "data" / "droid_rlds"
     expected = json.loads((folder / "expected.json").read_text())
     with np.load(folder / "expected.npz") as arrays:
@@ -100,7 +100,7 @@ def test_states_and_images_equal_what_tfds_reads_bit_for_bit(shared: Path) -> No
     assert compared == 18
 
 
-def test_real_robot_episodes_of_another_schema_are_read_by_mapped_names(shared: Path) -> None:
+def test_real_robot_episodes_with_mapped_feature_names(shared: Path) -> None:
     path = str(shared / "data" / "bridge_rlds" / "bridge_dataset" / "1.0.0")
     source = RldsSource(DataConfig(path=path, fields=BRIDGE, camera="image_0"))
     infos = source.infos()
@@ -138,7 +138,7 @@ def test_real_robot_episodes_of_another_schema_are_read_by_mapped_names(shared: 
         ),
     ],
 )
-def test_an_episode_that_cannot_be_used_is_a_problem_and_no_row(spoiled: Spoil, change: Any, message: str) -> None:
+def test_unusable_episode_is_a_problem_and_not_a_row(spoiled: Spoil, change: Any, message: str) -> None:
     def spoil(features: Features) -> None:
         change(features)
 
@@ -149,10 +149,10 @@ def test_an_episode_that_cannot_be_used_is_a_problem_and_no_row(spoiled: Spoil, 
     assert re.search(message, str(error_of(problem)))
 
 
-def test_where_no_episode_can_be_used_the_first_says_why(tmp_path: Path, droid: Path) -> None:
+def test_data_set_without_usable_episode_raises_first_error(tmp_path: Path, droid: Path) -> None:
     drawn = [synthetic_episode(number, steps=40, size=(16, 32)) for number in range(3)]
-    far = {"observation/cartesian_position": np.full((40, 6), 7.0)}
-    bad = [dataclasses.replace(episode, arrays={**episode.arrays, **far}) for episode in drawn]
+    out_of_reach = {"observation/cartesian_position": np.full((40, 6), 7.0)}
+    bad = [dataclasses.replace(episode, arrays={**episode.arrays, **out_of_reach}) for episode in drawn]
     folder = write_droid_rlds(tmp_path / "some", [drawn[0], *bad[1:]], shards=1)
     table = open_droid(folder).infos()
     assert ([info.id for info in table], len(table.problems)) == ([table.identity(0)], 2)
@@ -163,7 +163,7 @@ def test_where_no_episode_can_be_used_the_first_says_why(tmp_path: Path, droid: 
         open_droid(droid, fields=RldsFields(state=("steps/nothing",))).infos()
 
 
-def test_damage_is_found_by_the_first_read_on_this_machine(droid: Path, tmp_path: Path) -> None:
+def test_first_read_on_a_machine_detects_damage(droid: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(droid, tmp_path / "set")
     shard = sorted(folder.glob("*.tfrecord-*"))[0]
     open_droid(folder).read(0)
@@ -181,7 +181,7 @@ def change_silently(file: Path, place: int, status: os.stat_result) -> None:
     os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
-def test_a_file_that_changes_while_it_is_in_use_is_an_error(droid: Path, tmp_path: Path) -> None:
+def test_file_changed_during_use_raises(droid: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(droid, tmp_path / "set")
     source = open_droid(folder)
     episode = source.read(0)
@@ -195,7 +195,7 @@ def test_a_file_that_changes_while_it_is_in_use_is_an_error(droid: Path, tmp_pat
         source.read(0)
 
 
-def test_a_shard_truncated_anywhere_costs_the_records_behind_the_cut(droid: Path, tmp_path: Path) -> None:
+def test_truncated_shard_loses_only_records_after_the_cut(droid: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(droid, tmp_path / "set")
     shard = sorted(folder.glob("*.tfrecord-*"))[0]
     whole = shard.read_bytes()
@@ -209,7 +209,7 @@ def test_a_shard_truncated_anywhere_costs_the_records_behind_the_cut(droid: Path
         assert [problem.name for problem in table.problems] == [f"{shard.name}: record {n}" for n in range(found, 3)]
 
 
-def test_missing_shards_are_named(droid: Path, tmp_path: Path) -> None:
+def test_missing_shards_raise_with_their_names(droid: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(droid, tmp_path / "set")
     (folder / "r2d2_faceblur-train.tfrecord-00001-of-00002").unlink()
     with pytest.raises(
@@ -218,7 +218,7 @@ def test_missing_shards_are_named(droid: Path, tmp_path: Path) -> None:
         open_droid(folder).infos()
 
 
-def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Path) -> None:
+def test_folder_without_data_set_suggests_subfolders(droid: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         open_droid(tmp_path / "none").infos()
     with pytest.raises(InputError, match="is empty"):
@@ -242,7 +242,7 @@ def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Pa
         ('{"name": "a", "fileFormat": "array_record", "splits": []}', "array_record"),
     ],
 )
-def test_a_description_that_is_none_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_dataset_info_raises(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "dataset_info.json").write_text(text)
     with pytest.raises(InputError, match=message):
         open_droid(tmp_path).infos()

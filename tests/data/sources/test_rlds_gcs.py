@@ -29,16 +29,16 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def far(gcs: Gcs, tmp_path: Path) -> Callable[..., RldsSource]:
-    """Put a folder on the storage, once, and open it there with a cache of its own."""
-    there: set[Path] = set()
+def open_remote(gcs: Gcs, tmp_path: Path) -> Callable[..., RldsSource]:
+    """Upload a folder once, and open it through the storage with a separate disk cache."""
+    uploaded: set[Path] = set()
 
-    def put(folder: Path, **knobs: Any) -> RldsSource:
-        if folder not in there:
+    def put(folder: Path, **values: Any) -> RldsSource:
+        if folder not in uploaded:
             gcs.upload(folder, URL.removeprefix("gs://"))
-            there.add(folder)
-        disk_cache = {"dir": str(tmp_path / "cache"), "limit_gb": knobs.pop("limit_gb", 1.0)}
-        return RldsSource(DataConfig(path=URL, disk_cache=disk_cache, **knobs))
+            uploaded.add(folder)
+        disk_cache = {"dir": str(tmp_path / "cache"), "limit_gb": values.pop("limit_gb", 1.0)}
+        return RldsSource(DataConfig(path=URL, disk_cache=disk_cache, **values))
 
     return put
 
@@ -56,31 +56,31 @@ def same(one: Episode, other: Episode, steps: list[int]) -> bool:
 
 
 @pytest.mark.parametrize("order", ["sorted", "any"])
-def test_what_is_read_from_afar_is_what_is_read_here(
-    droid: Path, far: Callable[..., RldsSource], tmp_path: Path, order: str
+def test_remote_reads_equal_local_reads(
+    droid: Path, open_remote: Callable[..., RldsSource], tmp_path: Path, order: str
 ) -> None:
     folder = droid if order == "sorted" else in_any_order(droid, tmp_path / "any", seed=0)
-    here, there = RldsSource(DataConfig(path=str(folder))), far(folder)
-    assert list(there.infos()) == list(here.infos())
-    assert not there.infos().problems
+    local, remote = RldsSource(DataConfig(path=str(folder))), open_remote(folder)
+    assert list(remote.infos()) == list(local.infos())
+    assert not remote.infos().problems
     for number in range(6):
         for camera in RldsFields().cameras:
             for _ in range(2):  # fetched, and kept
-                assert same(there.read(number, camera), here.read(number, camera), [11, 0, 3])
+                assert same(remote.read(number, camera), local.read(number, camera), [11, 0, 3])
 
 
-def test_an_index_reads_a_part_of_the_records_and_is_made_once(
-    long: Path, far: Callable[..., RldsSource], gcs: Gcs, tmp_path: Path
+def test_remote_indexing_reads_record_parts_once(
+    long: Path, open_remote: Callable[..., RldsSource], gcs: Gcs, tmp_path: Path
 ) -> None:
     folder = in_any_order(long, tmp_path / "any", seed=1)
-    source, told = far(folder), list[tuple[int, int]]()
-    assert list(source.infos(lambda *counts: told.append(counts))) == list(
+    source, progress_calls = open_remote(folder), list[tuple[int, int]]()
+    assert list(source.infos(lambda *counts: progress_calls.append(counts))) == list(
         RldsSource(DataConfig(path=str(folder))).infos()
     )
-    assert told[-1] == (4, 4)
+    assert progress_calls[-1] == (4, 4)
     assert gcs.bytes_read("-of-00001") < next(folder.glob("*.tfrecord-*")).stat().st_size / 2
     gcs.forget()
-    far(folder).infos()
+    open_remote(folder).infos()
     assert not gcs.reads("-of-00001")
 
 
@@ -101,10 +101,10 @@ def entry_sizes(cache: Path) -> list[int]:
     return [file.stat().st_size for file in (cache / "fetched").rglob("*") if file.is_file()]
 
 
-def test_the_disk_cache_stays_within_its_limit_with_several_processes(
-    long: Path, far: Callable[..., RldsSource], popen: Popen, tmp_path: Path
+def test_disk_cache_stays_within_its_limit_with_several_processes(
+    long: Path, open_remote: Callable[..., RldsSource], popen: Popen, tmp_path: Path
 ) -> None:
-    unlimited = far(long)
+    unlimited = open_remote(long)
     for episode in range(4):
         for camera in RldsFields().cameras:
             unlimited.read(episode, camera).read_frames([0])
@@ -121,10 +121,10 @@ def test_the_disk_cache_stays_within_its_limit_with_several_processes(
 
 
 @pytest.mark.parametrize("failure", [503, 429, "reset", "cut", "short"])
-def test_a_network_that_fails_now_and_then_changes_nothing(
-    droid: Path, far: Callable[..., RldsSource], gcs: Gcs, failure: int | str
+def test_intermittent_network_errors_do_not_change_results(
+    droid: Path, open_remote: Callable[..., RldsSource], gcs: Gcs, failure: int | str
 ) -> None:
-    here = RldsSource(DataConfig(path=str(droid)))
+    local = RldsSource(DataConfig(path=str(droid)))
 
     def failing(action: Callable[[], Any]) -> Any:
         gcs.fail_next(failure, times=2, match=SHARD)
@@ -132,18 +132,18 @@ def test_a_network_that_fails_now_and_then_changes_nothing(
         assert gcs.faults_left == 0, "both were met"
         return result
 
-    assert failing(lambda: list(far(droid).infos())) == list(here.infos())
-    source = far(droid, limit_gb=0.0)
+    assert failing(lambda: list(open_remote(droid).infos())) == list(local.infos())
+    source = open_remote(droid, limit_gb=0.0)
     for _ in range(2):  # frames of the whole camera; then, their places known, each by itself
         episode = failing(lambda: source.read(2))
-        assert failing(lambda episode=episode: same(episode, here.read(2), [0, 5]))
+        assert failing(lambda episode=episode: same(episode, local.read(2), [0, 5]))
 
 
-def test_a_later_clip_costs_its_frames_where_nothing_is_cached(
-    far: Callable[..., RldsSource], gcs: Gcs, tmp_path: Path
+def test_later_clip_without_cache_fetches_only_its_frames(
+    open_remote: Callable[..., RldsSource], gcs: Gcs, tmp_path: Path
 ) -> None:
     folder = write_synthetic_droid(tmp_path / "large", episodes=1, steps=40, size=(720, 1280), shards=1)
-    source = far(folder, limit_gb=0.0)
+    source = open_remote(folder, limit_gb=0.0)
     source.read(0).read_frames([0])
     gcs.forget()
     source.read(0).read_frames(range(0, 40, 5))

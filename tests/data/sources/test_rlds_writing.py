@@ -21,13 +21,13 @@ def layout(shard: Path) -> dict[str, list[object]]:
     }
 
 
-def test_records_have_the_layout_that_tfds_writes(droid: Path) -> None:
+def test_records_have_the_layout_of_tfds(droid: Path) -> None:
     golden = json.loads((GOLDEN / "droid_record_layout.json").read_text())
     for shard in droid.glob("*.tfrecord-*"):
         assert layout(shard) == golden
 
 
-def test_the_golden_layout_is_that_of_a_file_by_tfds(shared: Path) -> None:
+def test_golden_layout_equals_a_file_written_by_tfds(shared: Path) -> None:
     folder = shared / "data" / "droid_rlds" / "r2d2_faceblur" / "1.0.0"
     assert layout(sorted(folder.glob("*.tfrecord-*"))[0]) == json.loads(
         (GOLDEN / "droid_record_layout.json").read_text()
@@ -35,12 +35,12 @@ def test_the_golden_layout_is_that_of_a_file_by_tfds(shared: Path) -> None:
     assert (folder / "features.json").read_text() == (GOLDEN / "droid_features.json").read_text()
 
 
-def test_features_json_is_tfds_own_byte_for_byte(tmp_path: Path) -> None:
+def test_features_json_equals_tfds_byte_for_byte(tmp_path: Path) -> None:
     folder = write_synthetic_droid(tmp_path / "set", episodes=1, steps=2, shards=1)
     assert (folder / "features.json").read_text() == (GOLDEN / "droid_features.json").read_text()
 
 
-def test_dataset_info_counts_what_the_shards_hold(droid: Path) -> None:
+def test_dataset_info_counts_match_the_shards(droid: Path) -> None:
     info = json.loads((droid / "dataset_info.json").read_text())
     (split,) = info["splits"]
     spans = [index_records(shard) for shard in sorted(droid.glob("*.tfrecord-*"))]
@@ -54,7 +54,7 @@ def test_dataset_info_counts_what_the_shards_hold(droid: Path) -> None:
     ]
 
 
-def test_what_was_given_is_written_and_flags_and_reward_follow_from_length_and_path(tmp_path: Path) -> None:
+def test_written_flags_and_reward_follow_from_length_and_path(tmp_path: Path) -> None:
     episodes = [synthetic_episode(number, steps=3, size=(16, 32), success=number == 0) for number in range(2)]
     folder = write_droid_rlds(tmp_path / "set", episodes, shards=1)
     spans = index_records(next(folder.glob("*.tfrecord-*")))

@@ -22,7 +22,7 @@ def reader_of(data: bytes) -> Callable[[int, int], bytes]:
     return lambda offset, length: data[offset : offset + length]
 
 
-def test_framing_is_the_published_one(tmp_path: Path) -> None:
+def test_record_framing_matches_the_specification(tmp_path: Path) -> None:
     """CRC-32C of eight zero bytes is 0x8c28b28a; the mask rotates right by 15 and adds 0xa282ead8."""
     assert google_crc32c.value(bytes(8)) == 0x8C28B28A
     masked = (((0x8C28B28A >> 15) | (0x8C28B28A << 17)) + 0xA282EAD8) & 0xFFFFFFFF
@@ -46,7 +46,7 @@ features = st.dictionaries(
 
 @settings(max_examples=50)
 @given(features=features)
-def test_features_are_found_without_reading_the_others(features: dict) -> None:
+def test_features_are_located_without_reading_other_features(features: dict) -> None:
     data = b"before" + encode_example(features) + b"after"
     located = dict(iterate_features(reader_of(data), 6, len(data) - 11))
     assert located.keys() == features.keys()
@@ -59,7 +59,7 @@ def test_features_are_found_without_reading_the_others(features: dict) -> None:
     assert {name: list(values) for name, (_, values) in decoded.items()} == {n: v for n, (_, v) in features.items()}
 
 
-def test_an_example_is_written_as_protobuf_writes_it() -> None:
+def test_encoded_example_equals_protobuf_output() -> None:
     """The bytes are those of protobuf 7.36.2 with deterministic=True."""
     features = {"a": ("int64_list", [1, -1, 300]), "a/b": ("float_list", [1.0, -2.5]), "none": ("float_list", [])}
     written = (
@@ -69,7 +69,7 @@ def test_an_example_is_written_as_protobuf_writes_it() -> None:
     assert encode_example({**features, "text": ("bytes_list", [b"x", b""])}).hex() == written
 
 
-def test_bytes_that_are_no_example_are_refused() -> None:
+def test_bytes_that_are_not_an_example_raise() -> None:
     example = encode_example({"name": ("bytes_list", [b"value" * 10])})
     for length in range(1, len(example)):
         with pytest.raises(NotAnExampleError):

@@ -1,4 +1,4 @@
-"""RLDS as other people write it: `init` proposes a config for it, and the config reads the true frames and states."""
+"""Third-party RLDS data sets: `init` proposes a config, and the config reads the true frames and states."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def require_true(config: DataConfig, *, tolerance: float = 1e-5) -> None:
 
 
 @pytest.mark.parametrize("mode", [None, "RGBA", "P", "L"])
-def test_png_images_are_read_by_their_content(mode: str | None, tmp_path: Path) -> None:
+def test_image_format_is_detected_from_content(mode: str | None, tmp_path: Path) -> None:
     folder = write(tmp_path / "set", images=lambda number: {IMAGE: [encoded(one, mode=mode) for one in FRAMES[number]]})
     config, _ = proposed(folder)
     read = open_source(config).read(2).read_frames([5, 0])
@@ -83,7 +83,7 @@ def test_png_images_are_read_by_their_content(mode: str | None, tmp_path: Path) 
     [lambda _: {}, lambda _: {NAME: [b""]}, lambda _: {NAME: [b"same"]}],
     ids=["without metadata", "empty names", "equal names"],
 )
-def test_records_without_a_usable_name_are_numbered(names: Any, tmp_path: Path) -> None:
+def test_records_without_identity_feature_are_numbered(names: Any, tmp_path: Path) -> None:
     config, guessed = proposed(write(tmp_path / "set", names=names))
     assert config.fields.identity == "record"
     assert "written again" in guessed["fields.identity"] or "rewriting the data set" in guessed["fields.identity"]
@@ -127,7 +127,7 @@ def in_format(states: Float[np.ndarray, "steps 7"], rotation: str) -> Float[np.n
     ],
     ids=["bool gripper", "gripper -1 to 1", "gripper in metres", "millimetres", "degrees", "quaternion", "LIBERO"],
 )
-def test_formats_of_states_are_proposed_and_read(
+def test_state_formats_are_proposed_and_read(
     states: Any, kinds: Any, expected: Mapping[str, Any], tmp_path: Path
 ) -> None:
     config, guessed = proposed(write(tmp_path / "set", states=states, kinds=kinds))
